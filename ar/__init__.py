@@ -1,0 +1,1 @@
+"""What the surgeon sees: triangles and cameras in, pixels out. Knows no brain."""

@@ -1,0 +1,1 @@
+"""What happens: scripted tools, the loop that plays them, and the command line."""

@@ -1,0 +1,38 @@
+"""The command line: `sulcus COMMAND ...`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+from sim.errors import InputError
+
+# A command's module is imported only when it is asked for: `sulcus solve` does not wait for torch.
+COMMANDS = {
+    "anatomy": "make a tetrahedral brain with a tumour, from the template or from a label volume",
+    "solve": "find the static equilibrium of any tetrahedral mesh",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command. Returns 0 (done), 1 (ran, but did not reach what was asked) or 2 (bad input)."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(prog="sulcus", description=__doc__, epilog="Research only; not a medical device.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    asked = arguments[0] if arguments else None
+    for name, text in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        if name == asked:
+            importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
+    args = parser.parse_args(arguments)
+    try:
+        return importlib.import_module(f"scenes.commands.{args.command}").run(args)
+    except InputError as error:
+        print(f"sulcus {args.command}: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

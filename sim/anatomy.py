@@ -1,0 +1,76 @@
+"""A body to operate on: a mesh, its regions, and what holds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from .errors import InputError
+from .mesh import TetMesh, digest_of
+
+BRAIN_LABEL, TUMOUR_LABEL = 1, 2
+"""Region labels that the project's own anatomies use."""
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """A mesh with its boundary conditions, in the volume's own RAS frame [m].
+
+    Parameters
+    ----------
+    mesh
+        The tetrahedra; regions `BRAIN_LABEL` and `TUMOUR_LABEL` where there is a tumour.
+    held
+        (V, 3) bool: displacement components that are prescribed (zero, unless a load says otherwise).
+    slide_normal
+        (V, 3): unit normal where a node slides along the skull, zero elsewhere.
+    craniotomy
+        (V,) bool: free surface nodes that a tool may touch.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit the mesh, or slide normals that are neither zero nor of unit length.
+    """
+
+    mesh: TetMesh
+    held: np.ndarray
+    slide_normal: np.ndarray
+    craniotomy: np.ndarray
+
+    def __post_init__(self) -> None:
+        count = len(self.mesh.nodes)
+        object.__setattr__(self, "held", np.ascontiguousarray(self.held, bool))
+        object.__setattr__(self, "slide_normal", np.ascontiguousarray(self.slide_normal, np.float64))
+        object.__setattr__(self, "craniotomy", np.ascontiguousarray(self.craniotomy, bool))
+        for name, shape in (("held", (count, 3)), ("slide_normal", (count, 3)), ("craniotomy", (count,))):
+            if getattr(self, name).shape != shape:
+                raise InputError(f"{name} has shape {getattr(self, name).shape}: this mesh needs {shape}.")
+        length = np.linalg.norm(self.slide_normal, axis=1)
+        if not np.all((length == 0.0) | (np.abs(length - 1.0) < 1e-6)):
+            raise InputError("slide_normal has rows that are neither zero nor of unit length: normalise them.")
+
+    @cached_property
+    def tumour_nodes(self) -> np.ndarray:
+        """Sorted vertex numbers (n,) of the tumour."""
+        return self.mesh.nodes_of(TUMOUR_LABEL)
+
+    @cached_property
+    def tumour_surface(self) -> np.ndarray:
+        """Triangles (S, 3), outwards, of the tumour's surface."""
+        return self.mesh.boundary_of(TUMOUR_LABEL)
+
+    @cached_property
+    def open_surface(self) -> np.ndarray:
+        """Surface triangles (S, 3), outwards, whose corners all lie in the craniotomy."""
+        surface = self.mesh.surface
+        return surface[self.craniotomy[surface].all(axis=1)]
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of the mesh and its boundary conditions."""
+        return digest_of(
+            self.mesh.nodes, self.mesh.tets, self.mesh.region, self.held, self.slide_normal, self.craniotomy
+        )

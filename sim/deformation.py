@@ -1,0 +1,106 @@
+"""What comes out of every deformer: displacements, how they came about, and what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from .anatomy import Anatomy
+from .loads import Loads
+
+
+class Outcome(Enum):
+    """How an answer came about; the value is the sentence that a user reads."""
+
+    CONVERGED = "converged to the tolerance asked for"
+    CONVERGED_IN_STEPS = "converged to the tolerance asked for, the load applied in steps"
+    BUDGET = "stopped when the budget of steps was spent; the last accepted state is returned"
+    STALLED = "stopped because no step lowered the energy; the last accepted state is returned"
+    NOT_FINITE = "stopped because a number overflowed; the last finite state is returned"
+    PREDICTED = "predicted by a learnt model inside the range that it was taught"
+    EXTRAPOLATED = "predicted by a learnt model outside the range that it was taught: do not rely on it"
+
+    @property
+    def good(self) -> bool:
+        """Whether the answer may be relied on."""
+        return self in (Outcome.CONVERGED, Outcome.CONVERGED_IN_STEPS, Outcome.PREDICTED)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Wall seconds by stage, for the whole batch; set-up (factorisation, compilation) is not among them."""
+
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def total(self) -> float:
+        """Sum over the stages [s]."""
+        return float(sum(self.seconds.values()))
+
+
+@dataclass(frozen=True, eq=False)
+class Deformation:
+    """B answers of one deformer.
+
+    Parameters
+    ----------
+    displacement
+        (B, n, 3) [m], always finite.
+    nodes
+        (n,) the mesh vertices that the rows belong to (a surrogate may know only the tumour's).
+    outcome
+        B outcomes.
+    iterations, residual, time
+        (B,): Newton steps, relative residual as in `Accuracy`, time [s]. A surrogate has zero iterations, and
+        NaN for the residual that it did not compute.
+    reaction
+        (B, tools, 6): force [N] and moment about the tool's point [N m] that each tool exerts.
+    history
+        Per term, opaque: what must travel to the next call.
+    cost
+        Seconds by stage.
+    """
+
+    displacement: np.ndarray
+    nodes: np.ndarray
+    outcome: tuple[Outcome, ...]
+    iterations: np.ndarray
+    residual: np.ndarray
+    time: np.ndarray
+    reaction: np.ndarray
+    history: Mapping[str, Any] = field(default_factory=dict)
+    cost: Cost = Cost()
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.displacement).all():
+            raise AssertionError("a deformer let a displacement pass that is not finite: a defect of the deformer")
+
+    def __len__(self) -> int:
+        return len(self.displacement)
+
+    def at(self, nodes: np.ndarray) -> Deformation:
+        """The rows of some mesh vertices `nodes` (n,), which must all be among `self.nodes`."""
+        order = np.argsort(self.nodes)
+        position = order[np.searchsorted(self.nodes, nodes, sorter=order).clip(max=len(order) - 1)]
+        missing = self.nodes[position] != nodes
+        if missing.any():
+            raise KeyError(f"this deformation does not know vertex {np.asarray(nodes)[missing][0]}")
+        return replace(self, displacement=self.displacement[:, position], nodes=np.asarray(nodes))
+
+
+@runtime_checkable
+class Deformer(Protocol):
+    """Whatever answers loads with a deformation: the finite elements, or a model that learnt from them."""
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The body that is deformed."""
+        ...
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """Answer `loads`, from `start`, at mesh vertices `at` (n,). Pure: same loads and start, same answer."""
+        ...

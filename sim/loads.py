@@ -1,0 +1,152 @@
+"""A batch of causes: what the world does to the tissue, one row per load case."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import numpy as np
+
+from .errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Pushed:
+    """A dead traction on a round footprint: t(x) = F w(|x - c| / r) / integral of w, w(s) = sqrt(1 - s^2).
+
+    point (B, 3) [m] in the rest configuration, force (B, 3) [N], footprint (B,) radius [m].
+    """
+
+    point: np.ndarray
+    force: np.ndarray
+    footprint: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Displaced:
+    """A tool that moves the tissue under it: the w-weighted mean motion of the footprint is prescribed.
+
+    The dual of `Pushed`: the force that it takes comes out as reaction, and `Pushed` with that force gives the
+    same deformation. point (B, 3) [m], displacement (B, 3) [m], footprint (B,) radius [m].
+    """
+
+    point: np.ndarray
+    displacement: np.ndarray
+    footprint: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Nodal:
+    """Dead forces at the mesh's own nodes: force (B, V, 3) [N]."""
+
+    force: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Prescribed:
+    """Values of the held components: displacement (B, V, 3) [m]; entries that are not held are ignored."""
+
+    displacement: np.ndarray
+
+
+Cause = Pushed | Displaced | Nodal | Prescribed
+C = TypeVar("C", Pushed, Displaced, Nodal, Prescribed)
+# The array of each cause that grows with the load; the others say where it acts.
+MAGNITUDE = {Pushed: "force", Displaced: "displacement", Nodal: "force", Prescribed: "displacement"}
+
+
+@dataclass(frozen=True, eq=False)
+class Loads:
+    """B load cases, each the sum of all causes; at most one cause of each kind.
+
+    Parameters
+    ----------
+    causes
+        `Pushed`, `Displaced`, `Nodal`, `Prescribed`.
+    time
+        (B,) [s]; the time at which the answer is wanted. Zero where nothing depends on time.
+
+    Raises
+    ------
+    InputError
+        No cause, a kind twice, rows that do not agree, or a number that is not finite.
+    """
+
+    causes: tuple[Cause, ...]
+    time: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        kinds = [type(cause) for cause in self.causes]
+        if not kinds or len(set(kinds)) < len(kinds):
+            names = ", ".join(kind.__name__ for kind in kinds) or "none"
+            raise InputError(f"loads have the causes {names}: give at least one, and each kind once.")
+        object.__setattr__(self, "causes", tuple(_checked(cause) for cause in self.causes))
+        rows = {len(getattr(cause, item.name)) for cause in self.causes for item in fields(cause)}
+        time = np.zeros(max(rows)) if self.time is None else np.asarray(self.time, np.float64)
+        if rows != {len(time)}:
+            raise InputError(f"load arrays have {sorted(rows | {len(time)})} rows: give one row per load case.")
+        object.__setattr__(self, "time", time)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def times(self) -> np.ndarray:
+        """(B,) [s]."""
+        assert self.time is not None
+        return self.time
+
+    def of(self, kind: type[C]) -> C | None:
+        """The cause of one kind, or None."""
+        return next((cause for cause in self.causes if isinstance(cause, kind)), None)
+
+    def rows(self, index: slice | np.ndarray) -> Loads:
+        """Some of the load cases, as loads."""
+        causes = tuple(
+            replace(cause, **{item.name: getattr(cause, item.name)[index] for item in fields(cause)})
+            for cause in self.causes
+        )
+        return Loads(causes, self.times[index])
+
+    def scaled(self, fraction: float | np.ndarray) -> Loads:
+        """The same causes with every magnitude times `fraction` (scalar or (B,))."""
+
+        def grown(cause: Cause) -> Cause:
+            name = MAGNITUDE[type(cause)]
+            array = getattr(cause, name)
+            factor = np.broadcast_to(fraction, len(array)).reshape(-1, *[1] * (array.ndim - 1))
+            return replace(cause, **{name: factor * array})
+
+        return Loads(tuple(grown(cause) for cause in self.causes), self.times)
+
+
+def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) -> Loads:
+    """Loads of one pushing tool: point (3,) or (B, 3) [m], force (3,) or (B, 3) [N], footprint radius [m]."""
+    point, force = np.atleast_2d(point), np.atleast_2d(force)
+    rows = max(len(point), len(force))
+    return Loads(
+        (
+            Pushed(
+                np.broadcast_to(point, (rows, 3)),
+                np.broadcast_to(force, (rows, 3)),
+                np.broadcast_to(footprint, rows),
+            ),
+        )
+    )
+
+
+def _checked(cause: Cause) -> Cause:
+    name = type(cause).__name__
+    arrays = {item.name: np.asarray(getattr(cause, item.name), np.float64) for item in fields(cause)}
+    for key, array in arrays.items():
+        scalar_rows = key == "footprint"
+        whole_field = isinstance(cause, Nodal | Prescribed)
+        good = array.ndim == (1 if scalar_rows else 3 if whole_field else 2)
+        if not good or (not scalar_rows and array.shape[-1] != 3):
+            want = "(B,)" if scalar_rows else "(B, V, 3)" if whole_field else "(B, 3)"
+            raise InputError(f"{name}.{key} has shape {array.shape}: give {want}.")
+        if not np.isfinite(array).all():
+            raise InputError(f"{name}.{key} has a value that is not finite: every number must be finite.")
+        if scalar_rows and not (array > 0.0).all():
+            raise InputError(f"{name}.{key} has a radius of {array.min():g} m: give positive radii in metres.")
+    return replace(cause, **arrays)

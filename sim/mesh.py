@@ -1,0 +1,168 @@
+"""Tetrahedral meshes: nodes, linear tetrahedra, region labels, and the surface that follows from them."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from .errors import InputError
+
+# Faces of a positively oriented tetrahedron, normals outwards.
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+# A volume below this share of the longest edge cubed is round-off, not an element.
+ZERO_VOLUME = 1e-12
+SLIVER_DEGREES = 1.0
+
+
+class MeshWarning(UserWarning):
+    """A mesh that can be used but will cost accuracy or was probably not meant so."""
+
+
+def signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Signed volumes (T,) [m^3] of tetrahedra `tets` (T, 4) over `nodes` (V, 3) [m]."""
+    a, b, c, d = (nodes[tets[:, k]] for k in range(4))
+    return np.einsum("ti,ti->t", np.cross(b - a, c - a), d - a) / 6.0
+
+
+def faces_once(tets: np.ndarray) -> np.ndarray:
+    """Triangles (S, 3), outwards, that belong to exactly one of the tetrahedra `tets` (T, 4)."""
+    faces = tets[:, FACES].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[np.sort(first[count == 1])]
+
+
+def dihedral_angles(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Dihedral angles (T, 6) [degrees] at the edges of each tetrahedron."""
+    corners = nodes[tets[:, FACES]]  # (T, 4, 3, 3)
+    normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    pairs = np.einsum("tei,tei->te", normals[:, EDGES[:, 0]], normals[:, EDGES[:, 1]])
+    return 180.0 - np.degrees(np.arccos(np.clip(pairs, -1.0, 1.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class TetMesh:
+    """Linear tetrahedra in metres.
+
+    Parameters
+    ----------
+    nodes
+        (V, 3) float64 [m].
+    tets
+        (T, 4) node numbers, positively oriented.
+    region
+        (T,) integer labels; a tissue law is chosen per label.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, non-finite coordinates, node numbers out of range, and elements of zero or negative
+        volume (`oriented` turns negative ones).
+
+    Warns
+    -----
+    MeshWarning
+        Dihedral angles below one degree; a body smaller than 1 mm or larger than 10 m.
+    """
+
+    nodes: np.ndarray
+    tets: np.ndarray
+    region: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, np.float64))
+        object.__setattr__(self, "tets", np.ascontiguousarray(self.tets, np.int32))
+        object.__setattr__(self, "region", np.ascontiguousarray(self.region, np.int32))
+        _check_shapes(self)
+        longest = np.linalg.norm(
+            self.nodes[self.tets[:, EDGES[:, 0]]] - self.nodes[self.tets[:, EDGES[:, 1]]], axis=2
+        ).max(axis=1)
+        bad = np.flatnonzero(self.volumes <= ZERO_VOLUME * longest**3)
+        if len(bad):
+            raise InputError(
+                f"tetrahedron {bad[0]} (and {len(bad) - 1} more) has volume {self.volumes[bad[0]]:.3g} m^3: "
+                "zero or negative. Remove degenerate elements, or turn negative ones with `oriented`."
+            )
+        _warn_of_doubtful(self)
+        for array in (self.nodes, self.tets, self.region):
+            array.flags.writeable = False
+
+    @cached_property
+    def volumes(self) -> np.ndarray:
+        """Element volumes (T,) [m^3]."""
+        return signed_volumes(self.nodes, self.tets)
+
+    @cached_property
+    def surface(self) -> np.ndarray:
+        """Outer triangles (S, 3), outwards."""
+        return faces_once(self.tets)
+
+    def boundary_of(self, label: int) -> np.ndarray:
+        """Triangles (S, 3), outwards, round the elements of one region."""
+        return faces_once(self.tets[self.region == label])
+
+    def nodes_of(self, label: int) -> np.ndarray:
+        """Sorted node numbers (n,) of the elements of one region."""
+        return np.unique(self.tets[self.region == label])
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of nodes, tetrahedra and regions (hexadecimal): the same bytes, the same mesh."""
+        return digest_of(self.nodes, self.tets, self.region)
+
+
+def digest_of(*arrays: np.ndarray) -> str:
+    """SHA-256 of the arrays' bytes and shapes, shortened to 16 hexadecimal digits."""
+    sha = hashlib.sha256()
+    for array in arrays:
+        little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+        sha.update(str(little.shape).encode() + little.dtype.str.encode() + little.tobytes())
+    return sha.hexdigest()[:16]
+
+
+def oriented(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, int]:
+    """Tetrahedra with every volume positive, and how many were turned. Zero volumes stay as they are."""
+    negative = signed_volumes(nodes, tets) < 0.0
+    turned = np.array(tets)
+    turned[negative] = turned[negative][:, [0, 1, 3, 2]]
+    return turned, int(negative.sum())
+
+
+def _check_shapes(mesh: TetMesh) -> None:
+    if mesh.nodes.ndim != 2 or mesh.nodes.shape[1] != 3:
+        raise InputError(f"nodes have shape {mesh.nodes.shape}: give (V, 3) coordinates in metres.")
+    if mesh.tets.ndim != 2 or mesh.tets.shape[1] != 4 or len(mesh.tets) == 0:
+        raise InputError(f"tets have shape {mesh.tets.shape}: give (T, 4) node numbers, at least one element.")
+    if mesh.region.shape != (len(mesh.tets),):
+        raise InputError(f"region has shape {mesh.region.shape}: give one label for each of {len(mesh.tets)} tets.")
+    if not np.isfinite(mesh.nodes).all():
+        node = int(np.flatnonzero(~np.isfinite(mesh.nodes).all(axis=1))[0])
+        raise InputError(f"node {node} has the coordinates {mesh.nodes[node]}: every coordinate must be finite.")
+    if mesh.tets.min() < 0 or mesh.tets.max() >= len(mesh.nodes):
+        raise InputError(
+            f"tets name node {mesh.tets.min() if mesh.tets.min() < 0 else mesh.tets.max()}, "
+            f"but the mesh has nodes 0 to {len(mesh.nodes) - 1}."
+        )
+
+
+def _warn_of_doubtful(mesh: TetMesh) -> None:
+    size = float(np.ptp(mesh.nodes[np.unique(mesh.tets)], axis=0).max())
+    if not 1e-3 <= size <= 10.0:
+        warnings.warn(
+            f"the body measures {size:.3g} m: coordinates are metres; give --unit mm if the file has millimetres.",
+            MeshWarning,
+            stacklevel=4,
+        )
+    slivers = int((dihedral_angles(mesh.nodes, mesh.tets).min(axis=1) < SLIVER_DEGREES).sum())
+    if slivers:
+        warnings.warn(
+            f"{slivers} tetrahedra have a dihedral angle below {SLIVER_DEGREES:g} degree: "
+            "expect slow convergence; remesh if you can.",
+            MeshWarning,
+            stacklevel=4,
+        )

@@ -1,0 +1,135 @@
+"""Mesh files: any tetrahedral format that meshio reads in, `.vtu` out, nothing half-written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .anatomy import Anatomy
+from .errors import InputError
+from .mesh import TetMesh, oriented
+
+UNITS = {"m": 1.0, "mm": 1e-3}
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """What a file held: the mesh in metres, its point data as stored, and what was changed in reading."""
+
+    mesh: TetMesh
+    point_data: Mapping[str, np.ndarray]
+    notes: tuple[str, ...]
+
+
+def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
+    """Read linear tetrahedra with cell data `region` (absent: one region 0).
+
+    Cells that are not tetrahedra are dropped and tetrahedra of negative orientation are turned, each with a note.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or unreadable, without tetrahedra, or with data that does not fit.
+    """
+    import meshio  # an optional reader: machines that only train have none
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file. Give a tetrahedral mesh that meshio reads, such as .vtu or .msh.")
+    if unit not in UNITS:
+        raise InputError(f"no unit is called {unit!r}: choose one of {', '.join(UNITS)}.")
+    try:
+        raw = meshio.read(path)
+    except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parser raises, or exit
+        reason = str(error).strip() or type(error).__name__
+        raise InputError(f"{path}: cannot be read as a mesh ({reason}). Convert it to .vtu or .msh.") from error
+    blocks = [number for number, block in enumerate(raw.cells) if block.type == "tetra"]
+    if not blocks:
+        kinds = ", ".join(sorted({block.type for block in raw.cells})) or "no cells"
+        raise InputError(f"{path}: holds {kinds}, but no linear tetrahedra (`tetra`). Mesh its volume first.")
+    notes = []
+    dropped = sorted({f"{len(block.data)} {block.type}" for block in raw.cells if block.type != "tetra"})
+    if dropped:
+        notes.append(f"dropped cells that are not tetrahedra: {', '.join(dropped)}")
+    tets, turned = oriented(raw.points, np.concatenate([raw.cells[number].data for number in blocks]))
+    if turned:
+        notes.append(f"turned {turned} tetrahedra of negative orientation")
+    region = np.zeros(len(tets), np.int32)
+    if "region" in raw.cell_data:
+        stored = np.concatenate([raw.cell_data["region"][number] for number in blocks])
+        if stored.ndim != 1 or not np.array_equal(stored, np.rint(stored)):
+            raise InputError(f"{path}: cell data `region` must be one whole number for each tetrahedron.")
+        region = stored.astype(np.int32)
+    try:
+        mesh = TetMesh(np.asarray(raw.points, np.float64) * UNITS[unit], tets, region)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return MeshFile(mesh, dict(raw.point_data), tuple(notes))
+
+
+def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray]) -> None:
+    """Write `.vtu` in metres, with cell data `region`; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        A name that does not end in .vtu, or a folder that cannot be written to.
+    """
+    import meshio
+
+    path = Path(path)
+    if path.suffix != ".vtu":
+        raise InputError(f"{path}: meshes are written as .vtu; give a name that ends so.")
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.vtu")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        meshio.Mesh(
+            mesh.nodes,
+            [("tetra", mesh.tets)],
+            point_data=dict(point_data),
+            cell_data={"region": [mesh.region]},
+        ).write(partial)
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}). Choose another folder.") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_anatomy(path: str | Path) -> Anatomy:
+    """Read an anatomy written by `write_anatomy`.
+
+    Raises
+    ------
+    InputError
+        As `read_mesh`; and a mesh that lacks `held`, `slide_normal` or `craniotomy`.
+    """
+    file = read_mesh(path)
+    missing = [name for name in ("held", "slide_normal", "craniotomy") if name not in file.point_data]
+    if missing:
+        raise InputError(
+            f"{path}: has no point data {', '.join(f'`{name}`' for name in missing)}, so it is a mesh but not an "
+            "anatomy. Make one with `sulcus anatomy`, or add them."
+        )
+    data = file.point_data
+    try:
+        return Anatomy(file.mesh, data["held"] != 0, data["slide_normal"], data["craniotomy"] != 0)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def write_anatomy(path: str | Path, anatomy: Anatomy) -> None:
+    """Write an anatomy as `.vtu` in metres (RAS): `region`, `held`, `slide_normal`, `craniotomy`."""
+    write_mesh(
+        path,
+        anatomy.mesh,
+        {
+            "held": anatomy.held.astype(np.uint8),
+            "slide_normal": anatomy.slide_normal,
+            "craniotomy": anatomy.craniotomy.astype(np.uint8),
+        },
+    )
