@@ -1,0 +1,145 @@
+"""Effects + anatomy + device -> Problem: the one `match` over effects. A term's module is imported in its own arm."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable
+from functools import partial
+
+import numpy as np
+
+from .anatomy import Anatomy
+from .constraint import Constraint
+from .device import Device
+from .effects import Effect, Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
+from .element import linear_elements
+from .errors import InputError
+from .footprint import footprint_weights
+from .holding import check_held
+from .loads import Displaced, Loads, Nodal, Prescribed, Pushed
+from .material import Material
+from .problem import Imposed, Problem
+from .term import Term
+
+CAUSES = {ToolForce: Pushed, ToolDisplacement: Displaced, NodalForce: Nodal, Held: Prescribed}
+"""The cause that each effect answers; other effects act by themselves."""
+
+
+def compile_problem(effects: Iterable[Effect], anatomy: Anatomy, device: Device) -> Problem:
+    """Build the terms and constraints that `effects` ask for, and nothing else.
+
+    Raises
+    ------
+    InputError
+        Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not held.
+    """
+    effects = tuple(effects)
+    kinds = [type(effect) for effect in effects]
+    for kind in kinds:
+        if kinds.count(kind) > 1:
+            raise InputError(f"the effect {kind.__name__} is asked for {kinds.count(kind)} times: once is enough.")
+    if Elasticity not in kinds:
+        raise InputError("no effect resists deformation: add Elasticity.")
+    terms: list[Term] = []
+    held = np.zeros_like(anatomy.held)
+    normal = np.zeros_like(anatomy.slide_normal)
+    for effect in effects:
+        match effect:
+            case Elasticity():
+                terms += _elasticity(effect, anatomy, device)
+            case Held():
+                held = anatomy.held
+            case Slide():
+                normal = anatomy.slide_normal
+            case ToolForce():
+                from .terms.dead_force import DeadForce
+
+                terms.append(DeadForce("tool force", partial(pushed_forces, anatomy), device))
+            case NodalForce():
+                from .terms.dead_force import DeadForce
+
+                terms.append(DeadForce("nodal force", partial(_nodal_forces, anatomy), device))
+            case ToolDisplacement():
+                pass  # a constraint: `_impose` reads the loads
+            case _:
+                allowed = ", ".join(kind.__name__ for kind in Effect.__args__)
+                raise InputError(f"no effect is called {type(effect).__name__}: choose from {allowed}.")
+    check_held(anatomy.mesh, held, normal)
+    return Problem(tuple(terms), Constraint(held, normal, device), device, partial(_impose, anatomy))
+
+
+def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
+    """Refuse loads that no effect of the scene answers.
+
+    Raises
+    ------
+    InputError
+        Naming the cause and the effect that it needs.
+    """
+    answered = {CAUSES[type(effect)] for effect in effects if type(effect) in CAUSES}
+    for cause in loads.causes:
+        if type(cause) not in answered:
+            needed = next(effect.__name__ for effect, kind in CAUSES.items() if kind is type(cause))
+            raise InputError(f"loads hold {type(cause).__name__}, which nothing answers: add the effect {needed}.")
+
+
+def footprint_of(anatomy: Anatomy, cause: Pushed | Displaced) -> np.ndarray:
+    """Weights (B, V) of a tool's footprint on the vertices; each row sums to one."""
+    mesh = anatomy.mesh
+    return footprint_weights(mesh.nodes, mesh.surface, cause.point, cause.footprint).toarray()
+
+
+def pushed_forces(anatomy: Anatomy, loads: Loads) -> np.ndarray:
+    """Nodal forces (3V, B) [N] of pushing tools."""
+    cause = loads.of(Pushed)
+    if cause is None:
+        return np.zeros((3 * len(anatomy.mesh.nodes), len(loads)))
+    weight = footprint_of(anatomy, cause)
+    return (weight[:, :, None] * cause.force[:, None, :]).reshape(len(loads), -1).T
+
+
+def _nodal_forces(anatomy: Anatomy, loads: Loads) -> np.ndarray:
+    cause = loads.of(Nodal)
+    if cause is None:
+        return np.zeros((3 * len(anatomy.mesh.nodes), len(loads)))
+    return _whole_field("Nodal.force", cause.force, anatomy)
+
+
+def _impose(anatomy: Anatomy, loads: Loads) -> Imposed:
+    prescribed, displaced = loads.of(Prescribed), loads.of(Displaced)
+    value = None if prescribed is None else _whole_field("Prescribed.displacement", prescribed.displacement, anatomy)
+    if displaced is None:
+        return Imposed(value)
+    return Imposed(value, footprint_of(anatomy, displaced).T, displaced.displacement.T)
+
+
+def _whole_field(name: str, field: np.ndarray, anatomy: Anatomy) -> np.ndarray:
+    if field.shape[1] != len(anatomy.mesh.nodes):
+        raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {len(anatomy.mesh.nodes)}.")
+    return field.reshape(len(field), -1).T
+
+
+def _elasticity(effect: Elasticity, anatomy: Anatomy, device: Device) -> list[Term]:
+    """One term for each law, over the elements of all regions that obey it."""
+    from .terms.elasticity import Elasticity as ElasticityTerm
+
+    mesh = anatomy.mesh
+    labels = [int(label) for label in np.unique(mesh.region)]
+    unknown = sorted(set(effect.regions) - set(labels))
+    if unknown:
+        raise InputError(f"a law is given for region {unknown[0]}, but the mesh has the regions {labels}.")
+    materials: dict[int, Material] = {}
+    for label in labels:
+        material = effect.regions.get(label, effect.default)
+        if material is None:
+            raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
+        materials[label] = material
+    terms: list[Term] = []
+    for name in sorted({material.law for material in materials.values()}):
+        law = importlib.import_module(f".terms.{name.replace('-', '_')}", __package__).LAW
+        obeying = {label: material for label, material in materials.items() if material.law == name}
+        chosen = np.isin(mesh.region, list(obeying))
+        lame = np.array([obeying[int(label)].lame for label in mesh.region[chosen]])
+        elements = linear_elements(mesh, chosen)
+        terms.append(ElasticityTerm(f"elasticity {name}", law, elements, lame[:, 0], lame[:, 1], device))
+    return terms

@@ -1,0 +1,208 @@
+"""Held, prescribed and sliding nodes, and footprints that a tool moves: one projection for all of them.
+
+Every constraint is linear, C u = value, with rows that are orthogonal to each other. `project` takes a gradient or a
+direction to the space of motions that the constraints leave free; `close_gap` is the motion that satisfies them.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from .columns import CHUNK, gathered
+from .device import Device
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Constraint arithmetic of one scalar type."""
+
+    project: wp.Kernel
+    close: wp.Kernel
+    average: wp.Kernel
+    spread: wp.Kernel
+
+
+@cache
+def kernels_of(device: Device) -> Kernels:
+    """Kernels of a device's scalar type."""
+    scalar, vec = device.scalar, device.vector
+    chunk = CHUNK
+
+    @wp.kernel(module="unique")
+    def project(
+        held: wp.array2d(dtype=wp.int8),
+        normal: wp.array(dtype=vec),
+        # outputs
+        v: wp.array2d(dtype=scalar),
+    ):
+        """v_i -= n (n . v_i); held components of v are zero."""
+        i, c = wp.tid()
+        x = vec(v[3 * i, c], v[3 * i + 1, c], v[3 * i + 2, c])
+        n = normal[i]
+        x -= wp.dot(n, x) * n
+        for k in range(3):
+            v[3 * i + k, c] = wp.where(held[i, k] == wp.int8(0), x[k], scalar(0.0))
+
+    @wp.kernel(module="unique")
+    def close(
+        held: wp.array2d(dtype=wp.int8),
+        normal: wp.array(dtype=vec),
+        value: wp.array2d(dtype=scalar),
+        u: wp.array2d(dtype=scalar),
+        # outputs
+        gap: wp.array2d(dtype=scalar),
+    ):
+        """gap_i = value - u where held, -n (n . u_i) where sliding, zero elsewhere."""
+        i, c = wp.tid()
+        x = vec(u[3 * i, c], u[3 * i + 1, c], u[3 * i + 2, c])
+        n = normal[i]
+        slip = -wp.dot(n, x) * n
+        for k in range(3):
+            r = 3 * i + k
+            gap[r, c] = wp.where(held[i, k] == wp.int8(0), slip[k], value[r, c] - x[k])
+
+    @wp.kernel(module="unique")
+    def average(
+        weight: wp.array2d(dtype=scalar),
+        v: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_kc += sum over a chunk of nodes of w_ic v_(3i+k)c."""
+        block, c = wp.tid()
+        total = vec()
+        for i in range(block * chunk, wp.min((block + 1) * chunk, weight.shape[0])):
+            total += weight[i, c] * vec(v[3 * i, c], v[3 * i + 1, c], v[3 * i + 2, c])
+        for k in range(3):
+            wp.atomic_add(out, k, c, total[k])
+
+    @wp.kernel(module="unique")
+    def spread(
+        weight: wp.array2d(dtype=scalar),
+        amount: wp.array2d(dtype=scalar),
+        # outputs
+        v: wp.array2d(dtype=scalar),
+    ):
+        """v_(3i+k)c += w_ic amount_kc."""
+        i, c = wp.tid()
+        for k in range(3):
+            v[3 * i + k, c] += weight[i, c] * amount[k, c]
+
+    return Kernels(project, close, average, spread)
+
+
+class Constraint:
+    """Which motions of N nodes are free.
+
+    Parameters
+    ----------
+    held
+        (N, 3) bool: components whose value is prescribed.
+    normal
+        (N, 3): unit normals of sliding nodes, zero elsewhere. Where components of a sliding node are held, the
+        normal acts on the others.
+    device
+        Where its arrays live.
+    """
+
+    def __init__(self, held: np.ndarray, normal: np.ndarray, device: Device):
+        self.held = held
+        self.normal = _within_free(held, normal)
+        self.device = device
+        self._held = device.array(held.astype(np.int8), wp.int8)
+        self._normal = device.array(self.normal, device.vector)
+        self._value: wp.array | None = None
+        self._weight: wp.array | None = None
+        self._target: wp.array | None = None
+
+    def begin(self, value: np.ndarray | None, weight: np.ndarray | None, target: np.ndarray | None) -> None:
+        """Take a batch of values (3N, b) [m] for held components; None holds them at zero.
+
+        Footprint weights (N, b) whose mean motion is `target` (3, b) [m], or None. Weights on constrained nodes
+        are dropped, so that all rows stay orthogonal; the rest sums to one again.
+        """
+        self._value = None if value is None else self.device.array(value)
+        self._weight = self._target = None
+        if weight is not None and target is not None:
+            weight = weight * ~(self.held | (self.normal != 0.0)).any(axis=1, keepdims=True)
+            weight = weight / weight.sum(axis=0)
+            self._weight, self._target = self.device.array(weight), self.device.array(target)
+
+    def keep(self, columns: np.ndarray) -> None:
+        """Keep these columns (k,) of the batch."""
+        if self._value is not None:
+            self._value = gathered(self.device, self._value, columns)
+        if self._weight is not None:
+            self._weight = gathered(self.device, self._weight, columns)
+            self._target = gathered(self.device, self._target, columns)
+
+    def project(self, v: wp.array) -> None:
+        """Remove from v (3N, b) what the constraints forbid, in place."""
+        self.device.launch(
+            kernels_of(self.device).project, (len(self.held), v.shape[1]), [self._held, self._normal], [v]
+        )
+        if self._weight is not None:
+            self._spread(-self._average(v), v)
+
+    def close_gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
+        """The least motion (3N, b) that takes u (3N, b) to the constraints, and its largest component (b,) [m]."""
+        gap = self.device.zeros(*u.shape)
+        value = self._value if self._value is not None else gap
+        inputs = [self._held, self._normal, value, u]
+        self.device.launch(kernels_of(self.device).close, (len(self.held), u.shape[1]), inputs, [gap])
+        if self._weight is not None and self._target is not None:
+            self._spread(self._target.numpy() - self._average(u), gap)
+        return gap, np.abs(gap.numpy()).max(axis=0, initial=0.0)
+
+    def force_on_footprint(self, gradient: wp.array) -> np.ndarray | None:
+        """The multipliers (3, b) [N]: the force with which the tool moves its footprint, or None without one.
+
+        In equilibrium the gradient is w (x) force on the footprint's nodes.
+        """
+        if self._weight is None:
+            return None
+        return self._average(gradient) / self._square()
+
+    def basis(self) -> sp.csc_array:
+        """Orthonormal basis (3N, n) of the motions that held and sliding nodes leave free, sparse."""
+        sliding = (self.normal != 0.0).any(axis=1)
+        plain = ~self.held & ~sliding[:, None]
+        rows = [np.flatnonzero(plain)]
+        columns, values = [np.arange(len(rows[0]))], [np.ones(len(rows[0]))]
+        count = len(rows[0])
+        for node in np.flatnonzero(sliding):
+            # Free directions: the orthogonal complement of the held axes and the normal.
+            blocked = np.vstack([np.eye(3)[self.held[node]], self.normal[node]])
+            _, _, right = np.linalg.svd(blocked)
+            free = right[len(blocked) :]
+            rows.append(np.tile(3 * node + np.arange(3), len(free)))
+            columns.append(np.repeat(count + np.arange(len(free)), 3))
+            values.append(free.ravel())
+            count += len(free)
+        data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+        return sp.csc_array(sp.coo_array(data, shape=(self.held.size, count)))
+
+    def _square(self) -> np.ndarray:
+        assert self._weight is not None
+        return (self._weight.numpy().astype(np.float64) ** 2).sum(axis=0)
+
+    def _average(self, v: wp.array) -> np.ndarray:
+        assert self._weight is not None
+        out = self.device.zeros(3, v.shape[1])
+        dim = (-(-len(self.held) // CHUNK), v.shape[1])
+        self.device.launch(kernels_of(self.device).average, dim, [self._weight, v], [out])
+        return out.numpy().astype(np.float64)
+
+    def _spread(self, amount: np.ndarray, v: wp.array) -> None:
+        inputs = [self._weight, self.device.array(amount / self._square())]
+        self.device.launch(kernels_of(self.device).spread, (len(self.held), v.shape[1]), inputs, [v])
+
+
+def _within_free(held: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Normals (N, 3) with their held components removed, of unit length again; zero where nothing is left."""
+    inside = np.where(held, 0.0, normal)
+    length = np.linalg.norm(inside, axis=1, keepdims=True)
+    return np.divide(inside, length, out=np.zeros_like(inside), where=length > 1e-9)

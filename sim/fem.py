@@ -1,0 +1,221 @@
+"""The finite-element deformer: warm start, batches, and load stepping when Newton fails."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import scipy.sparse as sp
+
+from .accuracy import TRAIN, Accuracy
+from .anatomy import Anatomy
+from .compile import check_causes, compile_problem, footprint_of
+from .deformation import Cost, Deformation, Outcome
+from .device import find_device
+from .direction import NewtonCG
+from .effects import Effect
+from .errors import InputError
+from .linear import BlockJacobi, Factor, Preconditioner
+from .loads import MAGNITUDE, Displaced, Loads, Pushed
+from .newton import Equilibrium, find_equilibrium
+from .problem import Problem
+from .term import Cases
+
+# Above this many unknowns the factor's memory and time outgrow what it saves.
+LARGEST_FACTOR = 400_000
+SMALLEST_LOAD_STEP = 1.0 / 64.0
+
+
+class Fem:
+    """A Deformer: static equilibrium by finite elements.
+
+    Parameters
+    ----------
+    anatomy
+        The body.
+    effects
+        What the scene calls for; nothing else is compiled.
+    accuracy
+        Tolerance, budgets and precision.
+    device
+        "auto", "cpu", "cuda" or "cuda:1".
+    batch
+        Most load cases that are solved together.
+
+    Raises
+    ------
+    InputError
+        Effects that cannot be had, a body that is not held, a device that is not there.
+    """
+
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        effects: Iterable[Effect],
+        accuracy: Accuracy = TRAIN,
+        device: str = "auto",
+        batch: int = 64,
+    ):
+        self._anatomy = anatomy
+        self.effects = tuple(effects)
+        self.accuracy = accuracy
+        self.batch = batch
+        self.problem = compile_problem(self.effects, anatomy, find_device(device, accuracy.precision))
+        self._direction = NewtonCG(choose_preconditioner(self.problem), accuracy.inner)
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The body that is deformed."""
+        return self._anatomy
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """Static equilibrium under every load case.
+
+        `start` (B rows, every vertex) is the first guess and brings history; at rest without one. `at` (n,) picks
+        vertices of the answer.
+
+        Raises
+        ------
+        InputError
+            Loads that no effect answers, or that do not touch the body; a start that does not fit.
+        """
+        check_causes(self.effects, loads)
+        guess = self._guess(loads, start)
+        parts = []
+        for first in range(0, len(loads), self.batch):
+            rows = slice(first, first + self.batch)
+            history = {} if start is None else {name: value[rows] for name, value in start.history.items()}
+            begun = np.zeros(len(loads))[rows] if start is None else start.time[rows]
+            parts.append(self._solve(Cases(loads.rows(rows), begun, history), guess[:, rows]))
+        whole = _joined(parts)
+        return whole if at is None else whole.at(at)
+
+    def _guess(self, loads: Loads, start: Deformation | None) -> np.ndarray:
+        """First guesses (3V, B). A case without any load starts at rest: its answer is exactly zero."""
+        if start is None:
+            return np.zeros((self.problem.rows, len(loads)))
+        if start.displacement.shape != (len(loads), self.problem.rows // 3, 3):
+            raise InputError(
+                f"the start has displacements of shape {start.displacement.shape}: give every vertex of "
+                f"{len(loads)} load cases, ({len(loads)}, {self.problem.rows // 3}, 3)."
+            )
+        loaded = np.zeros(len(loads), bool)
+        for cause in loads.causes:
+            loaded |= (getattr(cause, MAGNITUDE[type(cause)]) != 0.0).reshape(len(loads), -1).any(axis=1)
+        full = start.at(np.arange(self.problem.rows // 3)).displacement
+        return np.where(loaded, full.reshape(len(loads), -1).T, 0.0)
+
+    def _solve(self, cases: Cases, guess: np.ndarray) -> Deformation:
+        clock = time.perf_counter()
+        self.problem.begin(cases)
+        begun = time.perf_counter()
+        found = find_equilibrium(self.problem, self._direction, guess, self.accuracy)
+        solved = time.perf_counter()
+        for column in [c for c, outcome in enumerate(found.outcome) if not outcome.good]:
+            _replace_column(found, column, self._in_steps(cases, column))
+        rescued = time.perf_counter()
+        self.problem.begin(cases)
+        u = self.problem.device.array(found.u)
+        history = self.problem.end(u)
+        reaction = self._reaction(cases.loads, self.problem.constraint.force_on_footprint(self.problem.gradient(u)))
+        count = found.u.shape[1]
+        return Deformation(
+            displacement=found.u.T.reshape(count, -1, 3),
+            nodes=np.arange(self.problem.rows // 3),
+            outcome=tuple(found.outcome),
+            iterations=found.iterations,
+            residual=found.residual,
+            time=cases.loads.times,
+            reaction=reaction,
+            history=history,
+            cost=Cost(
+                {
+                    "loads": begun - clock,
+                    "newton": solved - begun,
+                    "load steps": rescued - solved,
+                    "reactions": time.perf_counter() - rescued,
+                }
+            ),
+        )
+
+    def _in_steps(self, cases: Cases, column: int) -> Equilibrium:
+        """One case from rest, its load raised in steps that halve on failure; the last equilibrium if it fails."""
+        pick = np.array([column])
+        loads = cases.loads.rows(pick)
+        history = {name: value[pick] for name, value in cases.history.items()}
+        reached, step = 0.0, 0.5
+        u, spent = np.zeros((self.problem.rows, 1)), 0
+        while True:
+            aim = min(1.0, reached + step)
+            self.problem.begin(Cases(loads.scaled(aim), cases.start_time[pick], history))
+            found = find_equilibrium(self.problem, self._direction, u, self.accuracy)
+            spent += int(found.iterations[0])
+            if found.outcome[0].good:
+                u, reached = found.u, aim
+                if reached == 1.0:
+                    return replace(found, outcome=np.array([Outcome.CONVERGED_IN_STEPS]), iterations=np.array([spent]))
+            elif step <= SMALLEST_LOAD_STEP:
+                return replace(found, u=u, iterations=np.array([spent]))
+            else:
+                step /= 2.0
+
+    def _reaction(self, loads: Loads, on_footprint: np.ndarray | None) -> np.ndarray:
+        """(B, tools, 6): force and moment about its point that each tool exerts [N, N m]."""
+        rows = []
+        for cause in loads.causes:
+            if isinstance(cause, Pushed | Displaced):
+                force = cause.force if isinstance(cause, Pushed) else on_footprint
+                assert force is not None
+                force = force if isinstance(cause, Pushed) else force.T
+                arm = footprint_of(self._anatomy, cause) @ self._anatomy.mesh.nodes - cause.point
+                rows.append(np.concatenate([force, np.cross(arm, force)], axis=1))
+        return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))
+
+
+def choose_preconditioner(problem: Problem) -> Preconditioner:
+    """The rest stiffness factorised where that pays, block Jacobi beyond.
+
+    Raises
+    ------
+    InputError
+        A free rest stiffness that is singular.
+    """
+    if problem.rows > LARGEST_FACTOR:
+        return BlockJacobi(problem.device)
+    stiffness: sp.csc_array = problem.rest_curvature()
+    try:
+        return Factor(stiffness, problem.constraint, problem.device)
+    except RuntimeError as error:
+        raise InputError(f"the stiffness at rest cannot be factorised ({error}): is every part held?") from error
+
+
+def _replace_column(found: Equilibrium, column: int, single: Equilibrium) -> None:
+    found.u[:, column] = single.u[:, 0]
+    found.outcome[column] = single.outcome[0]
+    found.iterations[column] += single.iterations[0]
+    found.residual[column] = single.residual[0]
+
+
+def _joined(parts: list[Deformation]) -> Deformation:
+    """Batches, one after the other, as one deformation; seconds add up."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def stacked(name: str) -> np.ndarray:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    history = {key: np.concatenate([part.history[key] for part in parts]) for key in parts[0].history}
+    stages = parts[0].cost.seconds
+    return Deformation(
+        displacement=stacked("displacement"),
+        nodes=parts[0].nodes,
+        outcome=tuple(outcome for part in parts for outcome in part.outcome),
+        iterations=stacked("iterations"),
+        residual=stacked("residual"),
+        time=stacked("time"),
+        reaction=stacked("reaction"),
+        history=history,
+        cost=Cost({stage: sum(part.cost.seconds[stage] for part in parts) for stage in stages}),
+    )

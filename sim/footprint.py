@@ -1,0 +1,108 @@
+"""A round tool on a triangulated surface: how its weight falls on the mesh's vertices.
+
+The traction w(s) = sqrt(1 - s^2), s = |x - c| / r, is that of a flat punch's smooth counterpart (Hertz), integrated
+over triangles subdivided until they are small against the footprint: force and moment do not depend on the mesh.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+
+from .errors import InputError
+
+# Triangles are divided until their longest edge is below this share of the footprint's radius.
+FINENESS = 0.12
+
+
+def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:
+    """Weights (B, V), each row summing to one: a force F at `points` (B, 3) puts weight x F on every vertex.
+
+    Parameters
+    ----------
+    nodes
+        (V, 3) [m].
+    triangles
+        (S, 3): where the tool may touch.
+    points, radii
+        (B, 3) and (B,) [m]. A point off the surface is moved to its nearest point on it, by at most its radius.
+
+    Raises
+    ------
+    InputError
+        A footprint that does not touch the surface.
+    """
+    corners = nodes[triangles]
+    centre = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+    rows, columns, values = [], [], []
+    for number, (point, radius) in enumerate(zip(points, radii, strict=True)):
+        near = np.flatnonzero(np.linalg.norm(centre - point, axis=1) <= reach + 2.0 * radius)
+        touched = nearest_on(corners[near], point) if len(near) else None
+        if touched is None or np.linalg.norm(touched - point) > radius:
+            raise InputError(
+                f"load {number} presses at {np.round(1e3 * point, 1)} mm with a footprint of {1e3 * radius:.3g} mm, "
+                "which does not touch the surface: choose a point on it."
+            )
+        weight = _integrate(corners[near], touched, radius)
+        rows.append(np.full(3 * len(near), number))
+        columns.append(triangles[near].ravel())
+        values.append((weight / weight.sum()).ravel())
+    shape = (len(points), len(nodes))
+    if not rows:
+        return sp.csr_array(shape)
+    weights = sp.csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+    weights.eliminate_zeros()
+    return weights
+
+
+def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m].
+
+    Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the plane's foot where it lies inside, else the
+    nearest of the three edges.
+    """
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    foot = point - (np.einsum("si,si->s", point - a, normal) / np.einsum("si,si->s", normal, normal))[:, None] * normal
+    inside = np.ones(len(corners), bool)
+    candidates = []
+    for start, end in ((a, b), (b, c), (c, a)):
+        edge = end - start
+        inside &= np.einsum("si,si->s", np.cross(edge, foot - start), normal) >= 0.0
+        along = np.einsum("si,si->s", point - start, edge) / np.einsum("si,si->s", edge, edge)
+        candidates.append(start + along.clip(0.0, 1.0)[:, None] * edge)
+    candidates.append(foot[inside])
+    nearest = np.concatenate(candidates)
+    return nearest[np.argmin(np.linalg.norm(nearest - point, axis=1))]
+
+
+def _integrate(corners: np.ndarray, point: np.ndarray, radius: float) -> np.ndarray:
+    """Integral of w N_a over the footprint (S, 3), up to a factor, by one point per subdivided triangle."""
+    out = np.zeros((len(corners), 3))
+    owner = np.arange(len(corners))
+    bary = np.broadcast_to(np.eye(3), (len(corners), 3, 3))  # corner coordinates of each piece within its owner
+    while len(owner):
+        at = bary @ corners[owner]
+        centre = at.mean(axis=1)
+        edges = at - np.roll(at, 1, axis=1)
+        longest = np.linalg.norm(edges, axis=2).max(axis=1)
+        inside = np.linalg.norm(centre - point, axis=1) <= radius + longest
+        small = longest <= FINENESS * radius
+        done = small & inside
+        area = np.linalg.norm(np.cross(edges[done, 0], edges[done, 1]), axis=1)
+        s = np.linalg.norm(centre[done] - point, axis=1) / radius
+        weight = area * np.sqrt(np.clip(1.0 - s * s, 0.0, None))
+        np.add.at(out, owner[done], weight[:, None] * bary[done].mean(axis=1))
+        split = inside & ~small
+        owner = np.repeat(owner[split], 4)
+        bary = _quartered(bary[split])
+    return out
+
+
+def _quartered(bary: np.ndarray) -> np.ndarray:
+    """Each triangle (n, 3, 3) cut at its mid-edges: (4n, 3, 3)."""
+    a, b, c = bary[:, 0], bary[:, 1], bary[:, 2]
+    ab, bc, ca = (a + b) / 2.0, (b + c) / 2.0, (c + a) / 2.0
+    pieces = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
+    return np.stack([np.stack(piece, axis=1) for piece in pieces], axis=1).reshape(-1, 3, 3)

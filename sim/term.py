@@ -1,0 +1,78 @@
+"""The Term protocol: what it costs to have an effect (energy, gradient, curvature)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from .loads import Loads
+
+
+@dataclass(frozen=True, eq=False)
+class Cases:
+    """The load cases of a batch: what acts, since when, and what each term remembers of the past.
+
+    loads, B rows; start_time (B,) [s]; history, by term name: arrays with B rows, as `Term.end` returned them.
+    """
+
+    loads: Loads
+    start_time: np.ndarray
+    history: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Term(Protocol):
+    """One summand of the total potential, for b load cases at once.
+
+    Arrays are Warp's, on the problem's device, batch last: (3N, b), one column per live load case; N counts the
+    element's nodes. Every `out` is added to, except in `longest_step`, where the least value wins.
+    """
+
+    @property
+    def name(self) -> str:
+        """Unique in a problem; the key of its history."""
+        ...
+
+    def begin(self, cases: Cases) -> None:
+        """Take the loads, times and history of every column."""
+        ...
+
+    def keep(self, columns: np.ndarray) -> None:
+        """Keep these columns (k,), in this order: the others have left the batch."""
+        ...
+
+    def energy(self, u: wp.array, out: wp.array) -> None:
+        """Add the energy [J] of u (3N, b) [m] to out (b,), float64; +inf outside the domain."""
+        ...
+
+    def add_gradient(self, u: wp.array, out: wp.array) -> None:
+        """Add the energy's gradient [N] at u (3N, b) to out (3N, b)."""
+        ...
+
+    def linearise(self, u: wp.array, definite: wp.array) -> None:
+        """Remember u (3N, b) for `add_curvature`; definite (b,) int32: 1 asks for positive semi-definite curvature."""
+        ...
+
+    def add_curvature(self, p: wp.array, out: wp.array) -> None:
+        """Add the curvature at the last `linearise` times p (3N, b) [m] to out (3N, b) [N]."""
+        ...
+
+    def add_diagonal(self, out: wp.array) -> None:
+        """Add the 3 x 3 diagonal blocks of the curvature at the last `linearise` to out (N, b) of matrices [N/m]."""
+        ...
+
+    def rest_curvature(self) -> sp.csc_array | None:
+        """Curvature at rest (3N, 3N) [N/m], assembled, for factorised preconditioners; None leaves the term out."""
+        ...
+
+    def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
+        """Lower out (b,) to the longest fraction of du (3N, b) that stays inside the domain."""
+        ...
+
+    def end(self, u: wp.array) -> Any:
+        """What must travel to the next call, rows first (B, ...), or None."""
+        ...

@@ -1,0 +1,104 @@
+"""Corotational law: Hooke's law in the frame of the rotation nearest to F.
+
+    psi = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2, F = R S
+
+Sifakis, Barbic 2012, "FEM Simulation of 3D Deformable Solids", SIGGRAPH course, section 3.4. R is a rotation for
+inverted elements too: the least singular value carries the sign.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from .law import Law
+
+
+@wp.func
+def axial(A: Any):
+    """The vector w with [w]x = A - A^T."""
+    return wp.vector(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
+
+
+@wp.func
+def spin(S: Any, A: Any):
+    """w with (tr S I - S) w = axial A: the rotation R exp([w]x) that follows a change R A of F = R S.
+
+    Zero where the stretch S determines no rotation (two principal stretches cancel).
+    """
+    tiny = type(S[0, 0])(1.0e-6)
+    G = wp.trace(S) * wp.identity(n=3, dtype=type(tiny)) - S
+    size = wp.ddot(G, G)
+    if wp.abs(wp.determinant(G)) <= tiny * size * wp.sqrt(size):
+        return axial(A) * type(tiny)(0.0)
+    return wp.inverse(G) * axial(A)
+
+
+@wp.func
+def cross_matrix(w: Any):
+    """[w]x."""
+    zero = type(w[0])(0.0)
+    return wp.matrix_from_rows(wp.vector(zero, -w[2], w[1]), wp.vector(w[2], zero, -w[0]), wp.vector(-w[1], w[0], zero))
+
+
+@wp.func
+def rotation_of(F: Any):
+    """The rotation R nearest to F: from Warp's approximate singular values, then two Newton steps to round-off."""
+    U, s, V = wp.svd3(F)
+    R = U * wp.transpose(V)
+    if wp.determinant(R) < type(F[0, 0])(0.0):
+        least = int(2)
+        if s[0] < s[1] and s[0] < s[2]:
+            least = int(0)
+        elif s[1] < s[2]:
+            least = int(1)
+        for i in range(3):
+            U[i, least] = -U[i, least]
+        R = U * wp.transpose(V)
+    one = type(F[0, 0])(1.0)
+    for _ in range(2):
+        A = wp.transpose(R) * F
+        w = spin((A + wp.transpose(A)) / type(one)(2.0), A)
+        # Cayley's transform: a rotation that agrees with exp to second order.
+        half = cross_matrix(w) / type(one)(2.0)
+        identity = wp.identity(n=3, dtype=type(one))
+        R = R * (wp.inverse(identity - half) * (identity + half))
+    return R
+
+
+@wp.func
+def energy(H: Any, mu: Any, lam: Any):
+    """psi [Pa] = mu |S - I|^2 + lambda/2 tr(S - I)^2."""
+    identity = wp.identity(n=3, dtype=type(mu))
+    R = rotation_of(identity + H)
+    strain = wp.transpose(R) * (identity + H) - identity
+    t = wp.trace(strain)
+    return mu * wp.ddot(strain, strain) + type(mu)(0.5) * lam * t * t
+
+
+@wp.func
+def stress(H: Any, mu: Any, lam: Any):
+    """P [Pa] = 2 mu (F - R) + lambda tr(S - I) R."""
+    identity = wp.identity(n=3, dtype=type(mu))
+    R = rotation_of(identity + H)
+    t = wp.trace(wp.transpose(R) * (identity + H) - identity)
+    return type(mu)(2.0) * mu * (H - (R - identity)) + lam * t * R
+
+
+@wp.func
+def stress_change(H: Any, D: Any, mu: Any, lam: Any):
+    """dP [Pa] for dF = D: 2 mu D + lambda tr(R^T D) R + (lambda tr(S - I) - 2 mu) dR.
+
+    dR = R [w]x with (tr S I - S) w = axial(R^T D): Barbic 2012, "Exact corotational linear FEM stiffness matrix".
+    """
+    two = type(mu)(2.0)
+    identity = wp.identity(n=3, dtype=type(mu))
+    F = identity + H
+    R = rotation_of(F)
+    S = wp.transpose(R) * F
+    A = wp.transpose(R) * D
+    w = spin(S, A)
+    t = wp.trace(S - identity)
+    return two * mu * D + lam * wp.trace(A) * R + (lam * t - two * mu) * (R * cross_matrix(w))
+
+
+LAW = Law("corotational", energy, stress, stress_change)

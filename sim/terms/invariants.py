@@ -1,0 +1,45 @@
+"""What isotropic laws share: invariants of F = I + H, written in H so that nothing cancels at small strain.
+
+Shakeri et al. 2024, "Stable numerics for finite-strain elasticity": with F formed first, single precision stalls
+near 3e-4 of the load; from H it reaches 1e-5.
+"""
+
+from typing import Any
+
+import warp as wp
+
+
+@wp.func
+def second_order_volume(H: Any):
+    """J - 1 - tr H = (tr^2 H - tr H^2) / 2 + det H."""
+    t = wp.trace(H)
+    return (t * t - wp.trace(H * H)) / type(t)(2.0) + wp.determinant(H)
+
+
+@wp.func
+def volume_change(H: Any):
+    """j = J - 1 = det(I + H) - 1."""
+    return wp.trace(H) + second_order_volume(H)
+
+
+@wp.func
+def cofactor(A: Any):
+    """cof A, the derivative of det A: its rows are cross products of A's rows."""
+    return wp.matrix_from_rows(wp.cross(A[1], A[2]), wp.cross(A[2], A[0]), wp.cross(A[0], A[1]))
+
+
+@wp.func
+def cofactor_excess(H: Any):
+    """cof(I + H) - I = tr H I - H^T + cof H."""
+    t = wp.trace(H)
+    return t * wp.identity(n=3, dtype=type(t)) - wp.transpose(H) + cofactor(H)
+
+
+@wp.func
+def cofactor_change(F: Any, D: Any):
+    """Derivative of cof F in the direction D."""
+    return wp.matrix_from_rows(
+        wp.cross(D[1], F[2]) + wp.cross(F[1], D[2]),
+        wp.cross(D[2], F[0]) + wp.cross(F[2], D[0]),
+        wp.cross(D[0], F[1]) + wp.cross(F[0], D[1]),
+    )

@@ -1,0 +1,31 @@
+"""Hooke's law on the small strain tensor: the first-order answer, for small rotations only.
+
+psi = mu eps : eps + lambda/2 (tr eps)^2, eps = (H + H^T)/2
+"""
+
+from typing import Any
+
+import warp as wp
+
+from .law import Law
+
+
+@wp.func
+def stress(H: Any, mu: Any, lam: Any):
+    """P [Pa] = mu (H + H^T) + lambda tr H I."""
+    return mu * (H + wp.transpose(H)) + lam * wp.trace(H) * wp.identity(n=3, dtype=type(mu))
+
+
+@wp.func
+def energy(H: Any, mu: Any, lam: Any):
+    """psi [Pa] = P : H / 2."""
+    return wp.ddot(stress(H, mu, lam), H) / type(mu)(2.0)
+
+
+@wp.func
+def stress_change(H: Any, D: Any, mu: Any, lam: Any):
+    """dP [Pa] for dF = D."""
+    return stress(D, mu, lam)
+
+
+LAW = Law("linear", energy, stress, stress_change)

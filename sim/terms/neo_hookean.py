@@ -1,0 +1,59 @@
+"""Compressible neo-Hookean law with logarithms, the form of FEBio and FElupe; infinite where J <= 0.
+
+    psi = mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2
+
+Bonet, Wood 2008, "Nonlinear Continuum Mechanics for Finite Element Analysis", eq. 6.27.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from .invariants import cofactor_change, cofactor_excess, second_order_volume, volume_change
+from .law import Law
+
+
+@wp.func
+def log_volume(H: Any):
+    """ln J = log1p(j), exact in the last digits at small strain (Kahan's quotient)."""
+    j = volume_change(H)
+    J = type(j)(1.0) + j
+    change = J - type(j)(1.0)
+    if change == type(j)(0.0):
+        return j
+    return wp.log(J) * (j / change)
+
+
+@wp.func
+def energy(H: Any, mu: Any, lam: Any):
+    """psi [Pa] = mu (|H|^2 / 2 + tr H - ln J) + lambda/2 (ln J)^2; +inf where J <= 0."""
+    half = type(mu)(0.5)
+    j = volume_change(H)
+    if j <= -type(mu)(1.0):
+        return type(mu)(wp.inf)
+    log_J = log_volume(H)
+    return mu * (half * wp.ddot(H, H) - second_order_volume(H) + (j - log_J)) + half * lam * log_J * log_J
+
+
+@wp.func
+def stress(H: Any, mu: Any, lam: Any):
+    """First Piola-Kirchhoff stress P [Pa] = (mu (H - (cof F - I) + j F) + lambda ln J cof F) / J."""
+    identity = wp.identity(n=3, dtype=type(mu))
+    j = volume_change(H)
+    excess = cofactor_excess(H)
+    shape = H - excess + j * (identity + H)
+    return (mu * shape + lam * log_volume(H) * (identity + excess)) / (type(mu)(1.0) + j)
+
+
+@wp.func
+def stress_change(H: Any, D: Any, mu: Any, lam: Any):
+    """dP [Pa] for dF = D: mu D + (lambda ln J - mu) d(F^-T) + lambda (F^-T : D) F^-T."""
+    identity = wp.identity(n=3, dtype=type(mu))
+    J = type(mu)(1.0) + volume_change(H)
+    inverse = (identity + cofactor_excess(H)) / J  # F^-T
+    trace = wp.ddot(inverse, D)
+    inverse_change = cofactor_change(identity + H, D) / J - trace * inverse
+    return mu * D + (lam * log_volume(H) - mu) * inverse_change + lam * trace * inverse
+
+
+LAW = Law("neo-hookean", energy, stress, stress_change, needs_positive_volume=True)
