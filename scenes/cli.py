@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+import warnings
 from collections.abc import Sequence
 
 from sim.errors import InputError
@@ -13,6 +14,8 @@ from sim.errors import InputError
 COMMANDS = {
     "anatomy": "make a tetrahedral brain with a tumour, from the template or from a label volume",
     "solve": "find the static equilibrium of any tetrahedral mesh",
+    "simulate": "draw loads of a tool and answer them by finite elements, into a data set",
+    "train": "fit the surrogates to a data set and say who wins",
 }
 
 
@@ -27,6 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if name == asked:
             importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
     args = parser.parse_args(arguments)
+    warnings.formatwarning = lambda message, *rest: f"sulcus {args.command}: {message}\n"
     try:
         return importlib.import_module(f"scenes.commands.{args.command}").run(args)
     except InputError as error:

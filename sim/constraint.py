@@ -13,6 +13,7 @@ import warp as wp
 
 from .columns import CHUNK, gathered
 from .device import Device
+from .errors import InputError
 
 
 @dataclass(frozen=True)
@@ -127,9 +128,13 @@ class Constraint:
         self._value = None if value is None else self.device.array(value)
         self._weight = self._target = None
         if weight is not None and target is not None:
-            weight = weight * ~(self.held | (self.normal != 0.0)).any(axis=1, keepdims=True)
-            weight = weight / weight.sum(axis=0)
-            self._weight, self._target = self.device.array(weight), self.device.array(target)
+            free = weight * ~(self.held | (self.normal != 0.0)).any(axis=1, keepdims=True)
+            total = free.sum(axis=0)
+            if not (total > 0.0).all():
+                raise InputError(
+                    f"load {np.argmin(total)} moves a footprint all of whose nodes are held: choose a free place."
+                )
+            self._weight, self._target = self.device.array(free / total), self.device.array(target)
 
     def keep(self, columns: np.ndarray) -> None:
         """Keep these columns (k,) of the batch."""

@@ -12,7 +12,7 @@ from .mesh import TetMesh
 def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray) -> None:
     """Refuse a body, or a loose piece of one, that can translate or rotate freely.
 
-    held (V, 3) bool and normal (V, 3) are the constraints. Nodes of no element must be held: nothing else moves them.
+    held (V, 3) bool and normal (V, 3) are the constraints. A node of no element must be held: nothing else stops it.
 
     Raises
     ------
@@ -22,20 +22,19 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray) -> None:
     count = len(mesh.nodes)
     used = np.zeros(count, bool)
     used[mesh.tets] = True
-    if not used.all():
-        raise InputError(
-            f"node {np.flatnonzero(~used)[0]} (and {(~used).sum() - 1} more) belongs to no tetrahedron: remove it."
-        )
+    loose = np.flatnonzero(~used & ~held.all(axis=1))
+    if len(loose):
+        raise InputError(f"node {loose[0]} (and {len(loose) - 1} more) belongs to no tetrahedron: remove or hold it.")
     links = sp.coo_array(
         (np.ones(3 * len(mesh.tets)), (np.repeat(mesh.tets[:, 0], 3), mesh.tets[:, 1:].ravel())), shape=(count, count)
     )
-    pieces, piece = sp.csgraph.connected_components(links, directed=False)
-    for number in range(pieces):
+    _, piece = sp.csgraph.connected_components(links, directed=False)
+    for number in np.unique(piece[used]):
         nodes = np.flatnonzero(piece == number)
         free = 6 - _rank_of_rigid_motions(mesh.nodes[nodes], held[nodes], normal[nodes])
         if free:
             where = np.round(1e3 * mesh.nodes[nodes].mean(axis=0), 1)
-            what = "the body" if pieces == 1 else f"a loose piece of {len(nodes)} nodes round {where} mm"
+            what = "the body" if len(nodes) == used.sum() else f"a loose piece of {len(nodes)} nodes round {where} mm"
             raise InputError(
                 f"{what} can move rigidly in {free} of 6 ways: hold at least three nodes of it that are not in line."
             )

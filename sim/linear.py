@@ -104,8 +104,9 @@ class BlockJacobi:
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """Invert the blocks at the last linearisation."""
-        self._blocks = problem.diagonal(columns)
-        self._device.launch(block_kernels_of(self._device)[0], self._blocks.shape, [], [self._blocks])
+        blocks = problem.diagonal(columns)
+        self._device.launch(block_kernels_of(self._device)[0], blocks.shape, [], [blocks])
+        self._blocks = blocks
 
     def apply(self, r: wp.array, out: wp.array) -> None:
         """out = B^-1 r, node by node."""

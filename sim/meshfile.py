@@ -71,6 +71,26 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
     return MeshFile(mesh, dict(raw.point_data), tuple(notes))
 
 
+def check_output(path: str | Path, suffix: str) -> Path:
+    """The path of a file that can be written, its folder made; asked before long work, so that none is lost.
+
+    Raises
+    ------
+    InputError
+        A name that does not end in `suffix`, or a folder that cannot be written to.
+    """
+    path = Path(path)
+    if path.suffix != suffix:
+        raise InputError(f"{path}: this file is written as {suffix}; give a name that ends so.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: its folder cannot be made ({error.strerror}). Choose another folder.") from error
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise InputError(f"{path}: cannot be written there. Choose another name or folder.")
+    return path
+
+
 def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray]) -> None:
     """Write `.vtu` in metres, with cell data `region`; the file appears whole or not at all.
 
@@ -81,12 +101,9 @@ def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndar
     """
     import meshio
 
-    path = Path(path)
-    if path.suffix != ".vtu":
-        raise InputError(f"{path}: meshes are written as .vtu; give a name that ends so.")
+    path = check_output(path, ".vtu")
     partial = path.with_name(f".{path.stem}.{os.getpid()}.vtu")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         meshio.Mesh(
             mesh.nodes,
             [("tetra", mesh.tets)],

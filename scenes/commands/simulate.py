@@ -1,0 +1,123 @@
+"""`sulcus simulate`: draw loads of a tool, answer them by finite elements, keep every displacement."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from importlib.metadata import version
+from importlib.resources import as_file, files
+
+import h5py
+import numpy as np
+from tqdm import tqdm
+
+from sim.accuracy import Accuracy
+from sim.anatomy import Anatomy
+from sim.deformation import Outcome
+from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolForce
+from sim.fem import Fem
+from sim.material import LAWS, MATERIALS, Material
+from sim.meshfile import read_anatomy
+from surrogate.sampling import PRESETS, draw
+from surrogate.simulate import simulate
+
+INTERRUPTED = 130
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "anatomy", nargs="?", metavar="ANATOMY.vtu", help="from `sulcus anatomy`; default: the template"
+    )
+    parser.add_argument("--out", required=True, metavar="DATA.h5", help="the data set; an unfinished one goes on")
+    parser.add_argument("--count", type=int, default=2000, help="loads to draw (default %(default)s)")
+    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
+    parser.add_argument(
+        "--material",
+        choices=(*MATERIALS, *LAWS),
+        default="default",
+        help="a named tissue, or a law with the default's E, nu",
+    )
+    parser.add_argument("--young", type=float, metavar="PA", help="Young's modulus instead of the material's [Pa]")
+    parser.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio instead of the material's")
+    parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
+    parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Returns 0: the file is complete, whether or not every case converged; it says which did."""
+    anatomy = shipped_template() if args.anatomy is None else read_anatomy(args.anatomy)
+    loads = draw(args.preset, anatomy, args.count, args.seed)
+    accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
+    effects = _effects(anatomy, _material(args))
+    fem = Fem(anatomy, effects, accuracy, args.device, max(args.batch, 1))
+    provenance = {
+        "effects": repr(effects),
+        "accuracy": repr(accuracy),
+        "preset": args.preset,
+        "seed": str(args.seed),
+        **{f"{name} version": version(name) for name in ("sulcus", "warp-lang", "numpy")},
+    }
+    with tqdm(unit="load", disable=args.json, file=sys.stderr) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        try:
+            solved = simulate(args.out, fem, loads, provenance, args.batch, progress)
+        except KeyboardInterrupt:
+            print(f"stopped; the same command goes on from {args.out}.partial", file=sys.stderr)
+            return INTERRUPTED
+    _report(args, len(loads), solved)
+    return 0
+
+
+def shipped_template() -> Anatomy:
+    """The template anatomy of the package."""
+    with as_file(files("scenes") / "data" / "template.vtu") as path:
+        return read_anatomy(path)
+
+
+def _effects(anatomy: Anatomy, material: Material) -> tuple[Effect, ...]:
+    """What pushing tools and unit forces call for on this body."""
+    slide = (Slide(),) if anatomy.slide_normal.any() else ()
+    return (Elasticity(material), Held(), *slide, ToolForce(), NodalForce())
+
+
+def _material(args: argparse.Namespace) -> Material:
+    base = MATERIALS.get(args.material, MATERIALS["default"])
+    return Material(
+        base.law if args.material in MATERIALS else args.material,
+        base.young if args.young is None else args.young,
+        base.poisson if args.poisson is None else args.poisson,
+    )
+
+
+def _report(args: argparse.Namespace, asked: int, solved: int) -> None:
+    with h5py.File(args.out, "r") as file:
+        outcomes = [Outcome[name.decode()] for name in file["answers/outcome"][:]]
+        units = len(file["unit/done"])
+    counts = {outcome.name.lower(): outcomes.count(outcome) for outcome in Outcome if outcome in outcomes}
+    failed = int(np.sum([not outcome.good for outcome in outcomes]))
+    if args.json:
+        print(
+            json.dumps(
+                {"out": args.out, "loads": len(outcomes), "unit": units, "solved_now": solved, "outcome": counts}
+            )
+        )
+        return
+    if asked < args.count:
+        print(f"the preset {args.preset} has {asked} loads: all of them were taken.")
+    if len(outcomes) > asked:
+        print(
+            f"{args.out} already holds {len(outcomes)} loads, more than the {asked} asked for: nothing was taken away."
+        )
+    listed = ", ".join(f"{number} {name}" for name, number in counts.items())
+    print(f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved} solved now.")
+    if failed:
+        print(f"{failed} cases did not converge; they stay in the file, marked, and are not learnt from.")

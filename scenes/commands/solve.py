@@ -1,0 +1,153 @@
+"""`sulcus solve`: static equilibrium of any tetrahedral mesh."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+
+import numpy as np
+
+from sim.accuracy import Accuracy
+from sim.anatomy import Anatomy
+from sim.effects import Effect, Elasticity, Held, NodalForce, Slide
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Cause, Loads, Nodal, Prescribed
+from sim.material import LAWS, Material
+from sim.meshfile import UNITS, MeshFile, check_output, read_mesh, write_mesh
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "mesh",
+        help="tetrahedral mesh with point data `fixed` (V,) or (V, 3), and `force` (V, 3) [N] or `prescribed` (V, 3) "
+        "in the file's unit of length; optional `slide_normal` (V, 3) and cell data `region`",
+    )
+    parser.add_argument("--material", default="stable-neo-hookean", choices=LAWS, help="tissue law")
+    parser.add_argument("--young", type=float, default=3000.0, help="Young's modulus [Pa]")
+    parser.add_argument("--poisson", type=float, default=0.45, help="Poisson's ratio")
+    parser.add_argument(
+        "--region",
+        action="append",
+        default=[],
+        metavar="LABEL:YOUNG,POISSON",
+        help="other constants for one region; may be repeated",
+    )
+    parser.add_argument("--tolerance", type=float, default=1e-6, help="relative residual")
+    parser.add_argument("--precision", default="float64", choices=("float32", "float64"))
+    parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
+    parser.add_argument("--out", required=True, help=".vtu in metres with point data `displacement` [m]")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve, write the displacement, print one JSON line. 0: converged; 1: not converged, last state written."""
+    out = check_output(args.out, ".vtu")
+    accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision)
+    law = Material(args.material, args.young, args.poisson)
+    regions = dict(parse_region(text, args.material) for text in args.region)
+    file = read_mesh(args.mesh, args.unit)
+    anatomy, loads, notes = problem_of(file, args.mesh, UNITS[args.unit])
+    for note in (*file.notes, *notes):
+        print(f"{args.mesh}: {note}", file=sys.stderr)
+    clock = time.perf_counter()
+    effects: list[Effect] = [Elasticity(law, regions), Held(), NodalForce()]
+    if anatomy.slide_normal.any():
+        effects.append(Slide())
+    deformation = Fem(anatomy, effects, accuracy, args.device).deform(loads)
+    seconds = time.perf_counter() - clock
+    write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
+    outcome = deformation.outcome[0]
+    report = {
+        "outcome": outcome.name.lower(),
+        "message": outcome.value,
+        "iterations": int(deformation.iterations[0]),
+        "residual": float(deformation.residual[0]),
+        "seconds": round(seconds, 4),
+        "largest_displacement_mm": round(1e3 * float(np.linalg.norm(deformation.displacement[0], axis=1).max()), 6),
+        "out": str(out),
+    }
+    print(json.dumps(report))
+    return 0 if outcome.good else 1
+
+
+def parse_region(text: str, law: str) -> tuple[int, Material]:
+    """Read "LABEL:YOUNG,POISSON".
+
+    Raises
+    ------
+    InputError
+        Text of another form, or constants that no tissue has.
+    """
+    try:
+        label, constants = text.split(":")
+        young, poisson = constants.split(",")
+        return int(label), Material(law, float(young), float(poisson))
+    except InputError as error:
+        raise InputError(f"--region {text}: {error}") from error
+    except ValueError as error:
+        raise InputError(f"--region {text}: write LABEL:YOUNG,POISSON, as in 2:9000,0.45.") from error
+
+
+def problem_of(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads, list[str]]:
+    """Constraints and loads from a file's point data, and what was changed. `metre`: the file's unit of length in m.
+
+    Raises
+    ------
+    InputError
+        Point data that are missing, of the wrong shape, or not finite.
+    """
+    mesh, data = file.mesh, file.point_data
+    count, notes = len(mesh.nodes), []
+    if "fixed" not in data:
+        raise InputError(f"{name}: has no point data `fixed`: mark the nodes that are held, (V,) or (V, 3).")
+    fixed = _field(name, "fixed", data["fixed"], {(count,), (count, 1), (count, 3)})
+    held = np.broadcast_to(fixed.reshape(count, -1) != 0.0, (count, 3)).copy()
+    orphan = np.ones(count, bool)
+    orphan[mesh.tets] = False
+    if orphan.any():
+        notes.append(f"{orphan.sum()} nodes belong to no tetrahedron: they stay where they are")
+        held[orphan] = True
+    normal = np.zeros((count, 3))
+    if "slide_normal" in data:
+        normal = _field(name, "slide_normal", data["slide_normal"], {(count, 3)})
+    causes: list[Cause] = []
+    if "force" in data:
+        force = _field(name, "force", data["force"], {(count, 3)})
+        if force[orphan].any():
+            notes.append("forces on nodes that belong to no tetrahedron are left out")
+        causes.append(Nodal(np.where(orphan[:, None], 0.0, force)[None]))
+    if "prescribed" in data:
+        stored = np.asarray(data["prescribed"])
+        if stored.shape == (count, 3):
+            free = ~held & (stored != 0.0)
+            if free.any():
+                notes.append(f"`prescribed` is ignored on {free.sum()} components that are not `fixed`")
+            stored = np.where(held & ~orphan[:, None], stored, 0.0)
+        prescribed = metre * _field(name, "prescribed", stored, {(count, 3)})
+        if prescribed.any():
+            causes.append(Prescribed(prescribed[None]))
+    if not causes:
+        raise InputError(
+            f"{name}: nothing acts on it: give point data `force` (V, 3) [N], or `prescribed` (V, 3) that is not zero "
+            "where `fixed`."
+        )
+    return Anatomy(mesh, held, normal, np.zeros(count, bool)), Loads(tuple(causes)), notes
+
+
+def _field(name: str, key: str, values: np.ndarray, shapes: set[tuple[int, ...]]) -> np.ndarray:
+    values = np.asarray(values)
+    if values.shape not in shapes:
+        allowed = " or ".join(str(shape) for shape in sorted(shapes))
+        raise InputError(f"{name}: point data `{key}` has shape {values.shape}: give {allowed}.")
+    try:
+        values = values.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: point data `{key}` does not hold numbers.") from error
+    if not np.isfinite(values).all():
+        node = int(np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))[0])
+        raise InputError(f"{name}: point data `{key}` is not finite at node {node}: every number must be finite.")
+    return values

@@ -1,0 +1,79 @@
+"""`sulcus train`: fit the learners to a data set, score them on left-out discs, and say who wins."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+
+import numpy as np
+from tqdm import tqdm
+
+from sim.errors import InputError
+from surrogate.dataset import read_dataset
+from surrogate.score import table, winner
+from surrogate.store import save
+from surrogate.train import LEARNERS, Trained, train
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("data", metavar="DATA.h5", help="from `sulcus simulate`; nothing else is needed")
+    parser.add_argument("--out", required=True, metavar="MODEL.npz", help="the models, all in one file")
+    parser.add_argument(
+        "--learners", default=",".join(LEARNERS), help="which, separated by commas (default %(default)s)"
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Returns 0 when the models are written."""
+    if not args.out.endswith(".npz"):
+        raise InputError(f"{args.out}: models are written as .npz; give a name that ends so.")
+    data = read_dataset(args.data)
+    learners = [name.strip() for name in args.learners.split(",")]
+    with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
+
+        def progress(learner: str) -> None:
+            bar.set_postfix_str(learner)
+            bar.update(0 if bar.n == 0 and not bar.postfix else 1)
+
+        trained = train(data, learners, progress)
+    save(args.out, trained.models)
+    failed = int(np.sum(~data.good))
+    print(_for_machines(trained, args.out, failed) if args.json else _for_people(trained, args.out, failed))
+    return 0
+
+
+def _for_people(trained: Trained, out: str, failed: int) -> str:
+    notes = [f"{failed} cases that did not converge were left aside."] if failed else []
+    bounds = ", ".join(f"{name} {1e3 * model.bound:.3f}" for name, model in trained.models.items())
+    return "\n".join(
+        [
+            *notes,
+            trained.split.summary(),
+            "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
+            table(trained.scores, 1e3 * trained.motion),
+            f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}",
+            f"written: {out}",
+        ]
+    )
+
+
+def _for_machines(trained: Trained, out: str, failed: int) -> str:
+    split = trained.split
+    return json.dumps(
+        {
+            "out": out,
+            "scores": [{**asdict(row), "bound_mm": 1e3 * trained.models[row.name].bound} for row in trained.scores],
+            "winner": winner(trained.scores).name,
+            "motion_mm": 1e3 * trained.motion,
+            "discs": len(split.centres),
+            "disc_radius_mm": 1e3 * split.radius,
+            "share_of_patch": split.share,
+            "taught": int((~split.test).sum()),
+            "held_out": int(split.test.sum()),
+            "not_converged": failed,
+        }
+    )
