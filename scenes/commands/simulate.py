@@ -19,6 +19,7 @@ from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
 from sim.material import LAWS, MATERIALS, Material
 from sim.meshfile import read_anatomy
+from surrogate.dataset import read_outcomes
 from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import simulate
 
@@ -100,8 +101,7 @@ def _material(args: argparse.Namespace) -> Material:
 
 def _report(args: argparse.Namespace, asked: int, solved: int) -> None:
     with h5py.File(args.out, "r") as file:
-        outcomes = [Outcome[name.decode()] for name in file["answers/outcome"][:]]
-        units = len(file["unit/done"])
+        outcomes, units = read_outcomes(file, "answers"), len(read_outcomes(file, "unit"))
     counts = {outcome.name.lower(): outcomes.count(outcome) for outcome in Outcome if outcome in outcomes}
     failed = int(np.sum([not outcome.good for outcome in outcomes]))
     if args.json:

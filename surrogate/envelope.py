@@ -1,0 +1,75 @@
+"""The range of loads that a model was taught: outside it, a prediction says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.loads import Pushed
+
+from .encode import directions
+from .patch import Patch, nearest
+
+# Round-off must not put a taught load outside.
+SLACK = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Envelope:
+    """Bounds of the taught loads.
+
+    Parameters
+    ----------
+    points
+        (n, 3) taught points [m].
+    reach
+        The farthest from a taught point that the held-out loads lay [m]: so far the errors are known.
+    overhang
+        Greatest footprint radius less distance to the rim [m].
+    angle
+        Greatest angle [rad] between force and inward normal.
+    force
+        Least and greatest [N]. Below the least the response is in proportion, so weaker loads lie inside.
+    footprint
+        Least and greatest radius [m].
+    """
+
+    points: np.ndarray
+    reach: float
+    overhang: float
+    angle: float
+    force: tuple[float, float]
+    footprint: tuple[float, float]
+
+    def holds(self, patch: Patch, pushed: Pushed) -> np.ndarray:
+        """(B,) bool: whether each load lies inside."""
+        magnitude, angle, overhang = _measures(patch, pushed)
+        return (
+            (nearest(pushed.point, self.points)[1] <= self.reach + SLACK)
+            & (overhang <= self.overhang + SLACK)
+            & ((angle <= self.angle + SLACK) | (magnitude == 0.0))
+            & (magnitude <= self.force[1] * (1.0 + SLACK))
+            & (pushed.footprint >= self.footprint[0] * (1.0 - SLACK))
+            & (pushed.footprint <= self.footprint[1] * (1.0 + SLACK))
+        )
+
+
+def envelope_of(patch: Patch, taught: Pushed, held_out: Pushed) -> Envelope:
+    """The envelope of the `taught` loads, with the reach at which `held_out` loads were scored."""
+    magnitude, angle, overhang = _measures(patch, taught)
+    return Envelope(
+        taught.point.astype(np.float32),
+        float(nearest(held_out.point, taught.point)[1].max()),
+        float(overhang.max()),
+        float(angle.max()),
+        (float(magnitude.min()), float(magnitude.max())),
+        (float(taught.footprint.min()), float(taught.footprint.max())),
+    )
+
+
+def _measures(patch: Patch, pushed: Pushed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Force [N], angle to the inward normal [rad], footprint beyond the rim [m]: (B,) each."""
+    magnitude, direction = directions(pushed)
+    cosine = np.einsum("bi,bi->b", direction, patch.normal_near(pushed.point))
+    return magnitude, np.arccos(np.clip(cosine, -1.0, 1.0)), pushed.footprint - patch.rim_distance(pushed.point)

@@ -1,0 +1,38 @@
+"""The compliance table: what superposition of small-strain responses says. The baseline that a learner must beat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Self
+
+import numpy as np
+
+
+class Linear:
+    """Y = X C without intercept, C of least norm among the least-squares solutions.
+
+    Taught with unit responses at the nodes it is the exact compliance table; with any other rows, its least-squares
+    estimate.
+    """
+
+    compliance_: np.ndarray
+
+    def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
+        """Learn C (f, r) from rows X (n, f), Y (n, r)."""
+        self.compliance_ = np.linalg.lstsq(X, Y, rcond=1e-8)[0].astype(np.float32)
+        return self
+
+    def predict(self, X: np.ndarray) -> np.ndarray:
+        """X C (B, r) float32."""
+        return X.astype(np.float32) @ self.compliance_
+
+    def state(self) -> dict[str, np.ndarray]:
+        """`compliance` (f, r)."""
+        return {"compliance": self.compliance_}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """From `state`."""
+        model = cls()
+        model.compliance_ = state["compliance"]
+        return model

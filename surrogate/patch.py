@@ -1,0 +1,108 @@
+"""The open cortex as a surface to draw from: areas, inward normals, and the rim that a footprint must not cross."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The triangles of `Anatomy.open_surface`.
+
+    Parameters
+    ----------
+    nodes
+        (m,) sorted mesh vertices of the patch: those that a footprint inside it loads.
+    triangles
+        (S, 3) positions in `nodes`, outwards.
+    points
+        (m, 3) [m], RAS.
+    """
+
+    nodes: np.ndarray
+    triangles: np.ndarray
+    points: np.ndarray
+
+    @cached_property
+    def _doubled(self) -> np.ndarray:
+        a, b, c = (self.points[self.triangles[:, corner]] for corner in range(3))
+        return np.cross(b - a, c - a)
+
+    @cached_property
+    def areas(self) -> np.ndarray:
+        """Triangle areas (S,) [m^2]."""
+        return 0.5 * np.linalg.norm(self._doubled, axis=1)
+
+    @cached_property
+    def inward(self) -> np.ndarray:
+        """Unit inward normals (m, 3) at the nodes, area-weighted."""
+        normal = np.zeros_like(self.points)
+        for corner in range(3):
+            np.add.at(normal, self.triangles[:, corner], -self._doubled)
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    @cached_property
+    def rim(self) -> np.ndarray:
+        """Edges (E, 2, 3) [m] that belong to one triangle only."""
+        edges = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, count = np.unique(edges, axis=0, return_counts=True)
+        return self.points[edges[count == 1]]
+
+    def rim_distance(self, points: np.ndarray) -> np.ndarray:
+        """Distances (B,) [m] from `points` (B, 3) to the rim."""
+        start, along = self.rim[:, 0], self.rim[:, 1] - self.rim[:, 0]
+        offset = points[:, None] - start
+        share = np.einsum("bei,ei->be", offset, along) / np.einsum("ei,ei->e", along, along)
+        offset -= np.clip(share, 0.0, 1.0)[:, :, None] * along
+        return np.sqrt(np.einsum("bei,bei->be", offset, offset).min(axis=1))
+
+    def place(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A point (3,) [m] and its unit inward normal (3,) from three uniform numbers; uniform by area."""
+        total = np.cumsum(self.areas)
+        triangle = self.triangles[np.searchsorted(total, uniform[0] * total[-1], side="right")]
+        root = np.sqrt(uniform[1])
+        share = np.array([1.0 - root, root * (1.0 - uniform[2]), root * uniform[2]])
+        normal = share @ self.inward[triangle]
+        return share @ self.points[triangle], normal / np.linalg.norm(normal)
+
+    def normal_near(self, points: np.ndarray) -> np.ndarray:
+        """Unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""
+        return self.inward[nearest(points, self.points)[0]]
+
+    def covered(self, centres: np.ndarray, radius: float) -> float:
+        """Share of the area within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
+        third = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(4) for j in range(4 - i)]
+        turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(3) for j in range(3 - i)]
+        share = np.array(third + turned) / 4.0
+        share = np.column_stack([1.0 - share.sum(axis=1), share])
+        samples = np.einsum("qc,scx->sqx", share, self.points[self.triangles])
+        inside = nearest(samples.reshape(-1, 3), centres)[1].reshape(len(samples), -1) <= radius
+        return float(inside.mean(axis=1) @ self.areas / self.areas.sum())
+
+
+def open_patch(anatomy: Anatomy) -> Patch:
+    """The open cortex of an anatomy.
+
+    Raises
+    ------
+    InputError
+        A craniotomy that holds no whole triangle.
+    """
+    if not len(anatomy.open_surface):
+        raise InputError("the anatomy has no open cortex for a tool to touch: make one with a wider --craniotomy.")
+    nodes, triangles = np.unique(anatomy.open_surface, return_inverse=True)
+    return Patch(nodes, triangles.reshape(-1, 3), anatomy.mesh.nodes[nodes])
+
+
+def nearest(points: np.ndarray, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the `sites` (n, 3) is nearest to each of the `points` (B, 3), and how far it is: (B,), (B,)."""
+    distance = cdist(points, sites)
+    which = distance.argmin(axis=1)
+    return which, distance[np.arange(len(points)), which]

@@ -1,0 +1,35 @@
+"""What every learner is: features in, coefficients out, in the shape of scikit-learn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol, Self
+
+import numpy as np
+
+
+class Regressor(Protocol):
+    """A map from features X (B, f) to coefficients Y (B, r). `fit` sets attributes that end in an underscore."""
+
+    def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
+        """Learn from rows X (n, f), Y (n, r)."""
+        ...
+
+    def predict(self, X: np.ndarray) -> np.ndarray:
+        """Coefficients (B, r) float32 of features (B, f)."""
+        ...
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What `fit` learnt, as plain arrays."""
+        ...
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """The regressor that `state` came from."""
+        ...
+
+
+def standardisation(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and deviation (f,) of the columns of X (n, f); a column that does not vary has the deviation one."""
+    deviation = X.std(axis=0)
+    return X.mean(axis=0), np.where(deviation > 1e-9 * np.abs(X).max(axis=0), deviation, 1.0)

@@ -1,0 +1,161 @@
+"""Loads as surgical tools make them: where a tool touches, how hard, in which direction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.loads import Loads, Pushed
+
+from .patch import Patch, nearest, open_patch
+
+ATTEMPTS = 2000
+# Deeper than this the tool has gone through the tissue; tissue harm begins at 2.7-4 kPa mean contact pressure.
+DEEPEST, HARDEST = 15e-3, 8e3
+# E / (1 - nu^2) of the default tissue: the depth F / (2 E* r) of a flat round punch judges a load before it is solved.
+PLANE_MODULUS = 3000.0 / (1.0 - 0.45**2)
+
+
+@dataclass(frozen=True)
+class Tool:
+    """The range of a surgical tool's loads.
+
+    Parameters
+    ----------
+    name
+        As `--preset` says it.
+    footprint
+        Least and greatest radius [m], uniform between; a plate counts as the disc of its area.
+    force
+        Least and greatest force [N], log-uniform between.
+    pressure
+        Least and greatest mean contact pressure F / (pi r^2) [Pa]; a draw outside is repeated.
+    cone
+        Greatest angle [rad] between the force and the inward normal; uniform by solid angle.
+    """
+
+    name: str
+    footprint: tuple[float, float]
+    force: tuple[float, float]
+    pressure: tuple[float, float] = (0.0, HARDEST)
+    cone: float = np.pi / 4.0
+
+    def admits(self, force: float, footprint: float) -> bool:
+        """Whether pressure and estimated depth are those of surgery."""
+        pressure = force / (np.pi * footprint**2)
+        return self.pressure[0] <= pressure <= self.pressure[1] and force / (2.0 * PLANE_MODULUS * footprint) <= DEEPEST
+
+
+TOOLS = {
+    tool.name: tool
+    for tool in (
+        Tool("palpation", (5e-3, 7.5e-3), (0.05, 0.4)),
+        Tool("bipolar", (0.5e-3, 1e-3), (0.01, 0.05)),
+        Tool("dissector", (1.5e-3, 2e-3), (0.02, 0.25)),
+        # 5-30 mmHg under plates of 10-20 x 20-40 mm.
+        Tool("spatula", (8e-3, 16e-3), (0.13, 3.2), pressure=(700.0, 4000.0)),
+    )
+}
+PRESETS = (*TOOLS, "mixed", "seed")
+
+
+def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
+    """Draw `count` loads on the open cortex; load i depends on the preset, the anatomy, the seed and i alone.
+
+    `mixed` draws the tool first. `seed` is the protocol of Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47, in
+    an order shuffled by the seed: at most 6,600 loads, of which fewer are returned when `count` is larger.
+
+    Raises
+    ------
+    InputError
+        Unknown preset, a count below one, a negative seed, an anatomy without open cortex or (for `seed`) without
+        tumour, or a patch too small for the tool.
+    """
+    if preset not in PRESETS:
+        raise InputError(f"no preset is called {preset!r}: choose one of {', '.join(PRESETS)}.")
+    if count < 1 or seed < 0:
+        raise InputError(f"a count of {count} with seed {seed} draws nothing: give --count >= 1 and --seed >= 0.")
+    patch = open_patch(anatomy)
+    if preset == "seed":
+        return _published(anatomy, patch, count, seed)
+    tools = list(TOOLS.values()) if preset == "mixed" else [TOOLS[preset]]
+    rows = [_one(tools, patch, np.random.default_rng((seed, number))) for number in range(count)]
+    point, force, footprint = (np.array(column) for column in zip(*rows, strict=True))
+    return Loads((Pushed(point, force, footprint),))
+
+
+def _one(tools: list[Tool], patch: Patch, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, float]:
+    """Point (3,) [m], force (3,) [N] and footprint [m] of one load."""
+    tool = tools[random.integers(len(tools))]
+    for _ in range(ATTEMPTS):
+        footprint = random.uniform(*tool.footprint)
+        force = float(np.exp(random.uniform(*np.log(tool.force))))
+        point, normal = patch.place(random.random(3))
+        direction = _within_cone(normal, tool.cone, random.random(2))
+        if tool.admits(force, footprint) and patch.rim_distance(point[None])[0] >= footprint:
+            return point, force * direction, footprint
+    raise InputError(
+        f"in {ATTEMPTS} draws no {tool.name} of radius {1e3 * tool.footprint[0]:g}-{1e3 * tool.footprint[1]:g} mm "
+        "fitted into the open cortex: widen the --craniotomy, or choose a smaller tool with --preset."
+    )
+
+
+def _within_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
+    """A unit vector (3,) within `angle` [rad] of the unit vector `axis` (3,), uniform by solid angle."""
+    cosine = 1.0 - uniform[0] * (1.0 - np.cos(angle))
+    turn = 2.0 * np.pi * uniform[1]
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    sideways = np.cos(turn) * first + np.sin(turn) * np.cross(axis, first)
+    return cosine * axis + np.sqrt(1.0 - cosine**2) * sideways
+
+
+POSITIONS, DIRECTIONS, MAGNITUDES = 11, 30, np.linspace(0.10, 1.05, 20)
+# The area behind one free surface node of the published mesh.
+PUBLISHED_FOOTPRINT = 7e-3
+PUBLISHED_CONE = np.pi / 3.0
+
+
+def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
+    """11 positions 20-28 mm from the tumour's centre x 30 directions x 20 magnitudes, shuffled.
+
+    The authors do not print their directions: a spherical Fibonacci lattice within 60 degrees of the inward normal
+    stands for them.
+    """
+    if not len(anatomy.tumour_nodes):
+        raise InputError("the anatomy has no tumour, so no position is 20-28 mm from it: choose another --preset.")
+    centre = anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0)
+    distance = np.linalg.norm(patch.points - centre, axis=1)
+    near = np.flatnonzero((distance >= 20e-3) & (distance <= 28e-3))
+    if not len(near):
+        raise InputError(
+            f"the open cortex is {1e3 * distance.min():.1f}-{1e3 * distance.max():.1f} mm from the tumour's centre, "
+            "never 20-28 mm: make the anatomy with --preset seed, or choose another --preset here."
+        )
+    near = near[spread(patch.points[near], POSITIONS)]
+    golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(DIRECTIONS) / (2.0 * np.pi)
+    lattice = np.column_stack([(np.arange(DIRECTIONS) + 0.5) / DIRECTIONS, golden % 1.0])
+    direction = np.array(
+        [[_within_cone(patch.inward[node], PUBLISHED_CONE, uniform) for uniform in lattice] for node in near]
+    )
+    whole = np.random.default_rng(seed).permutation(len(near) * DIRECTIONS * len(MAGNITUDES))[:count]
+    position, way, magnitude = np.unravel_index(whole, (len(near), DIRECTIONS, len(MAGNITUDES)))
+    force = MAGNITUDES[magnitude, None] * direction[position, way]
+    return Loads((Pushed(patch.points[near[position]], force, np.full(len(whole), PUBLISHED_FOOTPRINT)),))
+
+
+def spread(points: np.ndarray, count: int) -> np.ndarray:
+    """Numbers (k,) of at most `count` of the `points` (n, 3), far from each other: farthest-point sampling.
+
+    Starts at the point nearest to the mean, so that it depends on nothing but the points. Gonzalez 1985, Theor.
+    Comput. Sci. 38:293-306.
+    """
+    chosen = [int(nearest(points.mean(axis=0, keepdims=True), points)[0][0])]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < count and distance.max() > 0.0:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)

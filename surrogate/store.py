@@ -1,0 +1,128 @@
+"""Models on disk: one `.npz` of plain arrays with a JSON header, no pickle."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.mesh import digest_of
+
+from .ann import Ann
+from .encode import Basis
+from .envelope import Envelope
+from .learned import Learned, Part
+from .linear import Linear
+from .regressor import Regressor
+from .svr import Svr
+
+FORMAT = "sulcus model 1"
+REGRESSORS: dict[str, type[Regressor]] = {"linear": Linear, "ann": Ann, "svr": Svr}
+
+
+def save(path: str | Path, models: Mapping[str, Learned]) -> None:
+    """Write models of one anatomy under their names; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        No model, models of different anatomies, a name that does not end in .npz, or a folder that cannot be written.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise InputError(f"{path}: models are written as .npz; give a name that ends so.")
+    digests = {model.anatomy.digest for model in models.values()}
+    if len(digests) != 1:
+        raise InputError(f"{path}: a file holds models of one anatomy, not of {len(digests)}.")
+    arrays: dict[str, np.ndarray] = {}
+
+    def put(array: np.ndarray) -> str:
+        name = digest_of(array)  # parts that models share are stored once
+        arrays[name] = array
+        return name
+
+    header = {
+        "format": FORMAT,
+        "anatomy": digests.pop(),
+        "versions": {name: version(name) for name in ("sulcus", "numpy")},
+        "models": {name: _described(model, put) for name, model in models.items()},
+    }
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.npz")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(partial, header=np.array(json.dumps(header)), **arrays)  # pyright: ignore[reportArgumentType]
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}). Choose another folder.") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
+    """Read the models of an anatomy, by name.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or not a model file of this project, or that was taught on another anatomy.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(str(file["header"]))
+            if header["format"] != FORMAT:
+                raise InputError(f"{path}: has the format {header['format']!r}, not {FORMAT!r}: train it anew.")
+            if header["anatomy"] != anatomy.digest:
+                raise InputError(
+                    f"{path}: was taught on the anatomy {header['anatomy']}, but this one is {anatomy.digest}: "
+                    "use the mesh that it was made for, or run `sulcus simulate` and `sulcus train` for this one."
+                )
+            arrays = {name: file[name] for name in file.files if name != "header"}
+        return {name: _rebuilt(description, arrays, anatomy) for name, description in header["models"].items()}
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: cannot be read as a model ({error}). Make one with `sulcus train`.") from error
+
+
+def _described(model: Learned, put: Any) -> dict[str, Any]:
+    names = {kind: name for name, kind in REGRESSORS.items()}
+    parts = [
+        {
+            "encoder": part.encoder,
+            "regressor": names[type(part.regressor)],
+            "state": {name: put(array) for name, array in part.regressor.state().items()},
+            "nodes": put(part.basis.nodes),
+            "modes": put(part.basis.modes),
+        }
+        for part in model.parts
+    ]
+    envelope = {**asdict(model.envelope), "points": put(model.envelope.points)}
+    return {"parts": parts, "envelope": envelope, "bound": model.bound, "training": dict(model.training)}
+
+
+def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:
+    parts = tuple(
+        Part(
+            part["encoder"],
+            REGRESSORS[part["regressor"]].restored({name: arrays[key] for name, key in part["state"].items()}),
+            Basis(arrays[part["nodes"]], arrays[part["modes"]]),
+        )
+        for part in description["parts"]
+    )
+    envelope = dict(description["envelope"])
+    envelope["points"] = arrays[envelope["points"]]
+    for name in ("force", "footprint"):
+        envelope[name] = tuple(envelope[name])
+    return Learned(anatomy, parts, Envelope(**envelope), description["bound"], description["training"])
