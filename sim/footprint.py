@@ -13,6 +13,18 @@ from .errors import InputError
 
 # Triangles are divided until their longest edge is below this share of the footprint's radius.
 FINENESS = 0.12
+PIECES = 8
+
+
+def barycentric_lattice(rows: int) -> np.ndarray:
+    """Corner coordinates (rows^2, 3) of the centres of a triangle's equal pieces, `rows` along each edge."""
+    upright = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(rows) for j in range(rows - i)]
+    turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(rows - 1) for j in range(rows - 1 - i)]
+    share = np.array(upright + turned) / rows
+    return np.column_stack([1.0 - share.sum(axis=1), share])
+
+
+LATTICE = barycentric_lattice(PIECES)
 
 
 def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:
@@ -78,22 +90,27 @@ def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 
 def _integrate(corners: np.ndarray, point: np.ndarray, radius: float) -> np.ndarray:
-    """Integral of w N_a over the footprint (S, 3), up to a factor, by one point per subdivided triangle."""
+    """Integral of w N_a over the footprint (S, 3), up to a factor, by one point per subdivided triangle.
+
+    Triangles are quartered until a lattice of `PIECES` rows is fine enough, so that a small tool on a large triangle
+    costs no more than a large tool on small ones.
+    """
     out = np.zeros((len(corners), 3))
     owner = np.arange(len(corners))
     bary = np.broadcast_to(np.eye(3), (len(corners), 3, 3))  # corner coordinates of each piece within its owner
     while len(owner):
-        at = bary @ corners[owner]
+        at = bary @ corners[owner] - point
+        edges = at - at[:, [2, 0, 1]]
+        longest = np.sqrt(np.einsum("pci,pci->pc", edges, edges).max(axis=1))
         centre = at.mean(axis=1)
-        edges = at - np.roll(at, 1, axis=1)
-        longest = np.linalg.norm(edges, axis=2).max(axis=1)
-        inside = np.linalg.norm(centre - point, axis=1) <= radius + longest
-        small = longest <= FINENESS * radius
+        inside = np.sqrt(np.einsum("pi,pi->p", centre, centre)) <= radius + longest
+        small = longest <= PIECES * FINENESS * radius
         done = small & inside
         area = np.linalg.norm(np.cross(edges[done, 0], edges[done, 1]), axis=1)
-        s = np.linalg.norm(centre[done] - point, axis=1) / radius
-        weight = area * np.sqrt(np.clip(1.0 - s * s, 0.0, None))
-        np.add.at(out, owner[done], weight[:, None] * bary[done].mean(axis=1))
+        samples = LATTICE @ at[done]
+        share = np.einsum("pqi,pqi->pq", samples, samples) / radius**2
+        weight = area[:, None] * np.sqrt(np.clip(1.0 - share, 0.0, None))
+        np.add.at(out, owner[done], np.einsum("pa,pab->pb", weight @ LATTICE, bary[done]))
         split = inside & ~small
         owner = np.repeat(owner[split], 4)
         bary = _quartered(bary[split])
