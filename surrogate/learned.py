@@ -38,9 +38,9 @@ class Part:
     regressor: Regressor
     basis: Basis
 
-    def response(self, patch: Patch, pushed: Pushed) -> np.ndarray:
-        """Responses (B, n, 3) [m/N] of `basis.nodes`."""
-        return self.basis.decode(self.regressor.predict(ENCODERS[self.encoder](patch, pushed)))
+    def response(self, features: np.ndarray) -> np.ndarray:
+        """Responses (B, n, 3) [m/N] of `basis.nodes` to the encoder's features (B, f)."""
+        return self.basis.decode(self.regressor.predict(features))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +101,16 @@ class Learned:
         magnitude, direction = directions(pushed)
         at_least = np.maximum(magnitude, self.envelope.force[0])
         asked = replace(pushed, force=at_least[:, None] * direction)
+        features: dict[str, np.ndarray] = {}  # of each encoder that is needed
         displacement = np.zeros((len(loads), len(nodes), 3))
         known = np.zeros(len(nodes), bool)
         for part, row_of in zip(self.parts, self._row, strict=True):
             row = row_of[nodes]
             here = row >= 0
             if here.any():
-                response = part.response(self._patch, asked)
+                if part.encoder not in features:
+                    features[part.encoder] = ENCODERS[part.encoder](self._patch, asked)
+                response = part.response(features[part.encoder])
                 displacement[:, here] += magnitude[:, None, None] * response[:, row[here]]
                 known |= here
         if not known.all():

@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
+from sim.footprint import barycentric_lattice
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +79,7 @@ class Patch:
 
     def covered(self, centres: np.ndarray, radius: float) -> float:
         """Share of the area within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
-        third = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(4) for j in range(4 - i)]
-        turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(3) for j in range(3 - i)]
-        share = np.array(third + turned) / 4.0
-        share = np.column_stack([1.0 - share.sum(axis=1), share])
+        share = barycentric_lattice(4)
         samples = np.einsum("qc,scx->sqx", share, self.points[self.triangles])
         inside = nearest(samples.reshape(-1, 3), centres)[1].reshape(len(samples), -1) <= radius
         return float(inside.mean(axis=1) @ self.areas / self.areas.sum())

@@ -91,7 +91,7 @@ def _parts(name: str, table: Part, patch: Patch, taught: Pushed, truth: np.ndarr
     response = truth / directions(taught)[0][:, None, None]
     before = (table,) if name == "residual" else ()
     for part in before:
-        response = response - part.response(patch, taught)
+        response = response - part.response(ENCODERS[part.encoder](patch, taught))
     basis = reduce(table.basis.nodes, response, TOLERANCE, MODES)
     regressor = Svr() if name == "svr" else Ann()
     regressor.fit(ENCODERS["tool"](patch, taught), basis.encode(response))
