@@ -75,13 +75,18 @@ def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     nearest of the three edges.
     """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = np.cross(b - a, c - a)
-    foot = point - (np.einsum("si,si->s", point - a, normal) / np.einsum("si,si->s", normal, normal))[:, None] * normal
-    inside = np.ones(len(corners), bool)
+    first, second, offset = b - a, c - a, point - a
+    # Corner coordinates of the foot from the Gram matrix of two edges.
+    aa, ab, bb = (
+        np.einsum("si,si->s", one, other) for one, other in ((first, first), (first, second), (second, second))
+    )
+    pa, pb = np.einsum("si,si->s", offset, first), np.einsum("si,si->s", offset, second)
+    v, w = (bb * pa - ab * pb) / (aa * bb - ab * ab), (aa * pb - ab * pa) / (aa * bb - ab * ab)
+    foot = a + v[:, None] * first + w[:, None] * second
+    inside = (v >= 0.0) & (w >= 0.0) & (v + w <= 1.0)
     candidates = []
     for start, end in ((a, b), (b, c), (c, a)):
         edge = end - start
-        inside &= np.einsum("si,si->s", np.cross(edge, foot - start), normal) >= 0.0
         along = np.einsum("si,si->s", point - start, edge) / np.einsum("si,si->s", edge, edge)
         candidates.append(start + along.clip(0.0, 1.0)[:, None] * edge)
     candidates.append(foot[inside])
