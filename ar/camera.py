@@ -1,0 +1,138 @@
+"""A pinhole camera: where a world point lands in the picture.
+
+OpenCV's convention throughout: camera frame x right, y down, z forward; pixel (u, v) = (column, row) with whole numbers
+at pixel centres, so that the picture spans -0.5 .. width - 0.5. World points are in metres (RAS in this project).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A distortion-free camera.
+
+    Parameters
+    ----------
+    K
+        (3, 3) intrinsics [pixel]: (u w, v w, w) = K x_camera.
+    T_camera_world
+        (4, 4) rigid transform: x_camera = T_camera_world x_world [m].
+    width, height
+        Size of the picture [pixel].
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, numbers that are not finite, no focal length, or a transform that is not rigid.
+    """
+
+    K: np.ndarray
+    T_camera_world: np.ndarray
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        K, T = np.asarray(self.K, np.float64), np.asarray(self.T_camera_world, np.float64)
+        if K.shape != (3, 3) or T.shape != (4, 4) or not (np.isfinite(K).all() and np.isfinite(T).all()):
+            raise ValueError(f"a camera takes finite K (3, 3) and T_camera_world (4, 4), not {K.shape} and {T.shape}.")
+        if K[0, 0] <= 0.0 or K[1, 1] <= 0.0 or K[1, 0] != 0.0 or not np.array_equal(K[2], [0.0, 0.0, 1.0]):
+            raise ValueError("K must be upper triangular with positive focal lengths and last row (0, 0, 1).")
+        R = T[:3, :3]
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0.0:
+            raise ValueError("T_camera_world must be a rotation and a translation.")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"a picture of {self.width} x {self.height} pixels is empty: both must be at least 1.")
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "T_camera_world", T)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) the camera's position in the world [m]."""
+        return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
+
+    @property
+    def vertical_fov(self) -> float:
+        """Angle between the upper and the lower border [rad]; exact when the principal point is centred."""
+        return float(2.0 * np.arctan(0.5 * self.height / self.K[1, 1]))
+
+    def in_frame(self, points: np.ndarray) -> np.ndarray:
+        """World points (..., 3) in the camera frame, (..., 3) [m]."""
+        return points @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (..., 2) and depth (...) [m] of world points (..., 3); pixels are NaN where depth <= 0 (behind)."""
+        homogeneous = self.in_frame(np.asarray(points, np.float64)) @ self.K.T
+        depth = homogeneous[..., 2]
+        return homogeneous[..., :2] / np.where(depth > 0.0, depth, np.nan)[..., None], depth
+
+    def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """World points (..., 3) [m] at `depth` (...) [m] (z, not range) behind pixels (..., 2)."""
+        homogeneous = np.concatenate([pixels, np.ones((*np.shape(pixels)[:-1], 1))], axis=-1)
+        in_camera = homogeneous @ np.linalg.inv(self.K).T * np.asarray(depth)[..., None]
+        return (in_camera - self.T_camera_world[:3, 3]) @ self.T_camera_world[:3, :3]
+
+    def perturbed(self, degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Camera:
+        """The same camera turned about its own centre by an angle [degree] round `axis` (camera frame)."""
+        direction = np.asarray(axis, np.float64) / np.linalg.norm(axis)
+        turn = np.eye(4)
+        turn[:3, :3] = cv2.Rodrigues(np.radians(degrees) * direction)[0]
+        return replace(self, T_camera_world=turn @ self.T_camera_world)
+
+    def scaled(self, factor: float) -> Camera:
+        """The same view on `factor` times as many pixels along each side."""
+        width, height = round(self.width * factor), round(self.height * factor)
+        resize = np.array(
+            [
+                [width / self.width, 0.0, 0.5 * width / self.width - 0.5],
+                [0.0, height / self.height, 0.5 * height / self.height - 0.5],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+        return replace(self, K=resize @ self.K, width=width, height=height)
+
+    def padded(self, aspect: float) -> Camera:
+        """The same picture centred on the smallest canvas of width / height = `aspect` that contains it."""
+        width = max(self.width, round(self.height * aspect))
+        height = max(self.height, round(self.width / aspect))
+        shift = np.zeros((3, 3))
+        shift[:2, 2] = (width - self.width) // 2, (height - self.height) // 2
+        return replace(self, K=self.K + shift, width=width, height=height)
+
+
+def look_at(
+    eye: np.ndarray,
+    target: np.ndarray,
+    up: np.ndarray,
+    vertical_fov: float = np.radians(35.0),
+    width: int = 640,
+    height: int = 480,
+) -> Camera:
+    """A camera at `eye` (3,) [m] that looks at `target` (3,) [m], `up` (3,) upwards in the picture.
+
+    `vertical_fov` [rad]; square pixels, principal point in the centre. Raises ValueError where no direction is
+    defined: eye on target, or `up` along the line of sight.
+    """
+    forward = np.asarray(target, np.float64) - eye
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) <= 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up):
+        raise ValueError("eye, target and up leave the view undefined: move the eye off the target or turn up.")
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = right, np.cross(forward, right), forward
+    T[:3, 3] = -T[:3, :3] @ eye
+    focal = 0.5 * height / np.tan(0.5 * vertical_fov)
+    K = np.array([[focal, 0.0, 0.5 * (width - 1)], [0.0, focal, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+    return Camera(K, T, width, height)
+
+
+def project_cv2(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) of world points (N, 3) [m] by `cv2.projectPoints`: the independent check on `Camera.project`."""
+    rotation = cv2.Rodrigues(camera.T_camera_world[:3, :3])[0]
+    points = np.ascontiguousarray(points, np.float64).reshape(-1, 1, 3)
+    pixels, _ = cv2.projectPoints(points, rotation, camera.T_camera_world[:3, 3], camera.K, None)
+    return pixels.reshape(-1, 2)

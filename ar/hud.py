@@ -1,0 +1,52 @@
+"""Words on the picture: a number beside a thing, a panel in a corner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import cv2
+import numpy as np
+
+Corner = Literal["top left", "top right", "bottom left", "bottom right"]
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+WHITE = (244, 244, 240)
+PAD = 8
+
+
+def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5, ink: Sequence[int] = WHITE) -> None:
+    """Write one line of ASCII text into the picture (H, W, 3) uint8, its baseline's left end at (column, row).
+
+    A dark halo keeps it legible on any ground; the line is moved as far as it takes to lie inside the picture.
+    """
+    (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
+    column = min(max(at[0], 2), max(colour.shape[1] - width - 3, 2))
+    row = min(max(at[1], above + 2), max(colour.shape[0] - below - 2, above + 2))
+    box = slice(max(row - above - 4, 0), row + below + 5), slice(max(column - 4, 0), column + width + 5)
+    halo = np.zeros(colour[box].shape[:2], np.uint8)
+    cv2.putText(halo, text, (column - box[1].start, row - box[0].start), FONT, scale, (200,), 1, cv2.LINE_AA)
+    halo = cv2.dilate(halo, np.ones((3, 3), np.uint8))[..., None] / 255.0
+    colour[box] = colour[box] * (1.0 - halo) + 12.0 * halo
+    cv2.putText(colour, text, (column, row), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
+
+
+def panel(colour: np.ndarray, lines: Sequence[str], corner: Corner = "top left", scale: float = 0.45) -> np.ndarray:
+    """The picture (H, W, 3) uint8 with lines of ASCII text on a dark translucent ground in one corner; a copy.
+
+    Raises ValueError for an unknown corner.
+    """
+    if corner not in Corner.__args__:
+        raise ValueError(f"there is no corner {corner!r}: choose one of {', '.join(Corner.__args__)}.")
+    out = colour.copy()
+    if not lines:
+        return out
+    sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in lines]
+    step = max(height for _, height in sizes) + PAD
+    height, width = step * len(lines) + PAD, max(width for width, _ in sizes) + 2 * PAD
+    top = PAD if "top" in corner else max(out.shape[0] - height - PAD, 0)
+    left = PAD if "left" in corner else max(out.shape[1] - width - PAD, 0)
+    ground = out[top : top + height, left : left + width]
+    ground[:] = ground * 0.35 + np.array([6.0, 9.0, 11.0])
+    for number, line in enumerate(lines, start=1):
+        write(out, line, (left + PAD, top + number * step), scale)
+    return out

@@ -1,0 +1,156 @@
+"""What lies under the surface, drawn into the picture in register, and never over the tool."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from .camera import Camera
+from .hud import write
+from .layer import Layer, vertex_normals
+from .raster import Fragments, rasterise
+from .view import Picture
+
+Style = Literal["window", "contour", "fill"]
+# Light that falls to 1 / e over this depth under the surface [m]: the deeper, the darker.
+FADE = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Gauge:
+    """The number asked for first: how far the tool is from the hidden surface.
+
+    tip, nearest (3,) world points [m]: the tool's tip and the point of the hidden surface that is nearest to it.
+    """
+
+    tip: np.ndarray
+    nearest: np.ndarray
+
+    @property
+    def distance(self) -> float:
+        """[m]."""
+        return float(np.linalg.norm(np.asarray(self.tip) - self.nearest))
+
+
+def composite(
+    picture: Picture,
+    camera: Camera,
+    hidden: Layer,
+    occluders: Sequence[int] = (),
+    style: Style = "window",
+    margin: float | np.ndarray = 0.0,
+    gauge: Gauge | None = None,
+    device: str = "cpu",
+) -> Picture:
+    """The picture with a hidden surface drawn into it; depth, normals and segmentation stay as they are.
+
+    Parameters
+    ----------
+    picture, camera
+        What the camera sees, and that camera.
+    hidden
+        The surface to show; its colour is used, its place is its silhouette whatever lies in front.
+    occluders
+        Ids of the layers (tool, hand) that cover the overlay wherever the picture shows them.
+    style
+        "contour": the outline. "window": besides, the ground is dimmed round the outline and the surface shows through,
+        shaded, and darker the deeper it lies. "fill": besides the outline, a flat tint.
+    margin
+        One number or (V,) [m]: how uncertain the surface is. Where positive, a dashed second outline runs that far out.
+    gauge
+        Draws the line from the tip to the hidden surface, and its length in millimetres.
+
+    Raises
+    ------
+    ValueError
+        An unknown style, or a camera whose size is not the picture's.
+    """
+    if style not in Style.__args__:
+        raise ValueError(f"there is no overlay style {style!r}: choose one of {', '.join(Style.__args__)}.")
+    if picture.colour.shape[:2] != (camera.height, camera.width):
+        raise ValueError(f"the picture is {picture.colour.shape[:2]}, the camera {(camera.height, camera.width)}.")
+    fragments = rasterise(camera, hidden.vertices, hidden.triangles, device=device)
+    tint = tuple((255.0 * np.asarray(hidden.colour, np.float64).mean(axis=0)).tolist())
+    out = picture.colour.copy()
+    if style == "fill":
+        out[fragments.mask] = 0.55 * out[fragments.mask] + 0.45 * np.array(tint)
+    if style == "window":
+        draw_window(out, picture, camera, hidden, fragments)
+    if np.any(np.asarray(margin) > 0.0):
+        normals = vertex_normals(hidden.vertices, hidden.triangles)
+        grown = hidden.vertices + np.reshape(margin, (-1, 1)) * normals
+        for outline in outlines(silhouette(camera, grown, hidden.triangles, device)):
+            dash(out, outline, tint)
+    for ink, width in (((10.0, 12.0, 12.0), 4), (tint, 2)):
+        cv2.polylines(out, outlines(fragments.mask), True, ink, width, cv2.LINE_AA)
+    if gauge is not None:
+        draw_line(out, camera, gauge)
+    covered = np.isin(picture.segmentation, np.asarray(occluders, np.uint8))
+    out[covered] = picture.colour[covered]
+    if gauge is not None and fragments.mask.any():
+        columns, rows = (np.flatnonzero(fragments.mask.any(axis=axis)) for axis in (0, 1))
+        write(out, f"{1e3 * gauge.distance:.1f} mm", (int(columns[0] + columns[-1]) // 2 - 28, int(rows[-1]) + 22), 0.6)
+    return replace(picture, colour=out)
+
+
+def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
+    """(H, W) bool: the pixels whose centres a surface covers, seen alone. vertices (V, 3) [m], triangles (F, 3)."""
+    return rasterise(camera, vertices, triangles, device=device).mask
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of two masks (H, W); 0 when both are empty, for nothing seen is no agreement."""
+    union = np.count_nonzero(a | b)
+    return float(np.count_nonzero(a & b) / union) if union else 0.0
+
+
+def outlines(mask: np.ndarray) -> list[np.ndarray]:
+    """Closed outlines of a mask (H, W), each (n, 1, 2) int32 pixels."""
+    return list(cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
+
+
+def draw_window(out: np.ndarray, picture: Picture, camera: Camera, hidden: Layer, fragments: Fragments) -> None:
+    """Dim the ground round the silhouette with a soft rim, and let the hidden surface shine through, in place."""
+    mask = fragments.mask
+    if not mask.any():
+        return
+    soft = 0.02 * max(mask.shape)
+    reach = int(4.0 * soft)
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    box = (
+        slice(max(rows[0] - reach, 0), rows[-1] + reach + 1),
+        slice(max(columns[0] - reach, 0), columns[-1] + reach + 1),
+    )
+    mask, ground = mask[box], out[box].astype(np.float32)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (int(2.0 * soft) | 1, int(2.0 * soft) | 1))
+    window = cv2.GaussianBlur(cv2.dilate(mask.astype(np.float32), kernel), (0, 0), 0.6 * soft)[..., None]
+    ground *= 1.0 - 0.62 * window
+    seen = Fragments(fragments.face[box], fragments.weights[box], fragments.depth[box])
+    normals = seen.interpolate(hidden.triangles, vertex_normals(hidden.vertices, hidden.triangles))[mask]
+    facing = np.abs(normals @ camera.T_camera_world[2, :3])
+    surface = picture.depth[box][mask]
+    under = np.where(surface > 0.0, np.maximum(seen.depth[mask] - surface, 0.0), 0.0)
+    shine = (0.25 + 0.75 * facing) * np.exp(-under / FADE)
+    ground[mask] += 1.1 * shine[:, None] * seen.interpolate(hidden.triangles, 255.0 * np.asarray(hidden.colour))[mask]
+    out[box] = np.clip(ground, 0.0, 255.0)
+
+
+def dash(out: np.ndarray, outline: np.ndarray, ink: Sequence[float], length: int = 7) -> None:
+    """Draw every second stretch of `length` pixels of an outline (n, 1, 2), in place."""
+    for start in range(0, len(outline), 2 * length):
+        cv2.polylines(out, [outline[start : start + length]], False, ink, 1, cv2.LINE_AA)
+
+
+def draw_line(out: np.ndarray, camera: Camera, gauge: Gauge) -> None:
+    """Draw the gauge's line, in place; nothing when an end lies behind the camera."""
+    ends, depth = camera.project(np.stack([gauge.tip, gauge.nearest]))
+    if (depth <= 0.0).any():
+        return
+    tip, nearest = (tuple(end) for end in np.clip(ends, -1e4, 1e4).round().astype(int).tolist())
+    cv2.line(out, tip, nearest, (12, 14, 16), 3, cv2.LINE_AA)
+    cv2.line(out, tip, nearest, (250, 250, 250), 1, cv2.LINE_AA)
+    cv2.circle(out, nearest, 3, (250, 250, 250), -1, cv2.LINE_AA)

@@ -1,0 +1,246 @@
+"""Which triangle does each pixel see: a z-buffer rasteriser in Warp.
+
+Triangles are tested in homogeneous pixel coordinates q = K x_camera = (u w, v w, w), so nothing is ever clipped
+(Olano & Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates"): for p = (u, v, 1) the edge
+functions e_a = p . (q_b x q_c), e_b, e_c have one sign inside, their sum is p . n with n = (q_b - q_a) x (q_c - q_a),
+the depth is n . q_a / p . n, and e / sum e are the weights on the triangle itself, hence perspective-correct.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from .camera import Camera
+
+# Pictures are never differentiated, and start-up notes would stand among a command's own lines.
+wp.config.enable_backward = False
+wp.config.log_level = wp.LOG_ERROR
+
+NOTHING = np.uint64(0xFFFFFFFFFFFFFFFF)
+
+
+@dataclass(frozen=True, eq=False)
+class Fragments:
+    """What each pixel sees.
+
+    face (H, W) int32: index of the triangle, -1 where empty. weights (H, W, 3) float32: barycentric weights of the
+    triangle's corners, 0 where empty. depth (H, W) float32 [m]: z in the camera frame, 0 where empty.
+    """
+
+    face: np.ndarray
+    weights: np.ndarray
+    depth: np.ndarray
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(H, W) bool: where anything is seen."""
+        return self.face >= 0
+
+    def interpolate(self, triangles: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Vertex values (V, C) at every pixel, (H, W, C); 0 where empty. triangles (F, 3) as rasterised."""
+        picture = np.zeros((*self.face.shape, values.shape[1]))
+        seen = self.mask
+        picture[seen] = np.einsum("nk,nkc->nc", self.weights[seen], values[triangles[self.face[seen]]])
+        return picture
+
+
+def rasterise(
+    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = 1e-3, device: str = "cpu"
+) -> Fragments:
+    """The nearest triangle at every pixel centre.
+
+    Both sides of a triangle are seen. A pixel centre on an edge belongs to both neighbours (the z-buffer keeps one,
+    the lower index at equal depth), so shared edges leave no cracks; triangles without area leave no trace.
+
+    Parameters
+    ----------
+    vertices, triangles
+        (V, 3) world points [m]; (F, 3) vertex indices.
+    near
+        Nothing closer than this depth [m] is drawn; triangles may reach through the plane and behind the camera.
+    device
+        A Warp device.
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, indices out of range, vertices that are not finite, or near <= 0.
+    """
+    vertices, triangles = checked_mesh(vertices, triangles)
+    if not near > 0.0:
+        raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
+    shape = camera.height, camera.width
+    points = wp.array(camera.in_frame(vertices) @ camera.K.T, dtype=wp.vec3d, device=device)
+    corners = wp.array(triangles, dtype=wp.vec3i, device=device)
+    nearest = wp.full(shape, value=NOTHING, dtype=wp.uint64, device=device)
+    face = wp.empty(shape, dtype=wp.int32, device=device)
+    weights = wp.empty(shape, dtype=wp.vec3f, device=device)
+    depth = wp.empty(shape, dtype=wp.float32, device=device)
+
+    def draw(begin: int, end: int) -> None:
+        scan = [points, corners, wp.float64(near), begin, end]
+        wp.launch(keep_nearest, len(triangles), scan, [nearest], device=device)
+        read = [points, corners, nearest, begin]
+        wp.launch(read_nearest, (end - begin, camera.width), read, [face, weights, depth], device=device)
+
+    wp.load_module(__name__, device=device)
+    in_bands(draw, camera.height, device)
+    return Fragments(face.numpy(), weights.numpy(), depth.numpy())
+
+
+def in_bands(draw: Callable[[int, int], None], count: int, device: str) -> None:
+    """Call `draw(begin, end)` on ranges that cover 0 .. count: a thread for each core, where kernels have one each.
+
+    The ranges must not write to the same places; the modules of their kernels must be loaded.
+    """
+    if device != "cpu":
+        return draw(0, count)
+    pool, cores = workers()
+    edges = np.linspace(0, count, cores + 1).astype(int).tolist()
+    list(pool.map(draw, edges[:-1], edges[1:]))
+
+
+@cache
+def workers() -> tuple[ThreadPoolExecutor, int]:
+    """The threads that draw, and how many: Warp runs a CPU kernel on the calling thread and frees the interpreter."""
+    cores = min(len(os.sched_getaffinity(0)), 8)
+    return ThreadPoolExecutor(cores, thread_name_prefix="raster"), cores
+
+
+def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 and triangles (F, 3) int32; ValueError with the reason when they are no mesh."""
+    vertices = np.asarray(vertices, np.float64)
+    triangles = np.asarray(triangles, np.int32)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise ValueError(f"a surface is vertices (V, 3) and triangles (F, 3), not {vertices.shape}, {triangles.shape}.")
+    if not np.isfinite(vertices).all():
+        raise ValueError("a vertex is not finite: every coordinate must be a finite number of metres.")
+    if triangles.size and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
+        raise ValueError(f"a triangle names a vertex outside 0 .. {len(vertices) - 1}.")
+    return vertices, triangles
+
+
+@wp.func
+def edge(q: wp.array(dtype=wp.vec3d), i: wp.int32, j: wp.int32) -> wp.vec3d:
+    """q_i x q_j, rounded alike for both neighbours of the edge: exactly edge(i, j) = -edge(j, i)."""
+    if i < j:
+        return wp.cross(q[i], q[j])
+    return -wp.cross(q[j], q[i])
+
+
+@wp.func
+def reach(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4d:
+    """Grow the pixel box (u min, v min, u max, v max) by the part of the segment a b beyond the near plane."""
+    if a[2] < near and b[2] < near:
+        return box
+    start = a
+    stop = b
+    if a[2] < near:
+        start = a + (b - a) * ((near - a[2]) / (b[2] - a[2]))
+    if b[2] < near:
+        stop = b + (a - b) * ((near - b[2]) / (a[2] - b[2]))
+    u = start[0] / start[2]
+    v = start[1] / start[2]
+    box = wp.vec4d(wp.min(box[0], u), wp.min(box[1], v), wp.max(box[2], u), wp.max(box[3], v))
+    u = stop[0] / stop[2]
+    v = stop[1] / stop[2]
+    return wp.vec4d(wp.min(box[0], u), wp.min(box[1], v), wp.max(box[2], u), wp.max(box[3], v))
+
+
+@wp.kernel
+def keep_nearest(
+    q: wp.array(dtype=wp.vec3d),
+    triangles: wp.array(dtype=wp.vec3i),
+    near: wp.float64,
+    begin: wp.int32,
+    end: wp.int32,
+    # outputs
+    nearest: wp.array2d(dtype=wp.uint64),
+):
+    """One triangle in the rows begin .. end - 1: the 64-bit minimum of (depth bits, face) at each pixel centre inside.
+
+    The bits of positive floats sort as the floats do.
+    """
+    face = wp.tid()
+    t = triangles[face]
+    a = q[t[0]]
+    b = q[t[1]]
+    c = q[t[2]]
+    normal = wp.cross(b - a, c - a)
+    volume = wp.dot(normal, a)
+    if volume == wp.float64(0.0):
+        return
+    far = wp.float64(1.0e30)
+    box = wp.vec4d(far, far, -far, -far)
+    box = reach(a, b, near, box)
+    box = reach(b, c, near, box)
+    box = reach(c, a, near, box)
+    width = wp.float64(nearest.shape[1])
+    first_u = wp.int32(wp.clamp(wp.ceil(box[0]), wp.float64(0.0), width))
+    first_v = wp.int32(wp.clamp(wp.ceil(box[1]), wp.float64(begin), wp.float64(end)))
+    stop_u = wp.int32(wp.clamp(wp.floor(box[2]) + wp.float64(1.0), wp.float64(0.0), width))
+    stop_v = wp.int32(wp.clamp(wp.floor(box[3]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
+    if first_u >= stop_u or first_v >= stop_v:
+        return
+    side = wp.sign(volume)
+    ea = edge(q, t[1], t[2]) * side
+    eb = edge(q, t[2], t[0]) * side
+    ec = edge(q, t[0], t[1]) * side
+    zero = wp.float64(0.0)
+    for row in range(first_v, stop_v):
+        v = wp.float64(row)
+        row_a = ea[1] * v + ea[2]
+        row_b = eb[1] * v + eb[2]
+        row_c = ec[1] * v + ec[2]
+        for column in range(first_u, stop_u):
+            u = wp.float64(column)
+            if ea[0] * u + row_a >= zero and eb[0] * u + row_b >= zero and ec[0] * u + row_c >= zero:
+                across = normal[0] * u + normal[1] * v + normal[2]
+                if across * side > zero:
+                    z = volume / across
+                    if z >= near:
+                        bits = wp.uint64(wp.cast(wp.float32(z), wp.uint32))
+                        wp.atomic_min(nearest, row, column, (bits << wp.uint64(32)) | wp.uint64(face))
+
+
+@wp.kernel
+def read_nearest(
+    q: wp.array(dtype=wp.vec3d),
+    triangles: wp.array(dtype=wp.vec3i),
+    nearest: wp.array2d(dtype=wp.uint64),
+    begin: wp.int32,
+    # outputs
+    face: wp.array2d(dtype=wp.int32),
+    weights: wp.array2d(dtype=wp.vec3f),
+    depth: wp.array2d(dtype=wp.float32),
+):
+    """One pixel, in the rows from `begin` on: the winning face, its barycentric weights e / sum e, its depth."""
+    line, column = wp.tid()
+    row = begin + line
+    key = nearest[row, column]
+    if key == wp.uint64(0xFFFFFFFFFFFFFFFF):
+        face[row, column] = -1
+        weights[row, column] = wp.vec3f(0.0)
+        depth[row, column] = 0.0
+        return
+    winner = wp.int32(key & wp.uint64(0xFFFFFFFF))
+    t = triangles[winner]
+    a = q[t[0]]
+    b = q[t[1]]
+    c = q[t[2]]
+    p = wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
+    eb = wp.dot(p, wp.cross(c, a - c))
+    ec = wp.dot(p, wp.cross(a, b - a))
+    across = wp.dot(p, wp.cross(b - a, c - a))
+    wb = wp.float32(eb / across)
+    wc = wp.float32(ec / across)
+    face[row, column] = winner
+    weights[row, column] = wp.vec3f(1.0 - wb - wc, wb, wc)
+    depth[row, column] = wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)

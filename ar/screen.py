@@ -1,0 +1,119 @@
+"""Where pictures go: nowhere, a folder, a film file; the page is in `browser.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+
+class Screen(Protocol):
+    """Takes pictures (H, W, 3) uint8 sRGB, one a frame."""
+
+    def show(self, number: int, colour: np.ndarray) -> None:
+        """Show frame `number` (from 0)."""
+        ...
+
+
+class Blank:
+    """Shows nothing: the screen of checks and benchmarks."""
+
+    def show(self, number: int, colour: np.ndarray) -> None:
+        """Let the frame go."""
+
+
+class Film:
+    """A folder of `frame_0000.png`, `frame_0001.png`, ...; each file appears whole."""
+
+    def __init__(self, folder: Path) -> None:
+        """Make the folder where it is missing; ValueError when the path is a file."""
+        self.folder = Path(folder)
+        if self.folder.exists() and not self.folder.is_dir():
+            raise ValueError(f"{self.folder} is a file: name a folder for the frames.")
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def show(self, number: int, colour: np.ndarray) -> None:
+        """Write one PNG."""
+        write_png(self.folder / f"frame_{number:04d}.png", colour)
+
+
+def write_png(path: Path, colour: np.ndarray) -> None:
+    """Write a picture (H, W, 3) uint8 sRGB; the file appears whole. Raises OSError where it cannot be written."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_bytes(cv2.imencode(".png", colour[..., ::-1])[1].tobytes())
+    part.rename(path)
+
+
+def read_png(path: Path) -> np.ndarray:
+    """The picture (H, W, 3) uint8 sRGB in a file; ValueError when it holds none."""
+    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if bgr is None:
+        raise ValueError(f"{path} is not a picture that can be read.")
+    return np.ascontiguousarray(bgr[..., ::-1])
+
+
+def write_film(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float = 25.0) -> None:
+    """Write pictures (H, W, 3) uint8 sRGB of one size as a film: `.mp4`, or `.gif` or `.webp` that loops on a page.
+
+    The file appears whole, or not at all when `pictures` or the writing fails.
+
+    Raises
+    ------
+    ValueError
+        Another suffix, a rate that is not positive, no picture, or pictures of different sizes.
+    OSError
+        A file that cannot be written.
+    """
+    path = Path(path)
+    writers = {".mp4": write_video, ".gif": write_animation, ".webp": write_animation}
+    if path.suffix not in writers:
+        raise ValueError(f"{path} ends in {path.suffix!r}: films are {', '.join(writers)}.")
+    if not frames_per_second > 0.0:
+        raise ValueError(f"{frames_per_second} frames per second: give a positive rate.")
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        writers[path.suffix](part, pictures, frames_per_second)
+        part.rename(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_video(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float) -> None:
+    """MPEG-4 part 2, picture by picture: nothing is kept in memory."""
+    writer, size = None, None
+    for colour in pictures:
+        if writer is None:
+            size = colour.shape
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            writer = cv2.VideoWriter(str(path), code, frames_per_second, (size[1], size[0]))
+            if not writer.isOpened():
+                raise OSError(f"{path.parent} takes no film: see that the folder exists and may be written.")
+        check_size(colour, size)
+        writer.write(np.ascontiguousarray(colour[..., ::-1]))
+    if writer is None:
+        raise ValueError("a film needs at least one picture.")
+    writer.release()
+
+
+def write_animation(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float) -> None:
+    """GIF or WebP that loops for ever; all pictures are in memory at once."""
+    frames = [np.ascontiguousarray(colour[..., ::-1]) for colour in pictures]
+    if not frames:
+        raise ValueError("a film needs at least one picture.")
+    for frame in frames:
+        check_size(frame, frames[0].shape)
+    animation = cv2.Animation()
+    animation.frames = frames
+    animation.durations = [round(1e3 / frames_per_second)] * len(frames)
+    quality = [cv2.IMWRITE_WEBP_QUALITY, 80] if path.suffix == ".webp" else []
+    if not cv2.imwriteanimation(str(path), animation, quality):
+        raise OSError(f"{path.parent} takes no film: see that the folder exists and may be written.")
+
+
+def check_size(colour: np.ndarray, size: tuple[int, ...] | None) -> None:
+    """ValueError unless a picture has the size of the first."""
+    if colour.shape != size:
+        raise ValueError(f"pictures of {size} and {colour.shape}: a film's pictures all have one size.")
