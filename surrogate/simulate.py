@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -116,7 +115,7 @@ def _lay_out(
 ) -> None:
     """Create the file with all its space; keep the whole batches of a `finished` file that it extends."""
     nodes = open_patch(anatomy).nodes
-    draft = partial.with_name(f".{partial.name}.{os.getpid()}")
+    draft = partial.with_name(f".{partial.name}")
     try:
         with h5py.File(draft, "w") as file:
             file.attrs.update(stated)

@@ -1,0 +1,87 @@
+"""A body that many tests share, and a deformer that answers in microseconds."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pytest
+
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, Outcome
+from sim.footprint import footprint_weights
+from sim.loads import Nodal, Pushed
+from sim.mesh import TetMesh, oriented
+
+
+def make_box(cells=(12, 12, 7), spacing=6e-3, tumour=10e-3, depth=22e-3, opening=25e-3):
+    """A box with its top at z = 0: a disc of the top is open, the rest of the surface held, a tumour under the disc."""
+    axes = [spacing * (np.arange(n + 1) - n / 2) for n in cells[:2]] + [spacing * np.arange(-cells[2], 1)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    number = np.arange(len(nodes)).reshape([n + 1 for n in cells])
+    corner = [
+        number[i : cells[0] + i, j : cells[1] + j, k : cells[2] + k].ravel()
+        for i in (0, 1)
+        for j in (0, 1)
+        for k in (0, 1)
+    ]
+    paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]
+    tets, _ = oriented(nodes, np.concatenate([np.stack([corner[c] for c in path], axis=1) for path in paths]))
+    inside = np.linalg.norm(nodes[tets].mean(axis=1) + [0.0, 0.0, depth], axis=1) < tumour
+    mesh = TetMesh(nodes, tets, np.where(inside, 2, 1))
+    surface = np.zeros(len(nodes), bool)
+    surface[mesh.surface] = True
+    opened = surface & (np.linalg.norm(nodes, axis=1) < opening)
+    return Anatomy(mesh, np.repeat((surface & ~opened)[:, None], 3, axis=1), np.zeros_like(nodes), opened)
+
+
+@dataclass(frozen=True, eq=False)
+class Pretender:
+    """A Deformer by formula: Kelvin's solution, softer the smaller the force; fails above a force."""
+
+    anatomy: Anatomy
+    fails_above: float = np.inf
+
+    @cached_property
+    def _loaded(self):
+        return np.flatnonzero(self.anatomy.craniotomy)
+
+    @cached_property
+    def _kelvin(self):
+        """(V, m, 3, 3) [m/N] from the open nodes to every node."""
+        arm = self.anatomy.mesh.nodes[:, None] - self.anatomy.mesh.nodes[self._loaded]
+        length = np.sqrt(np.einsum("vmi,vmi->vm", arm, arm) + (4e-3) ** 2)[:, :, None, None]
+        return (np.eye(3) / length + arm[..., :, None] * arm[..., None, :] / length**3) / (8.0 * np.pi * 1000.0)
+
+    def deform(self, loads, start=None, at=None):
+        mesh = self.anatomy.mesh
+        pushed, nodal = loads.of(Pushed), loads.of(Nodal)
+        force = np.zeros((len(loads), len(mesh.nodes), 3)) if nodal is None else nodal.force
+        if pushed is not None:
+            weights = footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
+            force = force + weights[:, :, None] * pushed.force[:, None]
+        size = np.linalg.norm(force.sum(axis=1), axis=1)
+        linear = np.einsum("vmij,bmj->bvi", self._kelvin, force[:, self._loaded], optimize=True)
+        # Shallow nodes soften more than deep ones: no linear map and no common factor reproduces it.
+        shape = np.exp(mesh.nodes[:, 2] / 30e-3)
+        displacement = linear / (1.0 + size[:, None] * shape)[:, :, None]
+        good = size <= self.fails_above
+        answer = Deformation(
+            displacement,
+            np.arange(len(mesh.nodes)),
+            tuple(Outcome.CONVERGED if fine else Outcome.BUDGET for fine in good),
+            np.where(good, 4, 60),
+            np.where(good, 1e-5, 1e-2),
+            loads.times,
+            np.zeros((len(loads), 0, 6)),
+        )
+        return answer if at is None else answer.at(at)
+
+
+@pytest.fixture(scope="session")
+def box():
+    return make_box()
+
+
+@pytest.fixture(scope="session")
+def pretender(box):
+    return Pretender(box)

@@ -1,0 +1,127 @@
+"""Loads are those of the tools, spread over the open cortex; tests are whole discs."""
+
+import numpy as np
+import pytest
+
+from sim.errors import InputError
+from sim.loads import Pushed
+from surrogate.patch import open_patch
+from surrogate.sampling import HARDEST, PUBLISHED_FOOTPRINT, TOOLS, draw, spread
+from surrogate.split import leave_discs_out
+
+
+@pytest.fixture(scope="module")
+def patch(box):
+    return open_patch(box)
+
+
+def pushes(*args):
+    return draw(*args).of(Pushed)
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_tools_stay_in_their_ranges(box, patch, name):
+    tool, loads = TOOLS[name], pushes(name, box, 200, 1)
+    force = np.linalg.norm(loads.force, axis=1)
+    pressure = force / (np.pi * loads.footprint**2)
+    cosine = -loads.force[:, 2] / force  # the open top faces +z
+    assert (loads.footprint >= tool.footprint[0]).all() and (loads.footprint <= tool.footprint[1]).all()
+    assert (force >= tool.force[0] * (1 - 1e-12)).all() and (force <= tool.force[1] * (1 + 1e-12)).all()
+    assert pressure.max() <= HARDEST and pressure.min() >= tool.pressure[0]
+    assert cosine.min() >= np.cos(tool.cone) - 1e-12
+    assert (patch.rim_distance(loads.point) >= loads.footprint).all()
+
+
+def test_points_are_uniform_by_area_directions_by_solid_angle_and_forces_by_logarithm(box, patch):
+    loads = pushes("bipolar", box, 4000, 0)
+    inner = np.linalg.norm(loads.point[:, :2], axis=1) < 10e-3
+    allowed = patch.covered(np.zeros((1, 3)), 10e-3) * patch.areas.sum()
+    pressable = patch.areas.sum() - 0.85e-3 * np.linalg.norm(patch.rim[:, 1] - patch.rim[:, 0], axis=1).sum()
+    assert inner.mean() == pytest.approx(allowed / pressable, rel=0.12)
+    loads = pushes("palpation", box, 4000, 0)
+    force = np.linalg.norm(loads.force, axis=1)
+    cosine = -loads.force[:, 2] / force
+    assert np.median(force) == pytest.approx(np.sqrt(0.05 * 0.4), rel=0.08)
+    assert np.mean(cosine) == pytest.approx((1 + np.cos(np.pi / 4)) / 2, abs=0.01)
+
+
+def test_a_load_depends_on_its_number_alone(box):
+    for preset in ("palpation", "mixed", "seed"):
+        few, many = pushes(preset, box, 7, 5), pushes(preset, box, 40, 5)
+        assert np.array_equal(few.point, many.point[:7]) and np.array_equal(few.force, many.force[:7])
+    assert not np.array_equal(pushes("palpation", box, 7, 6).point, few.point)
+
+
+def test_mixed_uses_every_tool(box):
+    radii = pushes("mixed", box, 200, 0).footprint
+    for tool in TOOLS.values():
+        assert ((radii >= tool.footprint[0]) & (radii <= tool.footprint[1])).sum() > 20
+
+
+def test_published_protocol(box):
+    loads = pushes("seed", box, 100_000, 0)
+    centre = box.mesh.nodes[box.tumour_nodes].mean(axis=0)
+    distance = np.linalg.norm(loads.point - centre, axis=1)
+    magnitude = np.linalg.norm(loads.force, axis=1)
+    assert len(loads.point) == 11 * 30 * 20
+    assert len(np.unique(loads.point, axis=0)) == 11 and 20e-3 <= distance.min() and distance.max() <= 28e-3
+    assert np.allclose(np.unique(magnitude.round(9)), np.arange(0.10, 1.051, 0.05))
+    assert (loads.footprint == PUBLISHED_FOOTPRINT).all()
+    rows = np.column_stack([loads.point, loads.force]).round(9)
+    assert len(np.unique(rows, axis=0)) == len(rows)
+
+
+@pytest.mark.parametrize(
+    ("preset", "count", "seed", "words"),
+    [("hammer", 5, 0, "palpation"), ("palpation", 0, 0, "--count"), ("palpation", 5, -1, "--seed")],
+)
+def test_bad_draws_are_sentences(box, preset, count, seed, words):
+    with pytest.raises(InputError, match=words):
+        draw(preset, box, count, seed)
+
+
+def test_a_tool_too_large_for_the_patch_is_refused(make_small_opening):
+    with pytest.raises(InputError, match="--craniotomy"):
+        draw("spatula", make_small_opening, 3, 0)
+
+
+@pytest.fixture
+def make_small_opening(box):
+    from sim.anatomy import Anatomy
+
+    near = box.craniotomy & (np.linalg.norm(box.mesh.nodes, axis=1) < 9e-3)
+    return Anatomy(box.mesh, box.held | ~near[:, None], box.slide_normal, near)
+
+
+def test_spread_points_are_far_from_each_other():
+    points = np.random.default_rng(0).random((400, 3)) * [1, 1, 0]
+    chosen = points[spread(points, 9)]
+    gaps = np.linalg.norm(chosen[:, None] - chosen, axis=2) + np.eye(9) * 9
+    assert gaps.min() > 0.3  # a 3 x 3 grid has 0.33-0.5
+
+
+def test_whole_discs_are_left_out(box, patch):
+    points = pushes("palpation", box, 600, 0).point
+    split = leave_discs_out(points, patch)
+    distance = np.linalg.norm(points[:, None] - split.centres, axis=2)
+    assert split.radius == 6e-3 and len(split.centres) >= 6 and split.share >= 0.15
+    assert np.array_equal(split.test, distance.min(axis=1) <= 6e-3)  # none stays inside, none is taken outside
+    assert set(split.disc[split.test]) == set(range(len(split.centres)))
+    assert 0.1 < split.test.mean() <= 0.5
+
+
+def test_covered_share_is_that_of_discs(box, patch):
+    assert patch.covered(np.zeros((1, 3)), 12e-3) == pytest.approx(np.pi * 12e-3**2 / patch.areas.sum(), rel=0.03)
+
+
+def test_a_wide_patch_gets_more_discs(box, patch):
+    points = pushes("palpation", box, 300, 0).point
+    centres = leave_discs_out(points, patch).centres
+    wide = type(patch)(patch.nodes, patch.triangles, 3.0 * patch.points)
+    split = leave_discs_out(3.0 * points, wide)
+    assert split.share >= 0.15 and len(split.centres) > len(centres)
+
+
+def test_too_few_positions_are_refused(patch):
+    with pytest.raises(InputError, match="simulate more"):
+        leave_discs_out(np.repeat(np.eye(3)[:2] * 0.01, 5, axis=0), patch)
