@@ -41,11 +41,16 @@ def cross_matrix(w: Any):
 
 
 @wp.func
-def rotation_of(F: Any):
-    """The rotation R nearest to F: from Warp's approximate singular values, then two Newton steps to round-off."""
-    U, s, V = wp.svd3(F)
+def rotation_excess(H: Any):
+    """Q = R - I for the rotation R nearest to F = I + H: Warp's approximate singular values, then Newton steps.
+
+    With a unit quaternion (v, w), Q = 2 w [v]x + 2 [v]x^2: where R is near I, nothing cancels.
+    """
+    one = type(H[0, 0])(1.0)
+    two = type(one)(2.0)
+    U, s, V = wp.svd3(wp.identity(n=3, dtype=type(one)) + H)
     R = U * wp.transpose(V)
-    if wp.determinant(R) < type(F[0, 0])(0.0):
+    if wp.determinant(R) < type(one)(0.0):
         least = int(2)
         if s[0] < s[1] and s[0] < s[2]:
             least = int(0)
@@ -54,23 +59,34 @@ def rotation_of(F: Any):
         for i in range(3):
             U[i, least] = -U[i, least]
         R = U * wp.transpose(V)
-    one = type(F[0, 0])(1.0)
+    turn = wp.normalize(wp.quat_from_matrix(R))
+    Q = excess_of(turn)
     for _ in range(2):
-        A = wp.transpose(R) * F
-        w = spin((A + wp.transpose(A)) / type(one)(2.0), A)
-        # Cayley's transform: a rotation that agrees with exp to second order.
-        half = cross_matrix(w) / type(one)(2.0)
-        identity = wp.identity(n=3, dtype=type(one))
-        R = R * (wp.inverse(identity - half) * (identity + half))
-    return R
+        B = strain_of(H, Q)
+        half = spin(wp.identity(n=3, dtype=type(one)) + (B + wp.transpose(B)) / two, B) / two
+        # Cayley's transform of [2 half]x is the quaternion (half, 1): it agrees with exp to second order.
+        turn = wp.normalize(turn * wp.quaternion(half, one))
+        Q = excess_of(turn)
+    return Q
+
+
+@wp.func
+def excess_of(turn: Any):
+    """R - I of a unit quaternion."""
+    X = cross_matrix(wp.vector(turn[0], turn[1], turn[2]))
+    return type(turn[0])(2.0) * (turn[3] * X + X * X)
+
+
+@wp.func
+def strain_of(H: Any, Q: Any):
+    """R^T F - I from H = F - I and Q = R - I."""
+    return H + wp.transpose(Q) + wp.transpose(Q) * H
 
 
 @wp.func
 def energy(H: Any, mu: Any, lam: Any):
     """psi [Pa] = mu |S - I|^2 + lambda/2 tr(S - I)^2."""
-    identity = wp.identity(n=3, dtype=type(mu))
-    R = rotation_of(identity + H)
-    strain = wp.transpose(R) * (identity + H) - identity
+    strain = strain_of(H, rotation_excess(H))
     t = wp.trace(strain)
     return mu * wp.ddot(strain, strain) + type(mu)(0.5) * lam * t * t
 
@@ -78,10 +94,9 @@ def energy(H: Any, mu: Any, lam: Any):
 @wp.func
 def stress(H: Any, mu: Any, lam: Any):
     """P [Pa] = 2 mu (F - R) + lambda tr(S - I) R."""
-    identity = wp.identity(n=3, dtype=type(mu))
-    R = rotation_of(identity + H)
-    t = wp.trace(wp.transpose(R) * (identity + H) - identity)
-    return type(mu)(2.0) * mu * (H - (R - identity)) + lam * t * R
+    Q = rotation_excess(H)
+    t = wp.trace(strain_of(H, Q))
+    return type(mu)(2.0) * mu * (H - Q) + lam * t * (wp.identity(n=3, dtype=type(mu)) + Q)
 
 
 @wp.func
@@ -92,12 +107,12 @@ def stress_change(H: Any, D: Any, mu: Any, lam: Any):
     """
     two = type(mu)(2.0)
     identity = wp.identity(n=3, dtype=type(mu))
-    F = identity + H
-    R = rotation_of(F)
-    S = wp.transpose(R) * F
+    Q = rotation_excess(H)
+    R = identity + Q
+    strain = strain_of(H, Q)
     A = wp.transpose(R) * D
-    w = spin(S, A)
-    t = wp.trace(S - identity)
+    w = spin(identity + strain, A)
+    t = wp.trace(strain)
     return two * mu * D + lam * wp.trace(A) * R + (lam * t - two * mu) * (R * cross_matrix(w))
 
 

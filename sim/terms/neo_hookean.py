@@ -25,6 +25,18 @@ def log_volume(H: Any):
 
 
 @wp.func
+def log_volume_excess(j: Any):
+    """j - ln(1 + j), by the series of ln(1 + j) = 2 artanh s, s = j / (2 + j), where the difference would cancel."""
+    one = type(j)(1.0)
+    if wp.abs(j) > type(j)(0.1):
+        return j - wp.log(one + j)
+    s = j / (type(j)(2.0) + j)
+    q = s * s
+    tail = one / type(j)(3.0) + q * (one / type(j)(5.0) + q * (one / type(j)(7.0) + q * (one / type(j)(9.0))))
+    return s * (j - type(j)(2.0) * q * tail)
+
+
+@wp.func
 def energy(H: Any, mu: Any, lam: Any):
     """psi [Pa] = mu (|H|^2 / 2 + tr H - ln J) + lambda/2 (ln J)^2; +inf where J <= 0."""
     half = type(mu)(0.5)
@@ -32,7 +44,7 @@ def energy(H: Any, mu: Any, lam: Any):
     if j <= -type(mu)(1.0):
         return type(mu)(wp.inf)
     log_J = log_volume(H)
-    return mu * (half * wp.ddot(H, H) - second_order_volume(H) + (j - log_J)) + half * lam * log_J * log_J
+    return mu * (half * wp.ddot(H, H) - second_order_volume(H) + log_volume_excess(j)) + half * lam * log_J * log_J
 
 
 @wp.func

@@ -1,0 +1,42 @@
+"""Small bodies to test the solver on: structured boxes, distorted if wanted, and how they are held."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.mesh import TetMesh
+
+# Kuhn's six tetrahedra of a cube: paths from corner 0 to corner 7 along the axes; neighbours match.
+CORNER = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]])
+KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+
+
+def box(cells: tuple[int, int, int], size: float = 0.1, distortion: float = 0.0, seed: int = 0) -> TetMesh:
+    """A box of `cells` cubes, its longest side `size` [m]; inner nodes moved by a share of a cube's side at random."""
+    counts = np.array(cells) + 1
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    stride = np.array([counts[1] * counts[2], counts[2], 1])
+    first = grid[(grid < counts - 1).all(axis=1)]
+    tets = ((first[:, None] + CORNER) @ stride)[:, KUHN].reshape(-1, 4)
+    inside = ((grid > 0) & (grid < counts - 1)).all(axis=1)
+    shift = np.random.default_rng(seed).uniform(-distortion, distortion, grid.shape) * inside[:, None]
+    return TetMesh((grid + shift) * size / max(cells), tets, np.zeros(len(tets), int))
+
+
+def hold(mesh: TetMesh, held: np.ndarray, normal: np.ndarray | None = None) -> Anatomy:
+    """An anatomy that holds nodes (V,) or components (V, 3) bool, with slide normals (V, 3) if given."""
+    count = len(mesh.nodes)
+    slide = np.zeros((count, 3)) if normal is None else normal
+    return Anatomy(mesh, np.broadcast_to(held.reshape(count, -1), (count, 3)), slide, np.zeros(count, bool))
+
+
+def base_held(mesh: TetMesh) -> Anatomy:
+    """The anatomy of a box whose nodes at z = 0 are held."""
+    return hold(mesh, mesh.nodes[:, 2] < 1e-9)
+
+
+def top_forces(mesh: TetMesh, total: np.ndarray) -> np.ndarray:
+    """Nodal forces (B, V, 3) [N] that share total (B, 3) [N] among the nodes of the highest face."""
+    top = mesh.nodes[:, 2] > mesh.nodes[:, 2].max() - 1e-9
+    return np.atleast_2d(total)[:, None, :] * (top / top.sum())[None, :, None]
