@@ -77,22 +77,35 @@ def rasterise(
     if not near > 0.0:
         raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
     shape = camera.height, camera.width
-    points = wp.array(camera.in_frame(vertices) @ camera.K.T, dtype=wp.vec3d, device=device)
-    corners = wp.array(triangles, dtype=wp.vec3i, device=device)
+    homogeneous = camera.in_frame(vertices) @ camera.K.T
+    first, last = rows_reached(homogeneous, near, camera.height)
+    points = wp.array(homogeneous, dtype=wp.vec3d, device=device)
+    corners = wp.array(triangles, dtype=wp.vec3i, device=device, copy=False)
     nearest = wp.full(shape, value=NOTHING, dtype=wp.uint64, device=device)
-    face = wp.empty(shape, dtype=wp.int32, device=device)
-    weights = wp.empty(shape, dtype=wp.vec3f, device=device)
-    depth = wp.empty(shape, dtype=wp.float32, device=device)
+    face = wp.full(shape, value=-1, dtype=wp.int32, device=device)
+    weights = wp.zeros(shape, dtype=wp.vec3f, device=device)
+    depth = wp.zeros(shape, dtype=wp.float32, device=device)
 
     def draw(begin: int, end: int) -> None:
-        scan = [points, corners, wp.float64(near), begin, end]
+        scan = [points, corners, wp.float64(near), first + begin, first + end]
         wp.launch(keep_nearest, len(triangles), scan, [nearest], device=device)
-        read = [points, corners, nearest, begin]
+        read = [points, corners, nearest, first + begin]
         wp.launch(read_nearest, (end - begin, camera.width), read, [face, weights, depth], device=device)
 
     wp.load_module(__name__, device=device)
-    in_bands(draw, camera.height, device)
+    in_bands(draw, last - first, device)
     return Fragments(face.numpy(), weights.numpy(), depth.numpy())
+
+
+def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int, int]:
+    """First and last-but-one row of the picture that points (V, 3) (u w, v w, w) can cover: all, if one is too near."""
+    if not len(homogeneous):
+        return 0, 0
+    if homogeneous[:, 2].min() < near:
+        return 0, height
+    rows = homogeneous[:, 1] / homogeneous[:, 2]
+    first, last = np.clip([np.floor(rows.min()), np.ceil(rows.max()) + 1.0], 0, height).astype(int).tolist()
+    return first, last
 
 
 def in_bands(draw: Callable[[int, int], None], count: int, device: str) -> None:
@@ -136,22 +149,22 @@ def edge(q: wp.array(dtype=wp.vec3d), i: wp.int32, j: wp.int32) -> wp.vec3d:
 
 
 @wp.func
-def reach(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4d:
-    """Grow the pixel box (u min, v min, u max, v max) by the part of the segment a b beyond the near plane."""
-    if a[2] < near and b[2] < near:
-        return box
-    start = a
-    stop = b
-    if a[2] < near:
-        start = a + (b - a) * ((near - a[2]) / (b[2] - a[2]))
-    if b[2] < near:
-        stop = b + (a - b) * ((near - b[2]) / (a[2] - b[2]))
-    u = start[0] / start[2]
-    v = start[1] / start[2]
-    box = wp.vec4d(wp.min(box[0], u), wp.min(box[1], v), wp.max(box[2], u), wp.max(box[3], v))
-    u = stop[0] / stop[2]
-    v = stop[1] / stop[2]
+def around(q: wp.vec3d, box: wp.vec4d) -> wp.vec4d:
+    """The pixel box (u min, v min, u max, v max) grown to hold the pixel of q."""
+    scale = wp.float64(1.0) / q[2]
+    u = q[0] * scale
+    v = q[1] * scale
     return wp.vec4d(wp.min(box[0], u), wp.min(box[1], v), wp.max(box[2], u), wp.max(box[3], v))
+
+
+@wp.func
+def beyond(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4d:
+    """The pixel box grown to hold the part of the edge a b that lies beyond the near plane."""
+    if a[2] >= near:
+        box = around(a, box)
+    if (a[2] < near) != (b[2] < near):
+        box = around(a + (b - a) * ((near - a[2]) / (b[2] - a[2])), box)
+    return box
 
 
 @wp.kernel
@@ -179,14 +192,18 @@ def keep_nearest(
         return
     far = wp.float64(1.0e30)
     box = wp.vec4d(far, far, -far, -far)
-    box = reach(a, b, near, box)
-    box = reach(b, c, near, box)
-    box = reach(c, a, near, box)
+    box = beyond(a, b, near, box)
+    box = beyond(b, c, near, box)
+    box = beyond(c, a, near, box)
+    # Rounding must not push a pixel out that lies on the box.
+    slack = wp.vec2d(wp.float64(1.0e-6))
+    low = wp.vec2d(box[0], box[1]) - slack
+    high = wp.vec2d(box[2], box[3]) + slack
     width = wp.float64(nearest.shape[1])
-    first_u = wp.int32(wp.clamp(wp.ceil(box[0]), wp.float64(0.0), width))
-    first_v = wp.int32(wp.clamp(wp.ceil(box[1]), wp.float64(begin), wp.float64(end)))
-    stop_u = wp.int32(wp.clamp(wp.floor(box[2]) + wp.float64(1.0), wp.float64(0.0), width))
-    stop_v = wp.int32(wp.clamp(wp.floor(box[3]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
+    first_u = wp.int32(wp.clamp(wp.ceil(low[0]), wp.float64(0.0), width))
+    first_v = wp.int32(wp.clamp(wp.ceil(low[1]), wp.float64(begin), wp.float64(end)))
+    stop_u = wp.int32(wp.clamp(wp.floor(high[0]) + wp.float64(1.0), wp.float64(0.0), width))
+    stop_v = wp.int32(wp.clamp(wp.floor(high[1]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
     if first_u >= stop_u or first_v >= stop_v:
         return
     side = wp.sign(volume)
@@ -226,9 +243,6 @@ def read_nearest(
     row = begin + line
     key = nearest[row, column]
     if key == wp.uint64(0xFFFFFFFFFFFFFFFF):
-        face[row, column] = -1
-        weights[row, column] = wp.vec3f(0.0)
-        depth[row, column] = 0.0
         return
     winner = wp.int32(key & wp.uint64(0xFFFFFFFF))
     t = triangles[winner]

@@ -84,7 +84,7 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
     shadow, bounds = shadow_map(lamp, [layer for layer in layers if layer.casts_shadow], device)
     light = as_light(lamp)
     seen = fragments.face.reshape(-1)
-    on_device = partial(wp.array, device=device)
+    on_device = partial(wp.array, device=device, copy=False)
     face = on_device(seen, dtype=wp.int32)
     weights = on_device(fragments.weights.reshape(-1, 3), dtype=wp.vec3f)
     lamp_arrays = [
@@ -92,7 +92,7 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
         on_device(bounds, dtype=wp.vec2f),
         on_device(tone_curve(), dtype=wp.uint8),
     ]
-    colour = on_device(background(camera.width, camera.height), dtype=wp.uint8)
+    colour = wp.array(background(camera.width, camera.height), dtype=wp.uint8, device=device)
     normal = wp.zeros(face.shape, dtype=wp.vec3f, device=device)
     segmentation = wp.zeros(face.shape, dtype=wp.uint8, device=device)
     wp.load_module(shade.module, device=device)
@@ -140,10 +140,9 @@ def as_light(lamp: Lamp) -> Light:
     projection[:3] = camera.K @ camera.T_camera_world[:3]
     light = Light()
     light.position, light.axis = wp.vec3f(lamp.position), wp.vec3f(axis / np.linalg.norm(axis))
-    light.outer = float(np.cos(np.arctan(lamp.radius / np.linalg.norm(axis))))
-    light.inner = float(np.cos(0.55 * np.arctan(lamp.radius / np.linalg.norm(axis))))
+    angle = np.arctan(lamp.radius / np.linalg.norm(axis))
+    light.outer, light.steepness = float(np.cos(angle)), float(1.0 / (np.cos(0.55 * angle) - np.cos(angle)))
     light.strength, light.ambient, light.P = lamp.strength, lamp.ambient, wp.mat44f(projection)
-    light.pixel = 1.0 / camera.K[0, 0]
     return light
 
 
@@ -153,19 +152,19 @@ def as_surface(layer: Layer, device: str) -> list:
     look = Look()
     look.id, look.gloss, look.shininess = layer.id, layer.gloss, layer.shininess
     look.textured = layer.solid is not None
-    texels = np.zeros((1, 1, 1, 4))
+    texels = np.zeros((1, 1, 1, 4), np.float32)
     if layer.solid is not None:
         texels = layer.solid.texels
         look.T_index_world, look.relief = wp.mat44f(layer.solid.T_index_world), layer.solid.relief
         look.dark = wp.vec3f(layer.solid.dark)
     vectors = partial(wp.array, dtype=wp.vec3f, device=device)
     return [
-        wp.array(layer.triangles, dtype=wp.vec3i, device=device),
+        wp.array(layer.triangles, dtype=wp.vec3i, device=device, copy=False),
         vectors(layer.vertices),
         vectors(normals),
         vectors(np.asarray(layer.colour) ** 2),
         vectors(layer.vertices if layer.rest is None else layer.rest),
-        wp.array(texels, dtype=wp.vec4f, device=device),
+        wp.array(texels, dtype=wp.vec4f, device=device, copy=False),
         look,
     ]
 
