@@ -1,0 +1,153 @@
+"""`sulcus anatomy`: a tetrahedral brain with a tumour, from the template or from a label volume."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.errors import InputError
+from sim.intensity import sidecar, write_intensity
+from sim.labels import volume_subject
+from sim.mesh import dihedral_angles
+from sim.meshfile import write_anatomy
+from sim.meshing import surface_errors
+from sim.subject import Plan, Subject, make_anatomy
+from sim.template import SITES, Tumour, template_subject
+
+# Lengths in millimetres, as on the command line.
+DEFAULTS = {
+    "radius": 12.0,
+    "cover": 10.0,
+    "tumour_shape": "sphere",
+    "site": "central",
+    "craniotomy": 50.0,
+    "skull": "slide",
+}
+PRESETS = {
+    "default": {},
+    "superficial": {"cover": 3.0},
+    "subcortical": {"cover": 10.0},
+    "deep": {"cover": 25.0},
+    # Tonutti et al. 2017: forces from 20 mm off the centre of a tumour of 12 mm radius, 98 cm2 of cortex left free.
+    "seed": {"cover": 8.0, "craniotomy": 110.0, "skull": "held"},
+}
+PLACED = ("radius", "cover", "tumour_shape", "site")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("--out", required=True, type=Path, metavar="MESH.vtu", help="mesh to write [m, RAS]")
+    parser.add_argument(
+        "--nodes", type=int, default=5300, metavar="N", help="nodes wanted, 2000 to 60000 (%(default)s)"
+    )
+    parser.add_argument("--craniotomy", type=float, metavar="MM", help="diameter along the cortex [mm] (50)")
+    parser.add_argument("--skull", choices=("slide", "held"), help="how the brain's surface meets the skull (slide)")
+    parser.add_argument("--preset", choices=tuple(PRESETS), default="default", help="values of what is not given")
+    own = parser.add_argument_group("your own brain")
+    own.add_argument("--labels", type=Path, metavar="FILE.nii.gz", help="label volume; without it, the template")
+    own.add_argument("--brain", type=_labels, metavar="1,2", help="labels that are brain")
+    own.add_argument("--tumour", type=_labels, metavar="3,4", help="labels that are tumour")
+    own.add_argument(
+        "--t1", type=Path, metavar="FILE.nii.gz", help="intensities in the same space, for the camera view"
+    )
+    placed = parser.add_argument_group("the template's tumour")
+    placed.add_argument(
+        "--radius", type=float, metavar="MM", help="radius [mm]; of a ball of equal volume if lobed (12)"
+    )
+    placed.add_argument("--cover", type=float, metavar="MM", help="depth of its cap under the cortex [mm] (10)")
+    placed.add_argument("--tumour-shape", choices=("sphere", "lobed"), help="its shape (sphere)")
+    placed.add_argument("--site", choices=tuple(SITES), help="the cortex that it lies under (central)")
+    placed.add_argument("--seed", type=int, default=0, metavar="N", help="another lobed shape for another seed (0)")
+    parser.add_argument("--json", action="store_true", help="print the summary as one line of JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make the anatomy, write it, and print what it is."""
+    began = time.perf_counter()
+    if args.out.suffix != ".vtu":
+        raise InputError(f"{args.out}: meshes are written as .vtu; give a name that ends so.")
+    chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
+    plan = Plan(args.nodes, 1e-3 * chosen["craniotomy"], chosen["skull"])
+    subject = _subject(args, chosen)
+    for note in subject.notes:
+        print(f"{args.labels}: {note}", file=sys.stderr)
+    print(f"sulcus anatomy: meshing with about {plan.nodes} nodes ...", file=sys.stderr)
+    anatomy = make_anatomy(subject, plan)
+    intensity = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy])
+    write_anatomy(args.out, anatomy)
+    beside = sidecar(args.out)
+    if intensity is None:
+        beside.unlink(missing_ok=True)  # of an earlier mesh of this name
+    else:
+        write_intensity(beside, intensity)
+    figures = _figures(anatomy, subject)
+    files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
+    summary = {**files, **figures, "seconds": round(time.perf_counter() - began, 2)}
+    print(json.dumps(summary) if args.json else _sentences(summary))
+    return 0
+
+
+def _labels(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of whole numbers such as 1,2") from None
+
+
+def _given(args: argparse.Namespace) -> dict[str, float | str]:
+    return {name: getattr(args, name) for name in DEFAULTS if getattr(args, name) is not None}
+
+
+def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
+    if args.labels is None:
+        for name in ("brain", "tumour", "t1"):
+            if getattr(args, name) is not None:
+                raise InputError(f"--{name} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out.")
+        lengths = 1e-3 * chosen["radius"], 1e-3 * chosen["cover"]
+        return template_subject(Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed))
+    if not args.brain or not args.tumour:
+        raise InputError(
+            "--labels needs --brain and --tumour, the labels of each: for instance --brain 1,2 --tumour 3."
+        )
+    for name in PLACED:
+        if getattr(args, name) is not None:
+            raise InputError(f"--{name.replace('_', '-')} places the template's tumour: leave it out with --labels.")
+    return volume_subject(args.labels, args.brain, args.tumour, args.t1)
+
+
+def _figures(anatomy: Anatomy, subject: Subject) -> dict[str, float | int | str]:
+    mesh = anatomy.mesh
+    volume = mesh.volumes[mesh.region == TUMOUR_LABEL].sum()
+    error, weight = surface_errors(mesh.nodes, mesh.surface, subject.brain)
+    return {
+        "nodes": len(mesh.nodes),
+        "tets": len(mesh.tets),
+        "tumour_nodes": len(anatomy.tumour_nodes),
+        "craniotomy_nodes": int(anatomy.craniotomy.sum()),
+        "held_nodes": int(anatomy.held.any(axis=1).sum()),
+        "sliding_nodes": int(anatomy.slide_normal.any(axis=1).sum()),
+        "worst_dihedral_deg": round(float(dihedral_angles(mesh.nodes, mesh.tets).min()), 2),
+        "brain_ml": round(float(mesh.volumes.sum()) * 1e6, 2),
+        "tumour_ml": round(float(volume) * 1e6, 4),
+        "tumour_volume_error_percent": round(100.0 * float(volume / subject.tumour_volume - 1.0), 3),
+        "surface_error_mean_mm": round(1e3 * float(np.average(error, weights=weight)), 3),
+        "surface_error_p95_mm": round(1e3 * float(np.quantile(error, 0.95, weights=weight, method="inverted_cdf")), 3),
+        "digest": anatomy.digest,
+    }
+
+
+def _sentences(figures: dict) -> str:
+    lines = [
+        "{nodes} nodes, {tets} tetrahedra; worst dihedral angle {worst_dihedral_deg} deg",
+        "brain {brain_ml} ml; surface off by {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
+        "tumour {tumour_ml} ml ({tumour_volume_error_percent:+} % of the label's), {tumour_nodes} nodes",
+        "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} sliding, {held_nodes} held",
+        "written to {mesh}" + (", intensities to {t1}" if figures["t1"] else "") + " in {seconds} s",
+    ]
+    return "\n".join(lines).format(**figures)

@@ -1,0 +1,60 @@
+"""What holds a brain: the brainstem fast, the skull sliding or fast, and the craniotomy open."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from .anatomy import Anatomy
+from .errors import InputError
+from .geodesic import distances
+from .mesh import TetMesh
+
+Skull = Literal["slide", "held"]
+STEM_RADIUS = 0.022  # [m]; the medulla of the template and the tip of its cerebellum
+FEWEST_OPEN = 6  # nodes; fewer do not carry a tool
+
+
+def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) -> Anatomy:
+    """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
+
+    Stem: surface nodes within 22 mm of the lowest one (least superior); held. Craniotomy: surface nodes within half of
+    the diameter `craniotomy` [m] along the surface from the point nearest to `site`; free. Skull: the rest of the
+    surface; it slides (no motion along the outward area-weighted vertex normal) or is held.
+
+    Raises
+    ------
+    InputError
+        An opening with fewer than 6 nodes, or one that leaves no skull.
+    """
+    surface = mesh.surface
+    outer = np.unique(surface)
+    lowest = outer[mesh.nodes[outer, 2].argmin()]
+    stem = np.zeros(len(mesh.nodes), bool)
+    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= STEM_RADIUS
+    opened = (distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy) & ~stem
+    if opened.sum() < FEWEST_OPEN:
+        raise InputError(
+            f"a craniotomy of {craniotomy * 1e3:g} mm holds {opened.sum()} mesh nodes, and {FEWEST_OPEN} are needed: "
+            "ask for a larger one, or for more nodes."
+        )
+    rest = np.zeros(len(mesh.nodes), bool)
+    rest[outer] = True
+    rest &= ~stem & ~opened
+    if not rest.any():
+        raise InputError(f"a craniotomy of {craniotomy * 1e3:g} mm leaves no skull: ask for a smaller one.")
+    held = stem | (rest & (skull == "held"))
+    normals = np.where((rest & ~held)[:, None], vertex_normals(mesh.nodes, surface), 0.0)
+    return Anatomy(mesh, np.repeat(held[:, None], 3, axis=1), normals, opened)
+
+
+def vertex_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Unit outward normals (V, 3), the area-weighted mean of the triangles' own; zero off the surface."""
+    corners = nodes[triangles]
+    twice = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(nodes)
+    for corner in triangles.T:
+        np.add.at(total, corner, twice)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return total / np.where(length > 0.0, length, 1.0)

@@ -1,0 +1,71 @@
+"""NIfTI volumes as they come: any affine, in metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .errors import InputError
+
+METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
+COARSEST = 6e-3  # [m]; larger voxels do not show a brain's surface
+REMEDY = "Give one three-dimensional NIfTI volume (.nii or .nii.gz)."
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Voxels (I, J, K) and the affine (4, 4) from their indices to metres, RAS."""
+
+    values: np.ndarray
+    affine: np.ndarray
+
+
+def read_volume(path: str | Path) -> Volume:
+    """Read one volume of finite numbers from a NIfTI file.
+
+    Raises
+    ------
+    InputError
+        A path that is no readable NIfTI file; several volumes, a slice, colours or complex numbers; values that are
+        not finite; an affine that is singular; voxels of more than 6 mm.
+    """
+    import nibabel
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {REMEDY}")
+    if not path.name.lower().endswith((".nii", ".nii.gz")):
+        raise InputError(f"{path}: is not called .nii or .nii.gz. {REMEDY}")
+    try:
+        image = nibabel.Nifti1Image.from_filename(path)
+        values = np.asanyarray(image.dataobj)
+        unit = image.header.get_xyzt_units()[0]
+    except Exception as error:  # nibabel and zlib raise whatever the damaged byte led to
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise InputError(f"{path}: cannot be read as NIfTI ({reason}). {REMEDY}") from error
+    affine = np.array(image.affine, np.float64)
+    affine[:3] *= METRES.get(unit, 1e-3)
+    _check(path, values, affine)
+    while values.ndim > 3:
+        values = values[..., 0]
+    return Volume(values, affine)
+
+
+def _check(path: Path, values: np.ndarray, affine: np.ndarray) -> None:
+    shape = " x ".join(map(str, values.shape))
+    if values.dtype.kind not in "biuf":
+        raise InputError(f"{path}: holds colours or complex numbers ({values.dtype}), not plain ones. {REMEDY}")
+    if values.ndim < 3 or min(values.shape[:3]) < 2 or max(values.shape[3:], default=1) > 1:
+        raise InputError(f"{path}: measures {shape} voxels, which is not one volume. {REMEDY}")
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: {int((~np.isfinite(values)).sum())} voxels are not finite. Replace them by 0.")
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) <= 1e-6 * spacing.prod():
+        raise InputError(f"{path}: its affine is singular, so its voxels have no place. Set the sform or qform.")
+    if spacing.max() > COARSEST:
+        voxel = " x ".join(f"{edge * 1e3:.3g}" for edge in spacing)
+        raise InputError(
+            f"{path}: its voxels measure {voxel} mm; {COARSEST * 1e3:g} mm is the most that shows a brain."
+        )
