@@ -1,0 +1,275 @@
+"""One conformance suite that every term passes: derivatives, batches that shrink, bounds on steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import warp as wp
+from boxes import base_held, box
+from tiny_terms import Spring, Wall
+
+from sim.compile import compile_problem
+from sim.device import Device, find_device
+from sim.effects import Elasticity, Held, NodalForce, ToolForce
+from sim.loads import Loads, Nodal, Pushed
+from sim.material import LAWS, Material
+from sim.term import Cases, Term
+
+MESH = box((2, 2, 2), 0.1, distortion=0.15)
+ANATOMY = base_held(MESH)
+ROWS = MESH.nodes.size
+RNG = np.random.default_rng(11)
+
+
+@dataclass(frozen=True)
+class Example:
+    """A term to test, with three load cases and the states (3N, 3) [m] at which they are met.
+
+    `bounded`: the term is infinite beyond a limit; `flung` is a motion (3N, 3) that passes it. `crushed` (3N,) is a
+    state where the plain curvature may be indefinite.
+    """
+
+    build: Callable[[Device], Term]
+    cases: Cases
+    u: np.ndarray
+    bounded: bool = False
+
+    @property
+    def flung(self) -> np.ndarray:
+        """Up through the wall, and inside out."""
+        return np.outer(0.3 * np.sin(37.0 * np.arange(ROWS)) + 0.2, [1.0, 0.9, 2.0])
+
+    @property
+    def crushed(self) -> np.ndarray:
+        return (MESH.nodes * [0.15, 0.15, -0.55]).ravel()
+
+
+def of_effects(*effects: object) -> Callable[[Device], Term]:
+    def build(device: Device) -> Term:
+        terms = compile_problem([Elasticity(), Held(), *effects], ANATOMY, device).terms  # pyright: ignore
+        return terms[-1]
+
+    return build
+
+
+def of_law(law: str) -> Callable[[Device], Term]:
+    effects = Elasticity(Material(law, 3000.0, 0.45)), Held()
+    return lambda device: compile_problem(effects, ANATOMY, device).terms[0]
+
+
+def cases() -> Cases:
+    forces = Nodal(RNG.normal(size=(3, len(MESH.nodes), 3)))
+    pushes = Pushed(np.full((3, 3), [0.05, 0.05, 0.1]), RNG.normal(size=(3, 3)), np.array([0.01, 0.02, 0.03]))
+    history = {"spring": 1e-3 * RNG.normal(size=(3, len(MESH.nodes), 3))}
+    return Cases(Loads((forces, pushes), np.array([1.0, 2.0, 3.0])), np.array([0.5, 0.0, 2.9]), history)
+
+
+STATE = 4e-3 * RNG.normal(size=(ROWS, 3))
+EXAMPLES = {law: Example(of_law(law), cases(), STATE, bounded=law == "neo-hookean") for law in LAWS} | {
+    "nodal force": Example(of_effects(NodalForce()), cases(), STATE),
+    "tool force": Example(of_effects(ToolForce()), cases(), STATE),
+    "spring": Example(lambda device: Spring(device, ROWS, 7.0), cases(), STATE),
+    "wall": Example(lambda device: Wall(device, MESH.nodes, 0.12, 0.03, 500.0), cases(), STATE, bounded=True),
+}
+
+
+@pytest.fixture(params=EXAMPLES, scope="module")
+def example(request: pytest.FixtureRequest) -> Example:
+    return EXAMPLES[request.param]
+
+
+@pytest.fixture(scope="module")
+def device() -> Device:
+    return find_device("cpu", "float64")
+
+
+@pytest.fixture(scope="module")
+def term(example: Example, device: Device) -> Term:
+    return example.build(device)
+
+
+@pytest.fixture(autouse=True)
+def _begun(term: Term, example: Example) -> None:
+    term.begin(example.cases)
+
+
+def energy(term: Term, device: Device, u: np.ndarray) -> np.ndarray:
+    out = wp.zeros(u.shape[1], dtype=wp.float64, device="cpu")
+    term.energy(device.array(u), out)
+    return out.numpy()
+
+
+def gradient(term: Term, device: Device, u: np.ndarray) -> np.ndarray:
+    out = device.zeros(*u.shape)
+    term.add_gradient(device.array(u), out)
+    return out.numpy()
+
+
+def curvature(term: Term, device: Device, p: np.ndarray) -> np.ndarray:
+    out = device.zeros(*p.shape)
+    term.add_curvature(device.array(p), out)
+    return out.numpy()
+
+
+def linearise(term: Term, device: Device, u: np.ndarray, definite: bool = False) -> None:
+    flags = wp.array(np.full(u.shape[1], int(definite), np.int32), dtype=wp.int32, device="cpu")
+    term.linearise(device.array(u), flags)
+
+
+def longest_step(term: Term, device: Device, u: np.ndarray, du: np.ndarray) -> np.ndarray:
+    out = wp.full(u.shape[1], 1.0, dtype=device.scalar, device="cpu")
+    term.longest_step(device.array(u), device.array(du), out)
+    return out.numpy()
+
+
+def assembled(term: Term, device: Device, u: np.ndarray, definite: bool = False) -> np.ndarray:
+    """Curvature (3N, 3N) at one state u (3N,)."""
+    linearise(term, device, u[:, None], definite)
+    return np.hstack([curvature(term, device, unit[:, None]) for unit in np.eye(ROWS)])
+
+
+def test_name_is_a_word(term: Term) -> None:
+    assert term.name
+
+
+def test_gradient_is_the_derivative_of_the_energy(term: Term, example: Example, device: Device) -> None:
+    h = 1e-6
+    for _ in range(4):
+        p = RNG.normal(size=example.u.shape)
+        slope = (energy(term, device, example.u + h * p) - energy(term, device, example.u - h * p)) / (2.0 * h)
+        exact = (gradient(term, device, example.u) * p).sum(axis=0)
+        np.testing.assert_allclose(exact, slope, rtol=1e-6, atol=1e-6)
+
+
+def test_curvature_is_the_derivative_of_the_gradient(term: Term, example: Example, device: Device) -> None:
+    h = 1e-7
+    linearise(term, device, example.u)
+    for _ in range(4):
+        p = RNG.normal(size=example.u.shape)
+        change = (gradient(term, device, example.u + h * p) - gradient(term, device, example.u - h * p)) / (2.0 * h)
+        exact = curvature(term, device, p)
+        assert np.linalg.norm(exact - change) <= 1e-6 * max(np.linalg.norm(change), 1.0)
+
+
+def test_curvature_is_symmetric_and_its_blocks_are_the_diagonal(term: Term, example: Example, device: Device) -> None:
+    term.keep(np.array([1]))
+    K = assembled(term, device, example.u[:, 1])
+    assert np.abs(K - K.T).max() <= 1e-10 * max(np.abs(K).max(), 1.0)
+    out = wp.zeros((ROWS // 3, 1), dtype=device.matrix, device="cpu")
+    term.add_diagonal(out)
+    blocks = np.stack([K[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(ROWS // 3)])
+    np.testing.assert_allclose(out.numpy()[:, 0], blocks, atol=1e-10 * max(np.abs(K).max(), 1.0))
+
+
+def test_everything_is_added_to_what_is_there(term: Term, example: Example, device: Device) -> None:
+    already = RNG.normal(size=example.u.shape)
+    out = device.array(already)
+    term.add_gradient(device.array(example.u), out)
+    np.testing.assert_allclose(out.numpy() - already, gradient(term, device, example.u), atol=1e-10)
+    linearise(term, device, example.u)
+    out = device.array(already)
+    term.add_curvature(device.array(example.u), out)
+    np.testing.assert_allclose(out.numpy() - already, curvature(term, device, example.u), atol=1e-10)
+    total = wp.array(np.array([1.0, 2.0, 3.0]), dtype=wp.float64, device="cpu")
+    term.energy(device.array(example.u), total)
+    np.testing.assert_allclose(total.numpy() - [1.0, 2.0, 3.0], energy(term, device, example.u), atol=1e-12)
+
+
+@pytest.mark.parametrize("state", ["u", "crushed"])
+def test_definite_curvature_is_positive(term: Term, example: Example, device: Device, state: str) -> None:
+    u = example.u[:, 0] if state == "u" else example.crushed
+    term.keep(np.array([0]))
+    K = assembled(term, device, u, definite=True)
+    assert np.linalg.eigvalsh(K).min() >= -1e-10 * max(np.abs(K).max(), 1.0)
+
+
+@pytest.mark.parametrize("law", ["corotational", "neo-hookean", "stable-neo-hookean"])
+def test_plain_curvature_of_crushed_tissue_is_indefinite(law: str, device: Device) -> None:
+    """Otherwise the test above could not fail."""
+    example = EXAMPLES[law]
+    term = example.build(device)
+    term.begin(example.cases)
+    K = assembled(term, device, example.crushed)
+    assert np.linalg.eigvalsh(K).min() < -1e-3 * np.abs(K).max()
+
+
+def test_definite_is_asked_column_by_column(term: Term, example: Example, device: Device) -> None:
+    u = np.repeat(example.crushed[:, None], 3, axis=1)
+    p = np.repeat(RNG.normal(size=(ROWS, 1)), 3, axis=1)
+    linearise(term, device, u)
+    plain = curvature(term, device, p)
+    linearise(term, device, u, definite=True)
+    definite = curvature(term, device, p)
+    term.linearise(device.array(u), wp.array(np.array([0, 1, 0]), dtype=wp.int32, device="cpu"))
+    mixed = curvature(term, device, p)
+    np.testing.assert_array_equal(mixed, np.where([False, True, False], definite, plain))
+
+
+@pytest.mark.parametrize("columns", [[0], [2, 0], [1, 2]])
+def test_keeping_columns_is_starting_with_them(
+    term: Term, example: Example, device: Device, columns: list[int]
+) -> None:
+    index = np.array(columns)
+    u, p = example.u[:, index], RNG.normal(size=(ROWS, len(index)))
+
+    def answers() -> list[np.ndarray]:
+        linearise(term, device, u)
+        found = [energy(term, device, u), gradient(term, device, u), curvature(term, device, p)]
+        history = term.end(device.array(u))
+        return found if history is None else [*found, history]
+
+    term.keep(index)
+    kept = answers()
+    whole = example.cases
+    history = {name: value[index] for name, value in whole.history.items()}
+    term.begin(Cases(whole.loads.rows(index), whole.start_time[index], history))
+    for after, fresh in zip(kept, answers(), strict=True):
+        np.testing.assert_allclose(after, fresh, rtol=1e-13, atol=1e-15)
+        assert after.shape[0 if after is kept[0] or after.ndim == 3 else -1] == len(index)
+
+
+def test_rest_curvature_is_the_curvature_at_rest(term: Term, example: Example, device: Device) -> None:
+    offered = term.rest_curvature()
+    if offered is None:
+        return
+    assert sp.issparse(offered)
+    term.keep(np.array([0]))
+    K = assembled(term, device, np.zeros(ROWS))
+    np.testing.assert_allclose(offered.toarray(), K, atol=1e-10 * np.abs(K).max())
+
+
+def test_longest_step_stays_inside(term: Term, example: Example, device: Device) -> None:
+    longest = longest_step(term, device, example.u, example.flung)
+    assert ((longest > 0.0) & (longest <= 1.0)).all()
+    for fraction in np.linspace(0.0, 1.0, 23):
+        assert np.isfinite(energy(term, device, example.u + fraction * longest * example.flung)).all()
+    beyond = energy(term, device, example.u + example.flung)
+    if example.bounded:
+        assert (longest < 1.0).all()
+        assert np.isposinf(beyond).all()
+    else:
+        assert (longest == 1.0).all()
+        assert np.isfinite(beyond).all()
+
+
+def test_longest_step_of_a_tiny_motion_is_all_of_it(term: Term, example: Example, device: Device) -> None:
+    assert (longest_step(term, device, example.u, 1e-6 * example.flung) == 1.0).all()
+
+
+def test_longest_step_only_lowers(term: Term, example: Example, device: Device) -> None:
+    out = wp.full(3, 1e-9, dtype=device.scalar, device="cpu")
+    term.longest_step(device.array(example.u), device.array(example.flung), out)
+    assert (out.numpy() <= 1e-9).all()
+
+
+def test_history_creeps_and_travels_rows_first(device: Device) -> None:
+    example = EXAMPLES["spring"]
+    spring = example.build(device)
+    spring.begin(example.cases)
+    before, u = example.cases.history["spring"], example.u.T.reshape(3, -1, 3)
+    share = 1.0 - np.exp(-np.array([0.5, 2.0, 0.1]))[:, None, None]
+    np.testing.assert_allclose(spring.end(device.array(example.u)), before + share * (u - before), atol=1e-15)
