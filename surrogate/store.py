@@ -79,7 +79,8 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # Opened here: numpy leaves a broken archive open.
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
             if header["format"] != FORMAT:
                 raise InputError(f"{path}: has the format {header['format']!r}, not {FORMAT!r}: train it anew.")
@@ -92,7 +93,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         return {name: _rebuilt(description, arrays, anatomy) for name, description in header["models"].items()}
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: cannot be read as a model ({error}). Make one with `sulcus train`.") from error
 
 

@@ -18,7 +18,7 @@ from sim.deformation import Outcome
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
 from sim.material import LAWS, MATERIALS, Material
-from sim.meshfile import read_anatomy
+from sim.meshfile import check_output, read_anatomy
 from surrogate.dataset import read_outcomes
 from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import simulate
@@ -51,11 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Returns 0: the file is complete, whether or not every case converged; it says which did."""
+    out = check_output(args.out, ".h5")
     anatomy = shipped_template() if args.anatomy is None else read_anatomy(args.anatomy)
     loads = draw(args.preset, anatomy, args.count, args.seed)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
     effects = _effects(anatomy, _material(args))
-    fem = Fem(anatomy, effects, accuracy, args.device, max(args.batch, 1))
+    fem = Fem(anatomy, effects, accuracy, args.device, args.batch)
     provenance = {
         "effects": repr(effects),
         "accuracy": repr(accuracy),
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
             bar.update(done - bar.n)
 
         try:
-            solved = simulate(args.out, fem, loads, provenance, args.batch, progress)
+            solved = simulate(out, fem, loads, provenance, args.batch, progress)
         except KeyboardInterrupt:
             print(f"stopped; the same command goes on from {args.out}.partial", file=sys.stderr)
             return INTERRUPTED

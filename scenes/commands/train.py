@@ -10,7 +10,7 @@ from dataclasses import asdict
 import numpy as np
 from tqdm import tqdm
 
-from sim.errors import InputError
+from sim.meshfile import check_output
 from surrogate.dataset import read_dataset
 from surrogate.score import table, winner
 from surrogate.store import save
@@ -29,8 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Returns 0 when the models are written."""
-    if not args.out.endswith(".npz"):
-        raise InputError(f"{args.out}: models are written as .npz; give a name that ends so.")
+    out = check_output(args.out, ".npz")
     data = read_dataset(args.data)
     learners = [name.strip() for name in args.learners.split(",")]
     with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
@@ -40,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
             bar.update(0 if bar.n == 0 and not bar.postfix else 1)
 
         trained = train(data, learners, progress)
-    save(args.out, trained.models)
+    save(out, trained.models)
     failed = int(np.sum(~data.good))
     print(_for_machines(trained, args.out, failed) if args.json else _for_people(trained, args.out, failed))
     return 0

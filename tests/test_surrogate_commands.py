@@ -1,0 +1,116 @@
+"""`sulcus simulate` and `sulcus train`, with the finite elements, as a user gives them."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from scenes.cli import main
+from sim.meshfile import write_anatomy
+from surrogate.dataset import read_dataset
+from surrogate.store import load
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, box):
+    path = tmp_path_factory.mktemp("commands")
+    write_anatomy(path / "box.vtu", box)
+    assert main(["simulate", str(path / "box.vtu"), "--out", str(path / "data.h5"), "--count", "150"]) == 0
+    return path
+
+
+def test_data_say_where_they_come_from(folder, box):
+    data = read_dataset(folder / "data.h5")
+    assert data.good.all() and len(data.loads) == 150 and data.anatomy.digest == box.digest
+    assert data.residual.max() <= 1e-4 and data.iterations.min() >= 1
+    for name in ("anatomy", "effects", "accuracy", "preset", "seed", "sulcus version", "warp-lang version", "frame"):
+        assert data.provenance[name]
+    assert "stable-neo-hookean" in data.provenance["effects"] and "0.0001" in data.provenance["accuracy"]
+
+
+def test_displacements_are_those_of_the_finite_elements(folder, box):
+    from sim.effects import Elasticity, Held, ToolForce
+    from sim.fem import Fem
+
+    data = read_dataset(folder / "data.h5")
+    truth = Fem(box, (Elasticity(), Held(), ToolForce()), device="cpu").deform(data.loads.rows(np.arange(3)))
+    stored = data.displacement(slice(None))[:3]
+    assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
+
+
+def test_training_prints_every_figure_and_writes_every_model(folder, box, capsys):
+    out = folder / "model.npz"
+    assert main(["train", str(folder / "data.h5"), "--out", str(out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    rows = {row["name"]: row for row in report["scores"]}
+    assert set(rows) == {"linear", "ann", "svr", "residual"} == set(load(out, box))
+    figures = {f"{figure}_{unit}" for figure in ("mean", "p95", "p999", "max") for unit in ("mm", "percent")}
+    for row in rows.values():
+        assert figures | {"microseconds", "bound_mm"} <= set(row) and all(row[name] > 0 for name in figures)
+    assert rows["linear"]["mean_percent"] < 10.0 and rows["residual"]["mean_percent"] < rows["linear"]["mean_percent"]
+    assert report["winner"] == min(rows.values(), key=lambda row: row["mean_mm"])["name"]
+    assert report["discs"] >= 6 and report["share_of_patch"] >= 0.15 and report["taught"] + report["held_out"] == 150
+    assert main(["train", str(folder / "data.h5"), "--out", str(folder / "table.npz"), "--learners", "linear"]) == 0
+    assert "linear wins" in capsys.readouterr().out
+
+
+def test_the_same_command_again_solves_nothing(folder, capsys):
+    command = ["simulate", str(folder / "box.vtu"), "--out", str(folder / "data.h5"), "--count", "150", "--json"]
+    before = (folder / "data.h5").read_bytes()
+    assert main(command) == 0 and json.loads(capsys.readouterr().out)["solved_now"] == 0
+    assert (folder / "data.h5").read_bytes() == before
+    assert main([*command, "--young", "6000"]) == 2
+    assert "effects" in capsys.readouterr().err and (folder / "data.h5").read_bytes() == before
+
+
+def test_stiffer_tissue_moves_less(folder, tmp_path):
+    out = tmp_path / "stiff.h5"
+    command = ["simulate", str(folder / "box.vtu"), "--out", str(out), "--count", "2", "--material", "linear", "--json"]
+    assert main([*command, "--young", "6000"]) == 0
+    soft, stiff = read_dataset(folder / "data.h5"), read_dataset(out)
+    tumour = soft.anatomy.tumour_nodes
+    ratio = np.linalg.norm(soft.unit_response(tumour)) / np.linalg.norm(stiff.unit_response(tumour))
+    assert ratio == pytest.approx(2.0, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--count", "0"], "--count"),
+        (["--batch", "0"], "--batch"),
+        (["--poisson", "0.5"], "Poisson"),
+        (["--tolerance", "2"], "tolerance"),
+        (["--device", "tpu"], "device"),
+    ],
+)
+def test_bad_options_are_sentences(folder, tmp_path, capsys, options, words):
+    assert main(["simulate", str(folder / "box.vtu"), "--out", str(tmp_path / "data.h5"), *options]) == 2
+    assert words in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_bad_files_are_sentences(folder, tmp_path, capsys):
+    assert main(["simulate", str(tmp_path / "none.vtu"), "--out", str(tmp_path / "data.h5")]) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert main(["simulate", str(folder / "box.vtu"), "--out", str(tmp_path / "data.txt")]) == 2
+    assert ".h5" in capsys.readouterr().err
+    assert main(["train", str(tmp_path / "none.h5"), "--out", str(tmp_path / "model.npz")]) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert main(["train", str(folder / "data.h5"), "--out", str(tmp_path / "model.pkl")]) == 2
+    assert ".npz" in capsys.readouterr().err
+    assert main(["train", str(folder / "data.h5"), "--out", str(tmp_path / "m.npz"), "--learners", "forest"]) == 2
+    assert "forest" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_data_file_is_a_sentence(folder, tmp_path, capsys):
+    damaged = tmp_path / "data.h5"
+    content = (folder / "data.h5").read_bytes()
+    damaged.write_bytes(content[: len(content) // 2])
+    assert main(["train", str(damaged), "--out", str(tmp_path / "model.npz")]) == 2
+    assert "cannot be read" in capsys.readouterr().err
+    damaged.write_bytes(content)
+    with h5py.File(damaged, "r+") as file:
+        file["anatomy/nodes"][0] += 1e-4
+    assert main(["train", str(damaged), "--out", str(tmp_path / "model.npz")]) == 2
+    assert "was changed" in capsys.readouterr().err

@@ -1,0 +1,203 @@
+"""Learned deformers: what they were taught, what they refuse, how they are scored and stored."""
+
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim.anatomy import Anatomy
+from sim.deformation import Deformer, Outcome
+from sim.errors import InputError
+from sim.loads import Displaced, Loads, Nodal, Pushed, push
+from surrogate.dataset import read_dataset
+from surrogate.learned import Learned
+from surrogate.patch import open_patch
+from surrogate.sampling import draw
+from surrogate.score import score, winner
+from surrogate.simulate import simulate
+from surrogate.store import load, save
+from surrogate.train import LEARNERS, train
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory, pretender):
+    path = tmp_path_factory.mktemp("learned") / "data.h5"
+    loads = draw("palpation", pretender.anatomy, 400, 0)
+    size = np.linalg.norm(loads.of(Pushed).force, axis=1)
+    failing = type(pretender)(pretender.anatomy, float(np.quantile(size, 0.97)))
+    simulate(path, failing, loads, {"preset": "palpation"})
+    return read_dataset(path)
+
+
+@pytest.fixture(scope="module")
+def trained(data):
+    return train(data)
+
+
+@pytest.fixture(params=LEARNERS)
+def model(request, trained):
+    return trained.models[request.param]
+
+
+@pytest.fixture(scope="module")
+def fresh(box):
+    """Loads that no model saw, drawn like the taught ones."""
+    return draw("palpation", box, 60, 99)
+
+
+def test_every_model_is_a_deformer(model, box, fresh):
+    answer = model.deform(fresh)
+    assert isinstance(model, Deformer) and model.anatomy.digest == box.digest
+    assert np.array_equal(answer.nodes, np.union1d(box.tumour_nodes, open_patch(box).nodes))
+    assert answer.displacement.shape == (60, len(answer.nodes), 3) and np.isnan(answer.residual).all()
+    assert np.array_equal(answer.reaction[:, 0, :3], fresh.of(Pushed).force)
+    assert np.array_equal(model.deform(fresh).displacement, answer.displacement)
+    some = np.array([box.tumour_nodes[3], open_patch(box).nodes[2], box.tumour_nodes[0]])
+    assert np.allclose(model.deform(fresh, at=some).displacement, answer.at(some).displacement, atol=1e-9)
+    single = np.concatenate([model.deform(fresh.rows(slice(k, k + 1))).displacement for k in range(5)])
+    assert np.allclose(single, answer.displacement[:5], atol=1e-8)
+
+
+def test_no_force_no_motion_and_weak_loads_in_proportion(model, fresh):
+    assert (model.deform(fresh.scaled(0.0)).displacement == 0.0).all()
+    weak = fresh.scaled(1e-6)
+    assert np.allclose(3.0 * model.deform(weak).displacement, model.deform(weak.scaled(3.0)).displacement, rtol=1e-5)
+    assert model.deform(fresh.scaled(0.0)).outcome[0] is Outcome.PREDICTED
+
+
+def test_learners_beat_no_motion_and_the_residual_beats_its_table(trained):
+    mean = {row.name: row.mean_percent for row in trained.scores}
+    assert mean["linear"] < 25.0 and mean["svr"] < 25.0 and mean["ann"] < 8.0
+    assert mean["residual"] < 0.5 * mean["linear"]
+    assert winner(trained.scores).mean_mm == min(row.mean_mm for row in trained.scores)
+
+
+def test_no_load_of_a_left_out_disc_is_learnt(trained, data):
+    split = trained.split
+    for model in trained.models.values():
+        distance = np.linalg.norm(model.envelope.points[:, None] - split.centres, axis=2)
+        assert distance.min() > split.radius * (1 - 1e-5)
+        assert len(model.envelope.points) == (~split.test).sum()
+    assert len(split.test) == data.good.sum() < len(data.loads)  # failed cases are neither learnt nor scored
+
+
+def test_scores_are_the_errors_of_the_held_out_loads(trained, data, box):
+    """Recomputed here in another way, from the data file."""
+    name, model = "linear", trained.models["linear"]
+    row = next(row for row in trained.scores if row.name == name)
+    held_out = np.flatnonzero(data.good)[trained.split.test]
+    truth = data.displacement(box.tumour_nodes)[held_out].astype(float)
+    miss, motion = [], []
+    for number, load_case in enumerate(held_out):
+        answer = model.deform(data.loads.rows(np.array([load_case]))).at(box.tumour_nodes).displacement[0]
+        miss.append(np.sqrt(((answer - truth[number]) ** 2).sum(axis=1)))
+        motion.append(np.sqrt((truth[number] ** 2).sum(axis=1)).mean())
+    miss, motion = np.array(miss), np.array(motion)
+    assert row.mean_mm == pytest.approx(1e3 * miss.mean(), rel=1e-4)
+    assert row.max_mm == pytest.approx(1e3 * miss.max(), rel=1e-4)
+    assert row.p95_percent == pytest.approx(100 * np.percentile(miss / motion[:, None], 95), rel=1e-4)
+    assert trained.motion == pytest.approx(motion.mean(), rel=1e-4)
+    assert np.mean(miss.max(axis=1) <= model.bound * (1 + 1e-6)) >= 0.95
+    assert row.mean_mm <= row.p95_mm <= row.p999_mm <= row.max_mm and row.microseconds > 0
+
+
+def test_score_sees_a_shift(pretender, box, fresh):
+    truth = pretender.deform(fresh, at=box.tumour_nodes).displacement
+    nothing = score("same", pretender, fresh, truth, box.tumour_nodes)
+    shifted = score("shifted", pretender, fresh, truth + [0.0, 3e-3, 4e-3], box.tumour_nodes)
+    assert nothing.max_mm == 0.0 and shifted.mean_mm == pytest.approx(5.0) and shifted.max_mm == pytest.approx(5.0)
+
+
+def test_outside_the_taught_range_is_said(trained, box):
+    model = trained.models["residual"]
+    inside = push(model.envelope.points[0], [0.0, 0.0, -0.2], 6e-3)
+    steep = 0.2 * np.array([np.sin(1.3), 0.0, -np.cos(1.3)])
+    outside = [
+        push([24.5e-3, 0.0, 0.0], [0.0, 0.0, -0.2], 6e-3),  # its footprint crosses the rim
+        push(model.envelope.points[0], [0.0, 0.0, -0.8], 6e-3),
+        push(model.envelope.points[0], [0.0, 0.0, -0.2], 12e-3),
+        push(model.envelope.points[0], [0.0, 0.0, -0.2], 2e-3),
+        push(model.envelope.points[0], steep, 6e-3),
+        push(model.envelope.points[0], [0.0, 0.0, 0.2], 6e-3),
+    ]
+    assert model.deform(inside).outcome == (Outcome.PREDICTED,)
+    for loads in outside:
+        assert model.deform(loads).outcome == (Outcome.EXTRAPOLATED,)
+    narrow = Learned(box, model.parts, replace(model.envelope, points=model.envelope.points[:1], reach=1e-3))
+    assert narrow.deform(push(model.envelope.points[0] + [2e-3, 0, 0], [0, 0, -0.2], 6e-3)).outcome[0].name == (
+        "EXTRAPOLATED"
+    )
+
+
+def test_all_held_out_loads_lie_inside_the_reach(trained, data):
+    model = trained.models["linear"]
+    held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
+    good = [outcome is Outcome.PREDICTED for outcome in model.deform(held_out).outcome]
+    assert np.mean(good) > 0.95
+
+
+def test_other_loads_and_other_vertices_are_refused(model, box):
+    point = np.zeros((1, 3))
+    for cause in (Displaced(point, point, np.ones(1)), Nodal(np.zeros((1, len(box.mesh.nodes), 3)))):
+        with pytest.raises(InputError, match=f"{type(cause).__name__}.*taught pushing forces only"):
+            model.deform(Loads((cause,)))
+    deep = np.setdiff1d(np.arange(len(box.mesh.nodes)), model.nodes)[:1]
+    with pytest.raises(InputError, match=f"not vertex {deep[0]}"):
+        model.deform(push([0, 0, 0], [0, 0, -0.1], 6e-3), at=deep)
+
+
+def test_stored_models_answer_alike(trained, box, fresh, tmp_path):
+    path = tmp_path / "model.npz"
+    save(path, trained.models)
+    again = load(path, box)
+    assert list(again) == list(trained.models)
+    for name, model in trained.models.items():
+        before, after = model.deform(fresh), again[name].deform(fresh)
+        assert np.array_equal(before.displacement, after.displacement) and before.outcome == after.outcome
+        assert again[name].bound == model.bound and dict(again[name].training) == dict(model.training)
+    with np.load(path, allow_pickle=False) as file:
+        assert json.loads(str(file["header"]))["anatomy"] == box.digest
+    with zipfile.ZipFile(path) as archive:
+        shared = [entry for entry in archive.namelist() if entry != "header.npy"]
+    assert len(shared) == len(set(shared)) < 2 * 4 * len(LEARNERS) + 30
+
+
+def test_a_model_of_another_body_is_refused(trained, box, tmp_path):
+    path = tmp_path / "model.npz"
+    save(path, {"linear": trained.models["linear"]})
+    other = Anatomy(box.mesh, box.held, box.slide_normal, box.craniotomy & (box.mesh.nodes[:, 0] < 20e-3))
+    with pytest.raises(InputError, match=f"{box.digest}.*{other.digest}"):
+        load(path, other)
+    with pytest.raises(InputError, match="one anatomy, not of 2"):
+        save(path, {"a": trained.models["linear"], "b": replace(trained.models["linear"], anatomy=other)})
+
+
+def test_bad_model_files_are_sentences(trained, box, tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        load(tmp_path / "none.npz", box)
+    with pytest.raises(InputError, match="ends so"):
+        save(tmp_path / "model.pkl", trained.models)
+    for name, content in (("text.npz", b"text"), ("zip.npz", b"PK\x03\x04broken"), ("empty.npz", b"")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match="cannot be read as a model"):
+            load(tmp_path / name, box)
+    np.savez(tmp_path / "arrays.npz", header=np.array("[]"))
+    with pytest.raises(InputError, match="cannot be read as a model"):
+        load(tmp_path / "arrays.npz", box)
+    np.savez(tmp_path / "old.npz", header=np.array(json.dumps({"format": "sulcus model 0"})))
+    with pytest.raises(InputError, match="train it anew"):
+        load(tmp_path / "old.npz", box)
+
+
+def test_bad_training_is_a_sentence(data, pretender, tmp_path):
+    with pytest.raises(InputError, match="forest"):
+        train(data, ["forest"])
+    with pytest.raises(InputError, match="too few"):
+        few = draw("palpation", pretender.anatomy, 5, 0)
+        simulate(tmp_path / "few.h5", pretender, few, {})
+        train(read_dataset(tmp_path / "few.h5"), ["linear"])
+    untaught = replace(data, unit_good=~data.unit_good)
+    with pytest.raises(InputError, match="unit responses did not converge"):
+        train(untaught)

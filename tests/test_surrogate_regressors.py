@@ -1,0 +1,106 @@
+"""One suite for every regressor."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from surrogate.ann import Ann
+from surrogate.linear import Linear
+from surrogate.store import REGRESSORS
+from surrogate.svr import Svr
+
+MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr}
+RANDOM = np.random.default_rng(3)
+MIX, BEND = RANDOM.normal(size=(5, 4)), RANDOM.normal(size=(5, 4))
+
+
+def rows(count, seed):
+    """Features with a constant column, and outputs of very different size, nearly linear in them."""
+    X = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 5)) * [1.0, 1e-3, 10.0, 1.0, 0.0] + [0, 0, 0, 0, 1.0]
+    unit = X * [1.0, 1e3, 0.1, 1.0, 1.0]
+    return X, (unit @ MIX + 0.2 * np.sin(2.0 * unit) @ BEND) * [1e-2, 1e-3, 1e-4, 1e-3]
+
+
+@pytest.fixture(scope="module", params=REGRESSORS)
+def fitted(request):
+    return request.param, MAKE[request.param]().fit(*rows(300, 0))
+
+
+def test_every_regressor_is_tested():
+    assert set(MAKE) == set(REGRESSORS)
+
+
+def test_fit_returns_itself_and_predict_has_the_shape(fitted):
+    name, model = fitted
+    X, Y = rows(50, 1)
+    fresh = MAKE[name]()
+    assert fresh.fit(*rows(60, 0)) is fresh
+    assert model.predict(X).shape == Y.shape and model.predict(X).dtype == np.float32
+
+
+def test_a_second_fit_agrees(fitted):
+    name, model = fitted
+    X, _ = rows(50, 1)
+    assert np.array_equal(MAKE[name]().fit(*rows(300, 0)).predict(X), model.predict(X))
+
+
+def test_state_holds_the_whole_model(fitted, tmp_path):
+    name, model = fitted
+    X, _ = rows(50, 1)
+    np.savez(tmp_path / "state.npz", **model.state())
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as state:
+        again = REGRESSORS[name].restored(dict(state))
+    assert np.array_equal(again.predict(X), model.predict(X))
+
+
+def test_it_learns(fitted):
+    """Far better than the mean in the largest output, and better in every output."""
+    name, model = fitted
+    X, Y = rows(400, 2)
+    miss = np.sqrt(np.mean((model.predict(X) - Y) ** 2, axis=0)) / Y.std(axis=0)
+    assert (miss < 0.9).all() and miss[0] < {"linear": 0.25, "ann": 0.05, "svr": 0.25}[name]
+
+
+def test_a_batch_is_its_rows(fitted):
+    _, model = fitted
+    X, _ = rows(20, 4)
+    single = np.concatenate([model.predict(row[None]) for row in X])
+    assert np.allclose(model.predict(X), single, rtol=1e-5, atol=1e-8)
+
+
+def test_predictions_are_smooth(fitted):
+    """A step of a millionth of a feature's range moves no output by more than a thousandth of its own."""
+    _, model = fitted
+    X, Y = rows(20, 5)
+    nudged = model.predict(X * (1.0 + 1e-6))
+    assert (np.abs(nudged - model.predict(X)) < 1e-3 * Y.std(axis=0)).all()
+
+
+def test_the_table_is_exact_from_unit_rows():
+    C = RANDOM.normal(size=(9, 3))
+    X = RANDOM.normal(size=(4, 9))
+    assert np.allclose(Linear().fit(np.eye(9), C).predict(X), X @ C, atol=1e-5)
+
+
+def test_svr_has_the_published_settings():
+    """The same machine as scikit-learn's with MATLAB's defaults, in the output's own units."""
+    from sklearn.svm import SVR
+
+    X, Y = rows(300, 0)
+    y, iqr = Y[:, 0], np.subtract(*np.percentile(Y[:, 0], [75, 25]))
+    mean, deviation = X.mean(axis=0), np.where(X.std(axis=0) > 1e-9, X.std(axis=0), 1.0)
+    machine = SVR(C=iqr / 1.349, epsilon=iqr / 13.49, gamma=1.0 / 5.0, tol=1e-4 * iqr).fit((X - mean) / deviation, y)
+    test, _ = rows(50, 1)
+    assert np.allclose(Svr().fit(X, Y).predict(test)[:, 0], machine.predict((test - mean) / deviation), atol=0.01 * iqr)
+
+
+def test_predicting_needs_neither_torch_nor_sklearn():
+    script = (
+        "import sys, numpy as np, surrogate.store\n"
+        "from surrogate.linear import Linear\n"
+        "Linear().fit(np.eye(2), np.eye(2)).predict(np.eye(2))\n"
+        "assert not {'torch', 'sklearn', 'warp', 'meshio'} & set(sys.modules), sys.modules.keys()\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
