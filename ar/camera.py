@@ -95,6 +95,12 @@ class Camera:
         )
         return replace(self, K=resize @ self.K, width=width, height=height)
 
+    def cropped(self, rows: slice, columns: slice) -> Camera:
+        """The camera of `picture[rows, columns]`, slices with start and stop."""
+        shift = np.zeros((3, 3))
+        shift[:2, 2] = columns.start, rows.start
+        return replace(self, K=self.K - shift, width=columns.stop - columns.start, height=rows.stop - rows.start)
+
     def padded(self, aspect: float) -> Camera:
         """The same picture centred on the smallest canvas of width / height = `aspect` that contains it."""
         width = max(self.width, round(self.height * aspect))

@@ -18,6 +18,8 @@ from .view import Picture
 Style = Literal["window", "contour", "fill"]
 # Light that falls to 1 / e over this depth under the surface [m]: the deeper, the darker.
 FADE = 0.03
+# Room for the window's soft rim round the silhouette [pixel].
+SURROUND = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,28 +75,41 @@ def composite(
         raise ValueError(f"there is no overlay style {style!r}: choose one of {', '.join(Style.__args__)}.")
     if picture.colour.shape[:2] != (camera.height, camera.width):
         raise ValueError(f"the picture is {picture.colour.shape[:2]}, the camera {(camera.height, camera.width)}.")
-    fragments = rasterise(camera, hidden.vertices, hidden.triangles, device=device)
-    tint = tuple((255.0 * np.asarray(hidden.colour, np.float64).mean(axis=0)).tolist())
     out = picture.colour.copy()
-    if style == "fill":
-        out[fragments.mask] = 0.55 * out[fragments.mask] + 0.45 * np.array(tint)
-    if style == "window":
-        draw_window(out, picture, camera, hidden, fragments)
-    if np.any(np.asarray(margin) > 0.0):
-        normals = vertex_normals(hidden.vertices, hidden.triangles)
-        grown = hidden.vertices + np.reshape(margin, (-1, 1)) * normals
-        for outline in outlines(silhouette(camera, grown, hidden.triangles, device)):
-            dash(out, outline, tint)
-    for ink, width in (((10.0, 12.0, 12.0), 4), (tint, 2)):
-        cv2.polylines(out, outlines(fragments.mask), True, ink, width, cv2.LINE_AA)
+    grown = hidden.vertices + np.reshape(margin, (-1, 1)) * vertex_normals(hidden.vertices, hidden.triangles)
+    box = box_around(camera, np.concatenate([hidden.vertices, grown]))
+    if box is not None:
+        # Everything but the gauge happens in the box, which is small: a view of `out`, a camera that sees just it.
+        here, ground = camera.cropped(*box), out[box]
+        fragments = rasterise(here, hidden.vertices, hidden.triangles, device=device)
+        tint = tuple((255.0 * np.asarray(hidden.colour, np.float64).mean(axis=0)).tolist())
+        if style == "fill":
+            ground[fragments.mask] = 0.55 * ground[fragments.mask] + 0.45 * np.array(tint)
+        if style == "window":
+            draw_window(ground, picture.depth[box], here, hidden, fragments)
+        if np.any(np.asarray(margin) > 0.0):
+            for outline in outlines(silhouette(here, grown, hidden.triangles, device)):
+                dash(ground, outline, tint)
+        for ink, width in (((10.0, 12.0, 12.0), 4), (tint, 2)):
+            cv2.polylines(ground, outlines(fragments.mask), True, ink, width, cv2.LINE_AA)
     if gauge is not None:
         draw_line(out, camera, gauge)
     covered = np.isin(picture.segmentation, np.asarray(occluders, np.uint8))
     out[covered] = picture.colour[covered]
-    if gauge is not None and fragments.mask.any():
-        columns, rows = (np.flatnonzero(fragments.mask.any(axis=axis)) for axis in (0, 1))
-        write(out, f"{1e3 * gauge.distance:.1f} mm", (int(columns[0] + columns[-1]) // 2 - 28, int(rows[-1]) + 22), 0.6)
+    if gauge is not None and box is not None:
+        middle = (box[1].start + box[1].stop) // 2
+        write(out, f"{1e3 * gauge.distance:.1f} mm", (middle - 28, box[0].stop - SURROUND + 24), 0.6)
     return replace(picture, colour=out)
+
+
+def box_around(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None:
+    """Rows and columns that hold the pixels of points (V, 3) and `SURROUND` more; None when none is in the picture."""
+    pixels, depth = camera.project(points)
+    if not (depth > 0.0).all():
+        return slice(0, camera.height), slice(0, camera.width)
+    low = np.maximum(np.floor(pixels.min(axis=0)) - SURROUND, 0.0).astype(int)
+    high = np.minimum(np.ceil(pixels.max(axis=0)) + SURROUND + 1.0, (camera.width, camera.height)).astype(int)
+    return (slice(low[1], high[1]), slice(low[0], high[0])) if (low < high).all() else None
 
 
 def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
@@ -113,30 +128,18 @@ def outlines(mask: np.ndarray) -> list[np.ndarray]:
     return list(cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
 
 
-def draw_window(out: np.ndarray, picture: Picture, camera: Camera, hidden: Layer, fragments: Fragments) -> None:
+def draw_window(ground: np.ndarray, depth: np.ndarray, camera: Camera, hidden: Layer, seen: Fragments) -> None:
     """Dim the ground round the silhouette with a soft rim, and let the hidden surface shine through, in place."""
-    mask = fragments.mask
-    if not mask.any():
-        return
-    soft = 0.02 * max(mask.shape)
-    reach = int(4.0 * soft)
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    box = (
-        slice(max(rows[0] - reach, 0), rows[-1] + reach + 1),
-        slice(max(columns[0] - reach, 0), columns[-1] + reach + 1),
-    )
-    mask, ground = mask[box], out[box].astype(np.float32)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (int(2.0 * soft) | 1, int(2.0 * soft) | 1))
-    window = cv2.GaussianBlur(cv2.dilate(mask.astype(np.float32), kernel), (0, 0), 0.6 * soft)[..., None]
-    ground *= 1.0 - 0.62 * window
-    seen = Fragments(fragments.face[box], fragments.weights[box], fragments.depth[box])
-    normals = seen.interpolate(hidden.triangles, vertex_normals(hidden.vertices, hidden.triangles))[mask]
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (SURROUND | 1, SURROUND | 1))
+    near = cv2.dilate(seen.mask.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
+    window = cv2.GaussianBlur(near, (0, 0), 0.3 * SURROUND, borderType=cv2.BORDER_REPLICATE)
+    light = ground * (1.0 - 0.62 * window[..., None])
+    normals = seen.interpolate(hidden.triangles, vertex_normals(hidden.vertices, hidden.triangles))
     facing = np.abs(normals @ camera.T_camera_world[2, :3])
-    surface = picture.depth[box][mask]
-    under = np.where(surface > 0.0, np.maximum(seen.depth[mask] - surface, 0.0), 0.0)
-    shine = (0.25 + 0.75 * facing) * np.exp(-under / FADE)
-    ground[mask] += 1.1 * shine[:, None] * seen.interpolate(hidden.triangles, 255.0 * np.asarray(hidden.colour))[mask]
-    out[box] = np.clip(ground, 0.0, 255.0)
+    under = np.where(depth > 0.0, np.maximum(seen.depth - depth, 0.0), 0.0)
+    shine = 1.1 * (0.25 + 0.75 * facing) * np.exp(-under / FADE)
+    light += shine[..., None] * seen.interpolate(hidden.triangles, 255.0 * np.asarray(hidden.colour))
+    ground[:] = np.clip(light, 0.0, 255.0)
 
 
 def dash(out: np.ndarray, outline: np.ndarray, ink: Sequence[float], length: int = 7) -> None:

@@ -86,14 +86,19 @@ def rasterise(
     weights = wp.zeros(shape, dtype=wp.vec3f, device=device)
     depth = wp.zeros(shape, dtype=wp.float32, device=device)
 
-    def draw(begin: int, end: int) -> None:
-        scan = [points, corners, wp.float64(near), first + begin, first + end]
-        wp.launch(keep_nearest, len(triangles), scan, [nearest], device=device)
-        read = [points, corners, nearest, first + begin]
-        wp.launch(read_nearest, (end - begin, camera.width), read, [face, weights, depth], device=device)
+    run, threads = run_length(device), -(-len(triangles) // run_length(device))
+
+    def scan(begin: int, end: int) -> None:
+        inputs = [points, corners, wp.float64(near), first + begin, first + end, run]
+        wp.launch(keep_nearest, threads, inputs, [nearest], device=device)
 
     wp.load_module(__name__, device=device)
-    in_bands(draw, last - first, device)
+    in_bands(scan, last - first, device)
+    rows = slice(first, last)
+    found = [nearest[rows], points, corners, first]
+    launch_in_bands(
+        read_nearest, found, [face[rows], weights[rows], depth[rows]], (last - first) * camera.width, device
+    )
     return Fragments(face.numpy(), weights.numpy(), depth.numpy())
 
 
@@ -106,6 +111,21 @@ def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int
     rows = homogeneous[:, 1] / homogeneous[:, 2]
     first, last = np.clip([np.floor(rows.min()), np.ceil(rows.max()) + 1.0], 0, height).astype(int).tolist()
     return first, last
+
+
+def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str) -> None:
+    """Launch a kernel over `count` independent items; it takes (begin, end, run) first, see `run_length`."""
+    run = run_length(device)
+
+    def launch(begin: int, end: int) -> None:
+        wp.launch(kernel, -(-(end - begin) // run), [begin, end, run, *inputs], outputs, device=device)
+
+    in_bands(launch, count, device)
+
+
+def run_length(device: str) -> int:
+    """How many items one kernel thread does: on a processor each thread copies its arguments, which costs the most."""
+    return 64 if device == "cpu" else 1
 
 
 def in_bands(draw: Callable[[int, int], None], count: int, device: str) -> None:
@@ -167,21 +187,20 @@ def beyond(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4
     return box
 
 
-@wp.kernel
-def keep_nearest(
+@wp.func
+def draw_triangle(
+    face: wp.int32,
     q: wp.array(dtype=wp.vec3d),
     triangles: wp.array(dtype=wp.vec3i),
     near: wp.float64,
     begin: wp.int32,
     end: wp.int32,
-    # outputs
     nearest: wp.array2d(dtype=wp.uint64),
 ):
-    """One triangle in the rows begin .. end - 1: the 64-bit minimum of (depth bits, face) at each pixel centre inside.
+    """Keep, at each pixel centre inside triangle `face` in the rows begin .. end - 1, the minimum of (depth, face).
 
-    The bits of positive floats sort as the floats do.
+    Both fit in 64 bits, because the bits of positive floats sort as the floats do.
     """
-    face = wp.tid()
     t = triangles[face]
     a = q[t[0]]
     b = q[t[1]]
@@ -228,33 +247,54 @@ def keep_nearest(
 
 
 @wp.kernel
-def read_nearest(
+def keep_nearest(
     q: wp.array(dtype=wp.vec3d),
     triangles: wp.array(dtype=wp.vec3i),
-    nearest: wp.array2d(dtype=wp.uint64),
+    near: wp.float64,
     begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    # outputs
+    nearest: wp.array2d(dtype=wp.uint64),
+):
+    """A run of triangles, each in the rows begin .. end - 1."""
+    start = wp.tid() * run
+    for face in range(start, wp.min(start + run, triangles.shape[0])):
+        draw_triangle(face, q, triangles, near, begin, end, nearest)
+
+
+@wp.kernel
+def read_nearest(
+    begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    nearest: wp.array2d(dtype=wp.uint64),
+    q: wp.array(dtype=wp.vec3d),
+    triangles: wp.array(dtype=wp.vec3i),
+    first: wp.int32,
     # outputs
     face: wp.array2d(dtype=wp.int32),
     weights: wp.array2d(dtype=wp.vec3f),
     depth: wp.array2d(dtype=wp.float32),
 ):
-    """One pixel, in the rows from `begin` on: the winning face, its barycentric weights e / sum e, its depth."""
-    line, column = wp.tid()
-    row = begin + line
-    key = nearest[row, column]
-    if key == wp.uint64(0xFFFFFFFFFFFFFFFF):
-        return
-    winner = wp.int32(key & wp.uint64(0xFFFFFFFF))
-    t = triangles[winner]
-    a = q[t[0]]
-    b = q[t[1]]
-    c = q[t[2]]
-    p = wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
-    eb = wp.dot(p, wp.cross(c, a - c))
-    ec = wp.dot(p, wp.cross(a, b - a))
-    across = wp.dot(p, wp.cross(b - a, c - a))
-    wb = wp.float32(eb / across)
-    wc = wp.float32(ec / across)
-    face[row, column] = winner
-    weights[row, column] = wp.vec3f(1.0 - wb - wc, wb, wc)
-    depth[row, column] = wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
+    """Each pixel: the winning face, its barycentric weights e / sum e, its depth; `first` is the arrays' first row."""
+    start = begin + wp.tid() * run
+    for index in range(start, wp.min(start + run, end)):
+        row = index / nearest.shape[1]
+        column = index - row * nearest.shape[1]
+        key = nearest[row, column]
+        if key != wp.uint64(0xFFFFFFFFFFFFFFFF):
+            winner = wp.int32(key & wp.uint64(0xFFFFFFFF))
+            t = triangles[winner]
+            a = q[t[0]]
+            b = q[t[1]]
+            c = q[t[2]]
+            p = wp.vec3d(wp.float64(column), wp.float64(first + row), wp.float64(1.0))
+            eb = wp.dot(p, wp.cross(c, a - c))
+            ec = wp.dot(p, wp.cross(a, b - a))
+            scale = wp.float64(1.0) / wp.dot(p, wp.cross(b - a, c - a))
+            wb = wp.float32(eb * scale)
+            wc = wp.float32(ec * scale)
+            face[row, column] = winner
+            weights[row, column] = wp.vec3f(1.0 - wb - wc, wb, wc)
+            depth[row, column] = wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)

@@ -16,8 +16,9 @@ BRIGHTEST = wp.constant(4.0)
 
 @wp.struct
 class Light:
-    """The lamp as the kernel sees it: position [m], unit axis, cosine of the lit cone and how fast its rim fades in, strength, ambient share.
+    """The lamp as the kernel sees it.
 
+    position [m], unit axis, cosine of the lit cone's angle, how fast its rim fades in, strength, ambient share;
     `P` takes a world point to (u w, v w, w) in the shadow map.
     """
 
@@ -121,8 +122,10 @@ def tone(x: wp.float32, curve: wp.array(dtype=wp.uint8)) -> wp.uint8:
 
 @wp.kernel
 def shade(
-    pixels: wp.array(dtype=wp.int32),
     begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    pixels: wp.array(dtype=wp.int32),
     face: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.vec3f),
     first: wp.int32,
@@ -143,42 +146,44 @@ def shade(
     normal: wp.array(dtype=wp.vec3f),
     segmentation: wp.array(dtype=wp.uint8),
 ):
-    """One of the `pixels` from `begin` on, which see this layer (faces from `first` on); pictures are flat, (H W).
+    """A run of the `pixels` begin .. end - 1, which see this layer (faces from `first` on); pictures are flat, (H W).
 
     Light = base (ambient + wrapped Lambert) + Schlick's Fresnel x a Gaussian lobe, inside a lit circle with a soft rim.
     """
-    pixel = pixels[begin + wp.tid()]
-    t = triangles[face[pixel] - first]
-    w = weights[pixel]
-    point = blend(w, t, vertices)
-    view = unit(eye - point)
-    n = unit(blend(w, t, normals))
-    # Towards the viewer by the flat side that is seen: near a silhouette the smooth normal may point away.
-    flat = wp.cross(vertices[t[1]] - vertices[t[0]], vertices[t[2]] - vertices[t[0]])
-    if wp.dot(flat, n) * wp.dot(flat, view) < 0.0:
-        n = -n
-    normal[pixel] = n
-    segmentation[pixel] = look.id
-    base = blend(w, t, colours)
-    if look.textured:
-        x = blend(w, t, rest)
-        s = sample(texels, wp.transform_point(look.T_index_world, x))
-        base = wp.cw_mul(base, look.dark + (wp.vec3f(1.0) - look.dark) * s[0])
-        slope = wp.vec3f(s[1], s[2], s[3])
-        n = unit(n - look.relief * (slope - wp.dot(slope, n) * n))
-    ray = unit(light.position - point)
-    rim = wp.clamp((-wp.dot(ray, light.axis) - light.outer) * light.steepness, 0.0, 1.0)
-    arriving = light.strength * rim * rim * (3.0 - 2.0 * rim)
-    if arriving > 0.0:
-        arriving *= lit(point + OFFSET * n, light, shadow, bounds)
-    wrapped = wp.max(0.0, (wp.dot(n, ray) + 0.2) * 0.83333)
-    middle = unit(ray + view)
-    grazing = 1.0 - wp.max(0.0, wp.dot(view, middle))
-    fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing
-    lobe = wp.exp(look.shininess * (wp.dot(n, middle) - 1.0)) * (look.shininess + 8.0) * 0.04
-    # The lamp sits near the viewer: what faces away from both lies in the wound's shade.
-    ambient = light.ambient * (0.35 + 0.65 * wp.max(0.0, wp.dot(n, view)))
-    out = base * (ambient + arriving * wrapped) + wp.vec3f(arriving * look.gloss * fresnel * lobe)
-    colour[pixel, 0] = tone(out[0], curve)
-    colour[pixel, 1] = tone(out[1], curve)
-    colour[pixel, 2] = tone(out[2], curve)
+    start = begin + wp.tid() * run
+    for index in range(start, wp.min(start + run, end)):
+        pixel = pixels[index]
+        t = triangles[face[pixel] - first]
+        w = weights[pixel]
+        point = blend(w, t, vertices)
+        view = unit(eye - point)
+        n = unit(blend(w, t, normals))
+        # Towards the viewer by the flat side that is seen: near a silhouette the smooth normal may point away.
+        flat = wp.cross(vertices[t[1]] - vertices[t[0]], vertices[t[2]] - vertices[t[0]])
+        if wp.dot(flat, n) * wp.dot(flat, view) < 0.0:
+            n = -n
+        normal[pixel] = n
+        segmentation[pixel] = look.id
+        base = blend(w, t, colours)
+        if look.textured:
+            x = blend(w, t, rest)
+            s = sample(texels, wp.transform_point(look.T_index_world, x))
+            base = wp.cw_mul(base, look.dark + (wp.vec3f(1.0) - look.dark) * s[0])
+            slope = wp.vec3f(s[1], s[2], s[3])
+            n = unit(n - look.relief * (slope - wp.dot(slope, n) * n))
+        ray = unit(light.position - point)
+        rim = wp.clamp((-wp.dot(ray, light.axis) - light.outer) * light.steepness, 0.0, 1.0)
+        arriving = light.strength * rim * rim * (3.0 - 2.0 * rim)
+        if arriving > 0.0:
+            arriving *= lit(point + OFFSET * n, light, shadow, bounds)
+        wrapped = wp.max(0.0, (wp.dot(n, ray) + 0.2) * 0.83333)
+        middle = unit(ray + view)
+        grazing = 1.0 - wp.max(0.0, wp.dot(view, middle))
+        fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing
+        lobe = wp.exp(look.shininess * (wp.dot(n, middle) - 1.0)) * (look.shininess + 8.0) * 0.04
+        # The lamp sits near the viewer: what faces away from both lies in the wound's shade.
+        ambient = light.ambient * (0.35 + 0.65 * wp.max(0.0, wp.dot(n, view)))
+        out = base * (ambient + arriving * wrapped) + wp.vec3f(arriving * look.gloss * fresnel * lobe)
+        colour[pixel, 0] = tone(out[0], curve)
+        colour[pixel, 1] = tone(out[1], curve)
+        colour[pixel, 2] = tone(out[2], curve)

@@ -12,7 +12,7 @@ import warp as wp
 
 from .camera import Camera, look_at
 from .layer import Layer, vertex_normals
-from .raster import in_bands, rasterise
+from .raster import launch_in_bands, rasterise
 from .shade import BRIGHTEST, SOFT, Light, Look, shade
 
 DRAPE = (0.13, 0.30, 0.36)
@@ -100,12 +100,17 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
     for layer in layers:
         stop = first + len(layer.triangles)
         pixels = on_device(np.flatnonzero((first <= seen) & (seen < stop)), dtype=wp.int32)
-        look = [face, weights, first, *as_surface(layer, device), wp.vec3f(camera.centre), light, *lamp_arrays]
-
-        def draw(begin: int, end: int, pixels: wp.array = pixels, look: list = look) -> None:
-            wp.launch(shade, end - begin, [pixels, begin, *look], [colour, normal, segmentation], device=device)
-
-        in_bands(draw, len(pixels), device)
+        inputs = [
+            pixels,
+            face,
+            weights,
+            first,
+            *as_surface(layer, device),
+            wp.vec3f(camera.centre),
+            light,
+            *lamp_arrays,
+        ]
+        launch_in_bands(shade, inputs, [colour, normal, segmentation], len(pixels), device)
         first = stop
     height, width = fragments.face.shape
     return Picture(

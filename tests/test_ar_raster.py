@@ -1,0 +1,163 @@
+"""The rasteriser: against the ray cast, against analytic planes, and on the meshes that break rasterisers."""
+
+import numpy as np
+import pytest
+
+from ar.camera import Camera, look_at
+from ar.raster import rasterise
+from ar.raycast import raycast
+
+NO_TRIANGLES = np.zeros((0, 3), int)
+
+
+def camera(width: int = 160, height: int = 120) -> Camera:
+    return look_at(np.array([0.0, 0.0, -0.3]), np.zeros(3), np.array([0.0, -1.0, 0.0]), np.radians(30.0), width, height)
+
+
+def sphere(rings: int = 40, segments: int = 60, radius: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
+    """A closed sphere, its poles shared vertices."""
+    polar = np.linspace(0.0, np.pi, rings + 1)[1:-1, None]
+    turn = np.linspace(0.0, 2.0 * np.pi, segments, endpoint=False)[None]
+    body = np.stack(np.broadcast_arrays(np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)), -1)
+    vertices = np.concatenate([body.reshape(-1, 3), [[0, 0, 1.0], [0, 0, -1.0]]]) * radius
+    index = np.arange(body[..., 0].size).reshape(rings - 1, segments)
+    right = np.roll(index, -1, axis=1)
+    quads = np.stack([index[:-1], index[1:], right[1:], right[:-1]], -1).reshape(-1, 4)
+    top, bottom = np.full(segments, len(vertices) - 2), np.full(segments, len(vertices) - 1)
+    caps = [np.stack([top, index[0], right[0]], 1), np.stack([bottom, right[-1], index[-1]], 1)]
+    return vertices, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]], *caps])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_sees_what_rays_see(seed):
+    random = np.random.default_rng(seed)
+    vertices = random.uniform(-0.08, 0.08, (400, 3))
+    vertices[:200] = vertices[200:] + 0.015 * random.standard_normal((200, 3))
+    triangles = random.integers(0, 400, (600, 3))
+    triangles[:300, 1] = (triangles[:300, 0] + 200) % 400
+    here = camera()
+    drawn, cast = rasterise(here, vertices, triangles), raycast(here, vertices, triangles)
+    # Thin slivers: float32 rays and float64 edges may differ at a pixel that an edge runs through.
+    agree = drawn.face == cast.face
+    assert np.mean(~agree) < 2e-3
+    seen = agree & drawn.mask
+    assert seen.sum() > 5000
+    assert np.abs(drawn.depth - cast.depth)[seen].max() < 1e-6
+    near_edge = drawn.weights.min(axis=-1) < 1e-3
+    assert np.abs(drawn.weights - cast.weights)[seen & ~near_edge].max() < 2e-3
+
+
+def test_a_closed_surface_has_no_cracks_and_the_same_depth_as_rays():
+    vertices, triangles = sphere()
+    vertices = vertices * (1.0 + 0.05 * np.sin(150.0 * vertices).sum(axis=1, keepdims=True))
+    here = camera(640, 480)
+    drawn, cast = rasterise(here, vertices, triangles), raycast(here, vertices, triangles)
+    assert np.count_nonzero(drawn.mask != cast.mask) <= 2
+    both = drawn.mask & cast.mask
+    assert np.abs(drawn.depth - cast.depth)[both].max() < 1e-6
+    # A crack would show the far wall, behind the sphere's middle.
+    assert drawn.depth[drawn.mask].max() < 0.3
+
+
+def test_pixel_centres_on_shared_edges_and_vertices_are_covered():
+    """A grid whose every edge and vertex lies exactly on pixel centres."""
+    K = np.array([[8.0, 0.0, 16.0], [0.0, 8.0, 16.0], [0.0, 0.0, 1.0]])
+    here = Camera(K, np.eye(4), 33, 33)
+    x, y = np.meshgrid(np.linspace(-2.0, 2.0, 9), np.linspace(-2.0, 2.0, 9), indexing="ij")
+    vertices = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    index = np.arange(81).reshape(9, 9)
+    quads = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], -1).reshape(-1, 4)
+    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    fragments = rasterise(here, vertices, triangles)
+    assert fragments.mask.all()
+    assert (fragments.depth == 1.0).all()
+
+
+def test_the_nearer_surface_wins_whatever_the_order():
+    front = np.array([[-0.05, -0.05, -0.02], [0.05, -0.05, -0.02], [0.0, 0.05, -0.02]])
+    back = front * [3.0, 3.0, -1.0]
+    here = camera()
+    for first, second, wanted in ((front, back, 0), (back, front, 1)):
+        fragments = rasterise(here, np.concatenate([first, second]), np.array([[0, 1, 2], [3, 4, 5]]))
+        assert fragments.face[60, 80] == wanted
+        assert fragments.depth[60, 80] == pytest.approx(0.28, abs=1e-7)
+
+
+def test_values_are_interpolated_in_space_and_not_on_the_screen():
+    """A tilted plane: the value at a pixel is the linear function of the world point that the pixel's ray meets."""
+    vertices = np.array([[-0.2, -0.2, -0.1], [0.2, -0.2, -0.1], [0.2, 0.25, 0.4], [-0.2, 0.25, 0.4]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    here = camera()
+    fragments = rasterise(here, vertices, triangles)
+    rows, columns = np.nonzero(fragments.mask)
+    met = here.unproject(np.stack([columns, rows], -1), fragments.depth[rows, columns])
+    normal = np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0])
+    assert np.abs((met - vertices[0]) @ normal).max() / np.linalg.norm(normal) < 1e-7
+    values = vertices @ [[1.0], [2.0], [3.0]] + 0.5
+    wanted = met @ [1.0, 2.0, 3.0] + 0.5
+    got = fragments.interpolate(triangles, values)[rows, columns, 0]
+    assert np.abs(got - wanted).max() < 1e-6
+    assert fragments.interpolate(triangles, values)[~fragments.mask].max(initial=0.0) == 0.0
+
+
+def test_triangles_through_the_near_plane_and_behind_the_camera():
+    """A floor that starts far behind the eye: only its part beyond the near plane shows, and every ray agrees."""
+    vertices = np.array([[-1.0, 0.05, -2.0], [1.0, 0.05, -2.0], [0.0, 0.05, 3.0], [0.0, 0.0, -0.4], [0.1, 0.1, -0.5]])
+    triangles = np.array([[0, 1, 2], [3, 4, 0]])
+    here = camera()
+    drawn, cast = rasterise(here, vertices, triangles, near=0.05), raycast(here, vertices, triangles, near=0.05)
+    assert np.array_equal(drawn.face, cast.face)
+    assert (drawn.face == 0).any() and not (drawn.face == 1).any()
+    assert drawn.depth[drawn.mask].min() >= 0.05
+    assert np.abs(1.0 / drawn.depth[drawn.mask] - 1.0 / cast.depth[drawn.mask]).max() < 1e-4
+
+
+def test_one_triangle_larger_than_the_picture_covers_it():
+    vertices = np.array([[-50.0, -50.0, 1.0], [50.0, -50.0, 1.0], [0.0, 80.0, 1.0]])
+    assert rasterise(camera(), vertices, np.array([[0, 1, 2]])).mask.all()
+    assert not rasterise(camera(), vertices + [200.0, 0.0, 0.0], np.array([[0, 1, 2]])).mask.any()
+
+
+def test_what_has_no_area_leaves_no_trace():
+    line = np.array([[-0.05, 0.0, 0.0], [0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.03, 0.0]])
+    assert not rasterise(camera(), line, np.array([[0, 1, 2], [0, 0, 3], [1, 1, 1]])).mask.any()
+    edge_on = np.array([[0.0, 0.0, -0.1], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
+    assert not rasterise(camera(), edge_on, np.array([[0, 1, 2]])).mask.any()
+
+
+def test_nothing_gives_an_empty_picture():
+    fragments = rasterise(camera(), np.zeros((0, 3)), NO_TRIANGLES)
+    assert not fragments.mask.any() and (fragments.depth == 0.0).all() and (fragments.face == -1).all()
+    assert not raycast(camera(), np.zeros((0, 3)), NO_TRIANGLES).mask.any()
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "reason"),
+    [
+        (np.zeros((3, 2)), [[0, 1, 2]], "vertices"),
+        (np.zeros((3, 3)), [[0, 1, 3]], "names a vertex"),
+        (np.zeros((3, 3)), [[0, 1, -1]], "names a vertex"),
+        (np.full((3, 3), np.nan), [[0, 1, 2]], "finite"),
+    ],
+)
+def test_what_is_no_mesh_is_refused(vertices, triangles, reason):
+    with pytest.raises(ValueError, match=reason):
+        rasterise(camera(), vertices, np.array(triangles))
+
+
+def test_a_near_plane_behind_the_eye_is_refused():
+    with pytest.raises(ValueError, match="near"):
+        rasterise(camera(), *sphere(), near=0.0)
+
+
+@pytest.mark.gpu
+def test_the_graphics_card_draws_the_same():
+    import warp as wp
+
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    vertices, triangles = sphere()
+    here, there = rasterise(camera(), vertices, triangles), rasterise(camera(), vertices, triangles, device="cuda:0")
+    assert np.mean(here.face != there.face) < 1e-3
+    same = here.face == there.face
+    assert np.abs(here.depth - there.depth)[same].max() < 1e-6
