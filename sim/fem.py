@@ -84,7 +84,7 @@ class Fem:
         check_causes(self.effects, loads)
         guess = self._guess(loads, start)
         parts = []
-        for first in range(0, len(loads), self.batch):
+        for first in range(0, max(len(loads), 1), self.batch):
             rows = slice(first, first + self.batch)
             history = {} if start is None else {name: value[rows] for name, value in start.history.items()}
             begun = np.zeros(len(loads))[rows] if start is None else start.time[rows]
@@ -114,7 +114,11 @@ class Fem:
         found = find_equilibrium(self.problem, self._direction, guess, self.accuracy)
         solved = time.perf_counter()
         for column in [c for c, outcome in enumerate(found.outcome) if not outcome.good]:
-            _replace_column(found, column, self._in_steps(cases, column))
+            stepped = self._in_steps(cases, column)
+            found.iterations[column] += stepped.iterations[0]
+            if stepped.outcome[0].good:  # otherwise what was reached under the whole load says more
+                found.u[:, column], found.residual[column] = stepped.u[:, 0], stepped.residual[0]
+                found.outcome[column] = Outcome.CONVERGED_IN_STEPS
         rescued = time.perf_counter()
         self.problem.begin(cases)
         u = self.problem.device.array(found.u)
@@ -141,7 +145,7 @@ class Fem:
         )
 
     def _in_steps(self, cases: Cases, column: int) -> Equilibrium:
-        """One case from rest, its load raised in steps that halve on failure; the last equilibrium if it fails."""
+        """One case from rest, its load raised in steps that halve on failure; the last attempt, and all iterations."""
         pick = np.array([column])
         loads = cases.loads.rows(pick)
         history = {name: value[pick] for name, value in cases.history.items()}
@@ -152,12 +156,11 @@ class Fem:
             self.problem.begin(Cases(loads.scaled(aim), cases.start_time[pick], history))
             found = find_equilibrium(self.problem, self._direction, u, self.accuracy)
             spent += int(found.iterations[0])
-            if found.outcome[0].good:
+            good = found.outcome[0].good
+            if (good and aim == 1.0) or (not good and step <= SMALLEST_LOAD_STEP):
+                return replace(found, iterations=np.array([spent]))
+            if good:
                 u, reached = found.u, aim
-                if reached == 1.0:
-                    return replace(found, outcome=np.array([Outcome.CONVERGED_IN_STEPS]), iterations=np.array([spent]))
-            elif step <= SMALLEST_LOAD_STEP:
-                return replace(found, u=u, iterations=np.array([spent]))
             else:
                 step /= 2.0
 
@@ -189,13 +192,6 @@ def choose_preconditioner(problem: Problem) -> Preconditioner:
         return Factor(stiffness, problem.constraint, problem.device)
     except RuntimeError as error:
         raise InputError(f"the stiffness at rest cannot be factorised ({error}): is every part held?") from error
-
-
-def _replace_column(found: Equilibrium, column: int, single: Equilibrium) -> None:
-    found.u[:, column] = single.u[:, 0]
-    found.outcome[column] = single.outcome[0]
-    found.iterations[column] += single.iterations[0]
-    found.residual[column] = single.residual[0]
 
 
 def _joined(parts: list[Deformation]) -> Deformation:

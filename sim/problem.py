@@ -95,7 +95,8 @@ class Problem:
         whole = norms(self.device, total)
         self.constraint.project(total)
         free = norms(self.device, total)
-        reaction = np.sqrt(np.maximum(whole**2 - free**2, 0.0))  # the projection is orthogonal
+        with np.errstate(invalid="ignore", over="ignore"):  # forces that overflowed: the caller sees it in `free`
+            reaction = np.sqrt(np.maximum(whole**2 - free**2, 0.0))  # the projection is orthogonal
         return total, free, np.maximum(scale, reaction)
 
     def linearise(self, u: wp.array, definite: np.ndarray) -> None:
