@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import warp as wp
 
-# A caster must be this much nearer to the lamp [m] than what it shades, seen from this far [m] above the surface, or
-# surfaces at a slant to the lamp would shade themselves.
-BIAS = wp.constant(0.0005)
-OFFSET = wp.constant(0.001)
+# A caster must be this much nearer to the lamp [m] than what it shades.
+BIAS = wp.constant(0.0002)
 # Half the width of the shadow's soft rim [shadow-map pixel].
 SOFT = wp.constant(3)
 # Scene-linear light that is white.
@@ -19,7 +17,7 @@ class Light:
     """The lamp as the kernel sees it.
 
     position [m], unit axis, cosine of the lit cone's angle, how fast its rim fades in, strength, ambient share;
-    `P` takes a world point to (u w, v w, w) in the shadow map.
+    `P` takes a world point to (u w, v w, w) in the shadow map, which is asked `offset` [m] above the surface.
     """
 
     position: wp.vec3f
@@ -29,6 +27,7 @@ class Light:
     strength: wp.float32
     ambient: wp.float32
     P: wp.mat44f
+    offset: wp.float32
 
 
 @wp.struct
@@ -175,12 +174,12 @@ def shade(
         rim = wp.clamp((-wp.dot(ray, light.axis) - light.outer) * light.steepness, 0.0, 1.0)
         arriving = light.strength * rim * rim * (3.0 - 2.0 * rim)
         if arriving > 0.0:
-            arriving *= lit(point + OFFSET * n, light, shadow, bounds)
+            arriving *= lit(point + light.offset * n, light, shadow, bounds)
         wrapped = wp.max(0.0, (wp.dot(n, ray) + 0.2) * 0.83333)
         middle = unit(ray + view)
         grazing = 1.0 - wp.max(0.0, wp.dot(view, middle))
         fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing
-        lobe = wp.exp(look.shininess * (wp.dot(n, middle) - 1.0)) * (look.shininess + 8.0) * 0.04
+        lobe = wp.exp(look.shininess * (wp.dot(n, middle) - 1.0)) * (look.shininess + 8.0) * 0.12
         # The lamp sits near the viewer: what faces away from both lies in the wound's shade.
         ambient = light.ambient * (0.35 + 0.65 * wp.max(0.0, wp.dot(n, view)))
         out = base * (ambient + arriving * wrapped) + wp.vec3f(arriving * look.gloss * fresnel * lobe)

@@ -16,7 +16,7 @@ from .raster import launch_in_bands, rasterise
 from .shade import BRIGHTEST, SOFT, Light, Look, shade
 
 DRAPE = (0.13, 0.30, 0.36)
-SHADOW_PIXELS = 256
+SHADOW_PIXELS = 384
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +148,8 @@ def as_light(lamp: Lamp) -> Light:
     angle = np.arctan(lamp.radius / np.linalg.norm(axis))
     light.outer, light.steepness = float(np.cos(angle)), float(1.0 / (np.cos(0.55 * angle) - np.cos(angle)))
     light.strength, light.ambient, light.P = lamp.strength, lamp.ambient, wp.mat44f(projection)
+    # As high as the filter is wide: then no slant to the lamp brings the surface itself under the filter.
+    light.offset = float(1.05 * (SOFT + 0.5) * np.linalg.norm(axis) / camera.K[0, 0])
     return light
 
 

@@ -1,0 +1,75 @@
+"""Screens: what goes in is what lies in the folder, and nothing half-written stays."""
+
+import cv2
+import numpy as np
+import pytest
+
+from ar.screen import Blank, Film, Screen, read_png, write_film
+
+
+def picture(number: int = 0) -> np.ndarray:
+    colour = np.zeros((48, 64, 3), np.uint8)
+    colour[:, :, 0] = 200
+    colour[10:20, 5 + 5 * number : 15 + 5 * number] = (30, 220, 90)
+    return colour
+
+
+def test_a_folder_holds_the_frames_as_shown(tmp_path):
+    screen: Screen = Film(tmp_path / "deep" / "frames")
+    for number in (0, 1, 12):
+        screen.show(number, picture(number))
+    files = sorted(path.name for path in (tmp_path / "deep" / "frames").iterdir())
+    assert files == ["frame_0000.png", "frame_0001.png", "frame_0012.png"]
+    assert np.array_equal(read_png(tmp_path / "deep" / "frames" / "frame_0012.png"), picture(12))
+
+
+def test_blank_shows_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    screen: Screen = Blank()
+    screen.show(0, picture())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_video_has_every_picture_in_its_colours(tmp_path):
+    write_film(tmp_path / "film.mp4", (picture(number) for number in range(7)), 20.0)
+    video = cv2.VideoCapture(str(tmp_path / "film.mp4"))
+    frames = [frame for good, frame in iter(video.read, (False, None)) if good]
+    assert len(frames) == 7
+    assert np.abs(frames[3][..., ::-1].astype(int) - picture(3)).mean() < 12
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_an_animation_loops_over_every_picture(tmp_path, suffix):
+    write_film(tmp_path / f"film{suffix}", (picture(number) for number in range(5)), 10.0)
+    good, animation = cv2.imreadanimation(str(tmp_path / f"film{suffix}"))
+    assert good and len(animation.frames) == 5 and animation.loop_count == 0
+    assert list(animation.durations) == [100] * 5
+    assert np.abs(animation.frames[2][..., 2::-1].astype(int) - picture(2)).mean() < 12
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif", ".webp"])
+def test_a_film_that_fails_leaves_nothing(tmp_path, suffix):
+    def broken():
+        yield picture()
+        raise RuntimeError("the camera is gone")
+
+    with pytest.raises(RuntimeError, match="camera"):
+        write_film(tmp_path / f"film{suffix}", broken())
+    with pytest.raises(ValueError, match="at least one"):
+        write_film(tmp_path / f"film{suffix}", [])
+    with pytest.raises(ValueError, match="one size"):
+        write_film(tmp_path / f"film{suffix}", [picture(), picture()[:20]])
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_places_are_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="folder"):
+        Film(tmp_path / "file")
+    with pytest.raises(ValueError, match="mp4"):
+        write_film(tmp_path / "film.avi", [picture()])
+    with pytest.raises(ValueError, match="positive"):
+        write_film(tmp_path / "film.mp4", [picture()], 0.0)
+    with pytest.raises(ValueError, match="not a picture"):
+        read_png(tmp_path / "file")
