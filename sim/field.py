@@ -57,7 +57,7 @@ def mask_field(mask: np.ndarray, affine: np.ndarray) -> LevelSet:
 
 def cropped(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The part of a mask within 5 voxels of what is marked, padded where the volume ends, and its affine (4, 4)."""
-    box = cast(tuple[slice, ...], ndimage.find_objects(mask.astype(np.uint8))[0])
+    (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(mask.astype(np.uint8)))
     low = np.array([part.start for part in box]) - MARGIN
     shifted = affine.copy()
     shifted[:3, 3] += affine[:3, :3] @ low

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array, csgraph
 
+from .mesh import row_keys
+
 STEINER = 4  # extra points on every edge; with 4 of them the paths are at most about 1 % too long
 PAIRS = np.array([(i, j) for i in range(3 + 3 * STEINER) for j in range(i)])
 
@@ -27,7 +29,8 @@ def distances(nodes: np.ndarray, triangles: np.ndarray, source: np.ndarray, limi
     first = np.unique(corners[(local == nearest).any(axis=1)])
     points = np.concatenate([points, source[None]])
     start = len(points) - 1
-    links = np.unique(np.sort(np.concatenate([links, np.stack([first, np.full(len(first), start)], axis=1)])), axis=0)
+    links = np.concatenate([links, np.stack([first, np.full(len(first), start)], axis=1)])
+    links = links[np.unique(row_keys(links), return_index=True)[1]]  # once each: the graph would add doubles up
     length = np.linalg.norm(points[links[:, 0]] - points[links[:, 1]], axis=1)
     graph = coo_array((np.maximum(length, 1e-12), links.T), shape=(start + 1, start + 1)).tocsr()
     along = csgraph.dijkstra(graph, directed=False, indices=start, limit=limit)
@@ -39,7 +42,8 @@ def distances(nodes: np.ndarray, triangles: np.ndarray, source: np.ndarray, limi
 def _with_steiner_points(nodes: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """All points of the graph, the nodes first, and those on the rim of each triangle (S, 3 + 3 * STEINER)."""
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, number = np.unique(sides, axis=0, return_inverse=True)
+    _, first, number = np.unique(row_keys(sides), return_index=True, return_inverse=True)
+    edges = sides[first]
     share = (np.arange(STEINER) + 1.0) / (STEINER + 1.0)
     start, end = nodes[edges[:, 0]], nodes[edges[:, 1]]
     added = start[:, None] + share[:, None] * (end - start)[:, None]

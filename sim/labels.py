@@ -89,7 +89,7 @@ def _listed(labels: Sequence[int]) -> str:
 
 def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
     """The component of brain or tumour that holds most of the brain, its holes filled."""
-    component = cast(np.ndarray, ndimage.label(brain | tumour)[0])
+    component, _ = cast(tuple[np.ndarray, int], ndimage.label(brain | tumour))
     solid = component == np.bincount(component[brain]).argmax()
     lost = int((brain & ~solid).sum())
     if lost:
@@ -127,7 +127,7 @@ def _extended(tumour: np.ndarray, solid: np.ndarray) -> np.ndarray:
 
     A tumour that reaches the cortex then goes on beyond it, and its field crosses the cortex instead of touching it.
     """
-    box = cast(tuple[slice, ...], ndimage.find_objects(tumour.astype(np.uint8))[0])
+    (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(tumour.astype(np.uint8)))
     wide = tuple(slice(max(part.start - EXTENSION, 0), part.stop + EXTENSION) for part in box)
     if solid[wide].all():
         return tumour

@@ -94,7 +94,7 @@ def _children(halved: np.ndarray) -> np.ndarray:
 
 def _key(whole: np.ndarray, span: np.ndarray) -> np.ndarray:
     """One number for whole coordinates (..., 3)."""
-    return np.ravel_multi_index(tuple(np.moveaxis(whole, -1, 0)), tuple(span))
+    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(whole, -1, 0)), tuple(span)))
 
 
 def _face(corner: np.ndarray, axis: int, edge: int, upper: bool) -> np.ndarray:

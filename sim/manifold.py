@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array, csgraph
 
-from .mesh import FACES
+from .mesh import FACES, row_keys
 
 
 def largest_piece(tets: np.ndarray) -> np.ndarray:
     """Which tetrahedra (T,) belong to the largest piece whose tetrahedra hang together by faces."""
-    faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
-    _, number, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+    _, number, count = np.unique(row_keys(tets[:, FACES].reshape(-1, 3)), return_inverse=True, return_counts=True)
     owner = np.repeat(np.arange(len(tets)), 4)
     order = np.argsort(number, kind="stable")
     pairs = owner[order[np.flatnonzero(count[number[order]] == 2)]].reshape(-1, 2)
@@ -38,7 +37,7 @@ def clean(tets: np.ndarray) -> np.ndarray:
 def _pinching(tets: np.ndarray) -> np.ndarray:
     """Numbers of the tetrahedra behind every surface fan but the largest at its node."""
     faces = tets[:, FACES].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    _, first, count = np.unique(row_keys(faces), return_index=True, return_counts=True)
     outer = np.sort(first[count == 1])
     surface, behind = faces[outer], outer // 4
     # One graph node for each corner of a triangle; corners at one mesh node join across a surface edge, if just two do.
@@ -46,8 +45,8 @@ def _pinching(tets: np.ndarray) -> np.ndarray:
     sides = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]])
     ends = surface.ravel()[sides]
     turned = ends[:, 0] > ends[:, 1]
-    sides[turned], ends[turned] = sides[turned][:, ::-1], ends[turned][:, ::-1]
-    _, edge, shared = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    sides[turned] = sides[turned][:, ::-1]
+    _, edge, shared = np.unique(row_keys(ends), return_inverse=True, return_counts=True)
     order = np.argsort(edge, kind="stable")
     pairs = sides[order[shared[edge[order]] == 2]].reshape(-1, 2, 2)
     joined = np.concatenate([pairs[:, :, 0], pairs[:, :, 1]])
@@ -68,12 +67,10 @@ def ears(tets: np.ndarray, unwanted: np.ndarray) -> np.ndarray:
     within; of neighbours only one goes.
     """
     faces = tets[:, FACES].reshape(-1, 3)
-    ordered = np.sort(faces, axis=1)
-    _, number, count = np.unique(ordered, axis=0, return_inverse=True, return_counts=True)
+    _, number, count = np.unique(row_keys(faces), return_inverse=True, return_counts=True)
     outer = (count[number] == 1).reshape(-1, 4)
-    surface = faces[outer.ravel()]
     width = int(tets.max()) + 1
-    edges = np.sort(surface[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = np.sort(faces[outer.ravel()][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     surface_edges = np.unique(edges @ [width, 1])
     gone = np.zeros(len(tets), bool)
     taken = np.zeros(width, bool)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .anatomy import BRAIN_LABEL, TUMOUR_LABEL
 from .errors import InputError
@@ -22,6 +22,7 @@ FINE = 0.5  # of the coarsest cell: the cells at the tumour and the craniotomy
 CELLS_PER_RADIUS = 2.5  # at least, across the tumour's radius
 GROWTH = 0.5  # of a cell's size per distance from the points of interest
 ROUNDING = 2.0**0.5  # a cell up to this much larger than wanted is not halved
+SLACKS = (0.0, 3e-4, 6e-4)  # [m] that nodes may leave their surface by, at the first, second and third attempt
 DEEPEST = 4  # halvings of the coarsest cell
 TOO_COARSE = "so few nodes do not show the brain or the tumour: ask for more nodes, or check the labels."
 
@@ -79,8 +80,8 @@ def carve(solids: Solids, edge: float) -> Pieces:
     """The solid on a lattice of coarsest cell `edge` [m], split along the tumour's surface."""
     radius = (0.75 / np.pi * solids.tumour_volume) ** (1.0 / 3.0)
     wanted = (
-        (cKDTree(solids.interface), min(FINE * edge, radius / CELLS_PER_RADIUS)),
-        (cKDTree(solids.opening), FINE * edge),
+        (KDTree(solids.interface), min(FINE * edge, radius / CELLS_PER_RADIUS)),
+        (KDTree(solids.opening), FINE * edge),
     )
     levels = min(int(np.rint(np.log2(edge / wanted[0][1]))), DEEPEST)
 
@@ -106,10 +107,10 @@ def _finished(solids: Solids, pieces: Pieces) -> TetMesh:
     nodes = fitted(pieces.nodes, faces_once(pieces.tets), solids.brain, surface)
     nodes = fitted(nodes, faces_once(pieces.tets[pieces.inside]), solids.tumour, ~surface, solids.tumour_volume)
     pieces = replace(pieces, nodes=nodes)
-    for _ in range(2):
+    for slack in SLACKS:
         bad = smallest_sines(pieces.nodes[pieces.tets]) < GOOD_SINE
         pieces = pieces.kept(~ears(pieces.tets, bad))
-        pieces = replace(pieces, nodes=improved(pieces.nodes, pieces.tets, _projection(solids, pieces)))
+        pieces = replace(pieces, nodes=improved(pieces.nodes, pieces.tets, _projection(solids, pieces, slack)))
     region = np.where(pieces.inside, TUMOUR_LABEL, BRAIN_LABEL)
     return TetMesh(pieces.nodes, pieces.tets, region)
 
@@ -122,8 +123,8 @@ def _surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
     return marks[0], marks[1]
 
 
-def _projection(solids: Solids, pieces: Pieces) -> Projection:
-    """Keeps each node on the levels of the fields on which it lies now."""
+def _projection(solids: Solids, pieces: Pieces, slack: float) -> Projection:
+    """Keeps each node within `slack` [m] of the levels of the fields on which it lies now."""
     surface, interface = _surfaces(pieces)
     interface[np.setdiff1d(pieces.tets[pieces.inside], pieces.tets[~pieces.inside])] = False  # cortex that is tumour
     levels = solids.brain(pieces.nodes), solids.tumour(pieces.nodes)
@@ -132,14 +133,15 @@ def _projection(solids: Solids, pieces: Pieces) -> Projection:
         placed = points.copy()
         for field, level, on in ((solids.tumour, levels[1], interface), (solids.brain, levels[0], surface)):
             rows = on[of]
-            placed[rows] = onto_level(field, placed[rows], level[of[rows]])
+            aim = level[of[rows]]
+            placed[rows] = onto_level(field, placed[rows], np.clip(field(placed[rows]), aim - slack, aim + slack))
         return placed
 
     return project
 
 
 def surface_errors(nodes: np.ndarray, triangles: np.ndarray, field: Field) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (15 S,) [m] to a field's surface of points spread over triangles (S, 3), and their shares of its area."""
+    """Distances (15 S,) [m] from points spread over triangles (S, 3) to a field's surface, and their shares of area."""
     spread = np.array([(i, j, 12 - i - j) for i in range(1, 12, 2) for j in range(1, 12 - i, 2)]) / 12.0
     corners = nodes[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

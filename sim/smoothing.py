@@ -107,7 +107,7 @@ def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection) -> np.nda
         tried = np.where(own[:, None, :, None], trials[row][:, :, None], corners[:, None])
         badness = np.add.reduceat(_badness(smallest_sines(tried)), first)
         best = badness.argmin(axis=1)
-        better = badness.min(axis=1) < 0.999 * np.add.reduceat(_badness(sines[near]), first)
+        better = badness.min(axis=1) < 0.99 * np.add.reduceat(_badness(sines[near]), first)
 
         step[movers[~better]] *= 0.4
         moved = movers[better]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from scipy import ndimage
@@ -91,5 +92,5 @@ def make_anatomy(subject: Subject, plan: Plan) -> Anatomy:
 def rim(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
     """Centres (n, 3) [m] of the voxels of `mask` (I, J, K) that touch its outside."""
     padded = np.pad(mask, 1)
-    index = np.argwhere(padded & ~ndimage.binary_erosion(padded)) - 1
+    index = np.argwhere(padded & ~cast(np.ndarray, ndimage.binary_erosion(padded))) - 1
     return index @ affine[:3, :3].T + affine[:3, 3]

@@ -118,7 +118,7 @@ def _scaled_template() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     image = load_mni152_template(resolution=1)
     grey = np.asarray(image.dataobj)
-    component = cast(np.ndarray, ndimage.label(grey > THRESHOLD * grey.max())[0])
+    component, _ = cast(tuple[np.ndarray, int], ndimage.label(grey > THRESHOLD * grey.max()))
     mask = cast(np.ndarray, ndimage.binary_fill_holes(component == np.bincount(component.ravel())[1:].argmax() + 1))
     affine = np.array(image.affine, np.float64)
     centre = affine[:3, :3] @ np.argwhere(mask).mean(axis=0) + affine[:3, 3]

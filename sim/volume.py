@@ -41,7 +41,7 @@ def read_volume(path: str | Path) -> Volume:
     try:
         image = nibabel.Nifti1Image.from_filename(path)
         values = np.asanyarray(image.dataobj)
-        unit = image.header.get_xyzt_units()[0]
+        unit = str(image.header.get_xyzt_units()[0])
     except Exception as error:  # nibabel and zlib raise whatever the damaged byte led to
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise InputError(f"{path}: cannot be read as NIfTI ({reason}). {REMEDY}") from error
