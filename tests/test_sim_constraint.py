@@ -1,0 +1,250 @@
+"""Held, prescribed and sliding nodes, and footprints that a tool moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from boxes import box, hold
+
+from sim.accuracy import Accuracy
+from sim.anatomy import Anatomy
+from sim.constraint import Constraint
+from sim.deformation import Deformation
+from sim.device import Device, find_device
+from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.footprint import footprint_weights
+from sim.loads import Cause, Displaced, Loads, Nodal, Prescribed, Pushed
+from sim.material import Material
+
+MESH = box((3, 3, 3), 0.1, distortion=0.1)
+BASE = MESH.nodes[:, 2] < 1e-9
+TOP = MESH.nodes[:, 2] > 0.1 - 1e-9
+COUNT = len(MESH.nodes)
+RNG = np.random.default_rng(21)
+TIGHT = Accuracy(tolerance=1e-10)
+SOFT = Elasticity(Material("stable-neo-hookean", 3000.0, 0.45))
+
+
+@pytest.fixture(scope="module")
+def device() -> Device:
+    return find_device("cpu", "float64")
+
+
+def mixed() -> tuple[np.ndarray, np.ndarray]:
+    """Held (V, 3) and normals (V, 3): whole nodes, single components, sliding nodes, and nodes that are both."""
+    held = np.repeat(BASE[:, None], 3, axis=1)
+    held[RNG.random((COUNT, 3)) < 0.1] = True
+    normal = np.zeros((COUNT, 3))
+    sliding = TOP | (RNG.random(COUNT) < 0.2)
+    normal[sliding] = RNG.normal(size=(sliding.sum(), 3))
+    normal[sliding] /= np.linalg.norm(normal[sliding], axis=1, keepdims=True)
+    return held, normal
+
+
+def constraint(device: Device, footprint: bool, columns: int = 3) -> Constraint:
+    held, normal = mixed()
+    out = Constraint(held, normal, device)
+    weight = RNG.random((COUNT, columns)) if footprint else None
+    out.begin(RNG.normal(size=(3 * COUNT, columns)), weight, RNG.normal(size=(3, columns)) if footprint else None)
+    return out
+
+
+def projected(of: Constraint, device: Device, v: np.ndarray) -> np.ndarray:
+    array = device.array(v)
+    of.project(array)
+    return array.numpy()
+
+
+def solve(anatomy: Anatomy, effects: list[Effect], *causes: Cause, accuracy: Accuracy = TIGHT) -> Deformation:
+    found = Fem(anatomy, [SOFT, *effects], accuracy, "cpu").deform(Loads(causes))
+    assert all(outcome.good for outcome in found.outcome)
+    return found
+
+
+@pytest.mark.parametrize("footprint", [False, True])
+class TestProjection:
+    def test_is_idempotent(self, device: Device, footprint: bool) -> None:
+        of, v = constraint(device, footprint), RNG.normal(size=(3 * COUNT, 3))
+        once = projected(of, device, v)
+        np.testing.assert_allclose(projected(of, device, once), once, atol=1e-12)
+
+    def test_is_symmetric_and_shortens(self, device: Device, footprint: bool) -> None:
+        of = constraint(device, footprint)
+        v, w = RNG.normal(size=(2, 3 * COUNT, 3))
+        Pv, Pw = projected(of, device, v), projected(of, device, w)
+        np.testing.assert_allclose((w * Pv).sum(axis=0), (Pw * v).sum(axis=0), atol=1e-10)
+        assert (np.linalg.norm(Pv, axis=0) < np.linalg.norm(v, axis=0)).all()
+
+    def test_removes_what_is_forbidden(self, device: Device, footprint: bool) -> None:
+        of = constraint(device, footprint)
+        held, normal = of.held, of.normal
+        v = projected(of, device, RNG.normal(size=(3 * COUNT, 3))).reshape(COUNT, 3, 3)
+        assert not v[held].any()
+        np.testing.assert_allclose(np.einsum("ni,nic->nc", normal, v), 0.0, atol=1e-12)
+
+    def test_closing_the_gap_meets_the_constraints(self, device: Device, footprint: bool) -> None:
+        of = constraint(device, footprint)
+        u = RNG.normal(size=(3 * COUNT, 3))
+        gap, size = of.close_gap(device.array(u))
+        np.testing.assert_array_equal(size, np.abs(gap.numpy()).max(axis=0))
+        _, left = of.close_gap(device.array(u + gap.numpy()))
+        assert left.max() < 1e-12 * size.max()
+        # The least such motion: nothing in it is free.
+        np.testing.assert_allclose(projected(of, device, gap.numpy()), 0.0, atol=1e-11)
+
+    def test_keeping_columns_keeps_values_weights_and_targets(self, device: Device, footprint: bool) -> None:
+        of, u = constraint(device, footprint), RNG.normal(size=(3 * COUNT, 3))
+        gap = of.close_gap(device.array(u))[0].numpy()
+        free = projected(of, device, u)
+        of.keep(np.array([2, 0]))
+        np.testing.assert_array_equal(of.close_gap(device.array(u[:, [2, 0]]))[0].numpy(), gap[:, [2, 0]])
+        np.testing.assert_array_equal(projected(of, device, u[:, [2, 0]]), free[:, [2, 0]])
+
+
+def test_basis_spans_what_the_projection_leaves(device: Device) -> None:
+    of = constraint(device, False, columns=1)
+    basis = of.basis().toarray()
+    np.testing.assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-12)
+    v = RNG.normal(size=(3 * COUNT, 1))
+    np.testing.assert_allclose(basis @ (basis.T @ v), projected(of, device, v), atol=1e-12)
+
+
+def test_sliding_nodes_do_not_leave_their_plane() -> None:
+    tilted = np.array([0.6, 0.0, 0.8])
+    anatomy = hold(MESH, BASE, np.where(TOP[:, None], tilted, 0.0))
+    force = np.zeros((1, COUNT, 3))
+    force[0, TOP] = [0.02, 0.03, -0.05]
+    found = solve(anatomy, [Held(), Slide(), NodalForce()], Nodal(force))
+    u = found.displacement[0]
+    assert np.abs(u[TOP] @ tilted).max() < 1e-15
+    assert not u[BASE].any()
+    assert np.linalg.norm(u[TOP], axis=1).min() > 1e-4  # tangentially free
+
+
+def test_without_the_effect_normals_are_ignored() -> None:
+    anatomy = hold(MESH, BASE, np.where(TOP[:, None], [0.0, 0.0, 1.0], 0.0))
+    force = np.zeros((1, COUNT, 3))
+    force[0, TOP, 2] = -0.05
+    assert solve(anatomy, [Held(), NodalForce()], Nodal(force)).displacement[0, TOP, 2].max() < -1e-4
+
+
+def test_components_are_prescribed_one_by_one_and_row_by_row() -> None:
+    """One mask, three cases of other values; entries that are not held are ignored."""
+    held = np.repeat(BASE[:, None], 3, axis=1)
+    held[TOP, 2] = True
+    corner = int(np.flatnonzero(TOP)[0])
+    held[corner, 0] = True
+    value = RNG.normal(size=(3, COUNT, 3)) * 1e-3
+    found = solve(hold(MESH, held), [Held()], Prescribed(value))
+    np.testing.assert_allclose(found.displacement[:, held], value[:, held], atol=1e-15)
+    free = ~held
+    assert (np.abs(found.displacement[:, free] - value[:, free]) > 1e-12).all()
+    for row in range(3):
+        alone = solve(hold(MESH, held), [Held()], Prescribed(value[[row]]))
+        np.testing.assert_allclose(alone.displacement[0], found.displacement[row], atol=1e-10)
+
+
+@pytest.mark.parametrize("law", ["linear", "stable-neo-hookean"])
+def test_a_node_that_slides_and_is_partly_held_obeys_both(law: str) -> None:
+    """A prescribed component drags a sliding node along its plane: the normal motion is zero all the same."""
+    normal = np.array([0.6, 0.0, 0.8])
+    held = np.repeat(BASE[:, None], 3, axis=1)
+    held[TOP, 0] = True
+    anatomy = hold(MESH, held, np.where(TOP[:, None], normal, 0.0))
+    value = np.zeros((1, COUNT, 3))
+    value[0, TOP, 0] = 2e-3
+    found = Fem(anatomy, [Elasticity(Material(law, 3000.0, 0.4)), Held(), Slide()], TIGHT, "cpu")
+    u = found.deform(Loads((Prescribed(value),))).displacement[0]
+    np.testing.assert_allclose(u[TOP, 0], 2e-3, atol=1e-15)
+    np.testing.assert_allclose(u[TOP] @ normal, 0.0, atol=1e-15)
+
+
+POINT = np.array([[0.05, 0.05, 0.1], [0.06, 0.04, 0.1], [0.05, 0.0, 0.05]])
+MOTION = np.array([[0.0, 0.0, -4e-3], [3e-3, 1e-3, -6e-3], [1e-3, 5e-3, 2e-3]])
+RADIUS = np.array([0.02, 0.04, 0.03])
+
+
+def clamped() -> Anatomy:
+    """The base held: every footprint is free."""
+    return hold(MESH, BASE)
+
+
+def rimmed() -> Anatomy:
+    """Part of each footprint is held, part of it slides."""
+    held = np.repeat(BASE[:, None], 3, axis=1)
+    held[TOP & (MESH.nodes[:, 0] > 0.08)] = True
+    slides = TOP & (MESH.nodes[:, 1] < 0.04) & ~held.any(axis=1)
+    return hold(MESH, held, np.where(slides[:, None], [0.0, 0.6, 0.8], 0.0))
+
+
+@pytest.mark.parametrize("body", [clamped, rimmed])
+def test_a_tool_moves_the_mean_of_its_footprint(body) -> None:
+    found = solve(body(), [Held(), Slide(), ToolDisplacement()], Displaced(POINT, MOTION, RADIUS))
+    weight = footprint_weights(MESH.nodes, MESH.surface, POINT, RADIUS).toarray()
+    mean = np.einsum("bv,bvi->bi", weight, found.displacement)
+    np.testing.assert_allclose(mean, MOTION, atol=1e-9 * np.abs(MOTION).max())
+
+
+@pytest.mark.parametrize("body", [clamped, rimmed])
+def test_pushing_with_the_reaction_is_the_same(body) -> None:
+    """The two kinds of tool are dual: a displacement gives a force that gives the displacement."""
+    moved = solve(body(), [Held(), Slide(), ToolDisplacement()], Displaced(POINT, MOTION, RADIUS))
+    assert moved.reaction.shape == (3, 1, 6)
+    force = moved.reaction[:, 0, :3]
+    assert (np.einsum("bi,bi->b", force, MOTION) > 0.0).all()
+    pushed = solve(body(), [Held(), Slide(), ToolForce()], Pushed(POINT, force, RADIUS))
+    scale = np.abs(moved.displacement).max()
+    np.testing.assert_allclose(pushed.displacement, moved.displacement, atol=1e-7 * scale)
+    np.testing.assert_allclose(pushed.reaction, moved.reaction, atol=1e-9)
+
+
+def test_reaction_carries_the_moment_about_the_tool_point() -> None:
+    force = np.array([[0.1, 0.2, -0.3]])
+    found = solve(clamped(), [Held(), ToolForce()], Pushed(POINT[:1], force, RADIUS[:1]))
+    weight = footprint_weights(MESH.nodes, MESH.surface, POINT[:1], RADIUS[:1]).toarray()[0]
+    moment = (weight[:, None] * np.cross(MESH.nodes - POINT[0], force[0])).sum(axis=0)
+    np.testing.assert_allclose(found.reaction[0, 0], [*force[0], *moment], atol=1e-15)
+
+
+def test_a_footprint_that_is_held_cannot_be_moved() -> None:
+    fem = Fem(hold(MESH, BASE | TOP), [SOFT, Held(), ToolDisplacement()], TIGHT, "cpu")
+    with pytest.raises(InputError, match="held"):
+        fem.deform(Loads((Displaced(POINT[:1], MOTION[:1], RADIUS[:1]),)))
+
+
+def test_a_footprint_that_only_slides_cannot_be_moved_off_its_plane() -> None:
+    anatomy = hold(MESH, BASE, np.where(TOP[:, None], [0.0, 0.0, 1.0], 0.0))
+    fem = Fem(anatomy, [SOFT, Held(), Slide(), ToolDisplacement()], TIGHT, "cpu")
+    with pytest.raises(InputError, match="held"):
+        fem.deform(Loads((Displaced(POINT[:1], MOTION[:1], RADIUS[:1]),)))
+
+
+@pytest.mark.parametrize(
+    ("held", "sentence"),
+    [
+        (np.zeros(COUNT, bool), "6 of 6"),
+        (np.arange(COUNT) == 5, "3 of 6"),
+        (np.isin(np.arange(COUNT), np.flatnonzero(BASE & (MESH.nodes[:, 1] < 1e-9))), "1 of 6"),
+    ],
+)
+def test_a_body_that_can_move_rigidly_is_refused(held: np.ndarray, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Fem(hold(MESH, held), [SOFT, Held(), NodalForce()], TIGHT, "cpu")
+
+
+def test_six_components_are_enough_to_hold_a_body() -> None:
+    """Statically determinate: forces in balance deform it, and the six reactions vanish."""
+    a, b, c = (int(np.argmin(np.linalg.norm(MESH.nodes - p, axis=1))) for p in ([0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]))
+    held = np.zeros((COUNT, 3), bool)
+    held[a] = True
+    held[b, 1:] = True
+    held[c, 2] = True
+    force = np.zeros((1, COUNT, 3))
+    force[0, TOP, 2], force[0, BASE, 2] = 0.3 / TOP.sum(), -0.3 / BASE.sum()
+    anatomy = hold(MESH, held)
+    fem = Fem(anatomy, [SOFT, Held(), NodalForce()], TIGHT, "cpu")
+    found = fem.deform(Loads((Nodal(force),)))
+    assert found.outcome[0].good
+    assert found.displacement[0, TOP, 2].mean() > 1e-4
