@@ -81,8 +81,9 @@ def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
         np.einsum("si,si->s", one, other) for one, other in ((first, first), (first, second), (second, second))
     )
     pa, pb = np.einsum("si,si->s", offset, first), np.einsum("si,si->s", offset, second)
-    v, w = (bb * pa - ab * pb) / (aa * bb - ab * ab), (aa * pb - ab * pa) / (aa * bb - ab * ab)
-    foot = a + v[:, None] * first + w[:, None] * second
+    with np.errstate(divide="ignore", invalid="ignore"):  # a needle has no foot to round-off: its edges serve
+        v, w = (bb * pa - ab * pb) / (aa * bb - ab * ab), (aa * pb - ab * pa) / (aa * bb - ab * ab)
+        foot = a + v[:, None] * first + w[:, None] * second
     inside = (v >= 0.0) & (w >= 0.0) & (v + w <= 1.0)
     candidates = []
     for start, end in ((a, b), (b, c), (c, a)):

@@ -1,0 +1,134 @@
+"""A round tool on a triangulated surface: force, moment and moments of the traction do not depend on the mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from boxes import box
+from scipy.spatial import Delaunay
+
+from sim.errors import InputError
+from sim.footprint import footprint_weights, nearest_on
+
+RADIUS, POINT = 0.012, np.array([0.003, -0.002, 0.0])
+
+
+def sheet(count: int, seed: int = 0, half: float = 0.03) -> tuple[np.ndarray, np.ndarray]:
+    """A flat square at z = 0 of scattered points: nodes (V, 3) [m], triangles (S, 3)."""
+    rng = np.random.default_rng(seed)
+    side = np.linspace(-half, half, 8)
+    frame = [(x, y) for x in side for y in (-half, half)] + [(x, y) for x in (-half, half) for y in side[1:-1]]
+    plane = np.concatenate([np.array(frame), rng.uniform(-half, half, (count, 2))])
+    return np.column_stack([plane, np.zeros(len(plane))]), Delaunay(plane).simplices
+
+
+def weights(nodes: np.ndarray, triangles: np.ndarray, point: np.ndarray = POINT, radius: float = RADIUS) -> np.ndarray:
+    return footprint_weights(nodes, triangles, point[None], np.array([radius])).toarray()[0]
+
+
+@pytest.mark.parametrize("radius", [0.0005, 0.005, RADIUS, 0.02, 0.5])
+def test_the_whole_force_arrives(radius: float) -> None:
+    weight = weights(*sheet(200), radius=radius)
+    assert weight.sum() == pytest.approx(1.0, abs=1e-14)
+    assert weight.min() >= 0.0
+
+
+@pytest.mark.parametrize("count", [0, 30, 300, 3000])
+def test_the_centroid_is_the_tool_point_on_any_mesh(count: int) -> None:
+    """Linear functions are integrated exactly by linear elements: no moment about the tool's point."""
+    nodes, triangles = sheet(count)
+    np.testing.assert_allclose(weights(nodes, triangles) @ nodes, POINT, atol=2e-3 * RADIUS)
+
+
+def test_the_second_moment_is_that_of_the_traction() -> None:
+    """Integral of w x^2 over integral of w is r^2 / 5 for w = sqrt(1 - s^2); interpolation on fine meshes adds h^2."""
+    nodes, triangles = sheet(20000)
+    second = weights(nodes, triangles) @ (nodes - POINT)[:, 0] ** 2
+    assert second == pytest.approx(RADIUS**2 / 5.0, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("function", "bound"),
+    [
+        (lambda x: 3.0 * x[:, 0] - 2.0 * x[:, 1] + 0.01, 2e-3 * 3.6 * RADIUS),
+        (lambda x: x[:, 0] * x[:, 1] / RADIUS, 0.04 * RADIUS),
+        (lambda x: np.sin(x[:, 0] / RADIUS) * RADIUS, 0.02 * RADIUS),
+    ],
+    ids=["linear", "quadratic", "sine"],
+)
+def test_two_meshes_of_one_surface_agree(function: Callable[[np.ndarray], np.ndarray], bound: float) -> None:
+    answers = [float(weights(*mesh) @ function(mesh[0])) for mesh in (sheet(1500, 1), sheet(2500, 2))]
+    assert abs(answers[0] - answers[1]) < bound
+
+
+def test_a_small_tool_on_large_triangles() -> None:
+    """0.5 mm on triangles of 10 mm: three corners share the force as the point's barycentric coordinates."""
+    nodes = 0.01 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]])
+    weight = weights(nodes, np.array([[0, 1, 2], [1, 3, 2]]), np.array([0.003, 0.002, 0.0]), 0.0005)
+    np.testing.assert_allclose(weight, [0.5, 0.3, 0.2, 0.0], atol=2e-3)
+
+
+def test_the_edge_of_the_surface_cuts_the_footprint() -> None:
+    """Half of the disc lies outside: the force stays, and moves inwards by the half disc's centroid."""
+    nodes, triangles = sheet(6000)
+    at = np.array([0.03, 0.0, 0.0])
+    inward = at[0] - (weights(nodes, triangles, at) @ nodes)[0]
+    # Integral of x w over the half disc / integral of w: (pi/8 r^3) / (pi/3 r^2).
+    assert inward == pytest.approx(3.0 / 8.0 * RADIUS, rel=0.01)
+
+
+def test_a_point_beside_the_surface_is_moved_to_it() -> None:
+    nodes, triangles = sheet(300)
+    above = POINT + [0.0, 0.0, 0.9 * RADIUS]
+    np.testing.assert_allclose(weights(nodes, triangles, above), weights(nodes, triangles), atol=1e-15)
+
+
+@pytest.mark.parametrize("offset", [[0.0, 0.0, 1.1 * RADIUS], [0.1, 0.0, 0.0], [10.0, 0.0, 0.0]])
+def test_a_point_off_the_surface_is_refused(offset: list[float]) -> None:
+    nodes, triangles = sheet(300)
+    points = np.stack([POINT, POINT + offset])
+    with pytest.raises(InputError, match=r"load 1 .*does not touch the surface"):
+        footprint_weights(nodes, triangles, points, np.full(2, RADIUS))
+
+
+def test_only_nodes_near_the_tool_are_loaded() -> None:
+    nodes, triangles = sheet(3000)
+    weight = weights(nodes, triangles)
+    edges = nodes[triangles] - np.roll(nodes[triangles], 1, axis=1)
+    longest = np.linalg.norm(edges, axis=2).max()
+    distance = np.linalg.norm(nodes - POINT, axis=1)
+    assert not weight[distance > RADIUS + longest].any()
+    assert (weight[distance < 0.8 * RADIUS] > 0.0).all()
+
+
+def test_rows_do_not_depend_on_each_other() -> None:
+    mesh = box((3, 3, 3), 0.06)
+    points = np.array([[0.03, 0.03, 0.06], [0.0, 0.02, 0.03], [0.06, 0.06, 0.06]])
+    radii = np.array([0.01, 0.02, 0.015])
+    together = footprint_weights(mesh.nodes, mesh.surface, points, radii).toarray()
+    for row in range(3):
+        alone = footprint_weights(mesh.nodes, mesh.surface, points[[row]], radii[[row]]).toarray()[0]
+        np.testing.assert_array_equal(alone, together[row])
+
+
+def test_no_rows() -> None:
+    nodes, triangles = sheet(30)
+    assert footprint_weights(nodes, triangles, np.zeros((0, 3)), np.zeros(0)).shape == (0, len(nodes))
+
+
+@pytest.mark.parametrize("aspect", [1.0, 1e-3, 1e-6, 1e-10])
+def test_nearest_point_against_a_search(aspect: float) -> None:
+    """Triangles of every shape, needles too: no sampled point of any is nearer."""
+    rng = np.random.default_rng(5)
+    corners = rng.normal(size=(20, 3, 3))
+    corners[:, 2] = (corners[:, 0] + corners[:, 1]) / 2.0 + aspect * (corners[:, 2] - corners[:, 0])
+    share = rng.dirichlet([0.5, 0.5, 0.5], 4000)
+    samples = np.einsum("qc,sci->sqi", share, corners).reshape(-1, 3)
+    for point in rng.normal(size=(30, 3)):
+        found = nearest_on(corners, point)
+        best = np.linalg.norm(samples - point, axis=1).min()
+        length = np.linalg.norm(found - point)
+        assert length <= best + 1e-9
+        assert np.linalg.norm(samples - found, axis=1).min() < 0.15  # and it lies on one of them
