@@ -84,7 +84,7 @@ def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):  # a needle has no foot to round-off: its edges serve
         v, w = (bb * pa - ab * pb) / (aa * bb - ab * ab), (aa * pb - ab * pa) / (aa * bb - ab * ab)
         foot = a + v[:, None] * first + w[:, None] * second
-    inside = (v >= 0.0) & (w >= 0.0) & (v + w <= 1.0)
+        inside = (v >= 0.0) & (w >= 0.0) & (v + w <= 1.0)
     candidates = []
     for start, end in ((a, b), (b, c), (c, a)):
         edge = end - start

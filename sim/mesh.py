@@ -86,9 +86,9 @@ class TetMesh:
     region: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, np.float64))
-        object.__setattr__(self, "tets", np.ascontiguousarray(self.tets, np.int32))
-        object.__setattr__(self, "region", np.ascontiguousarray(self.region, np.int32))
+        object.__setattr__(self, "nodes", np.array(self.nodes, np.float64, order="C"))
+        object.__setattr__(self, "tets", np.array(self.tets, np.int32, order="C"))
+        object.__setattr__(self, "region", np.array(self.region, np.int32, order="C"))
         _check_shapes(self)
         longest = np.linalg.norm(
             self.nodes[self.tets[:, EDGES[:, 0]]] - self.nodes[self.tets[:, EDGES[:, 1]]], axis=2
