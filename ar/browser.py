@@ -1,0 +1,224 @@
+"""The page: the camera picture, a 3-D view beside it, playback, controls and a report; the only file that knows viser.
+
+The overlay is composited into the picture before it comes here, and the picture is shown whole, as an image of its own:
+no window shape and no client can bring the two out of register. The 3-D view follows by sending vertices alone.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+
+# A client that decodes more slowly than pictures arrive shows none at all.
+PICTURES_PER_SECOND = 15.0
+# Width of the panel with the picture [CSS pixel]: at most, at least, and as a share of the window.
+PANEL = (676, 320, 0.56)
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A surface in the 3-D view: vertices (V, 3) [m], triangles (F, 3), colour (3,) sRGB in [0, 1].
+
+    The browser makes normals anew for each update: some 5,000 vertices for all bodies together stay fluent.
+    """
+
+    name: str
+    vertices: np.ndarray
+    triangles: np.ndarray
+    colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    opacity: float = 1.0
+    wireframe: bool = False
+
+
+@dataclass(frozen=True)
+class Slider:
+    """A number that a visitor sets; `changed` takes it, on a thread of the page, and must return at once."""
+
+    label: str
+    low: float
+    high: float
+    step: float
+    start: float
+    changed: Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of several names; `changed` takes it, on a thread of the page, and must return at once."""
+
+    label: str
+    options: tuple[str, ...]
+    start: str
+    changed: Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Playback:
+    """Play, pause and scrub over frames 0 .. frames - 1: `played` takes whether it plays, `sought` a frame number."""
+
+    frames: int
+    played: Callable[[bool], None]
+    sought: Callable[[int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """Where the 3-D view starts: eye, target and up direction, (3,) [m]."""
+
+    eye: np.ndarray
+    target: np.ndarray
+    up: np.ndarray
+
+
+class Browser:
+    """A screen in the browser, for any number of visitors, who share picture and controls.
+
+    `show`, `move`, `report` and `put` only note what is newest and may be called from any thread at any rate; a
+    thread of the page sends it on, 15 times a second at most.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        viewpoint: Viewpoint,
+        playback: Playback,
+        controls: Sequence[Slider | Choice] = (),
+        title: str = "sulcus",
+        caption: str = "",
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        size: tuple[int, int] = (640, 480),
+    ) -> None:
+        """Start the server; where `port` is taken, the next free one serves, see `address`.
+
+        `caption` is Markdown under the picture, `size` the picture's width and height [pixel] until the first arrives.
+        """
+        self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        self.dress(title, viewpoint)
+        gui = self.server.gui
+        blank = np.full((size[1], size[0], 3), 24, np.uint8)
+        self.picture = gui.add_image(blank, format="jpeg", jpeg_quality=88)
+        self.add_playback(playback)
+        self.inputs = {control.label: self.add_control(control) for control in controls}
+        self.text = gui.add_markdown("")
+        gui.add_markdown(caption)
+        self.meshes = {body.name: self.add_body(body) for body in bodies}
+        self.newest: dict[str, Callable[[], None]] = {}
+        self.lock = threading.Lock()
+        self.closed = threading.Event()
+        self.sender = threading.Thread(target=self.send, name="page", daemon=True)
+        self.sender.start()
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        return f"http://localhost:{self.server.get_port()}"
+
+    @property
+    def visitors(self) -> int:
+        """How many browsers look at the page now."""
+        return len(self.server.get_clients())
+
+    def show(self, number: int, colour: np.ndarray) -> None:
+        """Show the picture (H, W, 3) uint8 of frame `number`, and put the playback slider there."""
+
+        def send() -> None:
+            self.picture.image = colour
+            self.frame.value = number
+
+        self.note("picture", send)
+
+    def move(self, name: str, vertices: np.ndarray) -> None:
+        """Put the vertices (V, 3) [m] of a body in the 3-D view elsewhere."""
+        mesh = self.meshes[name]
+        self.note(f"body {name}", lambda: setattr(mesh, "vertices", np.asarray(vertices, np.float32)))
+
+    def report(self, markdown: str) -> None:
+        """Show Markdown text under the controls."""
+        self.note("report", lambda: setattr(self.text, "content", markdown))
+
+    def put(self, label: str, value: float | str) -> None:
+        """Set a control without calling its `changed`, as when a script moves the tool."""
+        self.note(f"control {label}", lambda: setattr(self.inputs[label], "value", value))
+
+    def close(self) -> None:
+        """Stop the page."""
+        self.closed.set()
+        self.sender.join()
+        self.server.stop()
+
+    def note(self, key: str, send: Callable[[], None]) -> None:
+        """Keep the newest thing to send of each kind."""
+        with self.lock:
+            self.newest[key] = send
+
+    def send(self) -> None:
+        """Send what is newest until the page is closed; all that came together arrives together."""
+        while not self.closed.wait(1.0 / PICTURES_PER_SECOND):
+            with self.lock:
+                newest, self.newest = self.newest, {}
+            with self.server.atomic():
+                for send in newest.values():
+                    send()
+
+    def dress(self, title: str, viewpoint: Viewpoint) -> None:
+        """Colours, light, the panel's place and the first view of the 3-D scene."""
+        gui, scene = self.server.gui, self.server.scene
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
+        gui.set_panel_label(title)
+        gui.main_panel.dock_left()
+        scene.configure_default_lights(cast_shadow=False)
+        start = self.server.initial_camera
+        start.position, start.look_at = tuple(viewpoint.eye), tuple(viewpoint.target)
+        start.up = tuple(viewpoint.up)
+
+        @self.server.on_client_connect
+        def fit(client: viser.ClientHandle) -> None:
+            most, least, share = PANEL
+            client.gui.main_panel.set_width(float(np.clip(share * client.camera.image_width, least, most)))
+
+    def add_playback(self, playback: Playback) -> None:
+        """A button that plays and pauses, and a slider over the frames."""
+        gui = self.server.gui
+        button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+        self.frame = gui.add_slider("frame", 0, max(playback.frames - 1, 1), 1, 0)
+
+        @button.on_click
+        def toggle(_: viser.GuiEvent) -> None:
+            plays = button.label == "Play"
+            button.label = "Pause" if plays else "Play"
+            button.icon = viser.Icon.PLAYER_PAUSE if plays else viser.Icon.PLAYER_PLAY
+            playback.played(plays)
+
+        @self.frame.on_update
+        def seek(event: viser.GuiEvent) -> None:
+            # The page's own updates come through here too, without a client.
+            if event.client is not None:
+                playback.sought(int(self.frame.value))
+
+    def add_control(self, control: Slider | Choice) -> viser.GuiInputHandle:
+        """A slider or a list."""
+        gui = self.server.gui
+        if isinstance(control, Slider):
+            slider = gui.add_slider(control.label, control.low, control.high, control.step, control.start)
+            slider.on_update(lambda event: control.changed(slider.value) if event.client is not None else None)
+            return slider
+        menu = gui.add_dropdown(control.label, control.options, initial_value=control.start)
+        menu.on_update(lambda event: control.changed(menu.value) if event.client is not None else None)
+        return menu
+
+    def add_body(self, body: Body) -> viser.MeshHandle:
+        """A surface in the 3-D view, seen from both sides."""
+        return self.server.scene.add_mesh_simple(
+            f"/{body.name}",
+            np.asarray(body.vertices, np.float32),
+            np.asarray(body.triangles, np.uint32),
+            color=np.asarray(body.colour, np.float64),
+            opacity=None if body.opacity >= 1.0 else body.opacity,
+            wireframe=body.wireframe,
+            side="double",
+        )
