@@ -1,0 +1,81 @@
+"""Scripted tool motion as pure functions of time: what a surgeon's hand does, without a surgeon."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Touch:
+    """What the hand asks for at one moment.
+
+    Parameters
+    ----------
+    x, y
+        Where on the open cortex, in its tangent plane, from its centre [m].
+    force
+        How hard [N]; zero is no contact.
+    tilt
+        Direction of the force against the inward normal, towards x and y [rad].
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    force: float = 0.0
+    tilt: tuple[float, float] = (0.0, 0.0)
+
+
+Path = Callable[[float], Touch]
+"""Time [s] -> Touch."""
+
+
+def smooth(t: float) -> float:
+    """From 0 to 1 while t goes from 0 to 1, at rest at both ends: 6 t^5 - 15 t^4 + 10 t^3, least jerk.
+
+    Flash, Hogan 1985, J. Neurosci. 5:1688-1703.
+    """
+    t = min(max(t, 0.0), 1.0)
+    return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
+
+
+def press(force: float, rise: float = 1.5, hold: float = 1.0, at: tuple[float, float] = (0.0, 0.0)) -> Path:
+    """Press on one place up to `force` [N] within `rise` [s], hold [s], and let go as slowly."""
+
+    def path(time: float) -> Touch:
+        return Touch(*at, force * (smooth(time / rise) - smooth((time - rise - hold) / rise)))
+
+    return path
+
+
+def slide(
+    force: float, start: tuple[float, float], end: tuple[float, float], seconds: float, rise: float = 0.5
+) -> Path:
+    """Press with `force` [N], move from `start` to `end` [m] within `seconds`, and let go."""
+
+    def path(time: float) -> Touch:
+        share = smooth((time - rise) / seconds)
+        x, y = (1.0 - share) * np.array(start) + share * np.array(end)
+        return Touch(float(x), float(y), force * (smooth(time / rise) - smooth((time - rise - seconds) / rise)))
+
+    return path
+
+
+def retract(
+    force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tuple[float, float] = (0.0, 0.0)
+) -> Path:
+    """Lay on, then draw the tissue aside: the force turns by `tilt` [rad] towards x while it rises; hold; let go."""
+
+    def path(time: float) -> Touch:
+        drawn = smooth((time - 0.5 * rise) / rise)
+        let_go = smooth((time - 1.5 * rise - hold) / rise)
+        return Touch(*at, force * (smooth(time / rise) - let_go), (tilt * drawn, 0.0))
+
+    return path
+
+
+def fixed(touch: Touch) -> Path:
+    """The same touch for ever: what a user set by hand."""
+    return lambda time: touch

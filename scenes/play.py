@@ -1,0 +1,146 @@
+"""The loop: a scripted tool, a deformer and a camera make one frame after the other."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import trimesh
+
+from ar.camera import Camera
+from ar.hud import panel
+from ar.overlay import Gauge, Style, composite
+from ar.view import Picture, render
+from sim.deformation import Deformation, Deformer
+from sim.loads import Loads
+
+from .paths import Path, Touch
+from .scene import Scene
+from .site import Site
+from .stage import TOOL, Stage
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One moment of a scene.
+
+    Parameters
+    ----------
+    number, time
+        From 0; [s].
+    touch, loads
+        What the hand asked for, and what that does to the tissue.
+    deformation
+        The deformer's answer.
+    camera
+        The camera that the picture was drawn with.
+    pose, tip
+        T_world_tool (4, 4), and where the tool touches (3,) [m].
+    picture
+        What the camera sees, without overlay.
+    shown
+        The picture with the predicted tumour in it (H, W, 3) uint8.
+    distance
+        From the tool's tip to the tumour's predicted surface [m].
+    seconds
+        Wall time by stage.
+    """
+
+    number: int
+    time: float
+    touch: Touch
+    loads: Loads
+    deformation: Deformation
+    camera: Camera
+    pose: np.ndarray
+    tip: np.ndarray
+    picture: Picture
+    shown: np.ndarray
+    distance: float
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Player:
+    """A scene on a stage with one deformer. `draw` is a pure function of time, touch and the previous answer."""
+
+    stage: Stage
+    deformer: Deformer
+    style: Style = "window"
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that is played."""
+        return self.stage.scene
+
+    @property
+    def site(self) -> Site:
+        """The open cortex that it is played on."""
+        return self.stage.site
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The scene's camera."""
+        return self.scene.viewpoint.camera(self.site)
+
+    @cached_property
+    def _warm(self) -> bool:
+        """Whether this deformer can start from its last answer: it answers at every vertex."""
+        return not hasattr(self.deformer, "nodes")
+
+    def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
+        """The frame of a touch at a time [s]; `last` warms the deformer up."""
+        begun = clock.perf_counter()
+        loads = self.scene.loads(self.site, touch, time)
+        known = None if self._warm else self.stage.nodes
+        deformation = self.deformer.deform(loads, start=last if self._warm else None, at=known)
+        solved = clock.perf_counter()
+        positions = self.positions(deformation)
+        tip, pose = self.tool(touch, positions)
+        picture = render(self.camera, self.stage.layers(positions, pose), self.stage.lamp)
+        rendered = clock.perf_counter()
+        tumour = self.stage.tumour(positions)
+        surface = trimesh.Trimesh(tumour.vertices, tumour.triangles, process=False)
+        nearest = trimesh.proximity.closest_point_naive(surface, tip[None])[0][0]
+        gauge = Gauge(tip, nearest)
+        margin = getattr(self.deformer, "bound", 0.0)
+        over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin=margin, gauge=gauge)
+        return Frame(
+            number, time, touch, loads, deformation, self.camera, pose, tip, picture, over.colour, gauge.distance,
+            {"deform": solved - begun, "render": rendered - solved, "overlay": clock.perf_counter() - rendered},
+        )  # fmt: skip
+
+    def frames(self, path: Path | None = None) -> Iterator[Frame]:
+        """Every frame of the scene, or of another path through it."""
+        path = self.scene.path if path is None else path
+        last = None
+        for number, time in enumerate(self.scene.times):
+            frame = self.draw(number, float(time), path(float(time)), last)
+            last = frame.deformation
+            yield frame
+
+    def positions(self, deformation: Deformation) -> np.ndarray:
+        """Where all mesh vertices are (V, 3) [m]; those that the deformer does not know stay at rest."""
+        positions = self.site.anatomy.mesh.nodes.copy()
+        positions[deformation.nodes] += deformation.displacement[0]
+        return positions
+
+    def tool(self, touch: Touch, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Tip (3,) [m] and pose T_world_tool (4, 4): resting on the deformed surface, lifted off where it is idle."""
+        contact = self.site.contact(touch.x, touch.y)
+        inward = self.site.direction(replace(touch, tilt=(0.0, 0.0)))
+        lift = 4e-3 * max(0.0, 1.0 - touch.force / 0.02)
+        tip = contact.carried(positions) - lift * inward
+        return tip, self.scene.tool.pose(tip, inward, self.site.right)
+
+
+def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:
+    """The shown picture (H, W, 3) with a panel: deformer, milliseconds by stage, force, and error [m] if known."""
+    stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
+    lines = [f"{name}   {frame.touch.force:.2f} N   t {frame.time:.2f} s", f"ms: {stages}"]
+    if error is not None:
+        lines.append(f"error against FEM: {1e3 * error:.3f} mm (frame {frame.number})")
+    return panel(frame.shown, lines)

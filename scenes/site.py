@@ -1,0 +1,87 @@
+"""The open cortex as a place to work at: a frame on it, and material points of its surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import trimesh
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+
+from .paths import Touch
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """A material point of the surface: point (3,) [m] at rest, its triangle's vertices (3,) and weights (3,)."""
+
+    point: np.ndarray
+    vertices: np.ndarray
+    weights: np.ndarray
+
+    def carried(self, positions: np.ndarray) -> np.ndarray:
+        """Where it is (3,) when the mesh's vertices are at positions (V, 3) [m]."""
+        return self.weights @ positions[self.vertices]
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """Frame of the open cortex.
+
+    origin (3,) [m], on the surface; axis (3,), the mean inward normal; right and up (3,) span the tangent plane.
+    """
+
+    anatomy: Anatomy
+    origin: np.ndarray
+    axis: np.ndarray
+    right: np.ndarray
+    up: np.ndarray
+
+    @cached_property
+    def _surface(self) -> trimesh.Trimesh:
+        return trimesh.Trimesh(self.anatomy.mesh.nodes, self.anatomy.open_surface, process=False)
+
+    @cached_property
+    def radius(self) -> float:
+        """Radius of the circle of the open cortex's area [m]."""
+        return float(np.sqrt(self._surface.area / np.pi))
+
+    def contact(self, x: float, y: float) -> Contact:
+        """The material point of the open cortex nearest to the place (x, y) [m] of its tangent plane."""
+        asked = self.origin + x * self.right + y * self.up
+        point, _, triangle = trimesh.proximity.closest_point_naive(self._surface, asked[None])
+        weights = trimesh.triangles.points_to_barycentric(self._surface.triangles[triangle], point)
+        return Contact(point[0], self.anatomy.open_surface[triangle[0]], weights[0])
+
+    def direction(self, touch: Touch) -> np.ndarray:
+        """Unit direction (3,) of a touch's force: inwards, tilted."""
+        along = self.axis + np.tan(touch.tilt[0]) * self.right + np.tan(touch.tilt[1]) * self.up
+        return along / np.linalg.norm(along)
+
+
+def site_of(anatomy: Anatomy) -> Site:
+    """The frame of an anatomy's open cortex; `up` is as superior as the surface allows.
+
+    Raises
+    ------
+    InputError
+        An anatomy without open cortex.
+    """
+    triangles = anatomy.open_surface
+    if len(triangles) == 0:
+        raise InputError("this anatomy has no open cortex: make one with `sulcus anatomy --craniotomy 50`.")
+    a, b, c = (anatomy.mesh.nodes[triangles[:, corner]] for corner in range(3))
+    area = 0.5 * np.cross(b - a, c - a)
+    axis = -area.sum(axis=0) / np.linalg.norm(area.sum(axis=0))
+    size = np.linalg.norm(area, axis=1)
+    middle = (size @ (a + b + c)) / (3.0 * size.sum())
+    surface = trimesh.Trimesh(anatomy.mesh.nodes, triangles, process=False)
+    origin = trimesh.proximity.closest_point_naive(surface, middle[None])[0][0]
+    # Superior, or anterior where the craniotomy looks straight up.
+    reference = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(axis, reference)
+    right /= np.linalg.norm(right)
+    return Site(anatomy, origin, axis, right, np.cross(right, axis))

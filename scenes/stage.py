@@ -1,0 +1,140 @@
+"""What the camera sees of an anatomy: open cortex, drape with a hole, tool; and the tumour that lies beneath."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ar.layer import Layer, Solid, vertex_normals
+from ar.view import Lamp, lamp_beside
+from sim.intensity import Intensity
+
+from .scene import Scene
+from .site import Site
+
+CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
+"""Segmentation ids."""
+NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", TUMOUR: "tumour (seen through)"}
+
+CORTEX_COLOUR = (0.86, 0.60, 0.54)
+DRAPE_COLOUR = (0.16, 0.36, 0.42)
+TOOL_COLOUR = (0.78, 0.80, 0.83)
+TUMOUR_COLOUR = (0.30, 0.95, 0.55)
+# Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
+READ_BELOW = 2.0e-3
+DRAPE_HEIGHT, DRAPE_DEPTH = 3.0e-3, 8.0e-3
+# Radius of the drape's hole over that of the open cortex: its rim hides the mesh's ragged border.
+HOLE = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """The drawn parts of a scene; positions are those of all mesh vertices (V, 3) [m]."""
+
+    scene: Scene
+    site: Site
+    intensity: Intensity | None = None
+
+    @cached_property
+    def nodes(self) -> np.ndarray:
+        """Sorted mesh vertices (n,) whose motion is drawn: open cortex and tumour."""
+        anatomy = self.site.anatomy
+        return np.union1d(np.unique(anatomy.open_surface), anatomy.tumour_nodes)
+
+    @cached_property
+    def lamp(self) -> Lamp:
+        """A lamp over the surgeon's shoulder."""
+        camera = self.scene.viewpoint.camera(self.site)
+        return lamp_beside(camera, self.site.origin, radius=1.6 * self.site.radius)
+
+    def layers(self, positions: np.ndarray, pose: np.ndarray) -> list[Layer]:
+        """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4)."""
+        vertices, triangles, rest, solid = self._cortex
+        cortex = Layer(
+            "cortex", CORTEX, positions[vertices], triangles, CORTEX_COLOUR, gloss=0.5, solid=solid,
+            rest=rest if solid is not None else None,
+        )  # fmt: skip
+        tool = self.scene.tool.mesh
+        at = np.asarray(tool.vertices) @ pose[:3, :3].T + pose[:3, 3]
+        probe = Layer("tool", TOOL, at, tool.faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
+        return [cortex, self._drape, probe]
+
+    def tumour(self, positions: np.ndarray) -> Layer:
+        """The tumour's surface at `positions` (V, 3) [m]."""
+        vertices, triangles = self._tumour
+        return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
+
+    @cached_property
+    def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
+        vertices, triangles = np.unique(self.site.anatomy.tumour_surface, return_inverse=True)
+        return vertices, triangles.reshape(-1, 3)
+
+    @cached_property
+    def _cortex(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Solid | None]:
+        """Mesh vertices, triangles, the points where the scan is read, and the scan as a solid texture."""
+        anatomy = self.site.anatomy
+        vertices, triangles = np.unique(anatomy.open_surface, return_inverse=True)
+        triangles = triangles.reshape(-1, 3)
+        at = anatomy.mesh.nodes[vertices]
+        rest = at - READ_BELOW * vertex_normals(at, triangles)
+        if self.intensity is None:
+            return vertices, triangles, rest, None
+        values = self.intensity.values.astype(np.float32) / 255.0
+        solid = Solid(values, np.linalg.inv(self.intensity.affine), dark=(0.34, 0.10, 0.10), relief=1.5e-3)
+        return vertices, triangles, rest, solid
+
+    @cached_property
+    def _drape(self) -> Layer:
+        """The surface lifted off the brain, with a round hole over the open cortex, and a wall round the hole."""
+        mesh, site = self.site.anatomy.mesh, self.site
+        normals = vertex_normals(mesh.nodes, mesh.surface)
+        lifted = mesh.nodes + DRAPE_HEIGHT * normals
+        # How far a place lies outside the hole: across the axis on the near side, everywhere on the far side.
+        arm = mesh.nodes - site.origin
+        across = np.linalg.norm(arm - np.outer(arm @ site.axis, site.axis), axis=1)
+        far = arm @ site.axis > 2.0 * site.radius
+        outside = np.where(far, site.radius, across - HOLE * site.radius)
+        points, triangles, rim = clipped(lifted, mesh.surface, outside)
+        low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis
+        number = len(points) + np.arange(2 * len(rim)).reshape(-1, 2)
+        wall = np.concatenate(
+            [np.column_stack([rim, number[:, 1]]), np.column_stack([rim[:, 0], number[:, 1], number[:, 0]])]
+        )
+        return Layer(
+            "drape", DRAPE, np.concatenate([points, low.reshape(-1, 3)]), np.concatenate([triangles, wall]),
+            DRAPE_COLOUR, gloss=0.05,
+        )  # fmt: skip
+
+
+def clipped(points: np.ndarray, triangles: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The part of a surface where a linear field is positive: points (n, 3), triangles (m, 3), cut edges (k, 2).
+
+    points (V, 3), triangles (F, 3), value (V,). Triangles that the zero line crosses are cut along it.
+    """
+    positive = value[triangles] > 0.0
+    whole = triangles[positive.all(axis=1)]
+    mixed = triangles[positive.any(axis=1) & ~positive.all(axis=1)]
+    added, pieces, rim = [], [], []
+    for corners in mixed:
+        inside = value[corners] > 0.0
+        # Turn the triangle so that the lone corner comes first.
+        lone = int(np.argmax(inside) if inside.sum() == 1 else np.argmin(inside))
+        a, b, c = np.roll(corners, -lone)
+        cuts = []
+        for other in (b, c):
+            share = value[a] / (value[a] - value[other])
+            cuts.append(len(points) + len(added))
+            added.append((1.0 - share) * points[a] + share * points[other])
+        if value[a] > 0.0:
+            pieces.append([[a, cuts[0], cuts[1]]])
+        else:
+            pieces.append([[cuts[0], b, c], [cuts[0], c, cuts[1]]])
+        rim.append(cuts)
+    parts = [whole, *(np.array(piece) for piece in pieces)]
+    return (
+        np.concatenate([points, *(point[None] for point in added)]),
+        np.concatenate(parts),
+        np.array(rim).reshape(-1, 2),
+    )

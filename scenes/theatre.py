@@ -1,0 +1,84 @@
+"""Who can play: an anatomy with its scan, and the deformers that know it, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files
+from pathlib import Path
+
+from sim.anatomy import Anatomy
+from sim.deformation import Deformer
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.intensity import Intensity, read_intensity, sidecar
+from sim.meshfile import read_anatomy
+
+from .scene import Scene
+from .site import Site, site_of
+
+
+@dataclass(frozen=True, eq=False)
+class Theatre:
+    """An anatomy, its T1 scan if there is one, and learnt models by name."""
+
+    anatomy: Anatomy
+    intensity: Intensity | None
+    models: Mapping[str, Deformer]
+    device: str = "auto"
+
+    @cached_property
+    def site(self) -> Site:
+        """The open cortex."""
+        return site_of(self.anatomy)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every deformer that can be asked for: the learnt ones, then the finite elements."""
+        return (*self.models, "fem")
+
+    def deformer(self, name: str, scene: Scene) -> Deformer:
+        """A deformer by name; "fem" is made for the scene's effects and accuracy.
+
+        Raises
+        ------
+        InputError
+            A name that this theatre does not know.
+        """
+        if name == "fem":
+            return Fem(self.anatomy, scene.effects, scene.accuracy, self.device)
+        if name not in self.models:
+            raise InputError(
+                f"no deformer is called {name!r} here: choose one of {', '.join(self.names)}; "
+                "`sulcus train` makes the learnt ones."
+            )
+        return self.models[name]
+
+
+def template_path() -> Path:
+    """The anatomy that ships with the package."""
+    return Path(str(files("scenes"))) / "data" / "template.vtu"
+
+
+def model_path(anatomy: Path) -> Path:
+    """Where the models of an anatomy file are looked for: MESH.model.npz beside MESH.vtu."""
+    return anatomy.with_suffix(".model.npz")
+
+
+def open_theatre(anatomy: Path | None = None, model: Path | None = None, device: str = "auto") -> Theatre:
+    """Read an anatomy (default: the template that ships) with the scan and the models that lie beside it.
+
+    Raises
+    ------
+    InputError
+        Files that are missing, unreadable, or do not belong together.
+    """
+    from surrogate.store import load
+
+    path = template_path() if anatomy is None else Path(anatomy)
+    body = read_anatomy(path)
+    scan = sidecar(path)
+    learnt = model_path(path) if model is None else Path(model)
+    models = load(learnt, body) if model is not None or learnt.is_file() else {}
+    return Theatre(body, read_intensity(scan) if scan.is_file() else None, models, device)

@@ -1,0 +1,55 @@
+"""Tools: how one looks, and where it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import trimesh
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A palpation ball on a shaft.
+
+    Parameters
+    ----------
+    radius
+        Of the ball, and of its footprint on the tissue [m].
+    shaft
+        Radius of the shaft [m].
+    length
+        Of the shaft [m].
+    lean
+        Angle between the shaft and the outward normal [rad], away from the line of sight.
+    """
+
+    radius: float = 7e-3
+    shaft: float = 1.8e-3
+    length: float = 0.14
+    lean: float = 0.75
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """Surface in the tool's own frame [m]: lowest point of the ball at the origin, the shaft along +z."""
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=self.radius)
+        ball.apply_translation([0.0, 0.0, self.radius])
+        shaft = trimesh.creation.cylinder(self.shaft, self.length, sections=24)
+        shaft.apply_translation([0.0, 0.0, self.radius + 0.5 * self.length])
+        grip = trimesh.creation.capsule(0.6 * self.length, 2.2 * self.shaft, count=(16, 24))
+        grip.apply_translation([0.0, 0.0, self.radius + 0.55 * self.length])
+        return trimesh.util.concatenate([ball, shaft, grip])
+
+    def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
+        """T_world_tool (4, 4): the ball touches `tip` (3,) [m] from outside; the shaft leans towards `aside` (3,).
+
+        inward, aside: unit vectors (3,). The ball turns about its centre, so contact does not depend on the lean.
+        """
+        centre = tip - self.radius * inward
+        shaft = -np.cos(self.lean) * inward + np.sin(self.lean) * aside
+        across = np.cross(inward, aside)
+        T = np.eye(4)
+        T[:3, :3] = np.column_stack([np.cross(across, shaft), across, shaft])
+        T[:3, 3] = centre - self.radius * shaft
+        return T
