@@ -89,7 +89,9 @@ class TetMesh:
         object.__setattr__(self, "nodes", np.array(self.nodes, np.float64, order="C"))
         object.__setattr__(self, "tets", np.array(self.tets, np.int32, order="C"))
         object.__setattr__(self, "region", np.array(self.region, np.int32, order="C"))
-        _check_shapes(self)
+        _check_corners(self.nodes, self.tets)
+        if self.region.shape != (len(self.tets),):
+            raise InputError(f"region has shape {self.region.shape}: give one label for each of {len(self.tets)} tets.")
         longest = np.linalg.norm(
             self.nodes[self.tets[:, EDGES[:, 0]]] - self.nodes[self.tets[:, EDGES[:, 1]]], axis=2
         ).max(axis=1)
@@ -137,28 +139,31 @@ def digest_of(*arrays: np.ndarray) -> str:
 
 
 def oriented(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, int]:
-    """Tetrahedra with every volume positive, and how many were turned. Zero volumes stay as they are."""
+    """Tetrahedra with every volume positive, and how many were turned. Zero volumes stay as they are.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, non-finite coordinates, node numbers out of range.
+    """
+    _check_corners(nodes, tets)
     negative = signed_volumes(nodes, tets) < 0.0
     turned = np.array(tets)
     turned[negative] = turned[negative][:, [0, 1, 3, 2]]
     return turned, int(negative.sum())
 
 
-def _check_shapes(mesh: TetMesh) -> None:
-    if mesh.nodes.ndim != 2 or mesh.nodes.shape[1] != 3:
-        raise InputError(f"nodes have shape {mesh.nodes.shape}: give (V, 3) coordinates in metres.")
-    if mesh.tets.ndim != 2 or mesh.tets.shape[1] != 4 or len(mesh.tets) == 0:
-        raise InputError(f"tets have shape {mesh.tets.shape}: give (T, 4) node numbers, at least one element.")
-    if mesh.region.shape != (len(mesh.tets),):
-        raise InputError(f"region has shape {mesh.region.shape}: give one label for each of {len(mesh.tets)} tets.")
-    if not np.isfinite(mesh.nodes).all():
-        node = int(np.flatnonzero(~np.isfinite(mesh.nodes).all(axis=1))[0])
-        raise InputError(f"node {node} has the coordinates {mesh.nodes[node]}: every coordinate must be finite.")
-    if mesh.tets.min() < 0 or mesh.tets.max() >= len(mesh.nodes):
-        raise InputError(
-            f"tets name node {mesh.tets.min() if mesh.tets.min() < 0 else mesh.tets.max()}, "
-            f"but the mesh has nodes 0 to {len(mesh.nodes) - 1}."
-        )
+def _check_corners(nodes: np.ndarray, tets: np.ndarray) -> None:
+    if nodes.ndim != 2 or nodes.shape[1] != 3:
+        raise InputError(f"nodes have shape {nodes.shape}: give (V, 3) coordinates in metres.")
+    if tets.ndim != 2 or tets.shape[1] != 4 or len(tets) == 0:
+        raise InputError(f"tets have shape {tets.shape}: give (T, 4) node numbers, at least one element.")
+    if not np.isfinite(nodes).all():
+        node = int(np.flatnonzero(~np.isfinite(nodes).all(axis=1))[0])
+        raise InputError(f"node {node} has the coordinates {nodes[node]}: every coordinate must be finite.")
+    least, most = tets.min(), tets.max()
+    if least < 0 or most >= len(nodes):
+        raise InputError(f"tets name node {min(least, 0) or most}, but the mesh has nodes 0 to {len(nodes) - 1}.")
 
 
 def _warn_of_doubtful(mesh: TetMesh) -> None:

@@ -55,19 +55,21 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
     dropped = sorted({f"{len(block.data)} {block.type}" for block in raw.cells if block.type != "tetra"})
     if dropped:
         notes.append(f"dropped cells that are not tetrahedra: {', '.join(dropped)}")
-    tets, turned = oriented(raw.points, np.concatenate([raw.cells[number].data for number in blocks]))
-    if turned:
-        notes.append(f"turned {turned} tetrahedra of negative orientation")
+    tets = np.concatenate([raw.cells[number].data for number in blocks])
     region = np.zeros(len(tets), np.int32)
     if "region" in raw.cell_data:
         stored = np.concatenate([raw.cell_data["region"][number] for number in blocks])
-        if stored.ndim != 1 or not np.array_equal(stored, np.rint(stored)):
+        with np.errstate(invalid="ignore"):  # what is no number, or too large for one, does not come back
+            region = stored.astype(np.int32)
+        if stored.ndim != 1 or not np.array_equal(stored, region):
             raise InputError(f"{path}: cell data `region` must be one whole number for each tetrahedron.")
-        region = stored.astype(np.int32)
     try:
+        tets, turned = oriented(raw.points, tets)
         mesh = TetMesh(np.asarray(raw.points, np.float64) * UNITS[unit], tets, region)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    if turned:
+        notes.append(f"turned {turned} tetrahedra of negative orientation")
     return MeshFile(mesh, dict(raw.point_data), tuple(notes))
 
 

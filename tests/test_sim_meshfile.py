@@ -1,0 +1,211 @@
+"""Mesh files: several formats in, `.vtu` out, every refusal a sentence, nothing half-written."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from boxes import box, hold
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.mesh import MeshWarning, TetMesh
+from sim.meshfile import check_output, read_anatomy, read_mesh, write_anatomy, write_mesh
+
+BOX = box((2, 2, 2), 0.1, distortion=0.2)
+MESH = TetMesh(BOX.nodes, BOX.tets, np.arange(len(BOX.tets)) % 3)
+
+
+def write(path: Path, **changes: object) -> Path:
+    """A file by meshio, as another program would write it."""
+    fields = {
+        "points": MESH.nodes,
+        "cells": [("tetra", MESH.tets)],
+        "cell_data": {"region": [MESH.region]},
+        "point_data": {},
+    } | changes
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # meshio remarks on what a format cannot hold
+        meshio.Mesh(**fields).write(path)  # pyright: ignore[reportArgumentType]
+    return path
+
+
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    value = np.random.default_rng(0).normal(size=(len(MESH.nodes), 3))
+    write_mesh(tmp_path / "a.vtu", MESH, {"displacement": value})
+    file = read_mesh(tmp_path / "a.vtu")
+    assert file.mesh.digest == MESH.digest
+    np.testing.assert_array_equal(file.point_data["displacement"], value)
+    assert file.notes == ()
+
+
+def test_anatomy_round_trip_is_exact(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    normal = rng.normal(size=(27, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    whole = hold(MESH, rng.random((27, 3)) < 0.3, normal * (rng.random((27, 1)) < 0.5))
+    anatomy = Anatomy(MESH, whole.held, whole.slide_normal, rng.random(27) < 0.5)
+    write_anatomy(tmp_path / "a.vtu", anatomy)
+    assert read_anatomy(tmp_path / "a.vtu").digest == anatomy.digest
+
+
+def test_a_mesh_is_not_an_anatomy(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "a.vtu", MESH, {"held": np.zeros((27, 3))})
+    with pytest.raises(InputError, match="no point data `slide_normal`, `craniotomy`"):
+        read_anatomy(tmp_path / "a.vtu")
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".mesh", ".inp", ".xdmf"])
+def test_formats(tmp_path: Path, suffix: str) -> None:
+    file = read_mesh(write(tmp_path / f"a{suffix}"))
+    np.testing.assert_allclose(file.mesh.nodes, MESH.nodes, atol=1e-12)
+    np.testing.assert_array_equal(file.mesh.tets, MESH.tets)
+
+
+def test_millimetres(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.vtu", points=1e3 * MESH.nodes)
+    np.testing.assert_allclose(read_mesh(path, "mm").mesh.nodes, MESH.nodes, rtol=1e-15)
+    with pytest.warns(MeshWarning, match="--unit mm"):
+        read_mesh(path)
+
+
+def test_no_region_is_one_region(tmp_path: Path) -> None:
+    assert not read_mesh(write(tmp_path / "a.vtu", cell_data={})).mesh.region.any()
+
+
+def test_regions_written_as_whole_floats(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.vtu", cell_data={"region": [MESH.region.astype(float)]})
+    np.testing.assert_array_equal(read_mesh(path).mesh.region, MESH.region)
+
+
+def test_negative_tetrahedra_are_turned_with_a_note(tmp_path: Path) -> None:
+    tets = MESH.tets.copy()
+    tets[:5] = tets[:5][:, [1, 0, 2, 3]]
+    file = read_mesh(write(tmp_path / "a.vtu", cells=[("tetra", tets)]))
+    assert file.notes == ("turned 5 tetrahedra of negative orientation",)
+    assert file.mesh.volumes.min() > 0.0
+
+
+def test_other_cells_are_dropped_with_a_note(tmp_path: Path) -> None:
+    """Regions stay with their tetrahedra, wherever the other cells stand."""
+    cells = [("triangle", MESH.surface), ("tetra", MESH.tets[:20]), ("line", [[0, 1]]), ("tetra", MESH.tets[20:])]
+    region = [np.full(len(MESH.surface), 9), MESH.region[:20], np.array([8]), MESH.region[20:]]
+    file = read_mesh(write(tmp_path / "a.vtu", cells=cells, cell_data={"region": region}))
+    assert file.notes == ("dropped cells that are not tetrahedra: 1 line, 48 triangle",)
+    np.testing.assert_array_equal(file.mesh.tets, MESH.tets)
+    np.testing.assert_array_equal(file.mesh.region, MESH.region)
+
+
+SPLIT = [MESH.tets[:20], MESH.tets[20:]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"cells": [("triangle", MESH.surface)], "cell_data": {}}, "holds triangle, but no linear tetrahedra"),
+        ({"cells": [("tetra10", np.arange(10)[None])], "cell_data": {}}, "holds tetra10, but no linear"),
+        ({"cell_data": {"region": [MESH.region + 0.5]}}, "`region` must be one whole number"),
+        ({"cell_data": {"region": [np.where(MESH.region == 1, np.nan, 1.0)]}}, "`region` must be one whole number"),
+        ({"cell_data": {"region": [np.zeros((48, 3))]}}, "`region` must be one whole number"),
+        ({"cell_data": {"region": [np.full(48, 2**40)]}}, "`region`"),
+        ({"points": np.where(np.arange(81).reshape(27, 3) == 40, np.nan, MESH.nodes)}, "node 13 has the coordinates"),
+        ({"points": np.where(np.arange(81).reshape(27, 3) == 40, np.inf, MESH.nodes)}, "node 13 has the coordinates"),
+        ({"cells": [("tetra", np.where(MESH.tets == 5, 27, MESH.tets))]}, "node 27, but the mesh has nodes 0 to 26"),
+        ({"cells": [("tetra", np.where(MESH.tets == 5, -1, MESH.tets))]}, "node -1"),
+        ({"cells": [("tetra", MESH.tets[:, [0, 1, 2, 2]])]}, "zero or negative"),
+    ],
+)
+def test_bad_files_are_refused_by_name(tmp_path: Path, changes: dict, sentence: str) -> None:
+    path = write(tmp_path / "bad.vtu", **changes)
+    with pytest.raises(InputError, match=sentence) as caught:
+        read_mesh(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_mesh(tmp_path / "none.vtu")
+    with pytest.raises(InputError, match="no such file"):
+        read_mesh(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.vtu", "this is not xml"),
+        ("a.vtu", ""),
+        ("a.vtu", "<VTKFile type='ImageData'/>"),
+        ("a.vtk", "nonsense\n"),
+        ("a.msh", "$MeshFormat\n"),
+        ("a.inp", "*NODE\n1, a, b\n"),
+        ("a.txt", "hello"),
+        ("a", "hello"),
+        ("a.nii.gz", "hello"),
+    ],
+)
+def test_a_file_that_is_no_mesh(tmp_path: Path, name: str, text: str, capsys: pytest.CaptureFixture) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_mesh(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_truncated_file(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.vtu")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match="cannot be read as a mesh"):
+        read_mesh(path)
+
+
+def test_an_unknown_unit(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'inch': choose one of m, mm"):
+        read_mesh(write(tmp_path / "a.vtu"), "inch")
+
+
+def test_output_must_be_vtu(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"written as \.vtu"):
+        write_mesh(tmp_path / "a.vtk", MESH, {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_output_makes_its_folder_and_leaves_no_partial(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "new" / "deep" / "a.vtu", MESH, {})
+    assert [path.name for path in (tmp_path / "new" / "deep").iterdir()] == ["a.vtu"]
+
+
+def test_output_to_a_folder_or_through_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder.vtu").mkdir()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        check_output(tmp_path / "folder.vtu", ".vtu")
+    with pytest.raises(InputError, match="cannot be made"):
+        check_output(tmp_path / "file" / "a.vtu", ".vtu")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes anywhere")
+def test_output_to_a_closed_folder_is_refused(tmp_path: Path) -> None:
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0o500)
+    with pytest.raises(InputError, match="cannot be written"):
+        check_output(closed / "a.vtu", ".vtu")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.vtu"
+    write_mesh(path, MESH, {})
+    before = path.read_bytes()
+
+    def fails(self: meshio.Mesh, target: Path) -> None:
+        Path(target).write_text("half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(meshio.Mesh, "write", fails)
+    with pytest.raises(InputError, match="No space left"):
+        write_mesh(path, MESH, {})
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
