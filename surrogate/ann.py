@@ -25,16 +25,16 @@ class Ann:
     hidden
         Units in each layer.
     decay
-        Weight of the squared weights against the mean squared error of outputs whose total variance is one.
+        Weight of the summed squared weights against the summed squared error of outputs whose total variance is one.
     steps
         L-BFGS iterations.
     seed
         Of the first weights.
     """
 
-    hidden: int = 48
-    decay: float = 1e-6
-    steps: int = 1500
+    hidden: int = 64
+    decay: float = 1e-2
+    steps: int = 1000
     seed: int = 0
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
@@ -60,7 +60,7 @@ class Ann:
             for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
                 x = torch.tanh(x @ weight + bias)
             misfit = (x @ weights[-1] + biases[-1] - targets).square().sum(dim=1).mean()
-            return misfit + self.decay * torch.stack([weight.square().sum() for weight in weights]).sum()
+            return misfit + self.decay / len(X) * torch.stack([weight.square().sum() for weight in weights]).sum()
 
         search = torch.optim.LBFGS(
             [*weights, *biases],

@@ -60,9 +60,11 @@ def leave_discs_out(points: np.ndarray, patch: Patch) -> Split:
     InputError
         Fewer than seven positions.
     """
-    order = spread(points, MOST)
+    order = spread(points, MOST) if len(points) else np.zeros(0, int)
     if len(order) < FEWEST + 1:
-        raise InputError(f"the loads have {len(order)} positions, too few to leave {FEWEST} discs out: simulate more.")
+        raise InputError(
+            f"the loads that converged have {len(order)} positions, too few to leave {FEWEST} discs out: simulate more."
+        )
     split = _discs(points, order, patch, RADII[0])
     for radius in RADII[1:]:
         if split.test.mean() <= 0.5:

@@ -42,7 +42,7 @@ class Trained:
 
 
 def train(
-    data: Dataset, learners: Sequence[str] = LEARNERS, progress: Callable[[str], None] = lambda learner: None
+    data: Dataset, learners: Sequence[str] = LEARNERS, progress: Callable[[str], object] = lambda learner: None
 ) -> Trained:
     """Fit `learners` to the loads outside the left-out discs, and score them inside.
 
@@ -71,16 +71,17 @@ def train(
     split = leave_discs_out(pushed.point, patch)
     truth = data.displacement(nodes)[data.good]
     table = _compliance(data, nodes)
-    cortex = _compliance(data, np.setdiff1d(patch.nodes, nodes))
+    open_nodes = np.setdiff1d(patch.nodes, nodes)
+    cortex = (_compliance(data, open_nodes),) if len(open_nodes) else ()
     taught, held_out = (_pushed(loads.rows(np.flatnonzero(rows))) for rows in (~split.test, split.test))
     envelope = envelope_of(patch, taught, held_out)
     models, scores = {}, []
-    for name in learners:
-        progress(name)
-        parts = (*_parts(name, table, patch, taught, truth[~split.test]), cortex)
+    for name in dict.fromkeys(learners):
+        parts = (*_parts(name, table, patch, taught, truth[~split.test]), *cortex)
         model = Learned(data.anatomy, parts, envelope, training={"learner": name, **data.provenance})
         models[name], row = _judged(name, model, loads.rows(np.flatnonzero(split.test)), truth[split.test], nodes)
         scores.append(row)
+        progress(name)
     return Trained(models, tuple(scores), split, float(np.linalg.norm(truth[split.test], axis=2).mean()))
 
 

@@ -24,7 +24,7 @@ from surrogate.train import LEARNERS, train
 @pytest.fixture(scope="module")
 def data(tmp_path_factory, pretender):
     path = tmp_path_factory.mktemp("learned") / "data.h5"
-    loads = draw("palpation", pretender.anatomy, 400, 0)
+    loads = draw("palpation", pretender.anatomy, 240, 0)
     size = np.linalg.norm(loads.of(Pushed).force, axis=1)
     failing = type(pretender)(pretender.anatomy, float(np.quantile(size, 0.97)))
     simulate(path, failing, loads, {"preset": "palpation"})
@@ -201,3 +201,8 @@ def test_bad_training_is_a_sentence(data, pretender, tmp_path):
     untaught = replace(data, unit_good=~data.unit_good)
     with pytest.raises(InputError, match="unit responses did not converge"):
         train(untaught)
+
+
+def test_data_without_one_good_case_are_refused(data):
+    with pytest.raises(InputError, match="have 0 positions"):
+        train(replace(data, outcome=(Outcome.BUDGET,) * len(data.loads)))

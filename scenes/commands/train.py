@@ -33,12 +33,7 @@ def run(args: argparse.Namespace) -> int:
     data = read_dataset(args.data)
     learners = [name.strip() for name in args.learners.split(",")]
     with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
-
-        def progress(learner: str) -> None:
-            bar.set_postfix_str(learner)
-            bar.update(0 if bar.n == 0 and not bar.postfix else 1)
-
-        trained = train(data, learners, progress)
+        trained = train(data, learners, lambda learner: bar.update())
     save(out, trained.models)
     failed = int(np.sum(~data.good))
     print(_for_machines(trained, args.out, failed) if args.json else _for_people(trained, args.out, failed))
