@@ -171,7 +171,13 @@ class Browser:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
         gui.set_panel_label(title)
         gui.main_panel.dock_left()
-        scene.configure_default_lights(cast_shadow=False)
+        # Two soft lights from the first viewpoint's sides: the page's own four wash the colours out.
+        scene.configure_default_lights(enabled=False)
+        scene.add_light_ambient("/light/ambient", intensity=0.9)
+        across = np.cross(np.asarray(viewpoint.target) - viewpoint.eye, viewpoint.up)
+        for name, side, strength in (("left", -1.0, 1.8), ("right", 1.0, 0.6)):
+            place = np.asarray(viewpoint.eye) + side * across / np.linalg.norm(across)
+            scene.add_light_directional(f"/light/{name}", intensity=strength, position=tuple(place))
         start = self.server.initial_camera
         start.position, start.look_at = tuple(viewpoint.eye), tuple(viewpoint.target)
         start.up = tuple(viewpoint.up)
@@ -184,7 +190,7 @@ class Browser:
     def add_playback(self, playback: Playback) -> None:
         """A button that plays and pauses, and a slider over the frames."""
         gui = self.server.gui
-        button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+        self.button = button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self.frame = gui.add_slider("frame", 0, max(playback.frames - 1, 1), 1, 0)
 
         @button.on_click

@@ -1,0 +1,141 @@
+"""The page: served, shared by several visitors, told what they do. A visitor here is a bare web socket."""
+
+import socket
+import threading
+import time
+import urllib.request
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+import viser
+from viser import _messages
+from websockets.sync.client import connect
+
+from ar.browser import Body, Browser, Choice, Playback, Slider, Viewpoint
+
+TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def wait_for(reached: Callable[[], bool]) -> bool:
+    until = time.monotonic() + 10.0
+    while not reached() and time.monotonic() < until:
+        time.sleep(0.02)
+    return reached()
+
+
+class Visitor:
+    """A browser as the server sees one: it says where its camera is, gets messages, sends what its user does."""
+
+    def __init__(self, page: Browser, width: int) -> None:
+        address = page.address.replace("http", "ws")
+        self.wire = connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None)
+        self.received = 0
+        threading.Thread(target=self.listen, daemon=True).start()
+        axes = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 1.0), "look_at": (0.0, 0.0, 0.0)}
+        self.say(
+            _messages.ViewerCameraMessage(
+                **axes, fov=1.0, near=0.01, far=10.0, image_height=600, image_width=width, up_direction=(0.0, 1.0, 0.0)
+            )
+        )
+
+    def listen(self) -> None:
+        for message in self.wire:
+            self.received += len(message)
+
+    def say(self, message: _messages.Message) -> None:
+        self.wire.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+
+    def set(self, handle: viser.GuiInputHandle, value: object) -> None:
+        self.say(_messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
+
+
+@pytest.fixture
+def told() -> dict[str, list]:
+    return {"force": [], "deformer": [], "play": [], "frame": []}
+
+
+@pytest.fixture
+def page(told):
+    page = Browser(
+        [
+            Body("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
+            Body("brain", TRIANGLE, [[0, 1, 2]], opacity=0.3),
+        ],
+        Viewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
+        Playback(100, told["play"].append, told["frame"].append),
+        [
+            Choice("deformer", ("FEM", "ANN"), "ANN", told["deformer"].append),
+            Slider("force [N]", 0.0, 1.0, 0.01, 0.2, told["force"].append),
+        ],
+        port=free_port(),
+        size=(64, 48),
+    )
+    yield page
+    page.close()
+
+
+def test_the_page_is_served(page):
+    with urllib.request.urlopen(page.address) as answer:
+        assert answer.status == 200 and b"<html" in answer.read().lower()
+
+
+def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, told):
+    for number in range(50):
+        page.show(number, np.full((48, 64, 3), number, np.uint8))
+    assert wait_for(lambda: int(page.frame.value) == 49)
+    assert (page.picture.image == 49).all()
+    assert told["frame"] == []
+
+
+def test_bodies_move_and_reports_change(page):
+    page.move("tumour", TRIANGLE + 0.01)
+    page.report("render **12 ms**")
+    page.put("force [N]", 0.35)
+    assert wait_for(lambda: page.inputs["force [N]"].value == 0.35 and page.text.content == "render **12 ms**")
+    assert np.allclose(page.meshes["tumour"].vertices, TRIANGLE + 0.01)
+
+
+def test_an_unknown_body_is_an_error_at_once(page):
+    with pytest.raises(KeyError):
+        page.move("liver", TRIANGLE)
+
+
+def test_several_visitors_see_the_page_and_are_heard(page, told):
+    wide, narrow = Visitor(page, 1600), Visitor(page, 420)
+    assert wait_for(lambda: page.visitors == 2)
+    assert wait_for(lambda: wide.received > 0 and narrow.received > 0)
+    time.sleep(0.3)
+    before = wide.received, narrow.received
+    page.show(7, np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8))
+    assert wait_for(lambda: wide.received > before[0] + 1000 and narrow.received > before[1] + 1000)
+    wide.set(page.inputs["force [N]"], 0.4)
+    narrow.set(page.inputs["deformer"], "FEM")
+    narrow.set(page.frame, 31)
+    assert wait_for(lambda: told["force"] == [0.4] and told["deformer"] == ["FEM"] and told["frame"] == [31])
+    wide.wire.close()
+    assert wait_for(lambda: page.visitors == 1)
+    narrow.wire.close()
+
+
+def test_the_button_pauses_and_plays(page, told):
+    visitor = Visitor(page, 900)
+    assert wait_for(lambda: page.visitors == 1)
+    for wanted in ([False], [False, True]):
+        visitor.set(page.button, True)
+        assert wait_for(lambda wanted=wanted: told["play"] == wanted)
+    visitor.wire.close()
+
+
+def test_scripts_do_not_take_over_from_themselves(page, told):
+    page.put("force [N]", 0.5)
+    assert wait_for(lambda: page.inputs["force [N]"].value == 0.5)
+    time.sleep(0.2)
+    assert told["force"] == []
