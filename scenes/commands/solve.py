@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     out = check_output(args.out, ".vtu")
     accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision)
     law = Material(args.material, args.young, args.poisson)
-    regions = dict(parse_region(text, args.material) for text in args.region)
+    regions = parse_regions(args.region, args.material)
     file = read_mesh(args.mesh, args.unit)
     anatomy, loads, notes = problem_of(file, args.mesh, UNITS[args.unit])
     for note in (*file.notes, *notes):
@@ -72,6 +73,22 @@ def run(args: argparse.Namespace) -> int:
     }
     print(json.dumps(report))
     return 0 if outcome.good else 1
+
+
+def parse_regions(texts: Sequence[str], law: str) -> dict[int, Material]:
+    """Materials by label.
+
+    Raises
+    ------
+    InputError
+        As `parse_region`; and a label that is given twice.
+    """
+    pairs = [parse_region(text, law) for text in texts]
+    labels = [label for label, _ in pairs]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise InputError(f"--region {label} is given twice: give each label once.")
+    return dict(pairs)
 
 
 def parse_region(text: str, law: str) -> tuple[int, Material]:

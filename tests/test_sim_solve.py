@@ -1,0 +1,298 @@
+"""`sulcus solve`: from a mesh file to a mesh file, exit codes, and refusals that write nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from boxes import box, top_forces
+from oracle import internal_forces
+
+from scenes.cli import main
+from sim.material import LAWS, Material
+from sim.mesh import MeshWarning
+
+MESH = box((2, 2, 3), 0.1, distortion=0.15)
+COUNT = len(MESH.nodes)
+BASE = MESH.nodes[:, 2] < 1e-9
+TOP = MESH.nodes[:, 2] > 0.1 - 1e-9
+FORCE = top_forces(MESH, np.array([0.02, 0.01, -0.04]))[0]
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run of the command left behind."""
+
+    code: int
+    report: dict
+    errors: str
+    displacement: np.ndarray | None
+
+
+@pytest.fixture
+def solve(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Write a mesh with `data`, solve it with `flags`, collect everything; `changes` replace meshio's arguments."""
+
+    def run(data: dict, *flags: str, suffix: str = ".vtu", **changes: object) -> Run:
+        source, out = tmp_path / f"in{suffix}", tmp_path / "out" / "out.vtu"
+        fields = {"points": MESH.nodes, "cells": [("tetra", MESH.tets)], "point_data": data} | changes
+        meshio.Mesh(**fields).write(source)  # pyright: ignore[reportArgumentType]
+        capsys.readouterr()
+        code = main(["solve", str(source), "--device", "cpu", "--out", str(out), *flags])
+        printed = capsys.readouterr()
+        lines = printed.out.splitlines()
+        assert len(lines) == (0 if code == 2 else 1)
+        displacement = meshio.read(out).point_data["displacement"] if out.exists() else None
+        return Run(code, json.loads(lines[0]) if lines else {}, printed.err, displacement)
+
+    return run
+
+
+def refused(run: Run, *words: str) -> None:
+    """Exit code 2, one sentence on stderr with these words, and nothing written."""
+    assert run.code == 2
+    assert run.displacement is None
+    assert run.errors.splitlines()[-1].startswith("sulcus solve: ")
+    assert "Traceback" not in run.errors
+    for word in words:
+        assert word in run.errors
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_equilibrium_by_independent_formulas(solve, law: str) -> None:
+    run = solve({"fixed": BASE.astype(int), "force": FORCE}, "--material", law, "--young", "2500", "--poisson", "0.4")
+    assert run.code == 0
+    assert run.report["outcome"] == "converged"
+    assert run.report["residual"] <= 1e-6
+    assert run.report["iterations"] >= 1
+    assert run.report["seconds"] >= 0.0
+    residual = internal_forces(MESH, {0: Material(law, 2500.0, 0.4)}, run.displacement) - FORCE
+    assert np.linalg.norm(residual[~BASE]) <= 1.1e-6 * max(np.linalg.norm(residual[BASE]), np.linalg.norm(FORCE))
+    assert not run.displacement[BASE].any()
+    largest = 1e3 * np.linalg.norm(run.displacement, axis=1).max()
+    assert run.report["largest_displacement_mm"] == pytest.approx(largest, abs=1e-6)
+
+
+def test_the_file_written_is_the_mesh_in_metres(solve, tmp_path: Path) -> None:
+    solve({"fixed": BASE.astype(int), "force": FORCE}, "--unit", "mm", points=1e3 * MESH.nodes)
+    out = meshio.read(tmp_path / "out" / "out.vtu")
+    np.testing.assert_allclose(out.points, MESH.nodes, atol=1e-15)
+    np.testing.assert_array_equal(out.cells_dict["tetra"], MESH.tets)
+
+
+def test_millimetres_give_the_same_answer(solve) -> None:
+    value = np.where(TOP[:, None], [0.0, 0.0, -2e-3], 0.0)
+    fixed = (BASE | TOP).astype(int)
+    metres = solve({"fixed": fixed, "force": FORCE, "prescribed": value})
+    data = {"fixed": fixed, "force": FORCE, "prescribed": 1e3 * value}
+    millimetres = solve(data, "--unit", "mm", points=1e3 * MESH.nodes)
+    np.testing.assert_allclose(millimetres.displacement, metres.displacement, atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk"])
+def test_fixed_by_node_and_by_component(solve, suffix: str) -> None:
+    by_node = solve({"fixed": BASE.astype(float), "force": FORCE}, suffix=suffix)
+    by_component = solve({"fixed": np.repeat(BASE[:, None], 3, axis=1).astype(float), "force": FORCE}, suffix=suffix)
+    np.testing.assert_array_equal(by_node.displacement, by_component.displacement)
+    partly = np.repeat(BASE[:, None], 3, axis=1)
+    partly[TOP, 0] = True
+    run = solve({"fixed": partly.astype(float), "force": FORCE}, suffix=suffix)
+    assert run.code == 0
+    assert not run.displacement[partly].any()
+    assert np.abs(run.displacement[TOP, 1:]).min() > 0.0
+
+
+def test_prescribed_moves_what_is_fixed(solve) -> None:
+    value = np.where(TOP[:, None], [1e-3, 0.0, -2e-3], 0.0)
+    run = solve({"fixed": (BASE | TOP).astype(int), "prescribed": value})
+    assert run.code == 0
+    np.testing.assert_allclose(run.displacement[TOP], value[TOP], atol=1e-15)
+
+
+def test_prescribed_where_nothing_is_fixed_is_said_to_be_ignored(solve) -> None:
+    value = np.zeros((COUNT, 3))
+    value[TOP] = [0.0, 0.0, 5e-3]
+    run = solve({"fixed": BASE.astype(int), "prescribed": value, "force": FORCE})
+    plain = solve({"fixed": BASE.astype(int), "force": FORCE})
+    assert run.code == 0
+    assert f"ignored on {TOP.sum()} components" in run.errors
+    np.testing.assert_array_equal(run.displacement, plain.displacement)
+
+
+def test_slide_normals(solve) -> None:
+    normal = np.where(TOP[:, None], [0.0, 0.6, 0.8], 0.0)
+    run = solve({"fixed": BASE.astype(int), "force": FORCE, "slide_normal": normal})
+    assert run.code == 0
+    assert np.abs(run.displacement[TOP] @ [0.0, 0.6, 0.8]).max() < 1e-14
+
+
+def test_regions_have_their_own_constants(solve) -> None:
+    upper = (MESH.nodes[MESH.tets].mean(axis=1)[:, 2] > 0.05).astype(int) * 5
+    data = {"fixed": BASE.astype(int), "force": FORCE}
+    flags = "--material", "neo-hookean", "--region", "5:30000,0.3", "--tolerance", "1e-9"
+    run = solve(data, *flags, cell_data={"region": [upper]})
+    assert run.code == 0
+    mesh = type(MESH)(MESH.nodes, MESH.tets, upper)
+    laws = {0: Material("neo-hookean", 3000.0, 0.45), 5: Material("neo-hookean", 30000.0, 0.3)}
+    residual = (internal_forces(mesh, laws, run.displacement) - FORCE)[~BASE]
+    assert np.linalg.norm(residual) < 1e-8 * np.linalg.norm(FORCE)
+
+
+def test_turned_and_dropped_cells_are_printed(solve) -> None:
+    tets = MESH.tets.copy()
+    tets[:3] = tets[:3][:, [1, 0, 2, 3]]
+    cells = [("tetra", tets), ("triangle", MESH.surface)]
+    run = solve({"fixed": BASE.astype(int), "force": FORCE}, cells=cells)
+    plain = solve({"fixed": BASE.astype(int), "force": FORCE})
+    assert run.code == 0
+    assert "turned 3 tetrahedra of negative orientation" in run.errors
+    assert "dropped cells that are not tetrahedra" in run.errors
+    np.testing.assert_allclose(run.displacement, plain.displacement, atol=1e-8)
+
+
+def test_stray_nodes_stay_and_are_printed(solve) -> None:
+    points = np.vstack([MESH.nodes, [[1.0, 1.0, 1.0], [2.0, 0.0, 0.0]]])
+    data = {"fixed": np.append(BASE, [0, 0]).astype(int), "force": np.vstack([FORCE, np.ones((2, 3))])}
+    run = solve(data, points=points)
+    assert run.code == 0
+    assert "2 nodes belong to no tetrahedron" in run.errors
+    assert "left out" in run.errors
+    assert run.displacement.shape == (COUNT + 2, 3)
+    assert not run.displacement[COUNT:].any()
+
+
+def test_no_force_at_all_is_rest(solve) -> None:
+    run = solve({"fixed": BASE.astype(int), "force": np.zeros((COUNT, 3))})
+    assert run.code == 0
+    assert run.report["iterations"] == 0
+    assert not run.displacement.any()
+
+
+def test_single_precision(solve) -> None:
+    run = solve({"fixed": BASE.astype(int), "force": FORCE}, "--precision", "float32", "--tolerance", "1e-4")
+    exact = solve({"fixed": BASE.astype(int), "force": FORCE}, "--tolerance", "1e-10")
+    assert run.code == 0
+    assert np.linalg.norm(run.displacement - exact.displacement) < 1e-3 * np.linalg.norm(exact.displacement)
+
+
+def test_what_has_no_equilibrium_exits_with_one_and_writes_a_finite_state(solve) -> None:
+    """The top is pressed through the base: the logarithmic law has no such state."""
+    mesh = box((1, 1, 1), 0.1)
+    top = mesh.nodes[:, 2] > 0.05
+    run = solve(
+        {"fixed": np.ones(8, int), "prescribed": np.where(top[:, None], [0.0, 0.0, -0.11], 0.0)},
+        "--material",
+        "neo-hookean",
+        points=mesh.nodes,
+        cells=[("tetra", mesh.tets)],
+    )
+    assert run.code == 1
+    assert run.report["outcome"] not in ("converged", "converged_in_steps")
+    assert np.isfinite(run.displacement).all()
+    assert run.displacement[top, 2].min() >= -0.1  # not inverted
+
+
+GOOD = {"fixed": BASE.astype(int), "force": FORCE}
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ({"force": FORCE}, ["no point data `fixed`"]),
+        ({"fixed": BASE.astype(int)}, ["nothing acts on it", "`force`", "`prescribed`"]),
+        (
+            {"fixed": BASE.astype(int), "prescribed": np.where(TOP[:, None], [0.0, 0.0, 1.0], 0.0)},
+            ["nothing acts on it"],
+        ),
+        ({"fixed": BASE.astype(int), "prescribed": np.zeros((COUNT, 3))}, ["nothing acts on it"]),
+        ({"fixed": np.zeros(COUNT, int), "force": FORCE}, ["can move rigidly in 6 of 6 ways"]),
+        ({"fixed": np.repeat(BASE[:, None], 2, axis=1).astype(int), "force": FORCE}, ["`fixed` has shape"]),
+        ({"fixed": np.where(TOP, np.nan, BASE), "force": FORCE}, ["`fixed` is not finite at node"]),
+        ({"fixed": BASE.astype(int), "force": FORCE[:, 0]}, ["`force` has shape"]),
+        ({"fixed": BASE.astype(int), "force": np.where(TOP[:, None], np.nan, FORCE)}, ["`force` is not finite"]),
+        ({"fixed": BASE.astype(int), "force": np.where(TOP[:, None], np.inf, FORCE)}, ["`force` is not finite"]),
+        (
+            {"fixed": BASE.astype(int), "prescribed": np.where(BASE[:, None], np.nan, np.zeros((COUNT, 3)))},
+            ["`prescribed` is not finite"],
+        ),
+        (GOOD | {"slide_normal": np.full((COUNT, 3), 0.5)}, ["normalise"]),
+        (GOOD | {"slide_normal": np.zeros(COUNT)}, ["`slide_normal` has shape"]),
+    ],
+)
+def test_bad_point_data_is_refused(solve, data: dict, words: list[str]) -> None:
+    refused(solve(data), *words)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--poisson", "0.5"], ["Poisson's ratio is 0.5"]),
+        (["--poisson", "nan"], ["Poisson's ratio is nan"]),
+        (["--poisson", "-1"], ["Poisson's ratio is -1"]),
+        (["--young", "-1"], ["Young's modulus is -1"]),
+        (["--young", "0"], ["Young's modulus is 0"]),
+        (["--young", "nan"], ["Young's modulus is nan"]),
+        (["--young", "inf"], ["Young's modulus is inf"]),
+        (["--tolerance", "1e-13"], ["1e-13", "1e-11"]),
+        (["--tolerance", "nan"], ["tolerance of nan"]),
+        (["--tolerance", "1"], ["tolerance of 1"]),
+        (["--precision", "float32", "--tolerance", "1e-6"], ["2e-05", "float64"]),
+        (["--region", "7:3000,0.4"], ["region 7", "[0]"]),
+        (["--region", "0:3000"], ["--region 0:3000", "LABEL:YOUNG,POISSON"]),
+        (["--region", "zero:3000,0.4"], ["--region zero:3000,0.4"]),
+        (["--region", "0:3000,0.5"], ["--region 0:3000,0.5", "Poisson's ratio"]),
+        (["--region", "0:3000,0.4", "--region", "0:9000,0.4"], ["--region 0", "twice"]),
+        (["--device", "tpu"], ["no device 'tpu'"]),
+    ],
+)
+def test_bad_flags_are_refused(solve, flags: list[str], words: list[str]) -> None:
+    refused(solve(GOOD, *flags), *words)
+
+
+@pytest.mark.parametrize("flags", [["--material", "jelly"], ["--unit", "inch"], ["--young", "soft"], ["--nonsense"]])
+def test_flags_that_the_parser_knows_to_be_wrong_exit_with_two(solve, flags: list[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        solve(GOOD, *flags)
+    assert caught.value.code == 2
+
+
+def test_a_loose_piece_is_refused(solve) -> None:
+    points = np.vstack([MESH.nodes, MESH.nodes + [1.0, 0.0, 0.0]])
+    data = {"fixed": np.append(BASE, np.zeros(COUNT)).astype(int), "force": np.vstack([FORCE, FORCE])}
+    run = solve(data, points=points, cells=[("tetra", np.vstack([MESH.tets, MESH.tets + COUNT]))])
+    refused(run, f"a loose piece of {COUNT} nodes", "hold at least three nodes")
+
+
+@pytest.mark.parametrize("shared", [1, 2])
+def test_a_piece_that_hangs_by_a_corner_or_an_edge_is_refused(solve, shared: int) -> None:
+    """It touches the held body, but turns about what it shares."""
+    top = np.flatnonzero(TOP)[:shared]
+    apex = MESH.nodes[top].mean(axis=0) + [0.0, 0.0, 0.05]
+    extra = apex + 0.02 * np.random.default_rng(3).normal(size=(4 - shared, 3))
+    piece = np.append(top, COUNT + np.arange(4 - shared))
+    points = np.vstack([MESH.nodes, extra])
+    data = {"fixed": np.append(BASE, np.zeros(4 - shared)).astype(int)}
+    data["force"] = np.vstack([FORCE, np.full((4 - shared, 3), 1e-3)])
+    run = solve(data, points=points, cells=[("tetra", np.vstack([MESH.tets, piece]))])
+    refused(run, "can move rigidly")
+
+
+def test_bad_output_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert main(["solve", str(tmp_path / "none.vtu"), "--out", str(tmp_path / "a.txt")]) == 2
+    assert ".vtu" in capsys.readouterr().err
+
+
+def test_a_missing_mesh_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert main(["solve", str(tmp_path / "none.vtu"), "--out", str(tmp_path / "new" / "a.vtu")]) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert not (tmp_path / "new" / "a.vtu").exists()
+
+
+def test_slivers_are_warned_of(solve) -> None:
+    with pytest.warns(MeshWarning, match="dihedral angle below 1 degree"):
+        run = solve(GOOD, points=MESH.nodes * [1.0, 1.0, 0.005])
+    assert run.code == 0
