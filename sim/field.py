@@ -13,10 +13,9 @@ Field = Callable[[np.ndarray], np.ndarray]
 """A solid: values (n,) at points (n, 3) [m], negative inside, continuous; near its surface the distance to it [m]."""
 
 PROBE = 2e-4  # [m] for differences of a field: below a voxel, above round-off
-BLUR = 0.8  # voxels; takes the staircase off a mask and leaves what is wider than two voxels where it is
+BLUR = 0.7  # voxels; takes the staircase off a mask and leaves what is wider than two voxels where it is
 REACH = 3.5  # blurs; farther from the surface than this the blurred mask says no more than inside or outside
 MARGIN = 5  # voxels of surroundings that a field keeps round its mask
-COARSE = 1.5  # times the finest spacing: a direction sampled more coarsely than this is interpolated first
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,16 +37,10 @@ class LevelSet:
 def mask_field(mask: np.ndarray, affine: np.ndarray) -> LevelSet:
     """The field of the voxels `mask` (I, J, K) bool whose indices `affine` (4, 4) takes to metres.
 
-    The mask is blurred by 0.8 voxels and the blur of a plane, P = Phi(-d / sigma), is solved for the distance d.
-    Slices much farther apart than the voxels within them are first interpolated by shape (`_interpolated`).
+    The mask is blurred by 0.7 voxels and the blur of a plane, P = Phi(-d / sigma), is solved for the distance d.
+    Where voxels are oblong the mean of the three blurs stands for sigma, so that distances are right to a factor.
     """
     mask, affine = cropped(mask, affine)
-    for axis in range(3):
-        spacing = np.linalg.norm(affine[:3, :3], axis=0)
-        times = int(np.rint(spacing[axis] / spacing.min())) if spacing[axis] > COARSE * spacing.min() else 1
-        if times > 1:
-            mask = _interpolated(mask, axis, times)
-            affine = affine @ np.diag([1.0 / times if a == axis else 1.0 for a in (0, 1, 2, 3)])
     sigma = BLUR * abs(np.linalg.det(affine[:3, :3])) ** (1.0 / 3.0)
     share = ndimage.gaussian_filter(mask.astype(np.float32), BLUR, mode="nearest")
     limit = special.ndtr(-REACH)
@@ -62,28 +55,6 @@ def cropped(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarra
     shifted = affine.copy()
     shifted[:3, 3] += affine[:3, :3] @ low
     return np.pad(mask[box], MARGIN), shifted
-
-
-def _interpolated(mask: np.ndarray, axis: int, times: int) -> np.ndarray:
-    """Put `times - 1` slices between each two across `axis`, by linear interpolation of in-slice signed distances.
-
-    Shape-based interpolation (Raya & Udupa 1990): a slope sampled by few slices stays a slope, not a staircase.
-    """
-    slices = np.moveaxis(mask, axis, 0)
-    distance = np.stack([_signed_distance(part) for part in slices])
-    place = np.arange((len(slices) - 1) * times + 1) / times
-    below = np.minimum(place.astype(int), len(slices) - 2)
-    share = (place - below)[:, None, None]
-    return np.moveaxis((1.0 - share) * distance[below] + share * distance[below + 1] < 0.0, 0, axis)
-
-
-def _signed_distance(part: np.ndarray) -> np.ndarray:
-    """Distance (J, K) in voxels to the boundary of a slice's mask, negative inside."""
-    if not part.any():
-        return np.full(part.shape, float(max(part.shape)))
-    outside = ndimage.distance_transform_edt(~part)
-    inside = ndimage.distance_transform_edt(part)
-    return cast(np.ndarray, outside) - cast(np.ndarray, inside)
 
 
 def gradient(field: Field, points: np.ndarray) -> np.ndarray:

@@ -22,9 +22,11 @@ FINE = 0.5  # of the coarsest cell: the cells at the tumour and the craniotomy
 CELLS_PER_RADIUS = 2.5  # at least, across the tumour's radius
 GROWTH = 0.5  # of a cell's size per distance from the points of interest
 ROUNDING = 2.0**0.5  # a cell up to this much larger than wanted is not halved
-SLACKS = (0.0, 3e-4, 6e-4)  # [m] that nodes may leave their surface by, at the first, second and third attempt
+SLACKS = (0.0, 3e-4, 6e-4, 1.2e-3)  # [m] that nodes may leave their surface by, attempt by attempt
 DEEPEST = 4  # halvings of the coarsest cell
 TOO_COARSE = "so few nodes do not show the brain or the tumour: ask for more nodes, or check the labels."
+
+TOO_INTRICATE = "the surfaces are too intricate for so few nodes: ask for more nodes, or smooth the labels."
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +113,8 @@ def _finished(solids: Solids, pieces: Pieces) -> TetMesh:
         bad = smallest_sines(pieces.nodes[pieces.tets]) < GOOD_SINE
         pieces = pieces.kept(~ears(pieces.tets, bad))
         pieces = replace(pieces, nodes=improved(pieces.nodes, pieces.tets, _projection(solids, pieces, slack)))
+    if (smallest_sines(pieces.nodes[pieces.tets]) <= 0.0).any():
+        raise InputError(TOO_INTRICATE)
     region = np.where(pieces.inside, TUMOUR_LABEL, BRAIN_LABEL)
     return TetMesh(pieces.nodes, pieces.tets, region)
 

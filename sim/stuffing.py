@@ -19,7 +19,7 @@ from .mesh import EDGES
 # the pair that bounds every dihedral angle by 10.7 degrees on an ungraded lattice).
 SNAP_LONG, SNAP_SHORT = 0.24999, 0.41189
 SNAP_SHORTEST = 0.4
-SNAP_OTHER = 0.25  # edges that end at a node of an earlier cut
+SNAP_OTHER = 0.35  # edges that end at a node of an earlier cut
 CENTRE, CORNER, CUT = 0, 1, 2
 BISECTIONS = 24
 
