@@ -129,11 +129,13 @@ def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
         raise InputError("the anatomy has no tumour, so no position is 20-28 mm from it: choose another --preset.")
     centre = anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0)
     distance = np.linalg.norm(patch.points - centre, axis=1)
-    near = np.flatnonzero((distance >= 20e-3) & (distance <= 28e-3))
+    inside = patch.rim_distance(patch.points) >= PUBLISHED_FOOTPRINT
+    near = np.flatnonzero((distance >= 20e-3) & (distance <= 28e-3) & inside)
     if not len(near):
         raise InputError(
-            f"the open cortex is {1e3 * distance.min():.1f}-{1e3 * distance.max():.1f} mm from the tumour's centre, "
-            "never 20-28 mm: make the anatomy with --preset seed, or choose another --preset here."
+            f"the open cortex is {1e3 * distance.min():.1f}-{1e3 * distance.max():.1f} mm from the tumour's centre; "
+            f"no node at 20-28 mm lies {1e3 * PUBLISHED_FOOTPRINT:g} mm inside its rim: make the anatomy with --preset "
+            "seed, or choose another --preset here."
         )
     near = near[spread(patch.points[near], POSITIONS)]
     golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(DIRECTIONS) / (2.0 * np.pi)

@@ -122,6 +122,19 @@ def test_a_wide_patch_gets_more_discs(box, patch):
     assert split.share >= 0.15 and len(split.centres) > len(centres)
 
 
+def test_loads_at_few_positions_are_left_out_by_position(box, patch):
+    points = pushes("seed", box, 2000, 0).point
+    split = leave_discs_out(points, patch)
+    assert len(split.centres) == 6 and len(np.unique(points[split.test], axis=0)) == 6
+    assert len(np.unique(points[~split.test], axis=0)) == 5
+
+
+def test_discs_shrink_where_they_would_take_more_than_half(patch):
+    points = np.random.default_rng(0).normal(0, 5e-3, (500, 3)) * [1, 1, 0]
+    split = leave_discs_out(points, patch)
+    assert split.radius < 6e-3 and split.test.mean() <= 0.5 and len(split.centres) >= 6
+
+
 def test_too_few_positions_are_refused(patch):
     with pytest.raises(InputError, match="simulate more"):
         leave_discs_out(np.repeat(np.eye(3)[:2] * 0.01, 5, axis=0), patch)
