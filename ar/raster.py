@@ -188,6 +188,17 @@ def beyond(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4
 
 
 @wp.func
+def within(slope: wp.float64, offset: wp.float64, span: wp.vec2d) -> wp.vec2d:
+    """The part of a row's span where slope u + offset >= 0, and a little more: each pixel is tested again."""
+    slack = wp.float64(1.0e-3)
+    if slope > wp.float64(0.0):
+        return wp.vec2d(wp.max(span[0], -offset / slope - slack), span[1])
+    if slope < wp.float64(0.0):
+        return wp.vec2d(span[0], wp.min(span[1], -offset / slope + slack))
+    return span
+
+
+@wp.func
 def draw_triangle(
     face: wp.int32,
     q: wp.array(dtype=wp.vec3d),
@@ -218,26 +229,28 @@ def draw_triangle(
     slack = wp.vec2d(wp.float64(1.0e-6))
     low = wp.vec2d(box[0], box[1]) - slack
     high = wp.vec2d(box[2], box[3]) + slack
-    width = wp.float64(nearest.shape[1])
-    first_u = wp.int32(wp.clamp(wp.ceil(low[0]), wp.float64(0.0), width))
-    first_v = wp.int32(wp.clamp(wp.ceil(low[1]), wp.float64(begin), wp.float64(end)))
-    stop_u = wp.int32(wp.clamp(wp.floor(high[0]) + wp.float64(1.0), wp.float64(0.0), width))
-    stop_v = wp.int32(wp.clamp(wp.floor(high[1]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
-    if first_u >= stop_u or first_v >= stop_v:
+    zero = wp.float64(0.0)
+    left = wp.clamp(wp.ceil(low[0]), zero, wp.float64(nearest.shape[1]))
+    right = wp.clamp(wp.floor(high[0]), wp.float64(-1.0), wp.float64(nearest.shape[1] - 1))
+    first = wp.int32(wp.clamp(wp.ceil(low[1]), wp.float64(begin), wp.float64(end)))
+    stop = wp.int32(wp.clamp(wp.floor(high[1]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
+    if left > right or first >= stop:
         return
     side = wp.sign(volume)
     ea = edge(q, t[1], t[2]) * side
     eb = edge(q, t[2], t[0]) * side
     ec = edge(q, t[0], t[1]) * side
-    zero = wp.float64(0.0)
-    for row in range(first_v, stop_v):
+    for row in range(first, stop):
         v = wp.float64(row)
-        row_a = ea[1] * v + ea[2]
-        row_b = eb[1] * v + eb[2]
-        row_c = ec[1] * v + ec[2]
-        for column in range(first_u, stop_u):
+        ra = ea[1] * v + ea[2]
+        rb = eb[1] * v + eb[2]
+        rc = ec[1] * v + ec[2]
+        span = within(ec[0], rc, within(eb[0], rb, within(ea[0], ra, wp.vec2d(left, right))))
+        first_u = wp.int32(wp.min(wp.ceil(span[0]), right + wp.float64(1.0)))
+        last_u = wp.int32(wp.max(wp.floor(span[1]), left - wp.float64(1.0)))
+        for column in range(first_u, last_u + 1):
             u = wp.float64(column)
-            if ea[0] * u + row_a >= zero and eb[0] * u + row_b >= zero and ec[0] * u + row_c >= zero:
+            if ea[0] * u + ra >= zero and eb[0] * u + rb >= zero and ec[0] * u + rc >= zero:
                 across = normal[0] * u + normal[1] * v + normal[2]
                 if across * side > zero:
                     z = volume / across
