@@ -134,11 +134,11 @@ def draw_window(ground: np.ndarray, depth: np.ndarray, camera: Camera, hidden: L
     near = cv2.dilate(seen.mask.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
     window = cv2.GaussianBlur(near, (0, 0), 0.3 * SURROUND, borderType=cv2.BORDER_REPLICATE)
     light = ground * (1.0 - 0.62 * window[..., None])
-    normals = seen.interpolate(hidden.triangles, vertex_normals(hidden.vertices, hidden.triangles))
-    facing = np.abs(normals @ camera.T_camera_world[2, :3])
+    towards = vertex_normals(hidden.vertices, hidden.triangles) @ camera.T_camera_world[2, :3]
+    look = seen.interpolate(hidden.triangles, np.column_stack([towards, 255.0 * np.asarray(hidden.colour)]))
     under = np.where(depth > 0.0, np.maximum(seen.depth - depth, 0.0), 0.0)
-    shine = 1.1 * (0.25 + 0.75 * facing) * np.exp(-under / FADE)
-    light += shine[..., None] * seen.interpolate(hidden.triangles, 255.0 * np.asarray(hidden.colour))
+    shine = 1.1 * (0.25 + 0.75 * np.abs(look[..., 0])) * np.exp(-under / FADE)
+    light += shine[..., None] * look[..., 1:] * seen.mask[..., None]
     ground[:] = np.clip(light, 0.0, 255.0)
 
 

@@ -176,13 +176,16 @@ def shade(
         if arriving > 0.0:
             arriving *= lit(point + light.offset * n, light, shadow, bounds)
         wrapped = wp.max(0.0, (wp.dot(n, ray) + 0.2) * 0.83333)
-        middle = unit(ray + view)
-        grazing = 1.0 - wp.max(0.0, wp.dot(view, middle))
-        fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing
-        lobe = wp.exp(look.shininess * (wp.dot(n, middle) - 1.0)) * (look.shininess + 8.0) * 0.12
         # The lamp sits near the viewer: what faces away from both lies in the wound's shade.
         ambient = light.ambient * (0.35 + 0.65 * wp.max(0.0, wp.dot(n, view)))
-        out = base * (ambient + arriving * wrapped) + wp.vec3f(arriving * look.gloss * fresnel * lobe)
+        out = base * (ambient + arriving * wrapped)
+        glow = arriving * look.gloss
+        if glow > 0.0:
+            middle = unit(ray + view)
+            grazing = 1.0 - wp.max(0.0, wp.dot(view, middle))
+            fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing
+            lobe = wp.exp(look.shininess * (wp.dot(n, middle) - 1.0)) * (look.shininess + 8.0) * 0.12
+            out += wp.vec3f(glow * fresnel * lobe)
         colour[pixel, 0] = tone(out[0], curve)
         colour[pixel, 1] = tone(out[1], curve)
         colour[pixel, 2] = tone(out[2], curve)

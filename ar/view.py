@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from .camera import Camera, look_at
-from .layer import Layer, vertex_normals
+from .layer import Layer, Solid, vertex_normals
 from .raster import launch_in_bands, rasterise
 from .shade import BRIGHTEST, SOFT, Light, Look, shade
 
@@ -153,27 +153,33 @@ def as_light(lamp: Lamp) -> Light:
     return light
 
 
-def as_surface(layer: Layer, device: str) -> list:
-    """The layer as the kernel takes it, from `triangles` to `look`."""
+@lru_cache(maxsize=16)
+def as_surface(layer: Layer, device: str) -> tuple:
+    """The layer as the kernel takes it, from `triangles` to `look`; a layer that stands still is made once."""
     normals = vertex_normals(layer.vertices, layer.triangles) if layer.normals is None else layer.normals
     look = Look()
     look.id, look.gloss, look.shininess = layer.id, layer.gloss, layer.shininess
     look.textured = layer.solid is not None
-    texels = np.zeros((1, 1, 1, 4), np.float32)
     if layer.solid is not None:
-        texels = layer.solid.texels
         look.T_index_world, look.relief = wp.mat44f(layer.solid.T_index_world), layer.solid.relief
         look.dark = wp.vec3f(layer.solid.dark)
     vectors = partial(wp.array, dtype=wp.vec3f, device=device)
-    return [
-        wp.array(layer.triangles, dtype=wp.vec3i, device=device, copy=False),
+    return (
+        wp.array(layer.triangles, dtype=wp.vec3i, device=device),
         vectors(layer.vertices),
         vectors(normals),
         vectors(np.asarray(layer.colour) ** 2),
         vectors(layer.vertices if layer.rest is None else layer.rest),
-        wp.array(texels, dtype=wp.vec4f, device=device, copy=False),
+        as_texels(layer.solid, device),
         look,
-    ]
+    )
+
+
+@lru_cache(maxsize=4)
+def as_texels(solid: Solid | None, device: str) -> wp.array:
+    """A solid texture as the kernel takes it."""
+    texels = np.zeros((1, 1, 1, 4), np.float32) if solid is None else solid.texels
+    return wp.array(texels, dtype=wp.vec4f, device=device, copy=False)
 
 
 @lru_cache(maxsize=4)
