@@ -16,8 +16,9 @@ from ar.overlay import Gauge, Style, composite
 from ar.view import Picture, render
 from sim.deformation import Deformation, Deformer
 from sim.loads import Loads
+from surrogate.learned import Learned
 
-from .paths import Path, Touch
+from .paths import Touch
 from .scene import Scene
 from .site import Site
 from .stage import TOOL, Stage
@@ -86,17 +87,15 @@ class Player:
         """The scene's camera."""
         return self.scene.viewpoint.camera(self.site)
 
-    @cached_property
-    def _warm(self) -> bool:
-        """Whether this deformer can start from its last answer: it answers at every vertex."""
-        return not hasattr(self.deformer, "nodes")
-
     def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
         """The frame of a touch at a time [s]; `last` warms the deformer up."""
         begun = clock.perf_counter()
         loads = self.scene.loads(self.site, touch, time)
-        known = None if self._warm else self.stage.nodes
-        deformation = self.deformer.deform(loads, start=last if self._warm else None, at=known)
+        # A learnt model knows the drawn vertices alone; the finite elements start from their whole last answer.
+        if isinstance(self.deformer, Learned):
+            margin, deformation = self.deformer.bound, self.deformer.deform(loads, at=self.stage.nodes)
+        else:
+            margin, deformation = 0.0, self.deformer.deform(loads, start=last)
         solved = clock.perf_counter()
         positions = self.positions(deformation)
         tip, pose = self.tool(touch, positions)
@@ -106,26 +105,25 @@ class Player:
         surface = trimesh.Trimesh(tumour.vertices, tumour.triangles, process=False)
         nearest = trimesh.proximity.closest_point_naive(surface, tip[None])[0][0]
         gauge = Gauge(tip, nearest)
-        margin = getattr(self.deformer, "bound", 0.0)
         over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin=margin, gauge=gauge)
         return Frame(
             number, time, touch, loads, deformation, self.camera, pose, tip, picture, over.colour, gauge.distance,
             {"deform": solved - begun, "render": rendered - solved, "overlay": clock.perf_counter() - rendered},
         )  # fmt: skip
 
-    def frames(self, path: Path | None = None) -> Iterator[Frame]:
-        """Every frame of the scene, or of another path through it."""
-        path = self.scene.path if path is None else path
+    def frames(self, every: int = 1) -> Iterator[Frame]:
+        """The frames of the scene, or every so many of them."""
         last = None
-        for number, time in enumerate(self.scene.times):
-            frame = self.draw(number, float(time), path(float(time)), last)
+        for number in range(0, len(self.scene.times), every):
+            time = float(self.scene.times[number])
+            frame = self.draw(number, time, self.scene.path(time), last)
             last = frame.deformation
             yield frame
 
-    def positions(self, deformation: Deformation) -> np.ndarray:
-        """Where all mesh vertices are (V, 3) [m]; those that the deformer does not know stay at rest."""
+    def positions(self, deformation: Deformation, row: int = 0) -> np.ndarray:
+        """Where all mesh vertices are (V, 3) [m] in one load case; those that the deformer does not know are at rest."""
         positions = self.site.anatomy.mesh.nodes.copy()
-        positions[deformation.nodes] += deformation.displacement[0]
+        positions[deformation.nodes] += deformation.displacement[row]
         return positions
 
     def tool(self, touch: Touch, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -49,17 +49,25 @@ class Stage:
         camera = self.scene.viewpoint.camera(self.site)
         return lamp_beside(camera, self.site.origin, radius=1.6 * self.site.radius)
 
+    def cortex(self, positions: np.ndarray) -> Layer:
+        """The open cortex at `positions` (V, 3) [m]."""
+        vertices, triangles, rest, solid = self._cortex
+        at = rest if solid is not None else None
+        return Layer("cortex", CORTEX, positions[vertices], triangles, CORTEX_COLOUR, gloss=0.5, solid=solid, rest=at)
+
+    @cached_property
+    def brain(self) -> Layer:
+        """The closed part of the brain's surface, at rest."""
+        mesh, craniotomy = self.site.anatomy.mesh, self.site.anatomy.craniotomy
+        vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
+        return Layer("brain", CORTEX, mesh.nodes[vertices], triangles.reshape(-1, 3), CORTEX_COLOUR)
+
     def layers(self, positions: np.ndarray, pose: np.ndarray) -> list[Layer]:
         """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4)."""
-        vertices, triangles, rest, solid = self._cortex
-        cortex = Layer(
-            "cortex", CORTEX, positions[vertices], triangles, CORTEX_COLOUR, gloss=0.5, solid=solid,
-            rest=rest if solid is not None else None,
-        )  # fmt: skip
         tool = self.scene.tool.mesh
         at = np.asarray(tool.vertices) @ pose[:3, :3].T + pose[:3, 3]
         probe = Layer("tool", TOOL, at, tool.faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
-        return [cortex, self._drape, probe]
+        return [self.cortex(positions), self._drape, probe]
 
     def tumour(self, positions: np.ndarray) -> Layer:
         """The tumour's surface at `positions` (V, 3) [m]."""

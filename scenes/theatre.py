@@ -14,6 +14,8 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.intensity import Intensity, read_intensity, sidecar
 from sim.meshfile import read_anatomy
+from surrogate.learned import Learned
+from surrogate.store import load
 
 from .scene import Scene
 from .site import Site, site_of
@@ -25,7 +27,7 @@ class Theatre:
 
     anatomy: Anatomy
     intensity: Intensity | None
-    models: Mapping[str, Deformer]
+    models: Mapping[str, Learned]
     device: str = "auto"
 
     @cached_property
@@ -37,6 +39,11 @@ class Theatre:
     def names(self) -> tuple[str, ...]:
         """Every deformer that can be asked for: the learnt ones, then the finite elements."""
         return (*self.models, "fem")
+
+    @property
+    def best(self) -> str:
+        """The learnt model of the tightest error bound; the finite elements where nothing was learnt."""
+        return min(self.models, key=lambda name: self.models[name].bound, default="fem")
 
     def deformer(self, name: str, scene: Scene) -> Deformer:
         """A deformer by name; "fem" is made for the scene's effects and accuracy.
@@ -74,8 +81,6 @@ def open_theatre(anatomy: Path | None = None, model: Path | None = None, device:
     InputError
         Files that are missing, unreadable, or do not belong together.
     """
-    from surrogate.store import load
-
     path = template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)
     scan = sidecar(path)

@@ -39,7 +39,10 @@ class Probe:
         shaft.apply_translation([0.0, 0.0, self.radius + 0.5 * self.length])
         grip = trimesh.creation.capsule(0.6 * self.length, 2.2 * self.shaft, count=(16, 24))
         grip.apply_translation([0.0, 0.0, self.radius + 0.55 * self.length])
-        return trimesh.util.concatenate([ball, shaft, grip])
+        parts = [ball, shaft, grip]
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+        faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
+        return trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), process=False)
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
         """T_world_tool (4, 4): the ball touches `tip` (3,) [m] from outside; the shaft leans towards `aside` (3,).

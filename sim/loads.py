@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
@@ -118,6 +119,28 @@ class Loads:
             return replace(cause, **{name: factor * array})
 
         return Loads(tuple(grown(cause) for cause in self.causes), self.times)
+
+
+def stacked(parts: Sequence[Loads]) -> Loads:
+    """The load cases of several loads, one after the other.
+
+    Raises
+    ------
+    InputError
+        No loads, or loads of different kinds of causes.
+    """
+    kinds = {tuple(type(cause) for cause in part.causes) for part in parts}
+    if len(kinds) != 1:
+        raise InputError(f"loads of {len(kinds)} different sets of causes cannot be stacked: give them the same kinds.")
+
+    def joined(causes: Sequence[Cause]) -> Cause:
+        names = [item.name for item in fields(causes[0])]
+        return replace(
+            causes[0], **{name: np.concatenate([getattr(cause, name) for cause in causes]) for name in names}
+        )
+
+    causes = tuple(joined(same) for same in zip(*(part.causes for part in parts), strict=True))
+    return Loads(causes, np.concatenate([part.times for part in parts]))
 
 
 def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) -> Loads:

@@ -1,0 +1,137 @@
+"""A scene as one episode in HDF5: what the camera saw, what the tool did, and where the tumour went.
+
+Patient space is RAS [m]; the camera frame is OpenCV's (x right, y down, z forward). Read a picture with
+`cv2.imdecode(file["colour"][i], cv2.IMREAD_COLOR)`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+
+from ar.overlay import silhouette
+from sim.errors import InputError
+
+from .play import Frame, Player
+from .stage import NAMES
+from .theatre import Theatre
+from .truth import truth_of
+
+FORMAT = "sulcus episode 1"
+DEPTH_SCALE = 1e-5
+"""Metres in one step of the 16-bit depth; 0 where nothing is seen."""
+JPEG_QUALITY = 95
+UNITS = {
+    "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
+    "tumour_predicted": "m", "tumour_fem": "m", "seconds": "s", "depth": f"{DEPTH_SCALE:g} m (PNG, 16 bit)",
+}  # fmt: skip
+
+
+def collect(
+    path: Path, theatre: Theatre, player: Player, deformer: str, progress: Callable[[Iterable], Iterable]
+) -> dict[str, object]:
+    """Play a scene and write its episode; the file appears whole or not at all. Returns what it holds.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be written.
+    """
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.h5")
+    total = len(player.scene.times)
+    try:
+        with h5py.File(partial, "w") as file:
+            pictures = file.create_group("pictures")
+            stores = {
+                name: pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
+                for name in ("colour", "overlay", "depth", "segmentation", "tumour_mask")
+            }
+            frames = []
+            for frame in progress(player.frames()):
+                for name, code in encoded(frame, player).items():
+                    stores[name][frame.number] = code
+                frames.append(frame)
+            outcomes = write_motion(file, theatre, player, frames)
+            describe(file, player, deformer)
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error}). Choose another folder.") from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return {"out": str(path), "scene": player.scene.name, "deformer": deformer, "frames": total, "fem": outcomes}
+
+
+def encoded(frame: Frame, player: Player) -> dict[str, np.ndarray]:
+    """The frame's pictures as compressed bytes, by name."""
+    picture = frame.picture
+    tumour = player.stage.tumour(player.positions(frame.deformation))
+    mask = silhouette(frame.camera, tumour.vertices, tumour.triangles)
+    depth = np.clip(np.rint(picture.depth / DEPTH_SCALE), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    return {
+        "colour": cv2.imencode(".jpg", picture.colour[..., ::-1], quality)[1].ravel(),
+        "overlay": cv2.imencode(".jpg", frame.shown[..., ::-1], quality)[1].ravel(),
+        "depth": cv2.imencode(".png", depth)[1].ravel(),
+        "segmentation": cv2.imencode(".png", picture.segmentation)[1].ravel(),
+        "tumour_mask": cv2.imencode(".png", mask.astype(np.uint8))[1].ravel(),
+    }
+
+
+def write_motion(file: h5py.File, theatre: Theatre, player: Player, frames: list[Frame]) -> dict[str, int]:
+    """Write what is not a picture, one row per frame, and the finite elements' answers; returns their outcomes."""
+    nodes = theatre.anatomy.tumour_nodes
+    rest = theatre.anatomy.mesh.nodes[nodes]
+    truth = truth_of(theatre, player.scene, frames)
+    rows = {
+        "time": [frame.time for frame in frames],
+        "T_camera_world": [frame.camera.T_camera_world for frame in frames],
+        "T_world_tool": [frame.pose for frame in frames],
+        "tip": [frame.tip for frame in frames],
+        "force": [frame.touch.force * player.site.direction(frame.touch) for frame in frames],
+        "contact": [player.site.contact(frame.touch.x, frame.touch.y).point for frame in frames],
+        "tumour_predicted": [rest + frame.deformation.at(nodes).displacement[0] for frame in frames],
+        "tumour_fem": rest + truth.at(nodes).displacement,
+        "seconds": [list(frame.seconds.values()) for frame in frames],
+    }
+    for name, values in rows.items():
+        file.create_dataset(name, data=np.asarray(values), compression="gzip")
+    for name, answers in (
+        ("outcome_predicted", [frame.deformation.outcome[0] for frame in frames]),
+        ("outcome_fem", truth.outcome),
+    ):
+        file.create_dataset(name, data=np.array([outcome.name for outcome in answers], h5py.string_dtype()))
+    file["seconds"].attrs["stages"] = list(frames[0].seconds)
+    file.create_dataset("tumour_rest", data=rest)
+    file.create_dataset("tumour_nodes", data=nodes)
+    names = [outcome.name.lower() for outcome in truth.outcome]
+    return {name: names.count(name) for name in sorted(set(names))}
+
+
+def describe(file: h5py.File, player: Player, deformer: str) -> None:
+    """Units, frames and provenance as attributes."""
+    for name, unit in UNITS.items():
+        file[name if name in file else f"pictures/{name}"].attrs["unit"] = unit
+    scene, camera = player.scene, player.camera
+    file.create_dataset("K", data=camera.K)
+    file.attrs.update(
+        {
+            "format": FORMAT,
+            "scene": scene.name,
+            "deformer": deformer,
+            "effects": repr(scene.effects),
+            "anatomy": player.site.anatomy.digest,
+            "world_frame": "RAS [m]",
+            "camera_frame": "OpenCV: x right, y down, z forward; pixel centres at whole numbers",
+            "width": camera.width,
+            "height": camera.height,
+            "depth_scale_m": DEPTH_SCALE,
+            "segmentation": ", ".join(f"{label} {name}" for label, name in NAMES.items() if label != 4) + ", 0 nothing",
+            "sulcus_version": version("sulcus"),
+        }
+    )

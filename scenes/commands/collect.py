@@ -1,0 +1,42 @@
+"""`sulcus collect`: a scene as one episode in HDF5."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from sim.meshfile import check_output
+
+from .demo import add_theatre
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("scene", help="a built-in scene: press, slide or retract")
+    parser.add_argument("--out", required=True, type=Path, help="the episode, .h5")
+    add_theatre(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play and write."""
+    from tqdm import tqdm
+
+    from ..collect import collect
+    from ..play import Player
+    from ..scene import find_scene
+    from ..stage import Stage
+    from ..theatre import open_theatre
+
+    out = check_output(args.out, ".h5")
+    scene = find_scene(args.scene)
+    theatre = open_theatre(args.anatomy, args.model, args.device)
+    name = args.deformer or theatre.best
+    player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
+    report = collect(
+        out, theatre, player, name, lambda frames: tqdm(frames, total=len(scene.times), unit="frame", file=sys.stderr)
+    )
+    print(json.dumps(report) if args.json else f"{report['frames']} frames by {name} in {out}; FEM: {report['fem']}")
+    return 0

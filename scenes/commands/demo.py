@@ -1,0 +1,47 @@
+"""`sulcus demo`: a scene on a page in the browser."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_theatre(parser: argparse.ArgumentParser) -> None:
+    """Declare which anatomy and models play: shared by every command that plays a scene."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument(
+        "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
+    )
+    parser.add_argument("--deformer", help="linear, ann, svr, ... or fem (default: the learnt one of least error)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
+    add_theatre(parser)
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default %(default)s)")
+    parser.add_argument("--port", type=int, default=8080, help="port, or the next free one (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long (default: never)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until interrupted."""
+    from ..demo import Demo
+    from ..scene import find_scene
+    from ..theatre import open_theatre
+
+    scene = find_scene(args.scene)
+    theatre = open_theatre(args.anatomy, args.model, args.device)
+    name = args.deformer or theatre.best
+    demo = Demo(theatre, scene, name, args.host, args.port)
+    print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
+    if not theatre.models:
+        print("no learnt model lies beside this anatomy: the finite elements play alone; see `sulcus train`")
+    try:
+        demo.run(args.seconds)
+    except KeyboardInterrupt:
+        print()
+    finally:
+        demo.close()
+    return 0

@@ -1,0 +1,238 @@
+"""The page comes alive: a scripted or hand-set tool, any deformer, and the finite elements checking it behind."""
+
+from __future__ import annotations
+
+import threading
+import time as clock
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ar.browser import Body, Browser, Choice, Playback, Slider, Viewpoint
+from sim.deformation import Deformation
+from sim.loads import Loads
+
+from .paths import Touch
+from .play import Frame, Player
+from .scene import Scene
+from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR, Stage
+from .theatre import Theatre
+
+SCRIPT, HAND = "script", "hand"
+FEM_COLOUR = (0.95, 0.35, 0.75)
+CAPTION = """Left: the camera picture with the predicted tumour in register. Right: the same in 3-D, the tumour of the
+finite elements as a pink wire. Moving a slider takes the tool over; **tool: script** gives it back. Research only."""
+
+
+@dataclass
+class Wish:
+    """What the visitors ask for, written by the page's threads and read by the loop, under its lock."""
+
+    deformer: str
+    touch: Touch
+    tool: str = SCRIPT
+    plays: bool = True
+    number: int = 0
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def set(self, **values: object) -> None:
+        """Change some wishes at once."""
+        with self.lock:
+            for name, value in values.items():
+                setattr(self, name, value)
+
+    def hand(self, **values: object) -> None:
+        """Take the tool over with some of its numbers changed."""
+        with self.lock:
+            self.touch, self.tool = replace(self.touch, **values), HAND
+
+    def next(self, frames: int) -> tuple[int, str, Touch | None]:
+        """Frame number, deformer and hand-set touch (None: the script's) of the next frame; playing goes on by one."""
+        with self.lock:
+            now = self.number, self.deformer, self.touch if self.tool == HAND else None
+            if self.plays:
+                self.number = (self.number + 1) % frames
+            return now
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The finite elements' answer to one frame: its number, the deformation, the loads, and seconds."""
+
+    number: int
+    loads: Loads
+    deformation: Deformation
+    seconds: float
+
+
+class Referee:
+    """A thread that answers the newest loads by finite elements; older ones that it did not reach are dropped."""
+
+    def __init__(self, theatre: Theatre, scene: Scene) -> None:
+        self.newest: tuple[int, Loads] | None = None
+        self.truth: Truth | None = None
+        self.closed = threading.Event()
+        self.wake = threading.Condition()
+        self.thread = threading.Thread(target=self._judge, args=(theatre, scene), name="fem", daemon=True)
+        self.thread.start()
+
+    def ask(self, number: int, loads: Loads) -> None:
+        """Replace the question that waits."""
+        with self.wake:
+            self.newest = number, loads
+            self.wake.notify()
+
+    def close(self) -> None:
+        """Stop after the solve in hand."""
+        with self.wake:
+            self.closed.set()
+            self.wake.notify()
+        self.thread.join()
+
+    def _judge(self, theatre: Theatre, scene: Scene) -> None:
+        deformer, last = theatre.deformer("fem", scene), None
+        while True:
+            with self.wake:
+                self.wake.wait_for(lambda: self.closed.is_set() or self.newest is not None)
+                if self.closed.is_set() or self.newest is None:
+                    return
+                (number, loads), self.newest = self.newest, None
+            begun = clock.perf_counter()
+            last = deformer.deform(loads, start=last)
+            self.truth = Truth(number, loads, last, clock.perf_counter() - begun)
+
+
+class Demo:
+    """A scene on a page, for as long as `run` is let run."""
+
+    def __init__(self, theatre: Theatre, scene: Scene, deformer: str, host: str, port: int) -> None:
+        self.stage = Stage(scene, theatre.site, theatre.intensity)
+        self.theatre = theatre
+        self.players = {deformer: Player(self.stage, theatre.deformer(deformer, scene))}
+        self.wish = Wish(deformer, Touch(force=0.15))
+        self.referee = Referee(theatre, scene)
+        self.browser = Browser(
+            self._bodies(),
+            self._viewpoint(),
+            Playback(
+                len(scene.times),
+                lambda plays: self.wish.set(plays=plays),
+                lambda number: self.wish.set(number=number, tool=SCRIPT),
+            ),
+            self._controls(),
+            title=f"sulcus: {scene.name}",
+            caption=CAPTION,
+            host=host,
+            port=port,
+            size=(scene.viewpoint.width, scene.viewpoint.height),
+        )
+
+    def run(self, seconds: float = float("inf")) -> int:
+        """Play until the time is over; returns the frames drawn."""
+        scene, drawn, previous = self.stage.scene, 0, ""
+        frame: Frame | None = None
+        end = clock.perf_counter() + seconds
+        shown: tuple | None = None
+        while clock.perf_counter() < end:
+            begun = clock.perf_counter()
+            number, name, touch = self.wish.next(len(scene.times))
+            asked = (number, name, touch)
+            if asked != shown or frame is None:
+                time = float(scene.times[number])
+                touch = scene.path(time) if touch is None else touch
+                last = frame.deformation if frame is not None else None
+                frame = self._player(name).draw(number, time, touch, last if name == previous else None)
+                previous, shown = name, asked
+                self.referee.ask(number, frame.loads)
+                self._show(frame)
+                drawn += 1
+            self.browser.report(self._report(frame, name))
+            clock.sleep(max(0.0, 1.0 / scene.frames_per_second - (clock.perf_counter() - begun)))
+        return drawn
+
+    def close(self) -> None:
+        """Stop the page and the referee."""
+        self.browser.close()
+        self.referee.close()
+
+    def _player(self, name: str) -> Player:
+        if name not in self.players:
+            self.players[name] = Player(self.stage, self.theatre.deformer(name, self.stage.scene))
+        return self.players[name]
+
+    def _controls(self) -> list[Slider | Choice]:
+        wish = self.wish
+        return [
+            Choice("deformer", self.theatre.names, wish.deformer, lambda name: wish.set(deformer=name)),
+            Choice("tool", (SCRIPT, HAND), SCRIPT, lambda tool: wish.set(tool=tool)),
+            Slider("force [N]", 0.0, 0.4, 0.01, wish.touch.force, lambda value: self._take(force=value)),
+            Slider("direction right [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(right=value)),
+            Slider("direction up [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(up=value)),
+            Slider("place right [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(x=1e-3 * value)),
+            Slider("place up [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(y=1e-3 * value)),
+        ]
+
+    def _take(self, right: float | None = None, up: float | None = None, **values: float) -> None:
+        """A slider was moved: the tool is in the visitor's hand."""
+        tilt = list(self.wish.touch.tilt)
+        for axis, degrees in enumerate((right, up)):
+            if degrees is not None:
+                tilt[axis] = np.radians(degrees)
+        self.wish.hand(**values, tilt=(tilt[0], tilt[1]))
+        self.browser.put("tool", HAND)
+
+    def _bodies(self) -> list[Body]:
+        positions = self.stage.site.anatomy.mesh.nodes
+        tool = self.stage.scene.tool.mesh
+        brain, cortex, tumour = self.stage.brain, self.stage.cortex(positions), self.stage.tumour(positions)
+        return [
+            Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
+            Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.55),
+            Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
+            Body("finite elements", tumour.vertices, tumour.triangles, FEM_COLOUR, wireframe=True),
+            Body("tool", tool.vertices, tool.faces, TOOL_COLOUR),
+        ]
+
+    def _viewpoint(self) -> Viewpoint:
+        site = self.stage.site
+        eye = site.origin - 0.16 * site.axis + 0.16 * site.right + 0.05 * site.up
+        return Viewpoint(eye, site.origin + 0.015 * site.axis, site.up)
+
+    def _show(self, frame: Frame) -> None:
+        player = next(iter(self.players.values()))
+        positions = player.positions(frame.deformation)
+        self.browser.show(frame.number, frame.shown)
+        self.browser.move("cortex", self.stage.cortex(positions).vertices)
+        self.browser.move("tumour", self.stage.tumour(positions).vertices)
+        tool = self.stage.scene.tool.mesh
+        self.browser.move("tool", tool.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
+        truth = self.referee.truth
+        if truth is not None:
+            self.browser.move("finite elements", self.stage.tumour(player.positions(truth.deformation)).vertices)
+
+    def _report(self, frame: Frame, name: str) -> str:
+        """Milliseconds a stage, and the error of the frame that the finite elements answered last."""
+        stages = " · ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
+        outcome = frame.deformation.outcome[0]
+        lines = [
+            f"**{name}**: {outcome.value}",
+            f"frame {frame.number}: force {frame.touch.force:.2f} N, tip to tumour {1e3 * frame.distance:.1f} mm",
+            f"ms a stage: {stages}",
+        ]
+        truth = self.referee.truth
+        if truth is None:
+            lines.append("error: the finite elements are being prepared")
+        else:
+            nodes = self.stage.site.anatomy.tumour_nodes
+            guess = self._player(name).deformer.deform(truth.loads, at=nodes).displacement[0] if name != "fem" else None
+            right = truth.deformation.at(nodes).displacement[0]
+            motion = 1e3 * float(np.linalg.norm(right, axis=1).mean())
+            said = "this is the finite elements' own answer"
+            if guess is not None:
+                error = 1e3 * np.linalg.norm(guess - right, axis=1)
+                said = f"error against FEM: mean {error.mean():.3f}, largest {error.max():.3f} mm"
+            lines.append(
+                f"{said}; tumour moved {motion:.2f} mm (frame {truth.number}, FEM {1e3 * truth.seconds:.0f} ms, "
+                f"{truth.deformation.outcome[0].name.lower()})"
+            )
+        return "\n\n".join(lines)

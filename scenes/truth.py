@@ -1,0 +1,20 @@
+"""The finite elements' answer to every frame of a scene, in one batch: what drawn frames are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sim.accuracy import TRAIN
+from sim.deformation import Deformation
+from sim.fem import Fem
+from sim.loads import stacked
+
+from .play import Frame
+from .scene import Scene
+from .theatre import Theatre
+
+
+def truth_of(theatre: Theatre, scene: Scene, frames: Sequence[Frame]) -> Deformation:
+    """One row per frame, every vertex, at training accuracy."""
+    fem = Fem(theatre.anatomy, scene.effects, TRAIN, theatre.device)
+    return fem.deform(stacked([frame.loads for frame in frames]))
