@@ -47,7 +47,7 @@ def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarr
     corners = nodes[triangles]
     centre = corners.mean(axis=1)
     reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
-    rows, columns, values = [], [], []
+    columns, values, ends = [np.zeros(0, int)], [np.zeros(0)], [0]
     for number, (point, radius) in enumerate(zip(points, radii, strict=True)):
         near = np.flatnonzero(np.linalg.norm(centre - point, axis=1) <= reach + 2.0 * radius)
         touched = nearest_on(corners[near], point) if len(near) else None
@@ -57,15 +57,13 @@ def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarr
                 "which does not touch the surface: choose a point on it."
             )
         weight = _integrate(corners[near], touched, radius)
-        rows.append(np.full(3 * len(near), number))
-        columns.append(triangles[near].ravel())
-        values.append((weight / weight.sum()).ravel())
-    shape = (len(points), len(nodes))
-    if not rows:
-        return sp.csr_array(shape)
-    weights = sp.csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
-    weights.eliminate_zeros()
-    return weights
+        vertices, place = np.unique(triangles[near], return_inverse=True)
+        total = np.bincount(place.ravel(), weight.ravel())
+        loaded = total > 0.0
+        columns.append(vertices[loaded])
+        values.append(total[loaded] / weight.sum())
+        ends.append(ends[-1] + int(loaded.sum()))
+    return sp.csr_array((np.concatenate(values), np.concatenate(columns), ends), shape=(len(points), len(nodes)))
 
 
 def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
