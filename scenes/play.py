@@ -121,7 +121,7 @@ class Player:
             yield frame
 
     def positions(self, deformation: Deformation, row: int = 0) -> np.ndarray:
-        """Where all mesh vertices are (V, 3) [m] in one load case; those that the deformer does not know are at rest."""
+        """Where all mesh vertices are (V, 3) [m] in one load case; what the deformer does not know is at rest."""
         positions = self.site.anatomy.mesh.nodes.copy()
         positions[deformation.nodes] += deformation.displacement[row]
         return positions

@@ -49,6 +49,18 @@ class Site:
         """Radius of the circle of the open cortex's area [m]."""
         return float(np.sqrt(self._surface.area / np.pi))
 
+    @cached_property
+    def clearance(self) -> float:
+        """Radius of the largest circle round the origin, across the axis, that the open cortex fills [m]."""
+        edges = np.sort(self.anatomy.open_surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, count = np.unique(edges, axis=0, return_counts=True)
+        return float(self.across(self.anatomy.mesh.nodes[edges[count == 1]].mean(axis=1)).min())
+
+    def across(self, points: np.ndarray) -> np.ndarray:
+        """Distance (n,) [m] of points (n, 3) from the line through the origin along the axis."""
+        arm = points - self.origin
+        return np.linalg.norm(arm - np.outer(arm @ self.axis, self.axis), axis=1)
+
     def contact(self, x: float, y: float) -> Contact:
         """The material point of the open cortex nearest to the place (x, y) [m] of its tangent plane."""
         asked = self.origin + x * self.right + y * self.up

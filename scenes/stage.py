@@ -25,8 +25,8 @@ TUMOUR_COLOUR = (0.30, 0.95, 0.55)
 # Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
 READ_BELOW = 2.0e-3
 DRAPE_HEIGHT, DRAPE_DEPTH = 3.0e-3, 8.0e-3
-# Radius of the drape's hole over that of the open cortex: its rim hides the mesh's ragged border.
-HOLE = 0.9
+# Radius of the drape's hole over that of the largest circle of open cortex: its rim hides the mesh's ragged border.
+HOLE = 0.98
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,20 +100,15 @@ class Stage:
         normals = vertex_normals(mesh.nodes, mesh.surface)
         lifted = mesh.nodes + DRAPE_HEIGHT * normals
         # How far a place lies outside the hole: across the axis on the near side, everywhere on the far side.
-        arm = mesh.nodes - site.origin
-        across = np.linalg.norm(arm - np.outer(arm @ site.axis, site.axis), axis=1)
-        far = arm @ site.axis > 2.0 * site.radius
-        outside = np.where(far, site.radius, across - HOLE * site.radius)
+        far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
+        outside = np.where(far, site.radius, site.across(mesh.nodes) - HOLE * site.clearance)
         points, triangles, rim = clipped(lifted, mesh.surface, outside)
+        # The wall has its own vertices: normals shared with the drape would round its edge off.
         low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis
-        number = len(points) + np.arange(2 * len(rim)).reshape(-1, 2)
-        wall = np.concatenate(
-            [np.column_stack([rim, number[:, 1]]), np.column_stack([rim[:, 0], number[:, 1], number[:, 0]])]
-        )
-        return Layer(
-            "drape", DRAPE, np.concatenate([points, low.reshape(-1, 3)]), np.concatenate([triangles, wall]),
-            DRAPE_COLOUR, gloss=0.05,
-        )  # fmt: skip
+        corner = len(points) + np.arange(4 * len(rim)).reshape(-1, 4)  # two upper, two lower, of every edge
+        wall = np.concatenate([corner[:, [0, 1, 3]], corner[:, [0, 3, 2]]])
+        points = np.concatenate([points, np.concatenate([points[rim], low], axis=1).reshape(-1, 3)])
+        return Layer("drape", DRAPE, points, np.concatenate([triangles, wall]), DRAPE_COLOUR, gloss=0.05)
 
 
 def clipped(points: np.ndarray, triangles: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
