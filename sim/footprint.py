@@ -49,13 +49,14 @@ def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarr
     reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
     columns, values, ends = [np.zeros(0, int)], [np.zeros(0)], [0]
     for number, (point, radius) in enumerate(zip(points, radii, strict=True)):
-        near = np.flatnonzero(np.linalg.norm(centre - point, axis=1) <= reach + 2.0 * radius)
+        near = np.flatnonzero(np.linalg.norm(centre - point, axis=1) <= reach + radius)
         touched = nearest_on(corners[near], point) if len(near) else None
         if touched is None or np.linalg.norm(touched - point) > radius:
             raise InputError(
                 f"load {number} presses at {np.round(1e3 * point, 1)} mm with a footprint of {1e3 * radius:.3g} mm, "
                 "which does not touch the surface: choose a point on it."
             )
+        near = np.flatnonzero(np.linalg.norm(centre - touched, axis=1) <= reach + radius)
         weight = _integrate(corners[near], touched, radius)
         vertices, place = np.unique(triangles[near], return_inverse=True)
         total = np.bincount(place.ravel(), weight.ravel())
