@@ -95,7 +95,7 @@ def pushed_forces(anatomy: Anatomy, loads: Loads) -> np.ndarray:
     if cause is None:
         return np.zeros((3 * len(anatomy.mesh.nodes), len(loads)))
     weight = footprint_of(anatomy, cause)
-    return (weight[:, :, None] * cause.force[:, None, :]).reshape(len(loads), -1).T
+    return (weight[:, :, None] * cause.force[:, None, :]).reshape(len(loads), 3 * weight.shape[1]).T
 
 
 def _nodal_forces(anatomy: Anatomy, loads: Loads) -> np.ndarray:
@@ -116,7 +116,7 @@ def _impose(anatomy: Anatomy, loads: Loads) -> Imposed:
 def _whole_field(name: str, field: np.ndarray, anatomy: Anatomy) -> np.ndarray:
     if field.shape[1] != len(anatomy.mesh.nodes):
         raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {len(anatomy.mesh.nodes)}.")
-    return field.reshape(len(field), -1).T
+    return field.reshape(len(field), 3 * field.shape[1]).T
 
 
 def _elasticity(effect: Elasticity, anatomy: Anatomy, device: Device) -> list[Term]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .columns import combined, dots
+from .columns import combined, dots, norms
 from .linear import Preconditioner, conjugate_gradients
 from .problem import Problem
 
@@ -34,12 +34,13 @@ class NewtonCG:
         u: wp.array,
         g: wp.array,
         gap: wp.array | None,
-        tolerance: np.ndarray,
+        forcing: np.ndarray,
         definite: np.ndarray,
     ) -> Direction:
-        """Direction at u (3N, b) with free gradient g (3N, b) [N], to an absolute tolerance (b,) [N].
+        """Direction at u (3N, b) with free gradient g (3N, b) [N].
 
-        `gap` (3N, b) [m], if any, is the motion that closes the constraints; the free nodes follow it.
+        `forcing` (b,): the linear residual that is left, relative to the right-hand side. `gap` (3N, b) [m], if any,
+        is the motion that closes the constraints; the free nodes follow it.
         """
         device, columns = problem.device, u.shape[1]
         problem.linearise(u, definite)
@@ -51,6 +52,7 @@ class NewtonCG:
             problem.add_curvature(gap, pull)
             problem.constraint.project(pull)
             combined(device, rhs, minus, pull, rhs)
+        tolerance = forcing * norms(device, rhs)
         solution = conjugate_gradients(problem, self.preconditioner, wp.clone(rhs), tolerance, self.most)
         promised = dots(device, rhs, solution.x)
         d = solution.x if gap is None else combined(device, solution.x, np.ones(columns), gap, solution.x)

@@ -105,7 +105,7 @@ class Fem:
         for cause in loads.causes:
             loaded |= (getattr(cause, MAGNITUDE[type(cause)]) != 0.0).reshape(len(loads), -1).any(axis=1)
         full = start.at(np.arange(self.problem.rows // 3)).displacement
-        return np.where(loaded, full.reshape(len(loads), -1).T, 0.0)
+        return np.where(loaded, full.reshape(len(loads), self.problem.rows).T, 0.0)
 
     def _solve(self, cases: Cases, guess: np.ndarray) -> Deformation:
         clock = time.perf_counter()
@@ -126,7 +126,7 @@ class Fem:
         reaction = self._reaction(cases.loads, self.problem.constraint.force_on_footprint(self.problem.gradient(u)))
         count = found.u.shape[1]
         return Deformation(
-            displacement=found.u.T.reshape(count, -1, 3),
+            displacement=found.u.T.reshape(count, self.problem.rows // 3, 3),
             nodes=np.arange(self.problem.rows // 3),
             outcome=tuple(found.outcome),
             iterations=found.iterations,

@@ -46,7 +46,8 @@ def find_equilibrium(problem: Problem, direction: NewtonCG, start: np.ndarray, a
         gap, gap_size = problem.constraint.close_gap(u)
         values = u.numpy()
         open_gap = gap_size > slack * np.abs(values).max(axis=0, initial=0.0)
-        relative = np.divide(free, scale, out=np.zeros_like(free), where=(scale > 0.0) | ~np.isfinite(free))
+        with np.errstate(invalid="ignore"):
+            relative = np.divide(free, scale, out=np.zeros_like(free), where=scale != 0.0)
         bad = ~np.isfinite(relative)
         done = ~bad & ~open_gap & (relative <= accuracy.tolerance)
         outcome[live[done]] = Outcome.CONVERGED
@@ -61,10 +62,10 @@ def find_equilibrium(problem: Problem, direction: NewtonCG, start: np.ndarray, a
             problem.keep(stay)
             u, g, gap = (gathered(device, array, stay) for array in (u, g, gap))
             live, definite, open_gap = live[stay], definite[stay], open_gap[stay]
-            free, relative = free[stay], relative[stay]
+            relative = relative[stay]
         # Inexact Newton: superlinear, and never finer than the tolerance needs.
         forcing = np.clip(np.sqrt(relative), 0.3 * accuracy.tolerance / np.maximum(relative, 1e-300), 0.1)
-        found = direction.find(problem, u, g, gap if open_gap.any() else None, forcing * free, definite)
+        found = direction.find(problem, u, g, gap if open_gap.any() else None, forcing, definite)
         linear_iterations += found.iterations
         length = search(problem, u, found)
         combined(device, u, length, found.d, u)
