@@ -1,0 +1,387 @@
+"""One conformance suite that every deformer passes, and what finite elements promise besides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from boxes import base_held, box, hold, top_forces
+
+from sim.accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
+from sim.anatomy import Anatomy
+from sim.compile import pushed_forces
+from sim.deformation import Deformation, Deformer, Outcome
+from sim.device import find_device
+from sim.effects import Elasticity, Held, NodalForce, ToolDisplacement, ToolForce
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.footprint import footprint_weights
+from sim.loads import Displaced, Loads, Nodal, Prescribed, Pushed, push
+from sim.material import Material
+from sim.mesh import TetMesh
+
+MESH = box((3, 3, 3), 0.1, distortion=0.1)
+ANATOMY = base_held(MESH)
+COUNT = len(MESH.nodes)
+EFFECTS = Elasticity(), Held(), ToolForce()
+FORCE = np.array([[0.0, 0.0, -0.05], [0.02, -0.03, -0.3], [0.1, 0.0, -0.6], [0.0, 0.1, 0.2], [0.0, 0.0, -0.9]])
+POINT = np.array([[0.05, 0.05, 0.1], [0.04, 0.06, 0.1], [0.07, 0.05, 0.1], [0.05, 0.03, 0.1], [0.06, 0.06, 0.1]])
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A deformer to put through the suite; `error` is what it may differ by from itself, over the largest motion."""
+
+    build: Callable[[], Deformer]
+    error: float
+
+
+def fem(accuracy: Accuracy) -> Callable[[], Deformer]:
+    return lambda: Fem(ANATOMY, EFFECTS, accuracy, "cpu", batch=3)
+
+
+DEFORMERS = {
+    "fem float64": Candidate(fem(REFERENCE), 1e-6),
+    "fem float32": Candidate(fem(TRAIN), 2e-3),
+}
+"""Deformers of `ANATOMY` that answer `Pushed` loads: add a line for a new one."""
+
+
+@cache
+def built(name: str) -> Deformer:
+    return DEFORMERS[name].build()
+
+
+def loads(rows: slice | np.ndarray = slice(None), scale: float = 1.0, time: float = 0.0) -> Loads:
+    whole = push(POINT, scale * FORCE, 0.02)
+    return replace(whole, time=np.full(len(whole), time) + 0.1 * np.arange(len(whole))).rows(rows)
+
+
+class TestEveryDeformer:
+    @pytest.fixture(params=DEFORMERS)
+    def name(self, request: pytest.FixtureRequest) -> str:
+        return request.param
+
+    @pytest.fixture
+    def deformer(self, name: str) -> Deformer:
+        return built(name)
+
+    @pytest.fixture
+    def error(self, name: str) -> float:
+        return DEFORMERS[name].error
+
+    def test_is_a_deformer_of_its_anatomy(self, deformer: Deformer) -> None:
+        assert isinstance(deformer, Deformer)
+        assert deformer.anatomy is ANATOMY
+
+    def test_one_row_for_each_load(self, deformer: Deformer) -> None:
+        for count in (0, 1, 2, 5):
+            found = deformer.deform(loads(np.arange(count)))
+            assert len(found) == len(found.outcome) == count
+            assert found.displacement.shape == (count, len(found.nodes), 3)
+            assert found.iterations.shape == found.residual.shape == found.time.shape == (count,)
+            assert found.reaction.ndim == 3
+            assert found.reaction.shape[::2] == (count, 6)
+
+    def test_answers_are_finite_and_say_how_they_came_about(self, deformer: Deformer) -> None:
+        found = deformer.deform(loads())
+        assert np.isfinite(found.displacement).all()
+        assert np.isfinite(found.reaction).all()
+        assert all(isinstance(outcome, Outcome) and outcome.good for outcome in found.outcome)
+        assert all(len(outcome.value.split()) >= 5 for outcome in found.outcome)
+        assert np.linalg.norm(found.displacement, axis=2).max(axis=1).min() > 1e-4
+
+    def test_is_pure(self, deformer: Deformer) -> None:
+        """The same question gives the same bits, whatever was asked in between."""
+        first = deformer.deform(loads())
+        deformer.deform(loads(np.array([4, 2]), scale=-0.5), None)
+        again = deformer.deform(loads())
+        np.testing.assert_array_equal(first.displacement, again.displacement)
+        np.testing.assert_array_equal(first.reaction, again.reaction)
+        np.testing.assert_array_equal(first.iterations, again.iterations)
+        assert first.outcome == again.outcome
+        warm = [deformer.deform(loads(scale=1.1), first).displacement for _ in range(2)]
+        np.testing.assert_array_equal(*warm)
+
+    def test_does_not_touch_what_it_is_given(self, deformer: Deformer) -> None:
+        given, start = loads(), deformer.deform(loads(scale=0.9))
+        copies = [cause.force.copy() for cause in given.causes if isinstance(cause, Pushed)], start.displacement.copy()
+        deformer.deform(given, start)
+        np.testing.assert_array_equal([c.force for c in given.causes if isinstance(c, Pushed)], copies[0])
+        np.testing.assert_array_equal(start.displacement, copies[1])
+
+    def test_rows_do_not_depend_on_each_other(self, deformer: Deformer, error: float) -> None:
+        """In any order, and however the batch is split."""
+        whole = deformer.deform(loads()).displacement
+        scale = np.abs(whole).max()
+        order = np.array([3, 0, 4, 1, 2])
+        np.testing.assert_allclose(deformer.deform(loads(order)).displacement, whole[order], atol=error * scale)
+        for row in range(5):
+            alone = deformer.deform(loads(np.array([row]))).displacement[0]
+            np.testing.assert_allclose(alone, whole[row], atol=error * scale)
+
+    def test_at_picks_rows(self, deformer: Deformer) -> None:
+        whole = deformer.deform(loads())
+        picked = whole.nodes[[5, 2, 11]]
+        some = deformer.deform(loads(), at=picked)
+        np.testing.assert_array_equal(some.nodes, picked)
+        np.testing.assert_array_equal(some.displacement, whole.displacement[:, [5, 2, 11]])
+        np.testing.assert_array_equal(whole.at(picked).displacement, some.displacement)
+        with pytest.raises(KeyError):
+            deformer.deform(loads(), at=np.array([COUNT]))
+
+    def test_no_load_no_motion(self, deformer: Deformer) -> None:
+        """Exactly: from rest, from a warm start, alone and among others."""
+        still = push(POINT, np.zeros((5, 3)), 0.02)
+        assert not deformer.deform(still).displacement.any()
+        assert not deformer.deform(still, deformer.deform(loads())).displacement.any()
+        mixed = push(POINT, FORCE * np.array([[1.0], [0.0], [1.0], [0.0], [1.0]]), 0.02)
+        found = deformer.deform(mixed).displacement
+        assert not found[[1, 3]].any()
+        assert found[[0, 2, 4]].any(axis=(1, 2)).all()
+
+    def test_time_is_carried(self, deformer: Deformer) -> None:
+        given = loads(time=2.5)
+        np.testing.assert_array_equal(deformer.deform(given).time, given.times)
+
+    def test_costs_are_told(self, deformer: Deformer) -> None:
+        cost = deformer.deform(loads()).cost
+        assert cost.total > 0.0
+        assert min(cost.seconds.values()) >= 0.0
+        assert cost.total == pytest.approx(sum(cost.seconds.values()))
+
+    def test_a_warm_start_changes_the_way_not_the_answer(self, deformer: Deformer, error: float) -> None:
+        cold = deformer.deform(loads())
+        near = deformer.deform(loads(scale=0.95))
+        warm = deformer.deform(loads(), near)
+        assert (warm.iterations <= cold.iterations).all()
+        np.testing.assert_allclose(warm.displacement, cold.displacement, atol=error * np.abs(cold.displacement).max())
+
+    def test_the_answer_itself_is_the_best_start(self, deformer: Deformer) -> None:
+        found = deformer.deform(loads())
+        again = deformer.deform(loads(), found)
+        np.testing.assert_array_equal(again.iterations, 0)
+
+    def test_a_harder_push_moves_more(self, deformer: Deformer) -> None:
+        largest = [np.abs(deformer.deform(loads(scale=s)).displacement).max(axis=(1, 2)) for s in (0.3, 0.6, 1.0)]
+        assert (np.diff(largest, axis=0) > 0.0).all()
+
+    def test_loads_of_another_kind_are_refused(self, deformer: Deformer) -> None:
+        with pytest.raises(InputError, match="Displaced"):
+            deformer.deform(Loads((Displaced(POINT, FORCE, np.full(5, 0.02)),)))
+
+    def test_loads_off_the_body_are_refused(self, deformer: Deformer) -> None:
+        with pytest.raises(InputError, match="does not touch"):
+            deformer.deform(push([0.0, 0.0, 1.0], [0.0, 0.0, -0.1], 0.01))
+
+    def test_a_start_with_other_rows_is_refused(self, deformer: Deformer) -> None:
+        found = deformer.deform(loads())
+        with pytest.raises(InputError, match=r"start has displacements of shape \(5, "):
+            deformer.deform(loads(np.arange(2)), found)
+
+
+class TestLoads:
+    def test_no_cause_or_one_twice_is_refused(self) -> None:
+        with pytest.raises(InputError, match="causes none"):
+            Loads(())
+        with pytest.raises(InputError, match="each kind once"):
+            Loads((loads().causes[0], loads().causes[0]))
+
+    @pytest.mark.parametrize(
+        ("build", "sentence"),
+        [
+            (lambda: push(POINT, np.where(FORCE == 0.1, np.nan, FORCE), 0.02), r"Pushed\.force .*finite"),
+            (lambda: push(POINT, FORCE, 0.0), "positive radii"),
+            (lambda: push(POINT, FORCE, -0.01), "positive radii"),
+            (lambda: Loads((Pushed(POINT, FORCE[:2], np.full(5, 0.01)),)), r"\[2, 5\] rows"),
+            (lambda: Loads((Pushed(POINT[:, :2], FORCE, np.full(5, 0.01)),)), r"point has shape \(5, 2\)"),
+            (lambda: Loads((Nodal(np.zeros((COUNT, 3))),)), r"Nodal\.force has shape"),
+            (lambda: Loads((Nodal(np.zeros((5, COUNT, 3))),), np.zeros(4)), r"\[4, 5\] rows"),
+        ],
+    )
+    def test_bad_numbers_are_refused(self, build: Callable[[], Loads], sentence: str) -> None:
+        with pytest.raises(InputError, match=sentence):
+            build()
+
+    def test_a_whole_field_of_another_mesh_is_refused(self) -> None:
+        body = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TRAIN, "cpu")
+        with pytest.raises(InputError, match=rf"Nodal.force has 8 vertices, but the mesh has {COUNT}"):
+            body.deform(Loads((Nodal(np.zeros((1, 8, 3))),)))
+        with pytest.raises(InputError, match="Prescribed.displacement has 8 vertices"):
+            body.deform(Loads((Prescribed(np.zeros((1, 8, 3))),)))
+
+    def test_scaling_and_rows(self) -> None:
+        half = loads().scaled(0.5).of(Pushed)
+        each = loads().scaled(np.arange(5.0)).rows(np.array([3])).of(Pushed)
+        assert half is not None
+        assert each is not None
+        np.testing.assert_array_equal(half.force, 0.5 * FORCE)
+        np.testing.assert_array_equal(half.point, POINT)
+        np.testing.assert_array_equal(each.force, 3.0 * FORCE[[3]])
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 64])
+def test_batches_split_as_asked_give_the_same(size: int) -> None:
+    whole = built("fem float64").deform(loads(time=1.0))
+    split = Fem(ANATOMY, EFFECTS, REFERENCE, "cpu", batch=size).deform(loads(time=1.0))
+    np.testing.assert_allclose(split.displacement, whole.displacement, atol=1e-9)
+    np.testing.assert_allclose(split.reaction, whole.reaction, atol=1e-12)
+    np.testing.assert_array_equal(split.iterations, whole.iterations)
+    np.testing.assert_array_equal(split.time, whole.time)
+    assert split.outcome == whole.outcome
+
+
+def test_several_causes_act_together() -> None:
+    """A push beside nodal forces is the sum of both as nodal forces."""
+    both = Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu")
+    top = top_forces(MESH, FORCE / 3.0)
+    found = both.deform(Loads((*loads().causes, Nodal(top)))).displacement
+    pushed = pushed_forces(ANATOMY, loads()).T.reshape(5, COUNT, 3)
+    alone = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], REFERENCE, "cpu").deform(Loads((Nodal(top + pushed),)))
+    np.testing.assert_allclose(found, alone.displacement, atol=1e-8)
+
+
+def test_a_tool_displacement_is_never_drowned_in_a_batch() -> None:
+    """Columns of very different size, in single precision: each reaches its own."""
+    body = Fem(ANATOMY, [Elasticity(), Held(), ToolDisplacement()], TRAIN, "cpu")
+    motion = np.array([[0.0, 0.0, -1e-6], [0.0, 0.0, -1e-2], [1e-4, 0.0, 0.0]])
+    found = body.deform(Loads((Displaced(POINT[:3], motion, np.full(3, 0.03)),)))
+    assert all(outcome.good for outcome in found.outcome)
+    weight = footprint_weights(MESH.nodes, MESH.surface, POINT[:3], np.full(3, 0.03)).toarray()
+    mean = np.einsum("bv,bvi->bi", weight, found.displacement)
+    assert (np.linalg.norm(mean - motion, axis=1) < 1e-5 * np.linalg.norm(motion, axis=1)).all()
+
+
+def stubborn() -> tuple[Anatomy, Loads]:
+    """The top is pulled to three times the height and turned aside."""
+    top = MESH.nodes[:, 2] > 0.1 - 1e-9
+    value = np.where(top[:, None], [0.15, 0.0, 0.2], 0.0)
+    return hold(MESH, ANATOMY.held.all(axis=1) | top), Loads((Prescribed(value[None]),))
+
+
+def test_load_steps_rescue_what_newton_fails_on() -> None:
+    anatomy, asked = stubborn()
+    effects = Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held()
+    patient = Fem(anatomy, effects, Accuracy(tolerance=1e-8), "cpu").deform(asked)
+    assert patient.outcome == (Outcome.CONVERGED,)
+    hasty = Fem(anatomy, effects, Accuracy(tolerance=1e-8, outer=int(patient.iterations[0]) - 2), "cpu").deform(asked)
+    assert hasty.outcome == (Outcome.CONVERGED_IN_STEPS,)
+    assert hasty.outcome[0].good
+    assert hasty.iterations[0] > patient.iterations[0]
+    assert hasty.residual[0] <= 1e-8
+    np.testing.assert_allclose(hasty.displacement, patient.displacement, atol=1e-6)
+
+
+def test_a_rescue_leaves_the_other_rows_alone() -> None:
+    anatomy, asked = stubborn()
+    effects = Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held()
+    value = asked.of(Prescribed)
+    assert value is not None
+    three = Loads((Prescribed(value.displacement * np.array([0.01, 1.0, 0.02])[:, None, None]),))
+    body = Fem(anatomy, effects, Accuracy(tolerance=1e-8, outer=5), "cpu")
+    found = body.deform(three)
+    assert found.outcome[0] is found.outcome[2] is Outcome.CONVERGED
+    assert found.outcome[1] is Outcome.CONVERGED_IN_STEPS
+    for row in range(3):
+        alone = body.deform(three.rows(np.array([row])))
+        np.testing.assert_allclose(alone.displacement[0], found.displacement[row], atol=1e-8)
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "stable-neo-hookean"])
+def test_a_hopeless_case_returns_its_last_accepted_state(law: str) -> None:
+    """Two steps for a load of 50 N: not converged, said so, finite, and farther than rest; the others are not hurt."""
+    body = Fem(
+        ANATOMY,
+        [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()],
+        Accuracy(tolerance=1e-8, outer=2),
+        "cpu",
+    )
+    force = top_forces(MESH, np.array([[0.0, 0.0, -50.0], [0.0, 0.0, -1e-5]]))
+    found = body.deform(Loads((Nodal(force),)))
+    assert found.outcome[0] is Outcome.BUDGET
+    assert not found.outcome[0].good
+    assert found.outcome[1] is Outcome.CONVERGED
+    assert np.isfinite(found.displacement).all()
+    assert found.displacement[0].any()
+    assert found.residual[0] > 1e-8
+    assert found.iterations[0] > 2
+
+
+def test_numbers_that_overflow_are_an_outcome_not_an_answer() -> None:
+    body = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], REFERENCE, "cpu")
+    found = body.deform(Loads((Nodal(top_forces(MESH, np.array([[0.0, 0.0, -1e300], [0.0, 0.0, -0.1]]))),)))
+    assert found.outcome == (Outcome.NOT_FINITE, Outcome.CONVERGED)
+    assert np.isfinite(found.displacement).all()
+
+
+@pytest.mark.parametrize("law", ["corotational", "neo-hookean", "stable-neo-hookean"])
+def test_brutal_loads_converge(law: str) -> None:
+    """10 N on a 10 cm box of 3 kPa: strains of several hundred per cent."""
+    body = Fem(ANATOMY, [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()], Accuracy(1e-6), "cpu")
+    force = top_forces(MESH, np.array([[3.0, 2.0, -9.0], [0.0, 0.0, 10.0], [10.0, 0.0, 0.0]]))
+    found = body.deform(Loads((Nodal(force),)))
+    assert all(outcome.good for outcome in found.outcome)
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.49, 0.499, -0.4])
+def test_poissons_ratios(poisson: float) -> None:
+    body = Fem(ANATOMY, [Elasticity(Material("neo-hookean", 3000.0, poisson)), Held(), ToolForce()], REFERENCE, "cpu")
+    assert all(outcome.good for outcome in body.deform(loads()).outcome)
+
+
+def test_a_thousandfold_contrast() -> None:
+    inner = np.linalg.norm(MESH.nodes[MESH.tets].mean(axis=1) - 0.05, axis=1) < 0.03
+    mesh = TetMesh(MESH.nodes, MESH.tets, inner.astype(int))
+    for young in (3.0, 3e6):
+        regions = {1: Material("stable-neo-hookean", young, 0.45)}
+        body = Fem(base_held(mesh), [Elasticity(regions=regions), Held(), ToolForce()], REFERENCE, "cpu")
+        assert all(outcome.good for outcome in body.deform(loads()).outcome)
+
+
+def test_presets_hold_their_promise() -> None:
+    """Coarser presets differ from the reference by what their tolerance lets expect, in rising order."""
+    exact = built("fem float64").deform(loads()).displacement
+    errors = []
+    for accuracy in (TRAIN, LIVE, DRAFT):
+        found = Fem(ANATOMY, EFFECTS, replace(accuracy, outer=60), "cpu").deform(loads()).displacement
+        errors.append(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+    assert errors[0] < 1e-3
+    assert errors[1] < 1e-2
+    assert errors[2] < 5e-2
+
+
+def test_an_accuracy_that_a_type_cannot_reach_is_refused() -> None:
+    with pytest.raises(InputError, match="float32 reaches 2e-05"):
+        Accuracy(tolerance=1e-6, precision="float32")
+    with pytest.raises(InputError, match="no precision is called"):
+        Accuracy(precision="float16")  # pyright: ignore[reportArgumentType]
+
+
+def test_deformations_never_hold_what_is_not_finite() -> None:
+    good = built("fem float64").deform(loads())
+    with pytest.raises(AssertionError, match="not finite"):
+        replace(good, displacement=np.full_like(good.displacement, np.nan))
+
+
+def test_an_unknown_device_is_refused() -> None:
+    with pytest.raises(InputError, match="no device 'abacus'"):
+        Fem(ANATOMY, EFFECTS, device="abacus")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("law", ["linear", "corotational", "neo-hookean", "stable-neo-hookean"])
+@pytest.mark.parametrize("accuracy", [REFERENCE, TRAIN], ids=["float64", "float32"])
+def test_cuda_agrees_with_the_processor(law: str, accuracy: Accuracy) -> None:
+    """Within ten times the tolerance, of the largest motion."""
+    try:
+        find_device("cuda", "float64")
+    except InputError:
+        pytest.skip("no CUDA device")
+    effects = Elasticity(Material(law, 3000.0, 0.45)), Held(), ToolForce()
+    answers: list[Deformation] = [Fem(ANATOMY, effects, accuracy, device).deform(loads()) for device in ("cpu", "cuda")]
+    assert all(outcome.good for answer in answers for outcome in answer.outcome)
+    difference = np.abs(answers[0].displacement - answers[1].displacement).max()
+    assert difference < 10.0 * accuracy.tolerance * np.abs(answers[0].displacement).max()
