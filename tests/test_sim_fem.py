@@ -210,7 +210,7 @@ class TestLoads:
         body = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TRAIN, "cpu")
         with pytest.raises(InputError, match=rf"Nodal.force has 8 vertices, but the mesh has {COUNT}"):
             body.deform(Loads((Nodal(np.zeros((1, 8, 3))),)))
-        with pytest.raises(InputError, match="Prescribed.displacement has 8 vertices"):
+        with pytest.raises(InputError, match=r"Prescribed\.displacement has 8 vertices"):
             body.deform(Loads((Prescribed(np.zeros((1, 8, 3))),)))
 
     def test_scaling_and_rows(self) -> None:
