@@ -24,7 +24,17 @@ def test_data_say_where_they_come_from(folder, box):
     data = read_dataset(folder / "data.h5")
     assert data.good.all() and len(data.loads) == 150 and data.anatomy.digest == box.digest
     assert data.residual.max() <= 1e-4 and data.iterations.min() >= 1
-    for name in ("anatomy", "effects", "accuracy", "preset", "seed", "sulcus version", "warp-lang version", "frame"):
+    for name in (
+        "anatomy",
+        "effects",
+        "accuracy",
+        "device",
+        "preset",
+        "seed",
+        "sulcus version",
+        "warp-lang version",
+        "frame",
+    ):
         assert data.provenance[name]
     assert "stable-neo-hookean" in data.provenance["effects"] and "0.0001" in data.provenance["accuracy"]
 

@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
     provenance = {
         "effects": repr(effects),
         "accuracy": repr(accuracy),
+        "device": fem.problem.device.name.split(":")[0],
         "preset": args.preset,
         "seed": str(args.seed),
         **{f"{name} version": version(name) for name in ("sulcus", "warp-lang", "numpy")},
