@@ -17,6 +17,8 @@ import viser
 PICTURES_PER_SECOND = 15.0
 # Width of the panel with the picture [CSS pixel]: at most, at least, and as a share of the window.
 PANEL = (676, 320, 0.56)
+# Windows under this width [CSS pixel] get the panel as a sheet at the bottom.
+NARROW = 576
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +188,11 @@ class Browser:
         def fit(client: viser.ClientHandle) -> None:
             most, least, share = PANEL
             client.gui.main_panel.set_width(float(np.clip(share * client.camera.image_width, least, most)))
+            if client.camera.image_width < NARROW:
+                # The panel is a sheet over the lower half there: bring the scene into the upper one.
+                arm = np.asarray(viewpoint.eye) - viewpoint.target
+                target = viewpoint.target - 0.35 * np.linalg.norm(arm) * np.asarray(viewpoint.up)
+                client.camera.position, client.camera.look_at = tuple(target + 1.5 * arm), tuple(target)
 
     def add_playback(self, playback: Playback) -> None:
         """A button that plays and pauses, and a slider over the frames."""
