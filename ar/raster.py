@@ -143,7 +143,7 @@ def in_bands(draw: Callable[[int, int], None], count: int, device: str) -> None:
 @cache
 def workers() -> tuple[ThreadPoolExecutor, int]:
     """The threads that draw, and how many: Warp runs a CPU kernel on the calling thread and frees the interpreter."""
-    cores = min(len(os.sched_getaffinity(0)), 8)
+    cores = min(os.cpu_count() or 1, 8)
     return ThreadPoolExecutor(cores, thread_name_prefix="raster"), cores
 
 

@@ -62,22 +62,27 @@ def told() -> dict[str, list]:
     return {"force": [], "deformer": [], "play": [], "frame": []}
 
 
-@pytest.fixture
-def page(told):
-    page = Browser(
-        [
-            Body("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
-            Body("brain", TRIANGLE, [[0, 1, 2]], opacity=0.3),
-        ],
+def open_page(told: dict[str, list], port: int) -> Browser:
+    bodies = [
+        Body("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
+        Body("brain", TRIANGLE, np.array([[0, 1, 2]]), opacity=0.3),
+    ]
+    return Browser(
+        bodies,
         Viewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
         Playback(100, told["play"].append, told["frame"].append),
         [
             Choice("deformer", ("FEM", "ANN"), "ANN", told["deformer"].append),
             Slider("force [N]", 0.0, 1.0, 0.01, 0.2, told["force"].append),
         ],
-        port=free_port(),
+        port=port,
         size=(64, 48),
     )
+
+
+@pytest.fixture
+def page(told):
+    page = open_page(told, free_port())
     yield page
     page.close()
 
@@ -85,6 +90,14 @@ def page(told):
 def test_the_page_is_served(page):
     with urllib.request.urlopen(page.address) as answer:
         assert answer.status == 200 and b"<html" in answer.read().lower()
+
+
+def test_a_port_that_is_taken_is_left_to_its_owner(page, told):
+    second = open_page(told, int(page.address.rsplit(":", 1)[1]))
+    assert second.address != page.address
+    with urllib.request.urlopen(second.address) as answer:
+        assert answer.status == 200
+    second.close()
 
 
 def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, told):

@@ -72,6 +72,13 @@ def test_twice_the_pixels_see_the_same_view():
     assert np.allclose(double.project(points_in_front())[0] + 0.5, 2.0 * (camera.project(points_in_front())[0] + 0.5))
 
 
+def test_the_camera_of_a_part_of_the_picture_sees_that_part():
+    camera = some_camera()
+    part = camera.cropped(slice(20, 150), slice(30, 290))
+    assert (part.width, part.height) == (260, 130)
+    assert np.allclose(part.project(points_in_front())[0] + [30, 20], camera.project(points_in_front())[0])
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
