@@ -94,8 +94,8 @@ def composite(
             cv2.polylines(ground, outlines(fragments.mask), True, ink, width, cv2.LINE_AA)
     if gauge is not None:
         draw_line(out, camera, gauge)
-    covered = np.isin(picture.segmentation, np.asarray(occluders, np.uint8))
-    out[covered] = picture.colour[covered]
+    covered = cv2.LUT(picture.segmentation, np.isin(np.arange(256), occluders).astype(np.uint8))
+    cv2.copyTo(picture.colour, covered, out)
     if gauge is not None and box is not None:
         middle = (box[1].start + box[1].stop) // 2
         write(out, f"{1e3 * gauge.distance:.1f} mm", (middle - 28, box[0].stop - SURROUND + 24), 0.6)
@@ -130,12 +130,14 @@ def outlines(mask: np.ndarray) -> list[np.ndarray]:
 
 def draw_window(ground: np.ndarray, depth: np.ndarray, camera: Camera, hidden: Layer, seen: Fragments) -> None:
     """Dim the ground round the silhouette with a soft rim, and let the hidden surface shine through, in place."""
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (SURROUND | 1, SURROUND | 1))
-    near = cv2.dilate(seen.mask.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
-    window = cv2.GaussianBlur(near, (0, 0), 0.3 * SURROUND, borderType=cv2.BORDER_REPLICATE)
+    outside = cv2.distanceTransform((~seen.mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3) / SURROUND
+    window = np.clip(1.25 - 1.25 * outside, 0.0, 1.0)
+    window *= window * (3.0 - 2.0 * window)
     light = ground * (1.0 - 0.62 * window[..., None])
     towards = vertex_normals(hidden.vertices, hidden.triangles) @ camera.T_camera_world[2, :3]
-    look = seen.interpolate(hidden.triangles, np.column_stack([towards, 255.0 * np.asarray(hidden.colour)]))
+    look = seen.interpolate(
+        hidden.triangles, np.column_stack([towards, 255.0 * np.asarray(hidden.colour)]).astype(np.float32)
+    )
     under = np.where(depth > 0.0, np.maximum(seen.depth - depth, 0.0), 0.0)
     shine = 1.1 * (0.25 + 0.75 * np.abs(look[..., 0])) * np.exp(-under / FADE)
     light += shine[..., None] * look[..., 1:] * seen.mask[..., None]

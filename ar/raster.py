@@ -45,7 +45,7 @@ class Fragments:
 
     def interpolate(self, triangles: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Vertex values (V, C) at every pixel, (H, W, C); 0 where empty. triangles (F, 3) as rasterised."""
-        picture = np.zeros((*self.face.shape, values.shape[1]))
+        picture = np.zeros((*self.face.shape, values.shape[1]), values.dtype)
         seen = self.mask
         picture[seen] = np.einsum("nk,nkc->nc", self.weights[seen], values[triangles[self.face[seen]]])
         return picture
