@@ -8,20 +8,13 @@ the depth is n . q_a / p . n, and e / sum e are the weights on the triangle itse
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import warp as wp
 
+from .bands import in_bands, launch_in_bands, run_length
 from .camera import Camera
-
-# Pictures are never differentiated, and start-up notes would stand among a command's own lines.
-wp.config.enable_backward = False
-wp.config.log_level = wp.LOG_ERROR
 
 NOTHING = np.uint64(0xFFFFFFFFFFFFFFFF)
 
@@ -111,40 +104,6 @@ def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int
     rows = homogeneous[:, 1] / homogeneous[:, 2]
     first, last = np.clip([np.floor(rows.min()), np.ceil(rows.max()) + 1.0], 0, height).astype(int).tolist()
     return first, last
-
-
-def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str) -> None:
-    """Launch a kernel over `count` independent items; it takes (begin, end, run) first, see `run_length`."""
-    run = run_length(device)
-
-    def launch(begin: int, end: int) -> None:
-        wp.launch(kernel, -(-(end - begin) // run), [begin, end, run, *inputs], outputs, device=device)
-
-    in_bands(launch, count, device)
-
-
-def run_length(device: str) -> int:
-    """How many items one kernel thread does: on a processor each thread copies its arguments, which costs the most."""
-    return 64 if device == "cpu" else 1
-
-
-def in_bands(draw: Callable[[int, int], None], count: int, device: str) -> None:
-    """Call `draw(begin, end)` on ranges that cover 0 .. count: a thread for each core, where kernels have one each.
-
-    The ranges must not write to the same places; the modules of their kernels must be loaded.
-    """
-    if device != "cpu":
-        return draw(0, count)
-    pool, cores = workers()
-    edges = np.linspace(0, count, cores + 1).astype(int).tolist()
-    list(pool.map(draw, edges[:-1], edges[1:]))
-
-
-@cache
-def workers() -> tuple[ThreadPoolExecutor, int]:
-    """The threads that draw, and how many: Warp runs a CPU kernel on the calling thread and frees the interpreter."""
-    cores = min(os.cpu_count() or 1, 8)
-    return ThreadPoolExecutor(cores, thread_name_prefix="raster"), cores
 
 
 def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

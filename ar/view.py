@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 import warp as wp
 
+from .bands import launch_in_bands
 from .camera import Camera, look_at
 from .layer import Layer, Solid, vertex_normals
-from .raster import launch_in_bands, rasterise
+from .raster import rasterise
 from .shade import BRIGHTEST, SOFT, Light, Look, shade
 
 DRAPE = (0.13, 0.30, 0.36)
