@@ -20,6 +20,7 @@ COMMANDS = {
     "demo": "play a scene on a page in the browser",
     "render": "write the frames of a scene as pictures, without display",
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
+    "bench": "measure what each stage costs on this machine",
     "check": "play the built-in scenes blank and hold their figures to their bounds",
 }
 

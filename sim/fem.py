@@ -178,7 +178,7 @@ class Fem:
 
 
 def choose_preconditioner(problem: Problem) -> Preconditioner:
-    """The rest stiffness factorised where that pays, block Jacobi beyond.
+    """The rest stiffness, inverted (CUDA) or factorised where that pays; block Jacobi beyond.
 
     Raises
     ------
@@ -189,6 +189,11 @@ def choose_preconditioner(problem: Problem) -> Preconditioner:
         return BlockJacobi(problem.device)
     stiffness: sp.csc_array = problem.rest_curvature()
     try:
+        if problem.device.on_cuda:
+            from .dense import Dense, fits
+
+            if fits(problem.rows, problem.device):
+                return Dense(stiffness, problem.constraint, problem.device)
         return Factor(stiffness, problem.constraint, problem.device)
     except RuntimeError as error:
         raise InputError(f"the stiffness at rest cannot be factorised ({error}): is every part held?") from error

@@ -26,8 +26,8 @@ class Preconditioner(Protocol):
         """Use the last linearisation, if it matters; the batch has so many columns."""
         ...
 
-    def apply(self, r: wp.array, out: wp.array) -> None:
-        """out (3N, b) = M^-1 r (3N, b)."""
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+        """out (3N, b) = M^-1 r (3N, b), in the columns that are `live` (b,); the others may hold anything finite."""
         ...
 
 
@@ -52,10 +52,12 @@ class Factor:
     def prepare(self, problem: Problem, columns: int) -> None:
         """The rest stiffness serves every state."""
 
-    def apply(self, r: wp.array, out: wp.array) -> None:
-        """Two triangular solves."""
-        reduced = np.asfortranarray(self._transposed @ r.numpy())
-        out.assign(self._basis @ self._factor.solve(reduced))
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+        """Two triangular solves for each live column: the others would cost as much."""
+        values = r.numpy()
+        solved = np.zeros_like(values)
+        solved[:, live] = self._basis @ self._factor.solve(np.asfortranarray(self._transposed @ values[:, live]))
+        out.assign(solved)
 
 
 @cache
@@ -108,7 +110,7 @@ class BlockJacobi:
         self._device.launch(block_kernels_of(self._device)[0], blocks.shape, [], [blocks])
         self._blocks = blocks
 
-    def apply(self, r: wp.array, out: wp.array) -> None:
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
         """out = B^-1 r, node by node."""
         assert self._blocks is not None
         self._device.launch(block_kernels_of(self._device)[1], self._blocks.shape, [self._blocks, r], [out])
@@ -195,12 +197,12 @@ def conjugate_gradients(
         return out
 
     def precondition() -> None:
-        preconditioner.apply(r, z)
+        preconditioner.apply(r, live, z)
         problem.constraint.project(z)
 
+    live = np.sqrt(dot(r, r).numpy()) > tolerance
     precondition()
     p, rz = wp.clone(z), dot(r, z)
-    live = np.sqrt(dot(r, r).numpy()) > tolerance
     truncated = np.zeros(columns, bool)
     iterations = 0
     while live.any() and iterations < most:

@@ -1,0 +1,53 @@
+"""CUDA and CPU give the same answers, whatever preconditioner each uses."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from sim.accuracy import TRAIN, Accuracy
+from sim.effects import Elasticity, Held, Slide, ToolDisplacement, ToolForce
+from sim.fem import Fem
+from sim.linear import BlockJacobi
+from sim.loads import Displaced, Loads, push
+from sim.material import LAWS, Material
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here"),
+]
+BOUND = {"float64": 1e-6, "float32": 2e-3}
+"""Largest difference over the largest motion: both stop at a residual, not at the same iterate."""
+
+
+def pushes():
+    x = np.linspace(-8e-3, 8e-3, 7)
+    point = np.stack([x, x[::-1] / 2.0, np.zeros(7)], axis=1)
+    force = np.linspace(0.02, 0.3, 7)[:, None] * np.array([[0.3, 0.1, -1.0]])
+    return push(point, force, 7e-3)
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("law", LAWS)
+def test_a_batch_of_pushes(box, law, precision):
+    accuracy = Accuracy(1e-8) if precision == "float64" else TRAIN
+    effects = (Elasticity(Material(law, 3000.0, 0.45)), Held(), ToolForce())
+    on_cpu = Fem(box, effects, accuracy, "cpu").deform(pushes())
+    on_cuda = Fem(box, effects, accuracy, "cuda").deform(pushes())
+    assert all(outcome.good for outcome in on_cuda.outcome)
+    off = np.abs(on_cpu.displacement - on_cuda.displacement).max()
+    assert off <= BOUND[precision] * np.abs(on_cpu.displacement).max()
+
+
+def test_a_moved_footprint_and_its_reaction(box):
+    loads = Loads((Displaced(np.zeros((1, 3)), np.array([[1e-3, 0.0, -4e-3]]), np.array([7e-3])),))
+    effects = (Elasticity(), Held(), Slide(), ToolDisplacement())
+    on_cpu, on_cuda = (Fem(box, effects, Accuracy(1e-8), name).deform(loads) for name in ("cpu", "cuda"))
+    np.testing.assert_allclose(on_cuda.reaction, on_cpu.reaction, rtol=1e-5, atol=1e-9)
+
+
+def test_block_jacobi_reaches_what_the_inverse_reaches(box):
+    fem = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8), "cuda")
+    reference = fem.deform(pushes()).displacement
+    plain = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8, inner=4000), "cuda")
+    plain._direction = type(plain._direction)(BlockJacobi(plain.problem.device), 4000)
+    np.testing.assert_allclose(plain.deform(pushes()).displacement, reference, atol=1e-6 * np.abs(reference).max())
