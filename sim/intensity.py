@@ -10,6 +10,8 @@ import numpy as np
 from scipy import ndimage
 
 from .errors import InputError
+from .meshfile import check_output
+from .volume import read_volume
 
 BRIGHTEST = 99.5  # per cent of the voxels in the crop are at most white
 MARGIN = 0.015  # [m] round what is looked at
@@ -67,13 +69,12 @@ def write_intensity(path: str | Path, intensity: Intensity) -> None:
     """
     import nibabel
 
-    path = Path(path)
+    path = check_output(path, ".gz")
     affine = np.diag([1e3, 1e3, 1e3, 1.0]) @ intensity.affine
     image = nibabel.Nifti1Image(intensity.values, affine)
     image.header.set_xyzt_units("mm")
     partial = path.with_name(f".{os.getpid()}.{path.name}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         nibabel.save(image, partial)
         partial.replace(path)
     except OSError as error:
@@ -90,7 +91,5 @@ def read_intensity(path: str | Path) -> Intensity:
     InputError
         A file that is missing, unreadable, or not a volume.
     """
-    from .volume import read_volume
-
     volume = read_volume(path)
     return Intensity(volume.values, volume.affine)

@@ -41,7 +41,7 @@ def volume_subject(
     volume = read_volume(path)
     _check_labels(path, volume.values, brain, tumour)
     voxel = abs(float(np.linalg.det(volume.affine[:3, :3])))
-    notes: list[str] = []
+    notes = list(volume.notes)
     marked = np.isin(volume.values, tumour)
     solid = _whole(np.isin(volume.values, brain), marked, voxel, notes)
     if not SMALLEST_BRAIN <= solid.sum() * voxel <= LARGEST_BRAIN:
@@ -76,10 +76,12 @@ def _check_labels(path: str | Path, values: np.ndarray, brain: Sequence[int], tu
     if values.dtype.kind == "f" and not np.array_equal(values, np.rint(values)):
         raise InputError(f"{path}: holds fractions, so it is no label volume. Give whole-number labels.")
     present = np.unique(values).astype(int).tolist()
+    if present == [0]:
+        raise InputError(f"{path}: is empty, every voxel is 0. Export the labels again.")
     missing = sorted((set(brain) | set(tumour)) - set(present))
     if missing or 0 in (*brain, *tumour):
         wrong = f"has no label {_listed(missing)}" if missing else "has label 0 as background"
-        raise InputError(f"{path}: {wrong}. Choose from {_listed([label for label in present if label]) or 'none'}.")
+        raise InputError(f"{path}: {wrong}. Choose from {_listed([label for label in present if label])}.")
 
 
 def _listed(labels: Sequence[int]) -> str:

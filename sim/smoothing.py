@@ -47,6 +47,8 @@ def fitted(
     """
     on = np.unique(triangles)
     on = on[movable[on]]
+    if len(on) == 0:
+        return nodes
     middle, area = _middles_and_areas(nodes, triangles)
     weight, total = np.zeros(len(nodes)), np.zeros(len(nodes))
     for corner in triangles.T:
@@ -56,9 +58,10 @@ def fitted(
     nodes = nodes.copy()
     nodes[on] = onto_level(field, nodes[on], level)
     if volume is not None:
+        moving = movable[triangles].mean(axis=1)  # a triangle sweeps in proportion to its corners that move
         for _ in range(2):
             _, area = _middles_and_areas(nodes, triangles)
-            missing = (volume - enclosed_volume(nodes, triangles)) / area.sum()
+            missing = (volume - enclosed_volume(nodes, triangles)) / (area @ moving)
             level = np.clip(level + missing, -LARGEST_SHIFT, LARGEST_SHIFT)
             nodes[on] = onto_level(field, nodes[on], level)
     return nodes

@@ -25,7 +25,7 @@ SITES = {
 """Directions, from the brain's middle, of points on the right hemisphere's convexity: MNI152 coordinates [mm]."""
 
 Shape = Literal["sphere", "lobed"]
-LOBES, LOBE_HEIGHT, LOBE_SHARPNESS = 6, 0.28, 4.0
+LOBES, LOBE_HEIGHT, LOBE_SHARPNESS = 6, 0.5, 5.0
 SMOOTH = 5e-3  # [m] over which the cortex is levelled to find which way is in
 SMALLEST_RADIUS, LARGEST_RADIUS = 3e-3, 35e-3
 SMALLEST_COVER, LARGEST_COVER = 1e-3, 60e-3

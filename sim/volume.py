@@ -16,10 +16,11 @@ REMEDY = "Give one three-dimensional NIfTI volume (.nii or .nii.gz)."
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Voxels (I, J, K) and the affine (4, 4) from their indices to metres, RAS."""
+    """Voxels (I, J, K), the affine (4, 4) from their indices to metres (RAS), and what had to be assumed."""
 
     values: np.ndarray
     affine: np.ndarray
+    notes: tuple[str, ...]
 
 
 def read_volume(path: str | Path) -> Volume:
@@ -39,9 +40,12 @@ def read_volume(path: str | Path) -> Volume:
     if not path.name.lower().endswith((".nii", ".nii.gz")):
         raise InputError(f"{path}: is not called .nii or .nii.gz. {REMEDY}")
     try:
-        image = nibabel.Nifti1Image.from_filename(path)
+        image = nibabel.load(path)
+        if not isinstance(image, nibabel.Nifti1Image):
+            raise TypeError(f"it is {type(image).__name__}")
         values = np.asanyarray(image.dataobj)
         unit = str(image.header.get_xyzt_units()[0])
+        placed = bool(image.header["sform_code"] or image.header["qform_code"])
     except Exception as error:  # nibabel and zlib raise whatever the damaged byte led to
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise InputError(f"{path}: cannot be read as NIfTI ({reason}). {REMEDY}") from error
@@ -50,7 +54,8 @@ def read_volume(path: str | Path) -> Volume:
     _check(path, values, affine)
     while values.ndim > 3:
         values = values[..., 0]
-    return Volume(values, affine)
+    notes = () if placed else ("has neither sform nor qform: its axes are taken to point right, anterior and superior",)
+    return Volume(values, affine, notes)
 
 
 def _check(path: Path, values: np.ndarray, affine: np.ndarray) -> None:

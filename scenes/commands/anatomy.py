@@ -15,7 +15,7 @@ from sim.errors import InputError
 from sim.intensity import sidecar, write_intensity
 from sim.labels import volume_subject
 from sim.mesh import dihedral_angles
-from sim.meshfile import write_anatomy
+from sim.meshfile import check_output, write_anatomy
 from sim.meshing import surface_errors
 from sim.subject import Plan, Subject, make_anatomy
 from sim.template import SITES, Tumour, template_subject
@@ -70,8 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make the anatomy, write it, and print what it is."""
     began = time.perf_counter()
-    if args.out.suffix != ".vtu":
-        raise InputError(f"{args.out}: meshes are written as .vtu; give a name that ends so.")
+    check_output(args.out, ".vtu")
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
     plan = Plan(args.nodes, 1e-3 * chosen["craniotomy"], chosen["skull"])
     subject = _subject(args, chosen)

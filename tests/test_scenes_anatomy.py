@@ -1,0 +1,91 @@
+"""`sulcus anatomy` as a user runs it."""
+
+import json
+
+import nibabel
+import numpy as np
+import pytest
+
+from scenes.cli import main
+from sim.intensity import read_intensity, sidecar
+from sim.meshfile import read_anatomy, write_anatomy
+
+
+def run(capsys, *words):
+    code = main(["anatomy", *map(str, words)])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.fixture
+def brain(tmp_path):
+    """A ball of 55 mm radius with a ball of 10 mm in it, 2 mm voxels, and intensities that rise towards the right."""
+    index = np.moveaxis(np.indices((64, 64, 64)), 0, -1)
+    places = 2.0 * (index - 31.5)
+    labels = np.where(np.linalg.norm(places, axis=-1) < 55.0, 1, 0)
+    labels[np.linalg.norm(places - [20.0, 0.0, 20.0], axis=-1) < 10.0] = 2
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = -63.0
+    nibabel.save(nibabel.Nifti1Image(labels.astype(np.uint8), affine), tmp_path / "labels.nii.gz")
+    nibabel.save(nibabel.Nifti1Image((places[..., 0] + 70.0).astype(np.float32), affine), tmp_path / "t1.nii.gz")
+    return tmp_path
+
+
+def test_the_template_with_its_intensities_round_trip(tmp_path, capsys):
+    out = tmp_path / "brain.vtu"
+    code, text, _ = run(capsys, "--nodes", 2000, "--preset", "superficial", "--json", "--out", out)
+    summary = json.loads(text)
+    anatomy = read_anatomy(out)
+    assert code == 0 and summary["digest"] == anatomy.digest and summary["nodes"] == len(anatomy.mesh.nodes)
+    assert summary["worst_dihedral_deg"] >= 10.0 and abs(summary["tumour_volume_error_percent"]) < 2.0
+    write_anatomy(tmp_path / "again.vtu", anatomy)
+    assert read_anatomy(tmp_path / "again.vtu").digest == anatomy.digest
+    # Three millimetres under the opened cortex there is grey matter to be seen.
+    nodes = anatomy.mesh.nodes[anatomy.craniotomy]
+    inward = anatomy.mesh.nodes.mean(axis=0) - nodes
+    grey = read_intensity(sidecar(out)).at(nodes + 3e-3 * inward / np.linalg.norm(inward, axis=1, keepdims=True))
+    assert 0.3 < grey.mean() < 0.95 and grey.std() > 0.02
+    code, text, _ = run(capsys, "--nodes", 2000, "--preset", "superficial", "--out", tmp_path / "second.vtu")
+    assert code == 0 and "2.0" not in text.split()[0] and "mm mean" in text and "ml" in text
+    assert read_anatomy(tmp_path / "second.vtu").digest == anatomy.digest
+
+
+def test_a_users_volume_with_and_without_intensities(brain, capsys):
+    out = brain / "mine.vtu"
+    words = ("--labels", brain / "labels.nii.gz", "--brain", "1", "--tumour", "2", "--nodes", 2000, "--out", out)
+    code, text, _ = run(capsys, *words, "--t1", brain / "t1.nii.gz")
+    assert code == 0 and "intensities to" in text
+    grey = read_intensity(sidecar(out))
+    left, right = grey.at(np.array([[0.010, 0.0, 0.03], [0.030, 0.0, 0.03]]))
+    assert (right / left) == pytest.approx(100.0 / 80.0, rel=0.02)
+    code, text, _ = run(capsys, *words)
+    assert code == 0 and "intensities" not in text
+    assert not sidecar(out).exists()  # those of the earlier mesh do not belong to this one
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--nodes", "100"), "100 nodes are outside"),
+        (("--craniotomy", "nan"), "craniotomy of nan mm"),
+        (("--radius", "-3"), "radius of -3 mm"),
+        (("--brain", "1"), "give --labels"),
+        (("--t1", "x.nii"), "give --labels"),
+        (("--labels", "labels.nii.gz", "--brain", "1"), "needs --brain and --tumour"),
+        (("--labels", "labels.nii.gz", "--brain", "1", "--tumour", "5"), "has no label 5"),
+        (("--labels", "labels.nii.gz", "--brain", "1", "--tumour", "2", "--radius", "5"), "leave it out"),
+        (("--labels", "none.nii.gz", "--brain", "1", "--tumour", "2"), "no such file"),
+    ],
+)
+def test_bad_input_is_a_sentence_and_nothing_is_written(brain, capsys, monkeypatch, words, reason):
+    monkeypatch.chdir(brain)
+    before = sorted(brain.iterdir())
+    code, text, error = run(capsys, *words, "--out", "mine.vtu")
+    assert code == 2 and not text
+    assert reason in error and error.count("\n") == 1
+    assert sorted(brain.iterdir()) == before
+
+
+def test_a_name_that_is_no_mesh_is_refused_at_once(tmp_path, capsys):
+    code, _, error = run(capsys, "--out", tmp_path / "brain.stl")
+    assert code == 2 and ".vtu" in error

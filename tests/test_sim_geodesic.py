@@ -1,0 +1,38 @@
+"""Distances along surfaces against those known in closed form."""
+
+import numpy as np
+
+from sim.geodesic import distances
+from sim.lattice import graded_lattice
+from sim.mesh import faces_once
+from sim.stuffing import cut, whole
+
+
+def test_on_a_sphere_they_are_arcs():
+    radius = 0.06
+    lattice = graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
+    body = cut(whole(lattice), lambda points: np.linalg.norm(points, axis=1) - radius)
+    body = body.kept(body.inside)
+    surface = faces_once(body.tets)
+    source = radius * np.array([0.6, 0.0, 0.8])
+    found = distances(body.nodes, surface, source, 0.08)
+    outer = np.unique(surface)
+    arcs = radius * np.arccos(np.clip(body.nodes[outer] @ source / radius**2, -1.0, 1.0))
+    near = arcs < 0.07
+    np.testing.assert_allclose(found[outer][near], arcs[near], rtol=0.02, atol=2e-4)
+    assert np.isinf(found[outer][arcs > 0.085]).all()
+    assert np.isinf(np.delete(found, outer)).all()
+
+
+def test_they_go_round_a_gap():
+    # A horseshoe in the plane: from one tip to the other the way leads round the slit.
+    x, y = np.meshgrid(np.arange(11.0), np.arange(11.0), indexing="ij")
+    nodes = np.stack([x.ravel(), y.ravel(), np.zeros(121)], axis=1) * 0.001
+    number = np.arange(121).reshape(11, 11)
+    cells = np.array([(i, j) for i in range(10) for j in range(10) if not (i == 5 and j < 9)])
+    a, b = number[cells[:, 0], cells[:, 1]], number[cells[:, 0] + 1, cells[:, 1]]
+    c, d = number[cells[:, 0] + 1, cells[:, 1] + 1], number[cells[:, 0], cells[:, 1] + 1]
+    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    found = distances(nodes, triangles, nodes[number[5, 0]], 0.1)
+    exact = 0.009 + 0.001 + 0.009
+    assert exact <= found[number[6, 0]] + 1e-12 < 1.02 * exact

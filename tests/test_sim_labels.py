@@ -1,0 +1,208 @@
+"""Label volumes of many kinds become meshes in their own frame, or are refused in a sentence."""
+
+import nibabel
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from sim.anatomy import TUMOUR_LABEL
+from sim.errors import InputError
+from sim.labels import volume_subject
+from sim.mesh import dihedral_angles, faces_once, row_keys
+from sim.subject import Plan, make_anatomy
+
+AXES = np.array([0.045, 0.055, 0.042])  # [m] half axes of the ellipsoid that stands for a brain
+MIDDLE = np.array([0.004, -0.020, 0.012])
+TUMOUR, RADIUS = MIDDLE + [0.014, 0.008, 0.016], 0.010
+TURNED = Rotation.from_euler("xyz", [20, -15, 25], degrees=True).as_matrix()
+AFFINES = {
+    "straight": np.diag([1.2, 1.2, 1.2]),
+    "negative": np.diag([-1.2, 1.2, 1.2]),
+    "oblique": 1.2 * TURNED,
+    "oblique and negative": TURNED @ np.diag([1.2, -1.4, 1.2]),
+    "thick slices": np.diag([1.0, 1.0, 3.0]),
+    "oblique thick slices": TURNED @ np.diag([3.0, 1.0, 1.0]),
+}
+
+
+def ellipsoid(points):
+    return np.linalg.norm((points - MIDDLE) / AXES, axis=-1) < 1.0
+
+
+def ball(points, middle=TUMOUR, radius=RADIUS):
+    return np.linalg.norm(points - middle, axis=-1) < radius
+
+
+def grid(axes):
+    """Affine [mm] of a box round the brain, and the place (I, J, K, 3) [m] of each of its voxels."""
+    reach = np.abs(np.linalg.inv(axes)) @ (1e3 * AXES.max() * np.ones(3)) + 4.0
+    count = 2 * np.ceil(reach).astype(int)
+    affine = np.eye(4)
+    affine[:3, :3] = axes
+    affine[:3, 3] = 1e3 * MIDDLE - axes @ (0.5 * count)
+    index = np.moveaxis(np.indices(count), 0, -1)
+    return affine, 1e-3 * (index @ axes.T + affine[:3, 3])
+
+
+def save(path, labels, affine):
+    nibabel.save(nibabel.Nifti1Image(labels.astype(np.int16), affine), path)
+    return path
+
+
+def labelled(path, axes, tumour=ball):
+    """A brain of labels 1 and 2 (its right half), and a tumour of 3 and 4 within it."""
+    affine, places = grid(axes)
+    brain, core = ellipsoid(places), tumour(places)
+    labels = np.where(brain, 1 + (places[..., 0] > MIDDLE[0]), 0)
+    labels[core] = 3 + (places[..., 0] > places[core, 0].mean())[core]
+    return save(path, labels, affine), labels, affine
+
+
+@pytest.mark.parametrize("kind", AFFINES)
+def test_every_affine_gives_the_same_brain(tmp_path, kind):
+    path, labels, affine = labelled(tmp_path / "labels.nii", AFFINES[kind])
+    anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), Plan(nodes=3000))
+    mesh = anatomy.mesh
+    assert abs(len(mesh.nodes) - 3000) <= 300
+    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
+    assert faces_once(mesh.tets).size and len(np.unique(mesh.tets)) == len(mesh.nodes)
+    for triangles in (mesh.surface, anatomy.tumour_surface):
+        edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        assert set(np.unique(row_keys(edges), return_counts=True)[1]) == {2}
+    voxel = 1e-9 * abs(np.linalg.det(affine[:3, :3]))
+    assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx((labels > 2).sum() * voxel, rel=0.02)
+    # The frame is the volume's own: the ellipsoid that was sampled, in metres, whichever way its voxels lie.
+    outer = mesh.nodes[np.unique(mesh.surface)]
+    distance = np.abs(np.linalg.norm((outer - MIDDLE) / AXES, axis=1) - 1.0) * AXES.mean()
+    mean, p95 = (4e-4, 1.3e-3) if "thick" in kind else (3e-4, 1e-3)
+    assert distance.mean() < mean and np.percentile(distance, 95) < p95
+    core = mesh.nodes[np.unique(anatomy.tumour_surface)]
+    distance = np.abs(np.linalg.norm(core - TUMOUR, axis=1) - RADIUS)
+    assert distance.mean() < mean and np.percentile(distance, 95) < p95
+    # Opened over the tumour, held lowest.
+    opening = mesh.nodes[anatomy.craniotomy].mean(axis=0) - MIDDLE
+    assert opening @ (TUMOUR - MIDDLE) > 0.9 * np.linalg.norm(opening) * np.linalg.norm(TUMOUR - MIDDLE)
+    assert mesh.nodes[anatomy.held.all(axis=1), 2].max() < MIDDLE[2] - 0.03
+
+
+def test_the_same_volume_gives_the_same_anatomy(tmp_path):
+    path, _, _ = labelled(tmp_path / "labels.nii", AFFINES["oblique"])
+    first, second = (make_anatomy(volume_subject(path, (1, 2), (3, 4)), Plan(nodes=2000)) for _ in range(2))
+    assert first.digest == second.digest
+
+
+@pytest.mark.parametrize("rise", [-0.001, 0.006, 0.014])
+def test_a_tumour_that_reaches_or_breaks_the_cortex_is_meshed(tmp_path, rise):
+    middle = MIDDLE + [0.0, 0.0, AXES[2] - RADIUS + rise]
+    path, labels, affine = labelled(tmp_path / "l.nii", AFFINES["straight"], lambda points: ball(points, middle))
+    voxel = 1e-9 * abs(np.linalg.det(affine[:3, :3]))
+    anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), Plan(nodes=4000))
+    mesh = anatomy.mesh
+    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 5.0
+    assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx((labels > 2).sum() * voxel, rel=0.02)
+    assert mesh.volumes.sum() == pytest.approx((labels > 0).sum() * voxel, rel=0.01)
+    touching = np.intersect1d(np.unique(mesh.surface), anatomy.tumour_nodes)
+    assert len(touching) > 3 or rise < 0.0
+
+
+def test_components_and_holes(tmp_path):
+    affine, places = grid(AFFINES["straight"])
+    labels = np.where(ellipsoid(places), 1, 0)
+    labels[ball(places)] = 3
+    second = MIDDLE - [0.018, 0.0, 0.014]
+    labels[ball(places, second, 0.007)] = 4
+    labels[ball(places, MIDDLE - [0.0, 0.025, 0.0], 0.006)] = 0  # a ventricle
+    labels[:4, :4, :4] = 1  # a speck of brain
+    labels[-4:, -4:, -4:] = 3  # a speck of tumour, outside
+    labels[tuple(np.array(labels.shape) // 2 + [0, 12, 0])] = 3  # one voxel, inside
+    subject = volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3, 4))
+    text = " ".join(subject.notes)
+    for part in ("of brain that is not connected", "of holes", "of tumour outside", "of tumour in specks"):
+        assert part in text
+    anatomy = make_anatomy(subject, Plan(nodes=4000))
+    inside = anatomy.mesh.nodes[anatomy.tumour_nodes]
+    assert KDTree(inside).query(np.stack([TUMOUR, second]))[0].max() < 0.006
+    wanted = 4 / 3 * np.pi * (RADIUS**3 + 0.007**3)
+    mesh = anatomy.mesh
+    assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx(wanted, rel=0.02)
+    assert mesh.volumes.sum() == pytest.approx(4 / 3 * np.pi * AXES.prod(), rel=0.01)
+
+
+def test_the_skull_is_not_opened_from_below(tmp_path):
+    low = MIDDLE - [0.0, 0.0, 0.024]
+    path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], lambda points: ball(points, low))
+    subject = volume_subject(path, (1, 2), (3, 4))
+    assert subject.site[2] >= low[2]
+
+
+@pytest.mark.parametrize(
+    ("brain", "tumour", "reason"),
+    [
+        ((1, 7), (3,), "has no label 7. Choose from 1, 2, 3, 4"),
+        ((1, 2), (2, 3), "named as brain and as tumour"),
+        ((0, 1), (3,), "background"),
+        ((), (3,), "at least one label"),
+    ],
+)
+def test_labels_that_cannot_be_used(tmp_path, brain, tumour, reason):
+    path, _, _ = labelled(tmp_path / "l.nii", AFFINES["thick slices"])
+    with pytest.raises(InputError, match=reason):
+        volume_subject(path, brain, tumour)
+
+
+def test_volumes_that_cannot_be_used(tmp_path):
+    affine, places = grid(AFFINES["thick slices"])
+    labels = ellipsoid(places).astype(np.int16)
+    with_tumour = np.where(ball(places), 3, labels)
+
+    def refused(name, values, reason, used=affine):
+        path = tmp_path / name
+        nibabel.save(nibabel.Nifti1Image(values, used), path)
+        with pytest.raises(InputError, match=reason):
+            volume_subject(path, (1,), (3,))
+
+    outside = labels.copy()
+    outside[:3, :3, :3] = 3
+    not_finite = with_tumour.astype(np.float32)
+    not_finite[0, 0, 0] = np.nan
+    refused("outside.nii.gz", outside, "outside the brain")
+    refused("fractions.nii.gz", (0.5 * with_tumour).astype(np.float32), "fractions")
+    refused("nan.nii.gz", not_finite, "not finite")
+    refused("slice.nii.gz", with_tumour[:, :, 20], "not one volume")
+    refused("series.nii.gz", np.stack([with_tumour] * 2, axis=3), "not one volume")
+    refused("colours.nii.gz", np.zeros((9, 9, 9), [("R", "u1"), ("G", "u1"), ("B", "u1")]), "colours")
+    refused("empty.nii.gz", np.zeros_like(labels), "every voxel is 0")
+    refused("coarse.nii.gz", with_tumour, "voxels measure", used=np.diag([8.0, 8.0, 8.0, 1.0]))
+    refused("small.nii.gz", with_tumour, "make a brain of", used=np.diag([0.1, 0.1, 0.3, 1.0]))
+    few = labels.copy()
+    few[tuple(np.array(few.shape) // 2)] = 3
+    refused("few.nii.gz", few, "has 1 voxels")
+
+
+def test_files_that_are_no_volumes(tmp_path):
+    (tmp_path / "folder.nii").mkdir()
+    (tmp_path / "text.nii").write_text("not a volume" * 99)
+    (tmp_path / "text.nii.gz").write_text("not compressed")
+    (tmp_path / "text.mgz").write_text("")
+    affine, places = grid(AFFINES["thick slices"])
+    whole = save(tmp_path / "whole.nii.gz", ellipsoid(places), affine).read_bytes()
+    (tmp_path / "half.nii.gz").write_bytes(whole[: len(whole) // 2])
+    for name, reason in (
+        ("missing.nii.gz", "no such file"),
+        ("folder.nii", "is a folder"),
+        ("text.nii", "cannot be read as NIfTI"),
+        ("text.nii.gz", "cannot be read as NIfTI"),
+        ("half.nii.gz", "cannot be read as NIfTI"),
+        ("text.mgz", "is not called .nii"),
+    ):
+        with pytest.raises(InputError, match=reason) as caught:
+            volume_subject(tmp_path / name, (1,), (3,))
+        assert name in str(caught.value)
+
+
+def test_a_volume_without_orientation_is_taken_as_it_lies_and_says_so(tmp_path):
+    _, places = grid(AFFINES["thick slices"])
+    labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
+    nibabel.save(nibabel.Nifti1Image(labels, None), tmp_path / "l.nii")
+    assert any("neither sform nor qform" in note for note in volume_subject(tmp_path / "l.nii", (1,), (3,)).notes)

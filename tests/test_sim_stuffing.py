@@ -1,0 +1,75 @@
+"""Bodies carved from a lattice: angles, volumes, conformity, and what stays where it is."""
+
+import numpy as np
+import pytest
+
+from sim.lattice import graded_lattice
+from sim.mesh import dihedral_angles, faces_once, row_keys, signed_volumes
+from sim.stuffing import cut, whole
+
+RADIUS, INNER, MIDDLE = 0.06, 0.015, np.array([0.02, 0.01, 0.0])
+
+
+def ball(points):
+    return np.linalg.norm(points, axis=1) - RADIUS
+
+
+def core(points):
+    return np.linalg.norm(points - MIDDLE, axis=1) - INNER
+
+
+@pytest.fixture(scope="module")
+def carved():
+    lattice = graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
+    body = cut(whole(lattice), ball)
+    body = body.kept(body.inside)
+    return body, cut(body, core, pinned=body.surface)
+
+
+def test_angles_of_one_surface_keep_the_bound_of_the_paper(carved):
+    assert dihedral_angles(carved[0].nodes, carved[0].tets).min() > 10.7
+
+
+def test_both_materials_are_closed_and_fill_the_body(carved):
+    body, both = carved
+    assert signed_volumes(both.nodes, both.tets).min() > 0.0
+    for tets, volume in ((both.tets, 4 / 3 * np.pi * RADIUS**3), (both.tets[both.inside], 4 / 3 * np.pi * INNER**3)):
+        edges = faces_once(tets)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        assert set(np.unique(row_keys(edges), return_counts=True)[1]) == {2}
+        assert signed_volumes(both.nodes, tets).sum() == pytest.approx(volume, rel=0.1)
+    assert signed_volumes(both.nodes, both.tets).sum() == pytest.approx(
+        signed_volumes(body.nodes, body.tets).sum(), rel=1e-12
+    )
+
+
+def test_surface_nodes_lie_on_the_surface(carved):
+    body, both = carved
+    assert np.abs(ball(body.nodes[np.unique(faces_once(body.tets))])).max() < 1e-8
+    assert np.abs(core(both.nodes[np.unique(faces_once(both.tets[both.inside]))])).max() < 1e-8
+
+
+def test_no_tetrahedron_crosses_the_interface(carved):
+    both = carved[1]
+    values = core(both.nodes)[both.tets]
+    assert values[both.inside].max() < 1e-8
+    assert values[~both.inside].min() > -1e-8
+
+
+def test_pinned_nodes_stay():
+    lattice = graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
+    body = cut(whole(lattice), ball)
+    body = body.kept(body.inside)
+
+    def half(points):
+        return points[:, 0] - 0.0013
+
+    both = cut(body, half, pinned=body.surface)
+    np.testing.assert_array_equal(both.nodes[: len(body.nodes)][body.surface], body.nodes[body.surface])
+    assert not np.array_equal(both.nodes[: len(body.nodes)], body.nodes)
+
+
+def test_the_same_input_gives_the_same_mesh(carved):
+    body, both = carved
+    again = cut(body, core, pinned=body.surface)
+    np.testing.assert_array_equal(again.nodes, both.nodes)
+    np.testing.assert_array_equal(again.tets, both.tets)

@@ -1,0 +1,133 @@
+"""The built-in brain: the figures that its mesh is held to, its tumour, its boundary."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from sim.anatomy import TUMOUR_LABEL
+from sim.errors import InputError
+from sim.geodesic import distances
+from sim.mesh import dihedral_angles
+from sim.subject import Plan, make_anatomy
+from sim.template import VOLUME, Tumour, template_subject
+
+
+@pytest.fixture(scope="module")
+def subject():
+    return template_subject(Tumour())
+
+
+@pytest.fixture(scope="module")
+def anatomy(subject):
+    return make_anatomy(subject, Plan())
+
+
+def distances_to_voxel_faces(points, mask, affine):
+    """Exact distances (n,) [m] of points to the boundary squares of a mask of cubic voxels, by brute force nearby."""
+    centres, axes = [], []
+    for axis in range(3):
+        place = np.argwhere(np.diff(mask.astype(np.int8), axis=axis)).astype(float)
+        place[:, axis] += 0.5
+        centres.append(place)
+        axes.append(np.full(len(place), axis))
+    centre, axis = np.concatenate(centres), np.concatenate(axes)
+    inverse = np.linalg.inv(affine)
+    index = points @ inverse[:3, :3].T + inverse[:3, 3]
+    near = KDTree(centre).query(index, k=12)[1]
+    offset = np.abs(index[:, None] - centre[near])
+    half = np.where(axis[near][..., None] == np.arange(3), 0.0, 0.5)
+    return np.linalg.norm(np.maximum(offset - half, 0.0), axis=2).min(axis=1) * np.linalg.norm(affine[:3, 0])
+
+
+def spread_points(mesh, count):
+    rng = np.random.default_rng(0)
+    corners = mesh.nodes[mesh.surface]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = rng.choice(len(corners), count, p=area / area.sum())
+    return np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), count), corners[chosen])
+
+
+@pytest.mark.parametrize("shape", ["sphere", "lobed"])
+def test_at_17k_nodes_angles_surface_and_volume_are_as_promised(shape):
+    subject = template_subject(Tumour(shape=shape, seed=7))
+    mesh = make_anatomy(subject, Plan(nodes=17_000)).mesh
+    assert abs(len(mesh.nodes) - 17_000) <= 1_700
+    assert dihedral_angles(mesh.nodes, mesh.tets).min() >= 10.0
+    assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.02)
+    grey, affine = subject.intensity.values, subject.intensity.affine
+    distance = distances_to_voxel_faces(
+        spread_points(mesh, 20_000), ndimage.binary_fill_holes(grey > 0.2 * grey.max()), affine
+    )
+    assert distance.mean() < 3e-4
+    assert np.percentile(distance, 95) < 1e-3
+
+
+def test_it_has_the_volume_of_a_person(anatomy):
+    assert anatomy.mesh.volumes.sum() == pytest.approx(VOLUME, rel=0.005)
+    assert abs(len(anatomy.mesh.nodes) - 5300) <= 530
+
+
+def test_the_cap_lies_as_deep_as_asked():
+    for cover in (0.003, 0.025):
+        subject = template_subject(Tumour(cover=cover, shape="lobed", seed=1))
+        inward = subject.tumour.middle - subject.site
+        inward /= np.linalg.norm(inward)
+        assert subject.tumour((subject.site + cover * inward)[None])[0] == pytest.approx(0.0, abs=1e-6)
+        assert subject.brain(subject.site[None])[0] == pytest.approx(0.0, abs=5e-5)
+
+
+def test_seeds_vary_the_lobed_shape_but_not_its_volume():
+    first, again, other = (template_subject(Tumour(shape="lobed", seed=seed)).tumour for seed in (1, 1, 2))
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(200_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    np.testing.assert_array_equal(first.radius(directions), again.radius(directions))
+    assert np.abs(first.radius(directions) - other.radius(directions)).max() > 1e-3
+    for shape in (first, other):
+        assert (shape.radius(directions) ** 3).mean() == pytest.approx(0.012**3, rel=5e-3)
+        assert np.ptp(shape.radius(directions)) > 3e-3
+
+
+def test_the_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
+    mesh = anatomy.mesh
+    outer = np.unique(mesh.surface)
+    stem, skull = anatomy.held.all(axis=1), anatomy.slide_normal.any(axis=1)
+    sets = np.stack([stem, skull, anatomy.craniotomy])
+    assert (sets.sum(axis=0)[outer] == 1).all() and not np.delete(sets, outer, axis=1).any()
+    # 50 mm across, along the cortex, and at least the 90 nodes that the seed's experiment leaves free.
+    along = distances(mesh.nodes, mesh.surface, subject.site, 0.06)
+    np.testing.assert_array_equal(anatomy.craniotomy, along <= 0.025)
+    assert anatomy.craniotomy.sum() >= 90
+    # The held nodes are the medulla's: lowest, in the midline.
+    held = mesh.nodes[stem]
+    assert stem.sum() >= 6 and held[:, 2].max() < mesh.nodes[:, 2].min() + 0.022 and np.abs(held[:, 0]).max() < 0.022
+    # Normals point outwards: away from the middle on the convexity.
+    top = skull & (mesh.nodes[:, 2] > 0.05)
+    assert (
+        np.einsum("ni,ni->n", anatomy.slide_normal[top], mesh.nodes[top] - mesh.nodes.mean(axis=0)) > 0
+    ).mean() > 0.95
+    fast = make_anatomy(subject, Plan(skull="held", craniotomy=0.110))
+    assert not fast.slide_normal.any()
+    assert fast.held.all(axis=1).sum() + fast.craniotomy.sum() == len(np.unique(fast.mesh.surface))
+
+
+def test_what_cannot_be_placed_is_refused(subject):
+    for values, reason in (
+        ({"radius": 0.05}, "radius of 50 mm is outside"),
+        ({"cover": float("nan")}, "cover of nan mm"),
+        ({"site": "nowhere"}, "no site is called"),
+        ({"shape": "cube"}, "no tumour shape"),
+        ({"seed": -1}, "negative"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            Tumour(**values)
+    with pytest.raises(InputError, match="reaches out of the brain"):
+        template_subject(Tumour(radius=0.035, cover=0.06, site="frontal"))
+    for values, reason in (
+        ({"nodes": 100}, "100 nodes are outside"),
+        ({"craniotomy": 0.2}, "outside 15 to 120 mm"),
+        ({"skull": "loose"}, "cannot be 'loose'"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            Plan(**values)
