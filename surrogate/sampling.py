@@ -15,7 +15,7 @@ from .patch import Patch, nearest, open_patch
 ATTEMPTS = 2000
 # Deeper than this the tool has gone through the tissue; tissue harm begins at 2.7-4 kPa mean contact pressure.
 DEEPEST, HARDEST = 15e-3, 8e3
-# E / (1 - nu^2) of the default tissue: the depth F / (2 E* r) of a flat round punch judges a load before it is solved.
+# E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) judges a load before it is solved.
 PLANE_MODULUS = 3000.0 / (1.0 - 0.45**2)
 
 
@@ -33,6 +33,8 @@ class Tool:
         Least and greatest force [N], log-uniform between.
     pressure
         Least and greatest mean contact pressure F / (pi r^2) [Pa]; a draw outside is repeated.
+    depth
+        Greatest depth by Hertz's formula [m]; a deeper draw is repeated.
     cone
         Greatest angle [rad] between the force and the inward normal; uniform by solid angle.
     """
@@ -41,18 +43,20 @@ class Tool:
     footprint: tuple[float, float]
     force: tuple[float, float]
     pressure: tuple[float, float] = (0.0, HARDEST)
+    depth: float = DEEPEST
     cone: float = np.pi / 4.0
 
     def admits(self, force: float, footprint: float) -> bool:
         """Whether pressure and estimated depth are those of surgery."""
         pressure = force / (np.pi * footprint**2)
-        return self.pressure[0] <= pressure <= self.pressure[1] and force / (2.0 * PLANE_MODULUS * footprint) <= DEEPEST
+        depth = 3.0 * force / (4.0 * PLANE_MODULUS * footprint)
+        return self.pressure[0] <= pressure <= self.pressure[1] and depth <= self.depth
 
 
 TOOLS = {
     tool.name: tool
     for tool in (
-        Tool("palpation", (5e-3, 7.5e-3), (0.05, 0.4)),
+        Tool("palpation", (5e-3, 7.5e-3), (0.05, 0.4), depth=10e-3),
         Tool("bipolar", (0.5e-3, 1e-3), (0.01, 0.05)),
         Tool("dissector", (1.5e-3, 2e-3), (0.02, 0.25)),
         # 5-30 mmHg under plates of 10-20 x 20-40 mm.

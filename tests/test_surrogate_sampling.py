@@ -6,7 +6,7 @@ import pytest
 from sim.errors import InputError
 from sim.loads import Pushed
 from surrogate.patch import open_patch
-from surrogate.sampling import HARDEST, PUBLISHED_FOOTPRINT, TOOLS, draw, spread
+from surrogate.sampling import HARDEST, PLANE_MODULUS, PUBLISHED_FOOTPRINT, TOOLS, draw, spread
 from surrogate.split import leave_discs_out
 
 
@@ -28,6 +28,7 @@ def test_tools_stay_in_their_ranges(box, patch, name):
     assert (loads.footprint >= tool.footprint[0]).all() and (loads.footprint <= tool.footprint[1]).all()
     assert (force >= tool.force[0] * (1 - 1e-12)).all() and (force <= tool.force[1] * (1 + 1e-12)).all()
     assert pressure.max() <= HARDEST and pressure.min() >= tool.pressure[0]
+    assert (3 * force / (4 * PLANE_MODULUS * loads.footprint)).max() <= tool.depth
     assert cosine.min() >= np.cos(tool.cone) - 1e-12
     assert (patch.rim_distance(loads.point) >= loads.footprint).all()
 
@@ -41,7 +42,8 @@ def test_points_are_uniform_by_area_directions_by_solid_angle_and_forces_by_loga
     loads = pushes("palpation", box, 4000, 0)
     force = np.linalg.norm(loads.force, axis=1)
     cosine = -loads.force[:, 2] / force
-    assert np.median(force) == pytest.approx(np.sqrt(0.05 * 0.4), rel=0.08)
+    # No draw below 0.25 N is too deep: the octaves below it are equally full.
+    assert (force < 0.1).sum() == pytest.approx(((force >= 0.1) & (force < 0.2)).sum(), rel=0.1)
     assert np.mean(cosine) == pytest.approx((1 + np.cos(np.pi / 4)) / 2, abs=0.01)
 
 
