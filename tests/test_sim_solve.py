@@ -281,6 +281,26 @@ def test_a_piece_that_hangs_by_a_corner_or_an_edge_is_refused(solve, shared: int
     refused(run, "can move rigidly")
 
 
+def bridge(rigid: bool) -> dict:
+    """A piece on three corners of the box's top, joined to it by no face; `rigid`: the box's base is held."""
+    feet = [int(np.argmin(np.linalg.norm(MESH.nodes - p, axis=1))) for p in MESH.nodes[TOP][[0, 2, 6]]]
+    points = np.vstack([MESH.nodes, [[0.02, 0.02, 0.15], [0.04, 0.03, 0.13]]])
+    tets = np.array([[feet[0], feet[1], COUNT, COUNT + 1], [feet[0], feet[2], COUNT, COUNT + 1]])
+    return {
+        "data": {"fixed": np.append(BASE & rigid, [0, 0]).astype(int), "force": np.vstack([FORCE, np.zeros((2, 3))])},
+        "points": points,
+        "cells": [("tetra", np.vstack([MESH.tets, tets]))],
+    }
+
+
+def test_a_piece_on_three_corners_is_held_by_what_bears_it(solve) -> None:
+    assert solve(**bridge(rigid=True)).code == 0
+
+
+def test_a_piece_on_three_corners_of_a_loose_body_is_loose(solve) -> None:
+    refused(solve(**bridge(rigid=False)), "can move rigidly in 6 ways")
+
+
 def test_bad_output_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["solve", str(tmp_path / "none.vtu"), "--out", str(tmp_path / "a.txt")]) == 2
     assert ".vtu" in capsys.readouterr().err

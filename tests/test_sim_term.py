@@ -17,7 +17,9 @@ from sim.device import Device, find_device
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.loads import Loads, Nodal, Pushed
 from sim.material import LAWS, Material
+from sim.mesh import signed_volumes
 from sim.term import Cases, Term
+from sim.terms.elasticity import VOLUME_KEPT
 
 MESH = box((2, 2, 2), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
@@ -264,6 +266,36 @@ def test_longest_step_only_lowers(term: Term, example: Example, device: Device) 
     out = wp.full(3, 1e-9, dtype=device.scalar, device="cpu")
     term.longest_step(device.array(example.u), device.array(example.flung), out)
     assert (out.numpy() <= 1e-9).all()
+
+
+def test_linearisation_does_not_follow_the_state(term: Term, example: Example, device: Device) -> None:
+    """The outer iteration moves u in place: the curvature stays where it was taken."""
+    u, p = device.array(example.u), RNG.normal(size=example.u.shape)
+    term.linearise(u, wp.zeros(3, dtype=wp.int32, device="cpu"))
+    before = curvature(term, device, p)
+    u.assign(1.5 * example.u)
+    np.testing.assert_array_equal(curvature(term, device, p), before)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e-2, 0.1, 10.0])
+def test_steps_of_the_logarithmic_law_keep_a_tenth_of_every_volume(device: Device, size: float) -> None:
+    """At every point of the way; and twice the step would not, so that nothing is given away."""
+    example = EXAMPLES["neo-hookean"]
+    term = example.build(device)
+    term.begin(example.cases)
+    du = size * np.random.default_rng(13).normal(size=(ROWS, 3))
+    longest = longest_step(term, device, example.u, du)
+
+    def volumes(fraction: float) -> np.ndarray:
+        moved = (example.u + fraction * longest * du).T.reshape(3, -1, 3) + MESH.nodes
+        return np.stack([signed_volumes(nodes, MESH.tets) for nodes in moved])
+
+    floor = VOLUME_KEPT * volumes(0.0)
+    fractions = np.linspace(0.0, 1.0, 101)
+    assert all((volumes(fraction) >= floor - 1e-16).all() for fraction in fractions)
+    doubled = np.array([(volumes(2.0 * fraction) >= floor).all(axis=1) for fraction in fractions]).all(axis=0)
+    assert ((longest == 1.0) | ~doubled).all()
+    assert (size >= 0.1) == (longest < 1.0).all()
 
 
 def test_history_creeps_and_travels_rows_first(device: Device) -> None:

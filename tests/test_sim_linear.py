@@ -1,0 +1,161 @@
+"""Conjugate gradients, their preconditioners and the line search, each against dense algebra."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from boxes import base_held, box, top_forces
+
+from sim.compile import compile_problem
+from sim.device import Device, find_device
+from sim.direction import Direction
+from sim.effects import Elasticity, Held, NodalForce
+from sim.fem import choose_preconditioner
+from sim.linear import BlockJacobi, Preconditioner, conjugate_gradients
+from sim.loads import Loads, Nodal
+from sim.problem import Problem
+from sim.search import search
+from sim.term import Cases
+
+MESH = box((2, 2, 2), 0.1, distortion=0.15)
+ANATOMY = base_held(MESH)
+ROWS = MESH.nodes.size
+FREE = np.flatnonzero(~ANATOMY.held.ravel())
+FORCE = top_forces(MESH, np.array([[0.0, 0.1, -0.2], [0.3, 0.0, 0.1]]))
+CRUSHED = np.repeat((MESH.nodes * [0.15, 0.15, -0.55]).reshape(-1, 1), 2, axis=1)
+REST = np.zeros((ROWS, 2))
+
+
+@pytest.fixture(scope="module")
+def device() -> Device:
+    return find_device("cpu", "float64")
+
+
+@pytest.fixture
+def problem(device: Device) -> Problem:
+    out = compile_problem([Elasticity(), Held(), NodalForce()], ANATOMY, device)
+    out.begin(Cases(Loads((Nodal(FORCE),)), np.zeros(2)))
+    return out
+
+
+@pytest.fixture(params=["factor", "block jacobi"])
+def preconditioner(request: pytest.FixtureRequest, problem: Problem) -> Preconditioner:
+    return choose_preconditioner(problem) if request.param == "factor" else BlockJacobi(problem.device)
+
+
+def right_hand_side(problem: Problem) -> np.ndarray:
+    """Projected, one column much larger than the other."""
+    r = FORCE.reshape(2, -1).T * [1.0, 1e-6]
+    array = problem.device.array(r)
+    problem.constraint.project(array)
+    return array.numpy()
+
+
+def dense(problem: Problem, u: np.ndarray) -> np.ndarray:
+    """Free curvature (n, n) at the first column of u, after linearising there."""
+    problem.linearise(problem.device.array(u), np.zeros(u.shape[1], bool))
+    columns = []
+    for row in FREE:
+        p = np.zeros(u.shape)
+        p[row] = 1.0
+        out = problem.device.zeros(*u.shape)
+        problem.add_curvature(problem.device.array(p), out)
+        columns.append(out.numpy()[FREE, 0])
+    return np.array(columns).T
+
+
+def solve(problem: Problem, preconditioner: Preconditioner, r: np.ndarray, tolerance: np.ndarray, most: int):
+    preconditioner.prepare(problem, r.shape[1])
+    return conjugate_gradients(problem, preconditioner, problem.device.array(r), tolerance, most)
+
+
+def test_solves_to_the_tolerance_column_by_column(problem: Problem, preconditioner: Preconditioner) -> None:
+    K, r = dense(problem, 1e-2 * CRUSHED), right_hand_side(problem)
+    found = solve(problem, preconditioner, r, 1e-10 * np.linalg.norm(r, axis=0), 400)
+    x = found.x.numpy()
+    assert not np.delete(x, FREE, axis=0).any()
+    for column in range(2):
+        left = r[FREE, column] - K @ x[FREE, column]
+        assert np.linalg.norm(left) < 1.1e-10 * np.linalg.norm(r[:, column])
+    assert not found.truncated.any()
+
+
+def test_needs_no_more_iterations_than_unknowns(problem: Problem, preconditioner: Preconditioner) -> None:
+    """Directions are conjugate: exact arithmetic ends after n steps; steepest descent takes hundreds."""
+    dense(problem, 1e-2 * CRUSHED)
+    r = right_hand_side(problem)
+    found = solve(problem, preconditioner, r, 1e-8 * np.linalg.norm(r, axis=0), 1000)
+    assert found.iterations <= (1.2 * len(FREE) if isinstance(preconditioner, BlockJacobi) else 8)
+
+
+def test_the_factor_inverts_the_rest_stiffness(problem: Problem) -> None:
+    K, r = dense(problem, REST), right_hand_side(problem)
+    out = problem.device.zeros(*r.shape)
+    choose_preconditioner(problem).apply(problem.device.array(r), np.ones(2, bool), out)
+    np.testing.assert_allclose(out.numpy()[FREE], np.linalg.solve(K, r[FREE]), rtol=1e-9, atol=1e-18)
+
+
+def test_negative_curvature_gives_a_descent_direction(problem: Problem, preconditioner: Preconditioner) -> None:
+    K, r = dense(problem, CRUSHED), right_hand_side(problem)
+    assert np.linalg.eigvalsh(K)[0] < 0.0
+    found = solve(problem, preconditioner, r, 1e-10 * np.linalg.norm(r, axis=0), 400)
+    x = found.x.numpy()
+    assert found.truncated.all()
+    assert np.isfinite(x).all()
+    assert ((x * r).sum(axis=0) > 0.0).all()
+    # Steihaug: what was gathered lies where the model still curves upwards, or it is the first direction.
+    curved = np.einsum("ic,ij,jc->c", x[FREE], K, x[FREE])
+    out = problem.device.zeros(*r.shape)
+    preconditioner.apply(problem.device.array(r), np.ones(2, bool), out)
+    problem.constraint.project(out)
+    first = np.abs(x - out.numpy()).max(axis=0) < 1e-12 * np.abs(x).max(axis=0)
+    assert ((curved > 0.0) | first).all()
+
+
+def test_a_budget_ends_the_iteration(problem: Problem) -> None:
+    dense(problem, 1e-2 * CRUSHED)
+    r = right_hand_side(problem)
+    found = solve(problem, BlockJacobi(problem.device), r, np.zeros(2), 5)
+    assert found.iterations == 5
+    assert np.isfinite(found.x.numpy()).all()
+
+
+def test_nothing_to_solve_is_zero(problem: Problem, preconditioner: Preconditioner) -> None:
+    dense(problem, REST)
+    found = solve(problem, preconditioner, np.zeros((ROWS, 2)), np.zeros(2), 400)
+    assert found.iterations == 0
+    assert not found.x.numpy().any()
+
+
+def downhill(problem: Problem, sign: np.ndarray) -> tuple[wp.array, Direction]:
+    """At rest: minus the free gradient scaled to a motion of millimetres, times a sign per column."""
+    u = problem.device.zeros(ROWS, 2)
+    g = problem.gradient(u)
+    problem.constraint.project(g)
+    d = -sign * g.numpy() * 1e-3 / np.abs(g.numpy()).max(axis=0)
+    return u, Direction(problem.device.array(d), np.abs((g.numpy() * d).sum(axis=0)), 0)
+
+
+def test_search_accepts_where_the_energy_falls(problem: Problem) -> None:
+    u, direction = downhill(problem, np.ones(2))
+    length = search(problem, u, direction)
+    assert ((length > 0.0) & (length <= 1.0)).all()
+    before = problem.energy(u)
+    moved = problem.device.array(length * direction.d.numpy())
+    assert (problem.energy(moved) < before).all()
+
+
+def test_search_returns_zero_uphill_and_only_there(problem: Problem) -> None:
+    u, direction = downhill(problem, np.array([1.0, -1.0]))
+    length = search(problem, u, direction)
+    assert length[0] > 0.0
+    assert length[1] == 0.0
+
+
+def test_search_does_not_move_what_it_is_given(problem: Problem) -> None:
+    u, direction = downhill(problem, np.ones(2))
+    before = direction.d.numpy().copy()
+    search(problem, u, direction)
+    assert not u.numpy().any()
+    np.testing.assert_array_equal(direction.d.numpy(), before)
