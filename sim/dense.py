@@ -15,8 +15,8 @@ from .constraint import Constraint
 from .device import Device
 from .problem import Problem
 
-# Stiffness, its factor and its inverse stand in memory together, in double precision.
-COPIES = 3
+# Stiffness, factor, basis, inverse and a product stand in memory together, in double precision.
+COPIES = 6
 
 
 def fits(rows: int, device: Device) -> bool:
@@ -41,10 +41,9 @@ class Dense:
         where = wp.device_to_torch(device.name)
         basis = constraint.basis()
         free = torch.as_tensor((basis.T @ stiffness @ basis).toarray(), device=where)
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(free))
-        span = torch.sparse_coo_tensor(*_coordinates(basis, where), basis.shape, device=where)
-        whole = torch.sparse.mm(span, torch.sparse.mm(span, inverse).T)
-        self._inverse = whole.to(getattr(torch, device.precision))
+        span = torch.as_tensor(basis.toarray(), device=where)
+        inverse = span @ torch.cholesky_inverse(torch.linalg.cholesky(free)) @ span.T
+        self._inverse = inverse.to(getattr(torch, device.precision))
         torch.cuda.synchronize(where)
 
     def prepare(self, problem: Problem, columns: int) -> None:
@@ -54,9 +53,3 @@ class Dense:
         """One matrix product, in Warp's stream."""
         with torch.cuda.stream(wp.stream_to_torch(self._device.name)):
             torch.matmul(self._inverse, wp.to_torch(r), out=wp.to_torch(out))
-
-
-def _coordinates(matrix: sp.csc_array, where: str) -> tuple[torch.Tensor, torch.Tensor]:
-    entries = matrix.tocoo()
-    index = torch.as_tensor([entries.row.tolist(), entries.col.tolist()], device=where)
-    return index, torch.as_tensor(entries.data, device=where)
