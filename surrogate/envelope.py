@@ -26,7 +26,7 @@ class Envelope:
     reach
         The farthest from a taught point that the held-out loads lay [m]: so far the errors are known.
     overhang
-        Greatest footprint radius less distance to the rim [m].
+        Greatest footprint radius less distance to the rim [m], held-out loads included.
     angle
         Greatest angle [rad] between force and inward normal.
     force
@@ -56,8 +56,9 @@ class Envelope:
 
 
 def envelope_of(patch: Patch, taught: Pushed, held_out: Pushed) -> Envelope:
-    """The envelope of the `taught` loads, with the reach at which `held_out` loads were scored."""
+    """The envelope of the `taught` loads, as far in place as the `held_out` loads on which errors were measured."""
     magnitude, angle, overhang = _measures(patch, taught)
+    overhang = np.append(overhang, _measures(patch, held_out)[2])
     return Envelope(
         taught.point.astype(np.float32),
         float(nearest(held_out.point, taught.point)[1].max()),
