@@ -234,6 +234,25 @@ def test_a_body_that_can_move_rigidly_is_refused(held: np.ndarray, sentence: str
         Fem(hold(MESH, held), [SOFT, Held(), NodalForce()], TIGHT, "cpu")
 
 
+def test_walls_alone_hold_a_body() -> None:
+    """Three faces that slide leave no rigid motion; two leave one."""
+    faces = np.where(MESH.nodes < 1e-9, 1.0, 0.0)
+    for used, free in (([0, 1, 2], 0), ([0, 2], 1), ([2], 3)):
+        normal = np.zeros((COUNT, 3))
+        for axis in used:
+            normal[(faces[:, axis] > 0.0) & ~normal.any(axis=1), axis] = 1.0
+        anatomy = hold(MESH, np.zeros(COUNT, bool), normal)
+        if free:
+            with pytest.raises(InputError, match=f"{free} of 6"):
+                Fem(anatomy, [SOFT, Held(), Slide(), NodalForce()], TIGHT, "cpu")
+            continue
+        force = np.zeros((1, COUNT, 3))
+        force[0, TOP, 2] = -0.01
+        found = solve(anatomy, [Held(), Slide(), NodalForce()], Nodal(force))
+        assert found.displacement[0, TOP, 2].max() < -1e-4
+        assert np.abs(np.einsum("vi,vi->v", found.displacement[0], normal)).max() < 1e-15
+
+
 def test_six_components_are_enough_to_hold_a_body() -> None:
     """Statically determinate: forces in balance deform it, and the six reactions vanish."""
     a, b, c = (int(np.argmin(np.linalg.norm(MESH.nodes - p, axis=1))) for p in ([0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]))

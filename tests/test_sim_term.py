@@ -90,13 +90,15 @@ def device() -> Device:
 
 
 @pytest.fixture(scope="module")
-def term(example: Example, device: Device) -> Term:
+def built(example: Example, device: Device) -> Term:
     return example.build(device)
 
 
-@pytest.fixture(autouse=True)
-def _begun(term: Term, example: Example) -> None:
-    term.begin(example.cases)
+@pytest.fixture
+def term(built: Term, example: Example) -> Term:
+    """The term, begun afresh: a test may have dropped columns."""
+    built.begin(example.cases)
+    return built
 
 
 def energy(term: Term, device: Device, u: np.ndarray) -> np.ndarray:
