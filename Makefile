@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint template clean
 
 demo: $(STAMP)
 	$(VENV)/bin/sulcus demo
@@ -15,6 +15,12 @@ lint: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/basedpyright
+
+# The anatomy and the models that ship with the package: seconds on a graphics card, half an hour on two cores.
+template: $(STAMP)
+	$(VENV)/bin/sulcus anatomy --out scenes/data/template.vtu
+	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --count 3000 --out build/template.h5
+	$(VENV)/bin/sulcus train build/template.h5 --out scenes/data/template.model.npz
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
