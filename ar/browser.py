@@ -105,8 +105,8 @@ class Browser:
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
         self.picture = gui.add_image(blank, format="jpeg", jpeg_quality=88)
         self.add_playback(playback)
-        self.inputs = {control.label: self.add_control(control) for control in controls}
         self.text = gui.add_markdown("")
+        self.inputs = {control.label: self.add_control(control) for control in controls}
         gui.add_markdown(caption)
         self.meshes = {body.name: self.add_body(body) for body in bodies}
         self.newest: dict[str, Callable[[], None]] = {}
@@ -140,7 +140,7 @@ class Browser:
         self.note(f"body {name}", lambda: setattr(mesh, "vertices", np.asarray(vertices, np.float32)))
 
     def report(self, markdown: str) -> None:
-        """Show Markdown text under the controls."""
+        """Show Markdown text between playback and controls."""
         self.note("report", lambda: setattr(self.text, "content", markdown))
 
     def put(self, label: str, value: float | str) -> None:

@@ -186,8 +186,8 @@ class Demo:
         tool = self.stage.scene.tool.mesh
         brain, cortex, tumour = self.stage.brain, self.stage.cortex(positions), self.stage.tumour(positions)
         return [
-            Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
-            Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.55),
+            Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.14),
+            Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
             Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
             Body("finite elements", tumour.vertices, tumour.triangles, FEM_COLOUR, wireframe=True),
             Body("tool", tool.vertices, tool.faces, TOOL_COLOUR),
@@ -195,7 +195,7 @@ class Demo:
 
     def _viewpoint(self) -> Viewpoint:
         site = self.stage.site
-        eye = site.origin - 0.16 * site.axis + 0.16 * site.right + 0.05 * site.up
+        eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
         return Viewpoint(eye, site.origin + 0.015 * site.axis, site.up)
 
     def _show(self, frame: Frame) -> None:
