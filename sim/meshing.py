@@ -22,10 +22,9 @@ FINE = 0.5  # of the coarsest cell: the cells at the tumour and the craniotomy
 CELLS_PER_RADIUS = 2.5  # at least, across the tumour's radius
 GROWTH = 0.5  # of a cell's size per distance from the points of interest
 ROUNDING = 2.0**0.5  # a cell up to this much larger than wanted is not halved
-SLACKS = (0.0, 3e-4, 6e-4, 1.2e-3)  # [m] that nodes may leave their surface by, attempt by attempt
+SLACKS = (0.0, 3e-4, 6e-4, 1.2e-3, 2.4e-3)  # [m] that nodes may leave their surface by, attempt by attempt
 DEEPEST = 4  # halvings of the coarsest cell
 TOO_COARSE = "so few nodes do not show the brain or the tumour: ask for more nodes, or check the labels."
-
 TOO_INTRICATE = "the surfaces are too intricate for so few nodes: ask for more nodes, or smooth the labels."
 
 
