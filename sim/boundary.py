@@ -12,14 +12,14 @@ from .geodesic import distances
 from .mesh import TetMesh
 
 Skull = Literal["slide", "held"]
-STEM_RADIUS = 0.022  # [m]; the medulla of the template and the tip of its cerebellum
+STEM = 0.15  # of the brain's height: in the template 21 mm, the medulla and what touches it
 FEWEST_OPEN = 6  # nodes; fewer do not carry a tool
 
 
 def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) -> Anatomy:
     """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
 
-    Stem: surface nodes within 22 mm of the lowest one (least superior); held. Craniotomy: surface nodes within half of
+    Stem: surface nodes within 0.15 of the brain's height from the lowest one (least superior); held. Craniotomy: surface nodes within half of
     the diameter `craniotomy` [m] along the surface from the point nearest to `site`; free. Skull: the rest of the
     surface; it slides (no motion along the outward area-weighted vertex normal) or is held.
 
@@ -31,8 +31,9 @@ def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) ->
     surface = mesh.surface
     outer = np.unique(surface)
     lowest = outer[mesh.nodes[outer, 2].argmin()]
+    height = np.ptp(mesh.nodes[outer, 2])
     stem = np.zeros(len(mesh.nodes), bool)
-    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= STEM_RADIUS
+    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= STEM * height
     opened = (distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy) & ~stem
     if opened.sum() < FEWEST_OPEN:
         raise InputError(
