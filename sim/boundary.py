@@ -19,9 +19,10 @@ FEWEST_OPEN = 6  # nodes; fewer do not carry a tool
 def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) -> Anatomy:
     """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
 
-    Stem: surface nodes within 0.15 of the brain's height from the lowest one (least superior); held. Craniotomy: surface nodes within half of
-    the diameter `craniotomy` [m] along the surface from the point nearest to `site`; free. Skull: the rest of the
-    surface; it slides (no motion along the outward area-weighted vertex normal) or is held.
+    Stem: surface nodes within 0.15 of the brain's height from the lowest one (least superior); held. Craniotomy:
+    surface nodes within half of the diameter `craniotomy` [m] along the surface from the point nearest to `site`;
+    free. Skull: the rest of the surface; it slides (no motion along the outward area-weighted vertex normal) or is
+    held.
 
     Raises
     ------
