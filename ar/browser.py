@@ -6,6 +6,7 @@ no window shape and no client can bring the two out of register. The 3-D view fo
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -98,7 +99,15 @@ class Browser:
         """Start the server; where `port` is taken, the next free one serves, see `address`.
 
         `caption` is Markdown under the picture, `size` the picture's width and height [pixel] until the first arrives.
+
+        Raises
+        ------
+        ValueError
+            A port that is none.
+        OSError
+            A host that is not this machine.
         """
+        check_address(host, port)
         self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         self.dress(title, viewpoint)
         gui = self.server.gui
@@ -235,3 +244,20 @@ class Browser:
             wireframe=body.wireframe,
             side="double",
         )
+
+
+def check_address(host: str, port: int) -> None:
+    """Raise where no page can be served: viser would fail on a thread of its own, and its maker wait for ever.
+
+    Raises
+    ------
+    ValueError
+        A port outside 0 .. 65535.
+    OSError
+        A host that is not this machine.
+    """
+    if not 0 <= port <= 65535:
+        raise ValueError(f"{port} is no port: give 0 .. 65535.")
+    family = socket.getaddrinfo(host, None)[0][0]
+    with socket.create_server((host, 0), family=family):
+        pass

@@ -48,6 +48,7 @@ class Figures:
             f"overlap {self.overlap:.4f} is below {bounds.overlap}": self.overlap >= bounds.overlap,
             f"error {self.error_mm:.4f} mm is above {1e3 * bounds.error:g} mm": self.error_mm <= 1e3 * bounds.error,
             f"projection is {self.pixels:.3g} pixels off, more than {bounds.pixels:g}": self.pixels <= bounds.pixels,
+            "the tumour never moves: nothing was shown": self.motion_mm > 0.0,
             "a number is not finite": self.finite,
             "an answer is not good: see its outcome": self.answered,
             "a picture shows the answer to another moment": self.in_step,

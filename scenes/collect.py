@@ -16,9 +16,10 @@ import h5py
 import numpy as np
 
 from ar.overlay import silhouette
+from sim.deformation import Deformation
 from sim.errors import InputError
 
-from .play import Frame, Player
+from .play import STAGES, Frame, Player
 from .stage import NAMES
 from .theatre import Theatre
 from .truth import truth_of
@@ -52,12 +53,13 @@ def collect(
                 name: pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
                 for name in ("colour", "overlay", "depth", "segmentation", "tumour_mask")
             }
-            frames = []
+            rows, loads = [], []  # a frame itself holds seven megabytes
             for frame in progress(player.frames()):
                 for name, code in encoded(frame, player).items():
                     stores[name][frame.number] = code
-                frames.append(frame)
-            outcomes = write_motion(file, theatre, player, frames)
+                rows.append(motion(frame, player))
+                loads.append(frame.loads)
+            outcomes = write_motion(file, player, rows, truth_of(theatre, player.scene, loads))
             describe(file, player, deformer)
         partial.replace(path)
     except OSError as error:
@@ -83,34 +85,36 @@ def encoded(frame: Frame, player: Player) -> dict[str, np.ndarray]:
     }
 
 
-def write_motion(file: h5py.File, theatre: Theatre, player: Player, frames: list[Frame]) -> dict[str, int]:
-    """Write what is not a picture, one row per frame, and the finite elements' answers; returns their outcomes."""
-    nodes = theatre.anatomy.tumour_nodes
-    rest = theatre.anatomy.mesh.nodes[nodes]
-    truth = truth_of(theatre, player.scene, frames)
-    rows = {
-        "time": [frame.time for frame in frames],
-        "T_camera_world": [frame.camera.T_camera_world for frame in frames],
-        "T_world_tool": [frame.pose for frame in frames],
-        "tip": [frame.tip for frame in frames],
-        "force": [frame.touch.force * player.site.direction(frame.touch) for frame in frames],
-        "contact": [player.site.contact(frame.touch.x, frame.touch.y).point for frame in frames],
-        "tumour_predicted": [rest + frame.deformation.at(nodes).displacement[0] for frame in frames],
-        "tumour_fem": rest + truth.at(nodes).displacement,
-        "seconds": [list(frame.seconds.values()) for frame in frames],
+def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
+    """What is not a picture, by name."""
+    nodes = player.site.anatomy.tumour_nodes
+    return {
+        "time": frame.time,
+        "T_camera_world": frame.camera.T_camera_world,
+        "T_world_tool": frame.pose,
+        "tip": frame.tip,
+        "force": frame.touch.force * player.site.direction(frame.touch),
+        "contact": player.scene.contact(player.site, frame.touch).point,
+        "tumour_predicted": player.positions(frame.deformation)[nodes],
+        "outcome_predicted": frame.deformation.outcome[0].name,
+        "seconds": np.array([frame.seconds[stage] for stage in STAGES]),
     }
-    for name, values in rows.items():
-        file.create_dataset(name, data=np.asarray(values), compression="gzip")
-    for name, answers in (
-        ("outcome_predicted", [frame.deformation.outcome[0] for frame in frames]),
-        ("outcome_fem", truth.outcome),
-    ):
-        file.create_dataset(name, data=np.array([outcome.name for outcome in answers], h5py.string_dtype()))
-    file["seconds"].attrs["stages"] = list(frames[0].seconds)
+
+
+def write_motion(file: h5py.File, player: Player, rows: list[dict], truth: Deformation) -> dict[str, int]:
+    """Write what is not a picture, one row per frame, and the finite elements' answers; returns their outcomes."""
+    nodes = player.site.anatomy.tumour_nodes
+    rest = player.site.anatomy.mesh.nodes[nodes]
+    outcomes = [outcome.name for outcome in truth.outcome]
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    columns |= {"tumour_fem": rest + truth.at(nodes).displacement, "outcome_fem": outcomes}
+    for name, values in columns.items():
+        text = h5py.string_dtype() if isinstance(values[0], str) else None
+        file.create_dataset(name, data=np.asarray(values, text), compression="gzip")
+    file["seconds"].attrs["stages"] = STAGES
     file.create_dataset("tumour_rest", data=rest)
     file.create_dataset("tumour_nodes", data=nodes)
-    names = [outcome.name.lower() for outcome in truth.outcome]
-    return {name: names.count(name) for name in sorted(set(names))}
+    return {name.lower(): outcomes.count(name) for name in sorted(set(outcomes))}
 
 
 def describe(file: h5py.File, player: Player, deformer: str) -> None:
@@ -131,7 +135,7 @@ def describe(file: h5py.File, player: Player, deformer: str) -> None:
             "width": camera.width,
             "height": camera.height,
             "depth_scale_m": DEPTH_SCALE,
-            "segmentation": ", ".join(f"{label} {name}" for label, name in NAMES.items() if label != 4) + ", 0 nothing",
+            "segmentation": ", ".join(f"{label} {name}" for label, name in NAMES.items()) + ", 0 nothing",
             "sulcus_version": version("sulcus"),
         }
     )

@@ -110,14 +110,13 @@ class Demo:
         self.theatre = theatre
         self.players = {deformer: Player(self.stage, theatre.deformer(deformer, scene))}
         self.wish = Wish(deformer, Touch(force=0.15))
-        self.referee = Referee(theatre, scene)
         self.browser = Browser(
             self._bodies(),
             self._viewpoint(),
             Playback(
                 len(scene.times),
                 lambda plays: self.wish.set(plays=plays),
-                lambda number: self.wish.set(number=number, tool=SCRIPT),
+                self._seek,
             ),
             self._controls(),
             title=f"sulcus: {scene.name}",
@@ -126,6 +125,7 @@ class Demo:
             port=port,
             size=(scene.viewpoint.width, scene.viewpoint.height),
         )
+        self.referee = Referee(theatre, scene)
 
     def run(self, seconds: float = float("inf")) -> int:
         """Play until the time is over; returns the frames drawn."""
@@ -171,6 +171,11 @@ class Demo:
             Slider("place right [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(x=1e-3 * value)),
             Slider("place up [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(y=1e-3 * value)),
         ]
+
+    def _seek(self, number: int) -> None:
+        """The frame slider was moved: the script has the tool."""
+        self.wish.set(number=number, tool=SCRIPT)
+        self.browser.put("tool", SCRIPT)
 
     def _take(self, right: float | None = None, up: float | None = None, **values: float) -> None:
         """A slider was moved: the tool is in the visitor's hand."""

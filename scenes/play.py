@@ -23,6 +23,9 @@ from .scene import Scene
 from .site import Site
 from .stage import TOOL, Stage
 
+STAGES = ("deform", "render", "overlay")
+"""What the time of a frame is spent on."""
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -47,7 +50,7 @@ class Frame:
     distance
         From the tool's tip to the tumour's predicted surface [m].
     seconds
-        Wall time by stage.
+        Wall time by stage, see `STAGES`.
     """
 
     number: int
@@ -108,7 +111,7 @@ class Player:
         over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin=margin, gauge=gauge)
         return Frame(
             number, time, touch, loads, deformation, self.camera, pose, tip, picture, over.colour, gauge.distance,
-            {"deform": solved - begun, "render": rendered - solved, "overlay": clock.perf_counter() - rendered},
+            dict(zip(STAGES, np.diff([begun, solved, rendered, clock.perf_counter()]).tolist(), strict=True)),
         )  # fmt: skip
 
     def frames(self, every: int = 1) -> Iterator[Frame]:
@@ -128,7 +131,7 @@ class Player:
 
     def tool(self, touch: Touch, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Tip (3,) [m] and pose T_world_tool (4, 4): resting on the deformed surface, lifted off where it is idle."""
-        contact = self.site.contact(touch.x, touch.y)
+        contact = self.scene.contact(self.site, touch)
         inward = self.site.direction(replace(touch, tilt=(0.0, 0.0)))
         lift = 4e-3 * max(0.0, 1.0 - touch.force / 0.02)
         tip = contact.carried(positions) - lift * inward

@@ -14,7 +14,7 @@ from sim.errors import InputError
 from sim.loads import Loads, Pushed
 
 from .paths import Path, Touch
-from .site import Site
+from .site import Contact, Site
 from .tool import Probe
 
 
@@ -80,9 +80,13 @@ class Scene:
         """Time of every frame (n,) [s]."""
         return np.arange(round(self.duration * self.frames_per_second) + 1) / self.frames_per_second
 
+    def contact(self, site: Site, touch: Touch) -> Contact:
+        """The material point that the tool touches."""
+        return site.contact(touch.x, touch.y, self.tool.radius)
+
     def loads(self, site: Site, touch: Touch, time: float) -> Loads:
         """One load case: the tool at a place of the site."""
-        contact = site.contact(touch.x, touch.y)
+        contact = self.contact(site, touch)
         force = touch.force * site.direction(touch)
         return Loads((Pushed(contact.point[None], force[None], np.array([self.tool.radius])),), np.array([time]))
 

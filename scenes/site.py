@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +10,7 @@ import trimesh
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
+from surrogate.patch import open_patch
 
 from .paths import Touch
 
@@ -52,18 +53,22 @@ class Site:
     @cached_property
     def clearance(self) -> float:
         """Radius of the largest circle round the origin, across the axis, that the open cortex fills [m]."""
-        edges = np.sort(self.anatomy.open_surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges, count = np.unique(edges, axis=0, return_counts=True)
-        return float(self.across(self.anatomy.mesh.nodes[edges[count == 1]].mean(axis=1)).min())
+        patch = open_patch(self.anatomy)
+        flat = patch.points - np.outer((patch.points - self.origin) @ self.axis, self.axis)
+        return float(replace(patch, points=flat).rim_distance(self.origin[None])[0])
 
     def across(self, points: np.ndarray) -> np.ndarray:
         """Distance (n,) [m] of points (n, 3) from the line through the origin along the axis."""
         arm = points - self.origin
         return np.linalg.norm(arm - np.outer(arm @ self.axis, self.axis), axis=1)
 
-    def contact(self, x: float, y: float) -> Contact:
-        """The material point of the open cortex nearest to the place (x, y) [m] of its tangent plane."""
-        asked = self.origin + x * self.right + y * self.up
+    def contact(self, x: float, y: float, radius: float) -> Contact:
+        """The material point of the open cortex nearest to the place (x, y) [m] of its tangent plane.
+
+        A tool of this `radius` [m] stays inside the opening: the place is brought back to where the bone stops it.
+        """
+        share = max(0.0, self.clearance - radius) / max(float(np.hypot(x, y)), np.finfo(float).tiny)
+        asked = self.origin + min(1.0, share) * (x * self.right + y * self.up)
         point, _, triangle = trimesh.proximity.closest_point_naive(self._surface, asked[None])
         weights = trimesh.triangles.points_to_barycentric(self._surface.triangles[triangle], point)
         return Contact(point[0], self.anatomy.open_surface[triangle[0]], weights[0])

@@ -16,7 +16,8 @@ from .site import Site
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 """Segmentation ids."""
-NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", TUMOUR: "tumour (seen through)"}
+NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool"}
+"""What can be seen of them: the tumour never can."""
 
 CORTEX_COLOUR = (0.86, 0.60, 0.54)
 DRAPE_COLOUR = (0.16, 0.36, 0.42)

@@ -8,8 +8,10 @@ from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 
+from sim.accuracy import LIVE
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer
+from sim.device import find_device
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.intensity import Intensity, read_intensity, sidecar
@@ -79,8 +81,10 @@ def open_theatre(anatomy: Path | None = None, model: Path | None = None, device:
     Raises
     ------
     InputError
-        Files that are missing, unreadable, or do not belong together.
+        Files that are missing, unreadable, or do not belong together; a device that is not there.
     """
+    # Learnt models alone would not notice, and the finite elements behind them fail too late.
+    find_device(device, LIVE.precision)
     path = template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)
     scan = sidecar(path)

@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from sim.accuracy import TRAIN
 from sim.deformation import Deformation
 from sim.fem import Fem
-from sim.loads import stacked
+from sim.loads import Loads, stacked
 
-from .play import Frame
 from .scene import Scene
 from .theatre import Theatre
 
 
-def truth_of(theatre: Theatre, scene: Scene, frames: Sequence[Frame]) -> Deformation:
-    """One row per frame, every vertex, at training accuracy."""
+def truth_of(theatre: Theatre, scene: Scene, loads: Sequence[Loads]) -> Deformation:
+    """One row per frame's loads, every vertex, at training accuracy."""
     fem = Fem(theatre.anatomy, scene.effects, TRAIN, theatre.device)
-    return fem.deform(stacked([frame.loads for frame in frames]))
+    return fem.deform(stacked(loads))

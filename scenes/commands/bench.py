@@ -7,6 +7,8 @@ import json
 import sys
 from dataclasses import asdict
 
+from sim.errors import InputError
+
 from .demo import add_theatre
 
 
@@ -25,6 +27,8 @@ def run(args: argparse.Namespace) -> int:
     from ..scene import find_scene
     from ..theatre import open_theatre
 
+    if args.batch < 1:
+        raise InputError(f"--batch {args.batch} solves nothing: give a whole number from 1 up.")
     theatre = open_theatre(args.anatomy, args.model, args.device)
     found = []
     where = machine(args.device)

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     for scene in scenes:
         player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
         frames = list(player.frames(args.every))
-        figures = measure(player, player.camera, frames, truth_of(theatre, scene, frames))
+        figures = measure(player, player.camera, frames, truth_of(theatre, scene, [frame.loads for frame in frames]))
         broken = figures.broken(scene.bounds)
         rows.append({"scene": scene.name, "frames": len(frames), **figures.row(), "broken": broken})
         print(

@@ -30,11 +30,11 @@ def run(args: argparse.Namespace) -> int:
     from ..stage import Stage
     from ..theatre import open_theatre
 
-    out = check_output(args.out, ".h5")
     scene = find_scene(args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = args.deformer or theatre.best
     player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
+    out = check_output(args.out, ".h5")
     report = collect(
         out, theatre, player, name, lambda frames: tqdm(frames, total=len(scene.times), unit="frame", file=sys.stderr)
     )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sim.errors import InputError
+
 
 def add_theatre(parser: argparse.ArgumentParser) -> None:
     """Declare which anatomy and models play: shared by every command that plays a scene."""
@@ -27,10 +29,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until interrupted."""
+    from ar.browser import check_address
+
     from ..demo import Demo
     from ..scene import find_scene
     from ..theatre import open_theatre
 
+    if not args.seconds > 0.0:
+        raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
+    try:
+        check_address(args.host, args.port)
+    except (OSError, ValueError) as error:
+        raise InputError(f"no page on host {args.host}, port {args.port} ({error}): choose others.") from error
     scene = find_scene(args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = args.deformer or theatre.best

@@ -5,7 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sim.accuracy import TRAIN
+from sim.device import find_device
 from sim.errors import InputError
+from sim.meshfile import check_output
+from surrogate.sampling import PRESETS
+from surrogate.split import FEWEST
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,10 +20,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tumour", required=True, help="labels that are tumour, separated by commas")
     parser.add_argument("--t1", type=Path, help="intensities in the same space, for the camera view")
     parser.add_argument("--out", required=True, type=Path, help="the anatomy, PATIENT.vtu; all else is put beside it")
-    parser.add_argument("--nodes", default="5300", help="mesh nodes (default %(default)s)")
-    parser.add_argument("--craniotomy", default="50", help="diameter [mm] (default %(default)s)")
-    parser.add_argument("--count", default="1000", help="loads to simulate (default %(default)s)")
-    parser.add_argument("--preset", default="palpation", help="the tool (default %(default)s)")
+    parser.add_argument("--nodes", type=int, default=5300, help="mesh nodes (default %(default)s)")
+    parser.add_argument("--craniotomy", type=float, default=50.0, help="diameter [mm] (default %(default)s)")
+    parser.add_argument("--count", type=int, default=1000, help="loads to simulate (default %(default)s)")
+    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
 
 
@@ -27,14 +32,17 @@ def run(args: argparse.Namespace) -> int:
     from ..cli import main
     from ..theatre import model_path
 
-    if args.out.suffix != ".vtu":
-        raise InputError(f"{args.out}: the anatomy is written as .vtu; give a name that ends so.")
+    # Said now, not after minutes of meshing.
+    check_output(args.out, ".vtu")
+    find_device(args.device, TRAIN.precision)
+    if args.count < FEWEST + 1:
+        raise InputError(f"--count {args.count} is too few to learn from and to leave {FEWEST} discs out: give more.")
     data, model = args.out.with_suffix(".h5"), model_path(args.out)
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]
     steps = [
         ["anatomy", "--labels", str(args.labels), "--brain", args.brain, "--tumour", args.tumour, *t1,
-         "--nodes", args.nodes, "--craniotomy", args.craniotomy, "--out", str(args.out)],
-        ["simulate", str(args.out), "--out", str(data), "--count", args.count, "--preset", args.preset,
+         "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), "--out", str(args.out)],
+        ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--preset", args.preset,
          "--device", args.device],
         ["train", str(data), "--out", str(model)],
     ]  # fmt: skip

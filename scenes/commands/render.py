@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ar.screen import Film, read_png, write_film
 from sim.errors import InputError
+from sim.meshfile import check_output
 
 from .demo import add_theatre
 
@@ -36,22 +37,26 @@ def run(args: argparse.Namespace) -> int:
     scene = find_scene(args.scene)
     if args.every < 1:
         raise InputError(f"--every {args.every}: give a whole number from 1 up.")
+    if args.out.exists() and not args.out.is_dir():
+        raise InputError(f"{args.out}: is a file, but the frames need a folder. Choose another name.")
     if args.film is not None and args.film.suffix not in (".mp4", ".gif", ".webp"):
         raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = args.deformer or theatre.best
     player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
+    if args.film is not None:
+        check_output(args.film, args.film.suffix)
+    written, bad = [], 0
     try:
         film = Film(args.out)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{args.out}: cannot hold the frames ({error}). Choose another folder.") from error
-    written, bad = [], 0
-    for frame in tqdm(player.frames(every=args.every), total=len(scene.times[:: args.every]), file=sys.stderr):
-        film.show(frame.number, frame.shown if args.plain else labelled(frame, name))
-        written.append(args.out / f"frame_{frame.number:04d}.png")
-        bad += not frame.deformation.outcome[0].good
-    if args.film is not None:
-        write_film(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
+        for frame in tqdm(player.frames(every=args.every), total=len(scene.times[:: args.every]), file=sys.stderr):
+            film.show(frame.number, frame.shown if args.plain else labelled(frame, name))
+            written.append(args.out / f"frame_{frame.number:04d}.png")
+            bad += not frame.deformation.outcome[0].good
+        if args.film is not None:
+            write_film(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
+    except OSError as error:
+        raise InputError(f"{args.out}: the frames cannot be written ({error}). Choose another folder.") from error
     report = {"scene": scene.name, "deformer": name, "frames": len(written), "not_good": bad, "out": str(args.out)}
     print(json.dumps(report) if args.json else f"{len(written)} frames by {name} in {args.out}; {bad} not good")
     return 1 if bad else 0
