@@ -26,6 +26,8 @@ from .term import Cases
 # Above this many unknowns the factor's memory and time outgrow what it saves.
 LARGEST_FACTOR = 400_000
 SMALLEST_LOAD_STEP = 1.0 / 64.0
+# Load steps of one case may take this many times the outer steps of one load: hopeless cases cost no more.
+STEPPING_BUDGET = 4
 
 
 class Fem:
@@ -159,6 +161,8 @@ class Fem:
             good = found.outcome[0].good
             if (good and aim == 1.0) or (not good and step <= SMALLEST_LOAD_STEP):
                 return replace(found, iterations=np.array([spent]))
+            if spent >= STEPPING_BUDGET * self.accuracy.outer:
+                return replace(found, iterations=np.array([spent]), outcome=np.array([Outcome.BUDGET]))
             if good:
                 u, reached = found.u, aim
             else:

@@ -16,7 +16,7 @@ from sim.compile import pushed_forces
 from sim.deformation import Deformer, Outcome
 from sim.effects import Elasticity, Held, NodalForce, ToolDisplacement, ToolForce
 from sim.errors import InputError
-from sim.fem import Fem
+from sim.fem import STEPPING_BUDGET, Fem
 from sim.footprint import footprint_weights
 from sim.loads import Displaced, Loads, Nodal, Prescribed, Pushed, push
 from sim.material import Material
@@ -280,7 +280,7 @@ def test_a_rescue_leaves_the_other_rows_alone() -> None:
     value = asked.of(Prescribed)
     assert value is not None
     three = Loads((Prescribed(value.displacement * np.array([0.01, 1.0, 0.02])[:, None, None]),))
-    body = Fem(anatomy, effects, Accuracy(tolerance=1e-8, outer=5), "cpu")
+    body = Fem(anatomy, effects, Accuracy(tolerance=1e-8, outer=8), "cpu")
     found = body.deform(three)
     assert found.outcome[0] is found.outcome[2] is Outcome.CONVERGED
     assert found.outcome[1] is Outcome.CONVERGED_IN_STEPS
@@ -306,7 +306,8 @@ def test_a_hopeless_case_returns_its_last_accepted_state(law: str) -> None:
     assert np.isfinite(found.displacement).all()
     assert found.displacement[0].any()
     assert found.residual[0] > 1e-8
-    assert found.iterations[0] > 2
+    # Its own budget, that of the load steps, and the step in which that ended: no rescue without end.
+    assert 2 < found.iterations[0] <= 2 + (STEPPING_BUDGET + 1) * 2
 
 
 def test_numbers_that_overflow_are_an_outcome_not_an_answer() -> None:
