@@ -10,6 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .anatomy import Anatomy
+from .errors import InputError
 from .loads import Loads
 
 
@@ -83,12 +84,21 @@ class Deformation:
         return len(self.displacement)
 
     def at(self, nodes: np.ndarray) -> Deformation:
-        """The rows of some mesh vertices `nodes` (n,), which must all be among `self.nodes`."""
+        """The rows of some mesh vertices `nodes` (n,).
+
+        Raises
+        ------
+        InputError
+            A vertex that is not among `self.nodes`.
+        """
         order = np.argsort(self.nodes)
         position = order[np.searchsorted(self.nodes, nodes, sorter=order).clip(max=len(order) - 1)]
         missing = self.nodes[position] != nodes
         if missing.any():
-            raise KeyError(f"this deformation does not know vertex {np.asarray(nodes)[missing][0]}")
+            raise InputError(
+                f"this deformation does not know vertex {np.asarray(nodes)[missing][0]}: ask for one of its "
+                f"{len(self.nodes)} vertices."
+            )
         return replace(self, displacement=self.displacement[:, position], nodes=np.asarray(nodes))
 
 

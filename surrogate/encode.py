@@ -24,7 +24,8 @@ def directions(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
 def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Forces (B, 3 m) at the patch's nodes, for one newton: the finite elements' own integral over the footprint."""
     weights = footprint_weights(patch.points, patch.triangles, pushed.point, pushed.footprint)
-    return np.einsum("bm,bi->bmi", weights.toarray(), directions(pushed)[1]).reshape(len(pushed.point), -1)
+    shares = np.einsum("bm,bi->bmi", weights.toarray(), directions(pushed)[1])
+    return shares.reshape(len(shares), 3 * len(patch.points))
 
 
 def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
@@ -61,7 +62,7 @@ class Basis:
 
     def decode(self, coefficients: np.ndarray) -> np.ndarray:
         """Responses (B, n, 3) [m/N] of coefficients (B, r)."""
-        return (coefficients @ self.modes).reshape(len(coefficients), -1, 3)
+        return (coefficients @ self.modes).reshape(len(coefficients), len(self.nodes), 3)
 
 
 def reduce(nodes: np.ndarray, response: np.ndarray, tolerance: float, most: int) -> Basis:

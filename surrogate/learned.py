@@ -93,17 +93,27 @@ class Learned:
         Raises
         ------
         InputError
-            Loads of another kind, or a vertex in `at` that the model does not know.
+            Loads of another kind, a start with other rows, or a vertex in `at` that the model does not know.
         """
+        if start is not None and len(start) != len(loads):
+            raise InputError(
+                f"the start has displacements of shape {start.displacement.shape}: give one row for each of the "
+                f"{len(loads)} load cases."
+            )
         begun = time.perf_counter()
         pushed = _only_pushed(loads)
         nodes = self.nodes if at is None else np.asarray(at)
+        strange = ~np.isin(nodes, self.nodes)
+        if strange.any():
+            raise InputError(
+                f"this model knows the {len(self.nodes)} vertices of tumour and open cortex, not vertex "
+                f"{nodes[strange][0]}: ask the finite elements for it."
+            )
         magnitude, direction = directions(pushed)
         at_least = np.maximum(magnitude, self.envelope.force[0])
         asked = replace(pushed, force=at_least[:, None] * direction)
         features: dict[str, np.ndarray] = {}  # of each encoder that is needed
         displacement = np.zeros((len(loads), len(nodes), 3))
-        known = np.zeros(len(nodes), bool)
         for part, row_of in zip(self.parts, self._row, strict=True):
             row = row_of[nodes]
             here = row >= 0
@@ -112,12 +122,6 @@ class Learned:
                     features[part.encoder] = ENCODERS[part.encoder](self._patch, asked)
                 response = part.response(features[part.encoder])
                 displacement[:, here] += magnitude[:, None, None] * response[:, row[here]]
-                known |= here
-        if not known.all():
-            raise InputError(
-                f"this model knows the {len(self.nodes)} vertices of tumour and open cortex, not vertex "
-                f"{nodes[~known][0]}: ask the finite elements for it."
-            )
         inside = self.envelope.holds(self._patch, pushed)
         reaction = np.concatenate([pushed.force, np.zeros_like(pushed.force)], axis=1)[:, None]
         return Deformation(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -21,9 +23,15 @@ from sim.footprint import footprint_weights
 from sim.loads import Displaced, Loads, Nodal, Prescribed, Pushed, push
 from sim.material import Material
 from sim.mesh import TetMesh
+from surrogate.dataset import read_dataset
+from surrogate.simulate import simulate
+from surrogate.train import train
 
-MESH = box((3, 3, 3), 0.1, distortion=0.1)
-ANATOMY = base_held(MESH)
+BLOCK = box((3, 3, 3), 0.1, distortion=0.1)
+MESH = TetMesh(
+    BLOCK.nodes, BLOCK.tets, np.where(np.linalg.norm(BLOCK.nodes[BLOCK.tets].mean(axis=1) - 0.05, axis=1) < 0.03, 2, 1)
+)
+ANATOMY = replace(base_held(MESH), craniotomy=MESH.nodes[:, 2] > 0.1 - 1e-9)
 COUNT = len(MESH.nodes)
 EFFECTS = Elasticity(), Held(), ToolForce()
 FORCE = np.array([[0.0, 0.0, -0.05], [0.02, -0.03, -0.3], [0.1, 0.0, -0.6], [0.0, 0.1, 0.2], [0.0, 0.0, -0.9]])
@@ -42,9 +50,27 @@ def fem(accuracy: Accuracy) -> Callable[[], Deformer]:
     return lambda: Fem(ANATOMY, EFFECTS, accuracy, "cpu", batch=3)
 
 
+def learned(learner: str) -> Callable[[], Deformer]:
+    """Taught on pushes and pulls all over the top, by the reference."""
+
+    def build() -> Deformer:
+        random = np.random.default_rng(0)
+        point = np.column_stack([random.uniform(0.02, 0.08, (60, 2)), np.full(60, 0.1)])
+        force = random.normal(size=(60, 3)) * random.uniform(0.02, 1.0, (60, 1))
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "data.h5"
+            simulate(path, Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu"), push(point, force, 0.02), {})
+            return replace(train(read_dataset(path), [learner]).models[learner], anatomy=ANATOMY)
+
+    return build
+
+
 DEFORMERS = {
     "fem float64": Candidate(fem(REFERENCE), 1e-6),
     "fem float32": Candidate(fem(TRAIN), 2e-3),
+    "learned linear": Candidate(learned("linear"), 1e-5),
+    "learned svr": Candidate(learned("svr"), 1e-5),
+    "learned residual": Candidate(learned("residual"), 1e-5),
 }
 """Deformers of `ANATOMY` that answer `Pushed` loads: add a line for a new one."""
 
@@ -129,7 +155,7 @@ class TestEveryDeformer:
         np.testing.assert_array_equal(some.nodes, picked)
         np.testing.assert_array_equal(some.displacement, whole.displacement[:, [5, 2, 11]])
         np.testing.assert_array_equal(whole.at(picked).displacement, some.displacement)
-        with pytest.raises(KeyError):
+        with pytest.raises(InputError, match=f"vertex {COUNT}"):
             deformer.deform(loads(), at=np.array([COUNT]))
 
     def test_no_load_no_motion(self, deformer: Deformer) -> None:
