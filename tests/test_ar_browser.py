@@ -1,60 +1,15 @@
 """The page: served, shared by several visitors, told what they do. A visitor here is a bare web socket."""
 
-import socket
-import threading
 import time
 import urllib.request
-from collections.abc import Callable
 
-import msgspec
 import numpy as np
 import pytest
-import viser
-from viser import _messages
-from websockets.sync.client import connect
+from visitor import Visitor, free_port, wait_for
 
 from ar.browser import Body, Browser, Choice, Playback, Slider, Viewpoint
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def wait_for(reached: Callable[[], bool]) -> bool:
-    until = time.monotonic() + 10.0
-    while not reached() and time.monotonic() < until:
-        time.sleep(0.02)
-    return reached()
-
-
-class Visitor:
-    """A browser as the server sees one: it says where its camera is, gets messages, sends what its user does."""
-
-    def __init__(self, page: Browser, width: int) -> None:
-        address = page.address.replace("http", "ws")
-        self.wire = connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None)
-        self.received = 0
-        threading.Thread(target=self.listen, daemon=True).start()
-        axes = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 1.0), "look_at": (0.0, 0.0, 0.0)}
-        self.say(
-            _messages.ViewerCameraMessage(
-                **axes, fov=1.0, near=0.01, far=10.0, image_height=600, image_width=width, up_direction=(0.0, 1.0, 0.0)
-            )
-        )
-
-    def listen(self) -> None:
-        for message in self.wire:
-            self.received += len(message)
-
-    def say(self, message: _messages.Message) -> None:
-        self.wire.send(msgspec.msgpack.encode(message.as_serializable_dict()))
-
-    def set(self, handle: viser.GuiInputHandle, value: object) -> None:
-        self.say(_messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
 
 
 @pytest.fixture

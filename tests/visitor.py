@@ -1,0 +1,52 @@
+"""A browser as the page's server sees one, without a browser: a bare web socket."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+import msgspec
+import viser
+from viser import _messages
+from websockets.sync.client import connect
+
+from ar.browser import Browser
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def wait_for(reached: Callable[[], bool]) -> bool:
+    until = time.monotonic() + 10.0
+    while not reached() and time.monotonic() < until:
+        time.sleep(0.02)
+    return reached()
+
+
+class Visitor:
+    """Says where its camera is, gets messages, sends what its user does."""
+
+    def __init__(self, page: Browser, width: int) -> None:
+        address = page.address.replace("http", "ws")
+        self.wire = connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None)
+        self.received = 0
+        threading.Thread(target=self.listen, daemon=True).start()
+        axes = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 1.0), "look_at": (0.0, 0.0, 0.0)}
+        self.say(
+            _messages.ViewerCameraMessage(
+                **axes, fov=1.0, near=0.01, far=10.0, image_height=600, image_width=width, up_direction=(0.0, 1.0, 0.0)
+            )
+        )
+
+    def listen(self) -> None:
+        for message in self.wire:
+            self.received += len(message)
+
+    def say(self, message: _messages.Message) -> None:
+        self.wire.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+
+    def set(self, handle: viser.GuiInputHandle, value: object) -> None:
+        self.say(_messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
