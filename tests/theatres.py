@@ -1,0 +1,66 @@
+"""A small theatre: the shared box, taught by finite elements in a second, and short scenes to play in it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from scenes.paths import press
+from scenes.play import Player
+from scenes.scene import Scene, Viewpoint, find_scene
+from scenes.stage import Stage
+from scenes.theatre import Theatre, model_path
+from sim.accuracy import TRAIN
+from sim.anatomy import Anatomy
+from sim.effects import Elasticity, Held, NodalForce, Slide, ToolForce
+from sim.fem import Fem
+from sim.intensity import Intensity, sidecar, write_intensity
+from sim.meshfile import write_anatomy
+from surrogate.dataset import read_dataset
+from surrogate.sampling import draw
+from surrogate.simulate import simulate
+from surrogate.store import save
+from surrogate.train import train
+
+
+@cache
+def theatre_of(anatomy: Anatomy) -> Theatre:
+    """Models `linear` and `svr`, and a scan of slanted stripes."""
+    fem = Fem(anatomy, (Elasticity(), Held(), Slide(), ToolForce(), NodalForce()), TRAIN, "cpu")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "data.h5"
+        simulate(path, fem, draw("palpation", anatomy, 100, 0), {"preset": "palpation"})
+        learnt = train(read_dataset(path), ["linear", "svr"]).models
+    models = {name: replace(model, anatomy=anatomy) for name, model in learnt.items()}
+    stripes = 127.5 + 127.5 * np.sin(np.indices((40, 40, 24)).sum(axis=0) / 3.0)
+    affine = np.diag([2e-3, 2e-3, 2e-3, 1.0])
+    affine[:3, 3] = anatomy.mesh.nodes.mean(axis=0) - [0.04, 0.04, 0.02]
+    return Theatre(anatomy, Intensity(stripes.astype(np.uint8), affine), models, "cpu")
+
+
+def put(theatre: Theatre, path: Path) -> Path:
+    """The theatre as files: anatomy, scan and models beside it."""
+    write_anatomy(path, theatre.anatomy)
+    assert theatre.intensity is not None
+    write_intensity(sidecar(path), theatre.intensity)
+    save(model_path(path), theatre.models)
+    return path
+
+
+def small(name: str = "press", **values: object) -> Scene:
+    """A built-in scene on fewer pixels."""
+    return replace(find_scene(name), viewpoint=Viewpoint(width=320, height=240), **values)
+
+
+def short() -> Scene:
+    """Seven small frames: press and let go."""
+    return small(path=press(0.25, rise=0.1, hold=0.0), duration=0.2)
+
+
+def player(theatre: Theatre, scene: Scene, deformer: str) -> Player:
+    """As the commands make it."""
+    return Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(deformer, scene))
