@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from theatres import player, small
+from theatres import on_template, small, template_theatre
 
 from ar.camera import project_cv2
 from scenes.paths import Touch, fixed, press, retract, slide, smooth
 from scenes.scene import SCENES, Viewpoint, find_scene
 from scenes.site import site_of
 from scenes.stage import CORTEX, DRAPE, TOOL, Stage, clipped
-from scenes.theatre import open_theatre
 from scenes.tool import Probe
 from sim.errors import InputError
 from surrogate.patch import open_patch
@@ -28,7 +27,7 @@ LENGTH = {"press": 2.5, "slide": 3.0, "retract": 3.5}
 
 @pytest.fixture(scope="module")
 def template():
-    return open_theatre(device="cpu")
+    return template_theatre()
 
 
 @pytest.fixture(scope="module", params=["box", "template"])
@@ -187,7 +186,7 @@ class TestCamera:
 
     @pytest.mark.parametrize("name", SCENES)
     def test_cortex_drape_and_tool_are_seen(self, template, name):
-        play = player(template, small(name), "linear")
+        play = on_template(name)
         frame = play.draw(40, 1.3, play.scene.path(1.3))
         share = np.bincount(frame.picture.segmentation.ravel(), minlength=5) / frame.picture.segmentation.size
         assert share[CORTEX] > 0.08 and share[TOOL] > 0.03 and share[DRAPE] > 0.2 and share[4] == 0.0

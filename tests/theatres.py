@@ -13,13 +13,13 @@ from scenes.paths import press
 from scenes.play import Player
 from scenes.scene import Scene, Viewpoint, find_scene
 from scenes.stage import Stage
-from scenes.theatre import Theatre, model_path
-from sim.accuracy import TRAIN
+from scenes.theatre import Theatre, model_path, template_path
+from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
-from sim.intensity import Intensity, sidecar, write_intensity
-from sim.meshfile import write_anatomy
+from sim.intensity import Intensity, read_intensity, sidecar, write_intensity
+from sim.meshfile import read_anatomy, write_anatomy
 from surrogate.dataset import read_dataset
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
@@ -40,6 +40,24 @@ def theatre_of(anatomy: Anatomy) -> Theatre:
     affine = np.diag([2e-3, 2e-3, 2e-3, 1.0])
     affine[:3, 3] = anatomy.mesh.nodes.mean(axis=0) - [0.04, 0.04, 0.02]
     return Theatre(anatomy, Intensity(stripes.astype(np.uint8), affine), models, "cpu")
+
+
+@cache
+def template_theatre() -> Theatre:
+    """The anatomy that ships, and finite elements that every scene on it shares."""
+    path = template_path()
+    return Theatre(read_anatomy(path), read_intensity(sidecar(path)), {}, "cpu")
+
+
+@cache
+def template_fem() -> Fem:
+    return Fem(template_theatre().anatomy, find_scene("press").effects, LIVE, "cpu")
+
+
+def on_template(name: str) -> Player:
+    """A built-in scene by finite elements, on fewer pixels."""
+    theatre = template_theatre()
+    return Player(Stage(small(name), theatre.site, theatre.intensity), template_fem())
 
 
 def put(theatre: Theatre, path: Path) -> Path:

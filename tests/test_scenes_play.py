@@ -1,0 +1,190 @@
+"""The loop: a tool that rests on the tissue, one picture a moment, and a picture that is a function of its moment."""
+
+import numpy as np
+import pytest
+import trimesh
+from theatres import on_template, player, put, short, small, template_theatre, theatre_of
+
+from ar.camera import project_cv2
+from scenes.paths import Touch
+from scenes.play import STAGES, labelled
+from scenes.scene import SCENES, find_scene
+from scenes.stage import CORTEX, TOOL
+from scenes.theatre import model_path, open_theatre
+from sim.errors import InputError
+from sim.intensity import sidecar
+from sim.meshfile import write_anatomy
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module")
+def template():
+    return template_theatre()
+
+
+@pytest.fixture(scope="module", params=["linear", "svr", "fem"])
+def play(request, theatre):
+    return player(theatre, small(), request.param)
+
+
+def heights(play, frame, points):
+    """Signed distance (n,) [m] of points from the deformed open cortex, positive outside."""
+    surface = trimesh.Trimesh(play.positions(frame.deformation), play.site.anatomy.open_surface, process=False)
+    nearest, distance, triangle = trimesh.proximity.closest_point_naive(surface, points)
+    side = np.einsum("ni,ni->n", points - nearest, surface.face_normals[triangle])
+    return np.where(side >= 0.0, distance, -distance)
+
+
+def test_the_pressing_tip_rests_on_the_deformed_surface(play):
+    touch = play.scene.path(1.7)
+    frame = play.draw(51, 1.7, touch)
+    assert abs(heights(play, frame, frame.tip[None])[0]) < 1e-8
+    rest = play.scene.contact(play.site, touch).point
+    assert (frame.tip - rest) @ play.site.axis > 1.5e-3  # it has gone in with the tissue
+    middle = frame.pose[:3, :3] @ [0.0, 0.0, play.scene.tool.radius] + frame.pose[:3, 3]
+    assert np.linalg.norm(middle - frame.tip) == pytest.approx(play.scene.tool.radius)
+
+
+def test_a_lighter_touch_rests_higher_and_an_idle_tool_stands_off(play):
+    depth = [(play.draw(0, 0.0, Touch(force=force)).tip - play.site.origin) @ play.site.axis for force in (0, 0.1, 0.2)]
+    assert depth[0] == pytest.approx(-4e-3) and 0.0 < depth[1] < depth[2]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_idle_tool_is_outside_the_tissue(template, name):
+    play = on_template(name)
+    tool = np.asarray(play.scene.tool.mesh.vertices)
+    for number in (0, len(play.scene.times) - 1):
+        time = float(play.scene.times[number])
+        frame = play.draw(number, time, play.scene.path(time))
+        assert not frame.deformation.displacement.any()
+        at = tool @ frame.pose[:3, :3].T + frame.pose[:3, 3]
+        assert heights(play, frame, at[:642]).min() > 2e-3
+        surface = template.anatomy.mesh.nodes[np.unique(template.anatomy.mesh.surface)]
+        shaft = at[642:]
+        assert ((shaft - play.site.origin) @ play.site.axis < 0.0).all()
+        assert np.linalg.norm(shaft[:, None] - surface, axis=2).min() > 4e-3
+
+
+def test_drawing_is_a_function_of_its_moment(play):
+    """Whatever was drawn in between."""
+    touch = play.scene.path(1.2)
+    first = play.draw(36, 1.2, touch)
+    play.draw(3, 0.1, Touch(0.01, 0.0, 0.1, (0.3, 0.1)))
+    again = play.draw(36, 1.2, touch)
+    for name in ("colour", "depth", "normal", "segmentation"):
+        assert np.array_equal(getattr(first.picture, name), getattr(again.picture, name))
+    assert np.array_equal(first.shown, again.shown) and np.array_equal(first.pose, again.pose)
+    assert np.array_equal(first.deformation.displacement, again.deformation.displacement)
+    assert first.distance == again.distance and first.touch == again.touch
+
+
+def test_frames_are_stamped_with_their_moment(theatre):
+    for name in ("linear", "fem"):
+        play = player(theatre, short(), name)
+        frames = list(play.frames())
+        assert [frame.number for frame in frames] == list(range(7)) == list(range(len(play.scene.times)))
+        for frame, time in zip(frames, play.scene.times, strict=True):
+            assert frame.time == time == frame.loads.times[0] == frame.deformation.time[0]
+            assert frame.touch == play.scene.path(time) and frame.deformation.outcome[0].good
+            assert tuple(frame.seconds) == STAGES and min(frame.seconds.values()) > 0.0
+        assert [frame.number for frame in play.frames(every=3)] == [0, 3, 6]
+        pictures = {frame.shown.tobytes() for frame in frames[:4]}
+        assert len(pictures) == 4
+
+
+def test_warm_starts_of_the_loop_change_nothing_that_is_seen(theatre):
+    play = player(theatre, short(), "fem")
+    cold = [
+        play.draw(number, float(time), play.scene.path(float(time))) for number, time in enumerate(play.scene.times)
+    ]
+    for frame, alone in zip(play.frames(), cold, strict=True):
+        difference = np.linalg.norm(frame.deformation.displacement - alone.deformation.displacement, axis=2)
+        assert difference.max() < 5e-5
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_tool_is_never_tinted(name):
+    play = on_template(name)
+    for number in (20, 50, 75):
+        time = float(play.scene.times[number])
+        frame = play.draw(number, time, play.scene.path(time))
+        tool = frame.picture.segmentation == TOOL
+        changed = (frame.shown != frame.picture.colour).any(axis=2)
+        label = np.zeros_like(changed)  # the number beside the tumour may be written over a shaft
+        rows = np.flatnonzero(changed.any(axis=1))
+        label[rows.max() - 26 :] = True
+        assert tool.sum() > 500 and not (tool & changed & ~label).any()
+        assert (changed & (frame.picture.segmentation == CORTEX)).sum() > 500
+
+
+def test_the_overlay_lies_where_the_tumour_is(play):
+    """By another way: the tumour's corners through OpenCV's camera lie inside what was changed."""
+
+    frame = play.draw(51, 1.7, play.scene.path(1.7))
+    changed = (frame.shown != frame.picture.colour).any(axis=2)
+    corners = play.positions(frame.deformation)[play.site.anatomy.tumour_nodes]
+    column, row = np.rint(project_cv2(play.camera, corners)).astype(int).T
+    seen = frame.picture.segmentation[row, column] != TOOL
+    assert seen.sum() > 20 and changed[row, column][seen].mean() > 0.97
+
+
+def test_the_distance_is_that_from_tip_to_tumour(play):
+    frame = play.draw(51, 1.7, play.scene.path(1.7))
+    corners = play.positions(frame.deformation)[play.site.anatomy.tumour_surface]
+    share = np.random.default_rng(0).dirichlet(np.ones(3), 2000)
+    samples = np.einsum("nc,scx->snx", share, corners).reshape(-1, 3)
+    least = np.linalg.norm(samples - frame.tip, axis=1).min()
+    assert frame.distance <= least < frame.distance + 2e-4
+
+
+def test_learnt_and_finite_elements_are_interchangeable(theatre):
+    """The same scene, the same call: the answers agree to a fraction of the motion."""
+    nodes = theatre.anatomy.tumour_nodes
+    fem, learnt = (
+        player(theatre, small(), name).draw(51, 1.7, find_scene("press").path(1.7)).deformation.at(nodes).displacement
+        for name in ("fem", "linear")
+    )
+    assert np.linalg.norm(fem, axis=2).mean() > 3e-4
+    assert np.linalg.norm(fem - learnt, axis=2).mean() < 0.1 * np.linalg.norm(fem, axis=2).mean()
+
+
+def test_the_label_tells_name_force_and_error(play):
+    frame = play.draw(51, 1.7, play.scene.path(1.7))
+    plain, told = labelled(frame, "linear"), labelled(frame, "linear", 1.2e-4)
+    assert plain.shape == told.shape == frame.shown.shape
+    assert (plain != frame.shown).any() and (plain != told).any() and (plain[-60:] == frame.shown[-60:]).all()
+
+
+def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
+
+    again = open_theatre(put(theatre, tmp_path / "box.vtu"), device="cpu")
+    assert again.anatomy.digest == theatre.anatomy.digest and again.names == ("linear", "svr", "fem")
+    assert again.intensity is not None and theatre.intensity is not None
+    assert np.array_equal(again.intensity.values, theatre.intensity.values)
+    assert again.best == min(theatre.models, key=lambda name: theatre.models[name].bound)
+    touch = Touch(force=0.2)
+    pictures = [player(each, short(), "linear").draw(0, 0.0, touch).shown for each in (theatre, again)]
+    assert np.array_equal(*pictures)
+    sidecar(tmp_path / "box.vtu").unlink()
+    model_path(tmp_path / "box.vtu").unlink()
+    bare = open_theatre(tmp_path / "box.vtu", device="cpu")
+    assert bare.intensity is None and bare.names == ("fem",) and bare.best == "fem"
+    with pytest.raises(InputError, match=r"'linear'.*fem; `sulcus train`"):
+        bare.deformer("linear", short())
+
+
+def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_path):
+
+    put(theatre, tmp_path / "box.vtu")
+    write_anatomy(tmp_path / "box.vtu", template.anatomy)
+    with pytest.raises(InputError, match=f"{theatre.anatomy.digest}.*{template.anatomy.digest}"):
+        open_theatre(tmp_path / "box.vtu", device="cpu")
+    with pytest.raises(InputError, match=r"none\.npz: no such file"):
+        open_theatre(tmp_path / "box.vtu", tmp_path / "none.npz", "cpu")
+    with pytest.raises(InputError, match="no device 'abacus'"):
+        open_theatre(device="abacus")
