@@ -14,6 +14,9 @@ from sim.deformation import Deformation
 from .play import Frame, Player
 from .scene import Bounds
 
+NOWHERE = 0.0, np.inf, np.inf
+"""How far off a tumour is whose place is no number: overlap, distance [m], distance in the picture [pixel]."""
+
 
 @dataclass(frozen=True)
 class Figures:
@@ -55,9 +58,9 @@ class Figures:
         }
         return [sentence for sentence, kept in rules.items() if not kept]
 
-    def row(self) -> dict[str, float | bool]:
-        """For machines."""
-        return asdict(self)
+    def row(self) -> dict[str, float | bool | None]:
+        """For machines: JSON knows no infinity, so None is a figure that could not be measured."""
+        return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
 
 
 def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Deformation) -> Figures:
@@ -65,28 +68,37 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
 
     `camera` is the one that should have drawn them.
     """
-    nodes = player.site.anatomy.tumour_nodes
-    right = truth.at(nodes).displacement
-    overlap, error, pixels, finite, answered, in_step = [], [], [], [], [], []
-    for row, frame in enumerate(frames):
-        shown = player.stage.tumour(player.positions(frame.deformation))
-        true = player.stage.tumour(player.positions(truth, row))
-        drawn = silhouette(frame.camera, shown.vertices, shown.triangles)
-        overlap.append(iou(drawn, silhouette(camera, true.vertices, true.triangles)))
-        guess = frame.deformation.at(nodes).displacement[0]
-        error.append(np.linalg.norm(guess - right[row], axis=1).mean())
-        ours = frame.camera.project(shown.vertices)[0]
-        off = np.linalg.norm(ours - project_cv2(camera, shown.vertices), axis=1).max()
-        pixels.append(np.inf if np.isnan(off) else off)  # NaN: behind the camera
-        finite.append(np.isfinite(frame.picture.depth).all() and np.isfinite(guess).all() and np.isfinite(ours).all())
-        answered.append(frame.deformation.outcome[0].good and truth.outcome[row].good)
-        in_step.append(frame.deformation.time[0] == frame.time == truth.time[row])
+    motion = truth.at(player.site.anatomy.tumour_nodes).displacement
+    finite = [_finite(frame) for frame in frames]
+    misses = [_miss(player, camera, frame, truth, row) if finite[row] else NOWHERE for row, frame in enumerate(frames)]
+    overlap, error, pixels = zip(*misses, strict=True)
     return Figures(
-        overlap=float(np.min(overlap)),
-        error_mm=1e3 * float(np.max(error)),
-        motion_mm=1e3 * float(np.linalg.norm(right, axis=2).mean(axis=1).max()),
-        pixels=float(np.max(pixels)),
-        finite=bool(np.all(finite)),
-        answered=all(answered),
-        in_step=bool(np.all(in_step)),
+        overlap=min(overlap),
+        error_mm=1e3 * max(error),
+        motion_mm=1e3 * float(np.linalg.norm(motion, axis=2).mean(axis=1).max()),
+        pixels=max(pixels),
+        finite=all(finite),
+        answered=all(frame.deformation.outcome[0].good for frame in frames) and all(o.good for o in truth.outcome),
+        in_step=all(
+            bool(frame.deformation.time[0] == frame.time == time)
+            for frame, time in zip(frames, truth.time, strict=True)
+        ),
     )
+
+
+def _finite(frame: Frame) -> bool:
+    return bool(np.isfinite(frame.picture.depth).all() and np.isfinite(frame.deformation.displacement).all())
+
+
+def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, float, float]:
+    """Overlap, mean distance [m] and largest distance in the picture [pixel] between a frame and the truth."""
+    shown = player.stage.tumour(player.positions(frame.deformation))
+    true = player.stage.tumour(player.positions(truth, row))
+    drawn = silhouette(frame.camera, shown.vertices, shown.triangles)
+    overlap = iou(drawn, silhouette(camera, true.vertices, true.triangles))
+    nodes = player.site.anatomy.tumour_nodes
+    off = frame.deformation.at(nodes).displacement[0] - truth.at(nodes).displacement[row]
+    ours = frame.camera.project(shown.vertices)[0]
+    pixels = np.linalg.norm(ours - project_cv2(camera, shown.vertices), axis=1).max()
+    # Not a number: behind the camera.
+    return overlap, float(np.linalg.norm(off, axis=1).mean()), np.inf if np.isnan(pixels) else float(pixels)

@@ -1,0 +1,181 @@
+"""Each check fails when what it guards is perturbed, and passes when nothing is."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from theatres import player, put, small, theatre_of
+
+from scenes.check import Figures, measure
+from scenes.cli import main
+from scenes.scene import SCENES, Bounds
+from scenes.truth import truth_of
+from sim.deformation import Outcome
+
+GOOD = Figures(overlap=0.99, error_mm=0.1, motion_mm=1.0, pixels=1e-9, finite=True, answered=True, in_step=True)
+SENTENCES = {
+    "overlap": (0.90, "overlap 0.9000 is below 0.95"),
+    "error_mm": (0.31, "error 0.3100 mm is above 0.3 mm"),
+    "motion_mm": (0.0, "never moves"),
+    "pixels": (0.01, "0.01 pixels off"),
+    "finite": (False, "not finite"),
+    "answered": (False, "answer is not good"),
+    "in_step": (False, "another moment"),
+}
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module", params=["linear", "fem"])
+def play(request, theatre):
+    return player(theatre, small(), request.param)
+
+
+@pytest.fixture(scope="module")
+def frames(play):
+    return list(play.frames(every=30))
+
+
+@pytest.fixture(scope="module")
+def truth(theatre, play, frames):
+    return truth_of(theatre, play.scene, [frame.loads for frame in frames])
+
+
+def broken(play, frames, truth, camera=None):
+    figures = measure(play, play.camera if camera is None else camera, frames, truth)
+    return set(figures.broken(Bounds())), figures
+
+
+def about(sentences, word):
+    return any(word in sentence for sentence in sentences)
+
+
+def shifted(frame, by):
+    """The frame of an answer that puts the tumour elsewhere, `by` (3,) [m]."""
+    answer = frame.deformation
+    return replace(frame, deformation=replace(answer, displacement=answer.displacement + by))
+
+
+def test_every_bound_has_its_sentence():
+    assert GOOD.broken(Bounds()) == []
+    assert set(SENTENCES) == set(GOOD.row())
+    for name, (value, words) in SENTENCES.items():
+        (sentence,) = replace(GOOD, **{name: value}).broken(Bounds())
+        assert words in sentence
+    assert len(replace(GOOD, overlap=np.nan, error_mm=np.nan, pixels=np.nan).broken(Bounds())) == 3
+    assert json.loads(json.dumps(GOOD.row())) == GOOD.row()
+
+
+def test_what_was_not_perturbed_passes(play, frames, truth):
+    sentences, figures = broken(play, frames, truth)
+    assert not sentences
+    assert figures.overlap > 0.97 and figures.pixels < 1e-9 and figures.motion_mm > 0.5
+    assert figures.error_mm < (0.05 if play.deformer is not None else 0.0)
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+def test_a_camera_turned_by_half_a_degree_fails(play, frames, truth, axis):
+    off = [replace(frame, camera=frame.camera.perturbed(0.5, axis)) for frame in frames]
+    sentences, figures = broken(play, off, truth)
+    assert about(sentences, "pixels off") and figures.pixels > 0.2
+    if axis[2] == 0.0:  # about the line of sight a round tumour keeps its outline
+        assert about(sentences, "overlap")
+    one = [frames[0], off[1], *frames[2:]]  # in one frame only
+    assert about(broken(play, one, truth)[0], "pixels off")
+
+
+@pytest.mark.parametrize("direction", ["right", "up", "axis"])
+def test_a_tumour_off_by_a_millimetre_fails(play, frames, truth, direction):
+    by = 1e-3 * getattr(play.site, direction)
+    sentences, figures = broken(play, [frames[0], shifted(frames[1], by), *frames[2:]], truth)
+    assert about(sentences, "error") and figures.error_mm == pytest.approx(1.0, abs=0.1)
+    if direction == "right":
+        assert about(sentences, "overlap")
+
+
+def test_a_stale_frame_fails(play, frames, truth):
+    stale = [frames[0], replace(frames[1], deformation=frames[0].deformation), *frames[2:]]
+    assert about(broken(play, stale, truth)[0], "another moment")
+    # Even if it claims the right time: the tumour is elsewhere.
+    lying = replace(frames[0].deformation, time=np.array([frames[1].time]))
+    stale[1] = replace(frames[1], deformation=lying)
+    sentences = broken(play, stale, truth)[0]
+    assert about(sentences, "error") and not about(sentences, "another moment")
+
+
+def test_frames_in_another_order_fail(play, frames, truth):
+    assert about(broken(play, [frames[1], frames[0], *frames[2:]], truth)[0], "another moment")
+
+
+def test_what_is_not_finite_fails(play, frames, truth):
+    for poison in (np.nan, np.inf):
+        depth = frames[1].picture.depth.copy()
+        depth[3, 5] = poison
+        off = replace(frames[1], picture=replace(frames[1].picture, depth=depth))
+        assert about(broken(play, [frames[0], off, *frames[2:]], truth)[0], "not finite")
+        # No deformer lets such a displacement pass: it can only be put in afterwards.
+        answer = replace(frames[1].deformation, displacement=frames[1].deformation.displacement.copy())
+        answer.displacement[0, np.searchsorted(answer.nodes, play.site.anatomy.tumour_nodes[0])] = poison
+        off = replace(frames[1], deformation=answer)
+        assert about(broken(play, [frames[0], off, *frames[2:]], truth)[0], "not finite")
+
+
+def test_a_bad_outcome_fails_on_either_side(play, frames, truth):
+    doubtful = replace(frames[1].deformation, outcome=(Outcome.EXTRAPOLATED,))
+    off = [frames[0], replace(frames[1], deformation=doubtful), *frames[2:]]
+    assert broken(play, off, truth)[0] == {"an answer is not good: see its outcome"}
+    stopped = replace(truth, outcome=(*truth.outcome[:-1], Outcome.BUDGET))
+    assert broken(play, frames, stopped)[0] == {"an answer is not good: see its outcome"}
+
+
+def test_nothing_but_idle_frames_prove_nothing(play, frames, truth):
+    assert about(broken(play, frames[:1], replace(truth, **first_row(truth)))[0], "never moves")
+
+
+def first_row(truth):
+    return {
+        "displacement": truth.displacement[:1], "outcome": truth.outcome[:1], "time": truth.time[:1],
+        "iterations": truth.iterations[:1], "residual": truth.residual[:1], "reaction": truth.reaction[:1],
+    }  # fmt: skip
+
+
+class TestCommand:
+    @pytest.fixture(scope="class")
+    def anatomy(self, theatre, tmp_path_factory):
+        return put(theatre, tmp_path_factory.mktemp("check") / "box.vtu")
+
+    def test_passes_and_says_so(self, anatomy, capsys):
+        assert main(["check", "--anatomy", str(anatomy), "--every", "30", "--json"]) == 0
+        out, err = capsys.readouterr()
+        report = json.loads(out)
+        assert out.count("\n") == 1 and report["passed"] and report["deformer"] == "linear"
+        assert [row["scene"] for row in report["scenes"]] == list(SCENES)
+        for row in report["scenes"]:
+            assert row["frames"] >= 5 and row["broken"] == [] and row["motion_mm"] > 0.3
+        assert err.count("passes") == 3
+
+    def test_one_scene_by_finite_elements(self, anatomy, capsys):
+        words = ["check", "retract", "--anatomy", str(anatomy), "--every", "40", "--deformer", "fem", "--device", "cpu"]
+        assert main(words) == 0
+        assert capsys.readouterr().out.split()[:2] == ["retract", "passes"]
+
+    def test_a_wrong_model_fails_with_its_figures(self, theatre, anatomy, tmp_path, capsys):
+        linear = theatre.models["linear"]
+        parts = [replace(part, basis=replace(part.basis, modes=2 * part.basis.modes)) for part in linear.parts]
+        wrong = replace(theatre, models={"linear": replace(linear, parts=tuple(parts))})
+        off = put(wrong, tmp_path / "off.vtu")
+        assert main(["check", "press", "--anatomy", str(off), "--every", "60", "--json"]) == 1
+        report = json.loads(capsys.readouterr().out)
+        (row,) = report["scenes"]
+        assert not report["passed"] and about(row["broken"], "error") and row["error_mm"] > 0.3
+        assert main(["check", "press", "--anatomy", str(off), "--every", "60"]) == 1
+        out = capsys.readouterr().out
+        assert "FAILS" in out and "mm is above" in out
+
+    def test_idle_frames_alone_fail(self, anatomy, capsys):
+        assert main(["check", "press", "--anatomy", str(anatomy), "--every", "1000"]) == 1
+        assert "never moves" in capsys.readouterr().out
