@@ -6,7 +6,6 @@ Patient space is RAS [m]; the camera frame is OpenCV's (x right, y down, z forwa
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 
 from ar.overlay import silhouette
 from sim.deformation import Deformation
-from sim.errors import InputError
+from sim.files import written_whole
 
 from .play import STAGES, Frame, Player
 from .stage import NAMES
@@ -44,28 +43,21 @@ def collect(
     InputError
         A file that cannot be written.
     """
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.h5")
     total = len(player.scene.times)
-    try:
-        with h5py.File(partial, "w") as file:
-            pictures = file.create_group("pictures")
-            stores = {
-                name: pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
-                for name in ("colour", "overlay", "depth", "segmentation", "tumour_mask")
-            }
-            rows, loads = [], []  # a frame itself holds seven megabytes
-            for frame in progress(player.frames()):
-                for name, code in encoded(frame, player).items():
-                    stores[name][frame.number] = code
-                rows.append(motion(frame, player))
-                loads.append(frame.loads)
-            outcomes = write_motion(file, player, rows, truth_of(theatre, player.scene, loads))
-            describe(file, player, deformer)
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error}). Choose another folder.") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with written_whole(path, ".h5") as partial, h5py.File(partial, "w") as file:
+        pictures = file.create_group("pictures")
+        stores = {
+            name: pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
+            for name in ("colour", "overlay", "depth", "segmentation", "tumour_mask")
+        }
+        rows, loads = [], []  # a frame itself holds seven megabytes
+        for frame in progress(player.frames()):
+            for name, code in encoded(frame, player).items():
+                stores[name][frame.number] = code
+            rows.append(motion(frame, player))
+            loads.append(frame.loads)
+        outcomes = write_motion(file, player, rows, truth_of(theatre, player.scene, loads))
+        describe(file, player, deformer)
     return {"out": str(path), "scene": player.scene.name, "deformer": deformer, "frames": total, "fem": outcomes}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from .errors import InputError
-from .meshfile import check_output
+from .files import written_whole
 from .volume import read_volume
 
 BRIGHTEST = 99.5  # per cent of the voxels in the crop are at most white
@@ -69,18 +68,11 @@ def write_intensity(path: str | Path, intensity: Intensity) -> None:
     """
     import nibabel
 
-    path = check_output(path, ".gz")
     affine = np.diag([1e3, 1e3, 1e3, 1.0]) @ intensity.affine
     image = nibabel.Nifti1Image(intensity.values, affine)
     image.header.set_xyzt_units("mm")
-    partial = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
+    with written_whole(path, ".gz") as partial:
         nibabel.save(image, partial)
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}). Choose another folder.") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def read_intensity(path: str | Path) -> Intensity:

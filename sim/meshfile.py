@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from .anatomy import Anatomy
 from .errors import InputError
+from .files import written_whole
 from .mesh import TetMesh, oriented
 
 UNITS = {"m": 1.0, "mm": 1e-3}
@@ -73,26 +73,6 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
     return MeshFile(mesh, dict(raw.point_data), tuple(notes))
 
 
-def check_output(path: str | Path, suffix: str) -> Path:
-    """The path of a file that can be written, its folder made; asked before long work, so that none is lost.
-
-    Raises
-    ------
-    InputError
-        A name that does not end in `suffix`, or a folder that cannot be written to.
-    """
-    path = Path(path)
-    if path.suffix != suffix:
-        raise InputError(f"{path}: this file is written as {suffix}; give a name that ends so.")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: its folder cannot be made ({error.strerror}). Choose another folder.") from error
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise InputError(f"{path}: cannot be written there. Choose another name or folder.")
-    return path
-
-
 def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray]) -> None:
     """Write `.vtu` in metres, with cell data `region`; the file appears whole or not at all.
 
@@ -103,20 +83,13 @@ def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndar
     """
     import meshio
 
-    path = check_output(path, ".vtu")
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.vtu")
-    try:
+    with written_whole(path, ".vtu") as partial:
         meshio.Mesh(
             mesh.nodes,
             [("tetra", mesh.tets)],
             point_data=dict(point_data),
             cell_data={"region": [mesh.region]},
         ).write(partial)
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}). Choose another folder.") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def read_anatomy(path: str | Path) -> Anatomy:

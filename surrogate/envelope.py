@@ -33,6 +33,8 @@ class Envelope:
         Least and greatest [N]. Below the least the response is in proportion, so weaker loads lie inside.
     footprint
         Least and greatest radius [m].
+    line_force
+        Greatest force over radius [N/m], to which the indentation of a round tool is in proportion.
     """
 
     points: np.ndarray
@@ -41,6 +43,7 @@ class Envelope:
     angle: float
     force: tuple[float, float]
     footprint: tuple[float, float]
+    line_force: float
 
     def holds(self, patch: Patch, pushed: Pushed) -> np.ndarray:
         """(B,) bool: whether each load lies inside."""
@@ -50,6 +53,7 @@ class Envelope:
             & (overhang <= self.overhang + SLACK)
             & ((angle <= self.angle + SLACK) | (magnitude == 0.0))
             & (magnitude <= self.force[1] * (1.0 + SLACK))
+            & (magnitude <= self.line_force * pushed.footprint * (1.0 + SLACK))
             & (pushed.footprint >= self.footprint[0] * (1.0 - SLACK))
             & (pushed.footprint <= self.footprint[1] * (1.0 + SLACK))
         )
@@ -66,6 +70,7 @@ def envelope_of(patch: Patch, taught: Pushed, held_out: Pushed) -> Envelope:
         float(angle.max()),
         (float(magnitude.min()), float(magnitude.max())),
         (float(taught.footprint.min()), float(taught.footprint.max())),
+        float((magnitude / taught.footprint).max()),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -15,6 +14,7 @@ import numpy as np
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
+from sim.files import written_whole
 from sim.mesh import digest_of
 
 from .ann import Ann
@@ -37,9 +37,6 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
     InputError
         No model, models of different anatomies, a name that does not end in .npz, or a folder that cannot be written.
     """
-    path = Path(path)
-    if path.suffix != ".npz":
-        raise InputError(f"{path}: models are written as .npz; give a name that ends so.")
     digests = {model.anatomy.digest for model in models.values()}
     if len(digests) != 1:
         raise InputError(f"{path}: a file holds models of one anatomy, not of {len(digests)}.")
@@ -56,15 +53,8 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
         "versions": {name: version(name) for name in ("sulcus", "numpy")},
         "models": {name: _described(model, put) for name, model in models.items()},
     }
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.npz")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path, ".npz") as partial:
         np.savez_compressed(partial, header=np.array(json.dumps(header)), **arrays)  # pyright: ignore[reportArgumentType]
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}). Choose another folder.") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:

@@ -13,8 +13,9 @@ from boxes import box, hold
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
+from sim.files import check_output
 from sim.mesh import MeshWarning, TetMesh
-from sim.meshfile import check_output, read_anatomy, read_mesh, write_anatomy, write_mesh
+from sim.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
 
 BOX = box((2, 2, 2), 0.1, distortion=0.2)
 MESH = TetMesh(BOX.nodes, BOX.tets, np.arange(len(BOX.tets)) % 3)

@@ -119,6 +119,8 @@ def test_outside_the_taught_range_is_said(trained, box):
         push(model.envelope.points[0], [0.0, 0.0, -0.8], 6e-3),
         push(model.envelope.points[0], [0.0, 0.0, -0.2], 12e-3),
         push(model.envelope.points[0], [0.0, 0.0, -0.2], 2e-3),
+        # Force and radius were taught, but never so much force on so small a disc.
+        push(model.envelope.points[0], [0.0, 0.0, -model.envelope.force[1]], model.envelope.footprint[0]),
         push(model.envelope.points[0], steep, 6e-3),
         push(model.envelope.points[0], [0.0, 0.0, 0.2], 6e-3),
     ]

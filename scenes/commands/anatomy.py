@@ -12,10 +12,11 @@ import numpy as np
 
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.errors import InputError
+from sim.files import check_output
 from sim.intensity import sidecar, write_intensity
 from sim.labels import volume_subject
 from sim.mesh import dihedral_angles
-from sim.meshfile import check_output, write_anatomy
+from sim.meshfile import write_anatomy
 from sim.meshing import surface_errors
 from sim.subject import Plan, Subject, make_anatomy
 from sim.template import SITES, Tumour, template_subject

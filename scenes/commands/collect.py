@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from sim.meshfile import check_output
+from sim.files import check_output
 
 from .demo import add_theatre
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from sim.accuracy import TRAIN
 from sim.device import find_device
 from sim.errors import InputError
-from sim.meshfile import check_output
+from sim.files import check_output
 from surrogate.sampling import PRESETS
 from surrogate.split import FEWEST
 

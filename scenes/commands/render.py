@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ar.screen import Film, read_png, write_film
 from sim.errors import InputError
-from sim.meshfile import check_output
+from sim.files import check_output
 
 from .demo import add_theatre
 

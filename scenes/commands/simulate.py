@@ -17,8 +17,9 @@ from sim.anatomy import Anatomy
 from sim.deformation import Outcome
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
+from sim.files import check_output
 from sim.material import LAWS, MATERIALS, Material
-from sim.meshfile import check_output, read_anatomy
+from sim.meshfile import read_anatomy
 from surrogate.dataset import read_outcomes
 from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import simulate

@@ -15,9 +15,10 @@ from sim.anatomy import Anatomy
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.files import check_output
 from sim.loads import Cause, Loads, Nodal, Prescribed
 from sim.material import LAWS, Material
-from sim.meshfile import UNITS, MeshFile, check_output, read_mesh, write_mesh
+from sim.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

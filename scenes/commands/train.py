@@ -10,7 +10,7 @@ from dataclasses import asdict
 import numpy as np
 from tqdm import tqdm
 
-from sim.meshfile import check_output
+from sim.files import check_output
 from surrogate.dataset import read_dataset
 from surrogate.score import table, winner
 from surrogate.store import save
