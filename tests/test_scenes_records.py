@@ -1,0 +1,186 @@
+"""Scenes as files: episodes that read back, frames and films."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from theatres import player, put, short, theatre_of
+
+from ar.camera import Camera, project_cv2
+from scenes.cli import main
+from scenes.collect import DEPTH_SCALE, collect
+from scenes.paths import press
+from scenes.stage import CORTEX, DRAPE, TOOL
+from sim.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module")
+def anatomy(theatre, tmp_path_factory):
+    return put(theatre, tmp_path_factory.mktemp("records") / "box.vtu")
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    """The commands find a scene of seven small frames."""
+    monkeypatch.setattr("scenes.scene.find_scene", lambda name: short())
+
+
+@pytest.fixture(scope="module")
+def episode(theatre, tmp_path_factory):
+    path = tmp_path_factory.mktemp("episode") / "press.h5"
+    play = player(theatre, short(), "linear")
+    report = collect(path, theatre, play, "linear", iter)
+    assert list(path.parent.iterdir()) == [path]
+    with h5py.File(path, "r") as file:
+        yield report, file, play, list(play.frames())
+
+
+def decoded(file, name, number, flag=cv2.IMREAD_UNCHANGED):
+    return cv2.imdecode(file["pictures"][name][number], flag)
+
+
+class TestEpisode:
+    def test_pictures_read_back(self, episode):
+        _, file, _, frames = episode
+        assert file.attrs["depth_scale_m"] == DEPTH_SCALE and len(file["pictures/colour"]) == len(frames) == 7
+        for frame in frames:
+            for name, truth in (("colour", frame.picture.colour), ("overlay", frame.shown)):
+                picture = decoded(file, name, frame.number, cv2.IMREAD_COLOR)[..., ::-1]
+                assert picture.shape == truth.shape
+                assert np.abs(picture.astype(int) - truth).mean() < 2.0
+            depth = decoded(file, "depth", frame.number)
+            assert depth.dtype == np.uint16
+            assert np.abs(depth * DEPTH_SCALE - frame.picture.depth).max() <= 0.51 * DEPTH_SCALE
+            assert np.array_equal(depth == 0, frame.picture.depth == 0.0)
+            assert np.array_equal(decoded(file, "segmentation", frame.number), frame.picture.segmentation)
+
+    def test_camera_projects_the_tumour_onto_its_mask(self, episode):
+        _, file, _, _ = episode
+        width, height = int(file.attrs["width"]), int(file.attrs["height"])
+        for number in (0, 3):
+            camera = Camera(file["K"][:], file["T_camera_world"][number], width, height)
+            column, row = np.rint(project_cv2(camera, file["tumour_predicted"][number])).astype(int).T
+            mask = decoded(file, "tumour_mask", number) > 0
+            assert mask.shape == (height, width) and 0.003 < mask.mean() < 0.2
+            grown = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3)))  # a corner lies on the border
+            assert grown[row, column].all()
+            rows, columns = np.nonzero(mask)
+            for pixels, corners in ((rows, row), (columns, column)):
+                assert abs(pixels.min() - corners.min()) <= 2 and abs(pixels.max() - corners.max()) <= 2
+
+    def test_depth_and_camera_give_back_the_cortex(self, episode):
+        _, file, play, frames = episode
+        camera = Camera(file["K"][:], file["T_camera_world"][0], frames[0].camera.width, frames[0].camera.height)
+        pixels = np.argwhere(decoded(file, "segmentation", 0) == CORTEX)
+        depth = decoded(file, "depth", 0)[tuple(pixels.T)] * DEPTH_SCALE
+        height = camera.unproject(pixels[:, ::-1].astype(float), depth) @ play.site.axis
+        assert len(height) > 1000 and np.abs(height).max() < 2e-5  # the box is flat, its top at zero
+
+    def test_motion_is_that_of_the_frames(self, episode, theatre):
+        _, file, play, frames = episode
+        nodes = theatre.anatomy.tumour_nodes
+        rest = theatre.anatomy.mesh.nodes[nodes]
+        assert np.array_equal(file["tumour_nodes"][:], nodes) and np.array_equal(file["tumour_rest"][:], rest)
+        assert np.allclose(file["time"][:], play.scene.times)
+        for frame in frames:
+            assert np.array_equal(file["T_world_tool"][frame.number], frame.pose)
+            assert np.array_equal(file["tip"][frame.number], frame.tip)
+            assert np.allclose(file["force"][frame.number], frame.touch.force * play.site.axis)
+            assert np.allclose(file["contact"][frame.number], play.site.origin)
+            guess = rest + frame.deformation.at(nodes).displacement[0]
+            assert np.allclose(file["tumour_predicted"][frame.number], guess, atol=1e-12)
+        alone = player(theatre, short(), "fem").draw(3, 0.1, short().path(0.1)).deformation.at(nodes).displacement[0]
+        truth = file["tumour_fem"][3] - rest
+        assert np.linalg.norm(alone, axis=1).mean() > 3e-4
+        assert np.linalg.norm(truth - alone, axis=1).max() < 2e-5
+        assert file["seconds"].shape == (7, len(file["seconds"].attrs["stages"]))
+
+    def test_everything_says_what_it_is(self, episode, theatre):
+        report, file, _, _ = episode
+        units = {name: file[name].attrs["unit"] for name in file if "unit" in file[name].attrs}
+        assert units == {
+            "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
+            "tumour_predicted": "m", "tumour_fem": "m", "seconds": "s", "tumour_rest": "m",
+        }  # fmt: skip
+        assert "1e-05 m" in file["pictures/depth"].attrs["unit"]
+        assert file.attrs["anatomy"] == theatre.anatomy.digest and file.attrs["deformer"] == "linear"
+        assert "RAS" in file.attrs["world_frame"] and "OpenCV" in file.attrs["camera_frame"]
+        for label in (f"{CORTEX} cortex", f"{DRAPE} drape", f"{TOOL} tool"):
+            assert label in file.attrs["segmentation"]
+        assert [name.decode() for name in file["outcome_predicted"][:]] == 7 * ["PREDICTED"]
+        assert report["frames"] == 7 and report["fem"] == {"converged": 7}
+
+    @pytest.mark.parametrize("blow", [KeyboardInterrupt, RuntimeError])
+    def test_an_interrupted_episode_leaves_nothing(self, theatre, tmp_path, blow):
+        def stop(frames):
+            for number, frame in enumerate(frames):
+                if number == 2:
+                    raise blow
+                yield frame
+
+        with pytest.raises(blow):
+            collect(tmp_path / "press.h5", theatre, player(theatre, short(), "linear"), "linear", stop)
+        assert not list(tmp_path.iterdir())
+
+    def test_an_earlier_episode_survives_an_interruption(self, theatre, tmp_path):
+        path = tmp_path / "press.h5"
+        path.write_bytes(b"earlier")
+        with pytest.raises(ZeroDivisionError):
+            collect(path, theatre, player(theatre, short(), "linear"), "linear", lambda frames: [1 / 0])
+        assert path.read_bytes() == b"earlier" and list(tmp_path.iterdir()) == [path]
+
+    def test_a_folder_that_cannot_hold_it_is_a_sentence(self, theatre, tmp_path):
+        (tmp_path / "file").touch()
+        with pytest.raises(InputError, match="Choose another folder"):
+            collect(tmp_path / "file" / "a.h5", theatre, player(theatre, short(), "linear"), "linear", iter)
+
+    def test_the_command(self, brief, anatomy, tmp_path, capsys):
+        out = tmp_path / "new" / "press.h5"
+        words = ["collect", "press", "--anatomy", str(anatomy), "--deformer", "fem", "--out", str(out), "--json"]
+        assert main(words) == 0
+        text = capsys.readouterr().out
+        assert json.loads(text)["frames"] == 7 and text.count("\n") == 1
+        with h5py.File(out) as file:
+            moved = np.linalg.norm(file["tumour_fem"][:] - file["tumour_predicted"][:], axis=2).max()
+            assert moved < 3e-5 and file.attrs["deformer"] == "fem"
+
+
+class TestRender:
+    def test_frames_and_film(self, brief, anatomy, tmp_path, capsys):
+        frames, film = tmp_path / "a" / "frames", tmp_path / "film.mp4"
+        words = ["render", "press", "--anatomy", str(anatomy), "--out", str(frames), "--every", "2", "--json"]
+        assert main([*words, "--film", str(film)]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert report["frames"] == 4 and report["not_good"] == 0 and report["deformer"] == "linear"
+        names = sorted(path.name for path in frames.iterdir())
+        assert names == [f"frame_{number:04d}.png" for number in (0, 2, 4, 6)]
+        pictures = [cv2.imread(str(frames / name)) for name in names]
+        assert {picture.shape for picture in pictures} == {(240, 320, 3)}
+        assert (pictures[0] != pictures[2]).any()
+        video = cv2.VideoCapture(str(film))
+        assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 4 and video.get(cv2.CAP_PROP_FPS) == pytest.approx(15.0)
+        video.release()
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "film.mp4"]
+
+    def test_plain_frames_have_no_panel(self, brief, anatomy, theatre, tmp_path, capsys):
+        words = ["render", "press", "--anatomy", str(anatomy), "--every", "3", "--plain", "--out", str(tmp_path)]
+        assert main(words) == 0
+        assert "3 frames by linear" in capsys.readouterr().out
+        shown = [frame.shown for frame in player(theatre, short(), "linear").frames(every=3)]
+        for number, colour in zip((0, 3, 6), shown, strict=True):
+            assert np.array_equal(cv2.imread(str(tmp_path / f"frame_{number:04d}.png"))[..., ::-1], colour)
+
+    def test_doubtful_answers_are_told_by_the_exit_code(self, anatomy, tmp_path, monkeypatch, capsys):
+        strong = replace(short(), path=press(3.0, rise=0.1, hold=0.0))
+        monkeypatch.setattr("scenes.scene.find_scene", lambda name: strong)
+        words = ["render", "press", "--anatomy", str(anatomy), "--out", str(tmp_path), "--json"]
+        assert main(words) == 1
+        assert 2 <= json.loads(capsys.readouterr().out)["not_good"] <= 5
