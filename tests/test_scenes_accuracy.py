@@ -1,0 +1,40 @@
+"""What the accuracy presets promise, on the scene that ships."""
+
+import numpy as np
+import pytest
+
+from scenes.scene import find_scene
+from scenes.theatre import open_theatre
+from sim.accuracy import LIVE, TRAIN, Accuracy
+from sim.fem import Fem
+from sim.loads import stacked
+
+# Largest distance over all nodes from the converged solution [m].
+PROMISED = {"live": (LIVE, 5e-5), "train": (TRAIN, 5e-6)}
+
+
+@pytest.fixture(scope="module")
+def press():
+    """Anatomy, effects and the loads of the press scene, while the force rises and while it falls."""
+    scene, theatre = find_scene("press"), open_theatre()
+    times = (0.3, 0.6, 0.9, 1.2, 1.8, 2.6)
+    loads = stacked([scene.loads(theatre.site, scene.path(time), time) for time in times])
+    converged = Fem(theatre.anatomy, scene.effects, Accuracy(1e-7), "cpu").deform(loads)
+    assert all(outcome.good for outcome in converged.outcome)
+    return theatre.anatomy, scene.effects, loads, converged.displacement
+
+
+@pytest.mark.parametrize("name", PROMISED)
+def test_a_preset_keeps_its_promise(press, name):
+    anatomy, effects, loads, converged = press
+    accuracy, bound = PROMISED[name]
+    answer = Fem(anatomy, effects, accuracy, "cpu").deform(loads).displacement
+    assert np.linalg.norm(answer - converged, axis=2).max() <= bound
+
+
+def test_warm_starts_keep_the_live_promise(press):
+    anatomy, effects, loads, converged = press
+    fem, last = Fem(anatomy, effects, LIVE, "cpu"), None
+    for row in range(len(loads)):
+        last = fem.deform(loads.rows(np.array([row])), start=last)
+        assert np.linalg.norm(last.displacement[0] - converged[row], axis=1).max() <= PROMISED["live"][1]
