@@ -29,7 +29,8 @@ DEPTH_SCALE = 1e-5
 JPEG_QUALITY = 95
 UNITS = {
     "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
-    "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "seconds": "s", "depth": f"{DEPTH_SCALE:g} m (PNG, 16 bit)",
+    "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "seconds": "s",
+    "depth": f"{DEPTH_SCALE:g} m (PNG, 16 bit)",
 }  # fmt: skip
 
 

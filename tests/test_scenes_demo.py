@@ -1,0 +1,155 @@
+"""The page alive, without a browser: it plays, listens, is refereed, and goes away."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from theatres import small, theatre_of
+from visitor import Visitor, free_port, wait_for
+
+from ar.browser import Browser
+from scenes.demo import HAND, SCRIPT, Demo, Referee, Wish
+from scenes.paths import Touch, press
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture
+def scene():
+    """Two seconds, of which the first half presses harder and harder; cheap frames, quickly."""
+    return small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
+
+
+@pytest.fixture
+def demo(theatre, scene):
+    before = set(threading.enumerate())
+    demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
+    yield demo
+    demo.close()
+    assert wait_for(lambda: not [t for t in set(threading.enumerate()) - before if t.name in ("page", "fem")])
+
+
+@pytest.fixture
+def running(demo):
+    """The loop on a thread of its own, as the test takes the visitor's part."""
+    done, drawn = threading.Event(), []
+
+    def play():
+        while not done.is_set():
+            drawn.append(demo.run(0.5))
+
+    loop = threading.Thread(target=play)
+    loop.start()
+    visitor = Visitor(demo.browser, 1200)
+    assert wait_for(lambda: demo.browser.visitors == 1)
+    yield demo, visitor
+    done.set()
+    loop.join()
+    visitor.wire.close()
+    assert sum(drawn) > 5
+
+
+def report(demo):
+    return demo.browser.text.content
+
+
+def test_it_plays_by_itself_and_is_refereed(demo, theatre):
+    assert demo.run(2.0) > 15
+    demo.wish.set(plays=False)
+    demo.run(0.7)
+    assert demo.referee.truth is not None
+    assert wait_for(lambda: "error against FEM: mean" in report(demo))
+    text = report(demo)
+    assert (
+        "**linear**: predicted by a learnt model" in text and "tip to tumour" in text and "ms a stage: deform" in text
+    )
+    truth = demo.referee.truth
+    # The error belongs to the frame that the finite elements answered, and says which.
+    assert f"frame {truth.number}, FEM" in text
+    nodes = theatre.anatomy.tumour_nodes
+    scene = demo.stage.scene
+    loads = scene.loads(theatre.site, scene.path(scene.times[truth.number]), scene.times[truth.number])
+    assert np.array_equal(loads.causes[0].force, truth.loads.causes[0].force)
+    off = theatre.models["linear"].deform(loads, at=nodes).displacement[0] - truth.deformation.at(nodes).displacement[0]
+    assert f"mean {1e3 * np.linalg.norm(off, axis=1).mean():.3f}" in text
+    assert demo.browser.picture.image.shape == (240, 320, 3)
+    assert len(np.unique(demo.browser.picture.image)) > 50
+
+
+def test_the_3d_view_follows(demo, theatre):
+    demo.wish.set(plays=False, number=90)
+    assert demo.run(1.0) >= 1
+    tumour = np.asarray(demo.browser.meshes["tumour"].vertices)
+    rest = demo.stage.tumour(theatre.anatomy.mesh.nodes).vertices
+    assert wait_for(lambda: np.linalg.norm(demo.browser.meshes["tumour"].vertices - rest, axis=1).max() > 5e-4)
+    fem = demo.browser.meshes["finite elements"]
+    demo.run(1.0)
+    assert wait_for(lambda: np.linalg.norm(fem.vertices - demo.browser.meshes["tumour"].vertices, axis=1).max() < 2e-4)
+    assert tumour.shape == rest.shape
+
+
+def test_visitors_take_over_scrub_and_switch(running):
+    demo, visitor = running
+    page = demo.browser
+    visitor.set(page.inputs["force [N]"], 0.31)
+    assert wait_for(lambda: "force 0.31 N" in report(demo) and page.inputs["tool"].value == HAND)
+    visitor.set(page.inputs["direction right [deg]"], 20.0)
+    visitor.set(page.inputs["place up [mm]"], -5.0)
+    assert wait_for(lambda: demo.wish.touch == Touch(0.0, -5e-3, 0.31, (np.radians(20.0), 0.0)))
+    visitor.set(page.inputs["deformer"], "fem")
+    assert wait_for(lambda: report(demo).startswith("**fem**: converged"))
+    assert wait_for(lambda: "finite elements' own answer" in report(demo))
+    visitor.set(page.inputs["deformer"], "svr")
+    assert wait_for(lambda: report(demo).startswith("**svr**"))
+    visitor.set(page.button, True)
+    assert wait_for(lambda: not demo.wish.plays)
+    visitor.set(page.frame, 7)
+    assert wait_for(lambda: "frame 7:" in report(demo) and page.inputs["tool"].value == SCRIPT)
+    assert f"force {demo.stage.scene.path(7 / 60).force:.2f} N" in report(demo)
+    time.sleep(0.3)
+    assert "frame 7:" in report(demo)
+
+
+class TestWish:
+    def test_playing_goes_round(self):
+        wish = Wish("linear", Touch(force=0.1))
+        assert [wish.next(3)[0] for _ in range(5)] == [0, 1, 2, 0, 1]
+        wish.set(plays=False)
+        assert [wish.next(3)[0] for _ in range(3)] == [2, 2, 2]
+
+    def test_the_hand_holds_what_it_does_not_change(self):
+        wish = Wish("linear", Touch(force=0.1))
+        assert wish.next(9)[2] is None
+        wish.hand(x=0.01)
+        assert wish.next(9)[2] == Touch(x=0.01, force=0.1)
+        wish.hand(force=0.3)
+        assert wish.next(9)[2] == Touch(x=0.01, force=0.3)
+        wish.set(tool=SCRIPT, deformer="fem")
+        assert wish.next(9)[1:] == ("fem", None)
+
+
+def test_the_referee_answers_the_newest_question(theatre, scene):
+    referee = Referee(theatre, scene)
+    for number in range(60):
+        touch = scene.path(scene.times[number])
+        referee.ask(number, scene.loads(theatre.site, touch, scene.times[number]))
+    assert wait_for(lambda: referee.truth is not None and referee.truth.number == 59)
+    truth = referee.truth
+    assert truth is not None and truth.deformation.time[0] == truth.loads.times[0] == scene.times[59]
+    assert truth.deformation.outcome[0].good and truth.seconds > 0.0
+    referee.close()
+    assert not referee.thread.is_alive()
+
+
+def test_a_page_that_cannot_be_served_leaves_nothing_behind(theatre, scene):
+    before = set(threading.enumerate())
+    for host, port, kind in (("127.0.0.1", 70000, ValueError), ("no.such.host.invalid", 8080, OSError)):
+        with pytest.raises(kind):
+            Demo(theatre, scene, "linear", host, port)
+        with pytest.raises(kind):
+            Browser([], None, None, host=host, port=port)  # type: ignore[arg-type]
+    assert set(threading.enumerate()) <= before
