@@ -18,8 +18,6 @@ from sim.fem import Fem
 from surrogate.sampling import draw
 
 from .play import Player
-from .scene import Scene
-from .stage import Stage
 from .theatre import Theatre
 
 WARM_UP = 3
@@ -50,8 +48,9 @@ def timed(name: str, unit: str, scale: float, runs: int, note: str, work: Callab
     return Row(name, scale * float(np.median(seconds)), scale * float(np.percentile(seconds, 95)), unit, runs, note)
 
 
-def rows(theatre: Theatre, scene: Scene, solves: int, batch: int) -> Iterator[Row]:
-    """The figures of a theatre, one by one: finite elements, learners, pictures."""
+def rows(theatre: Theatre, player: Player, deformer: str, solves: int, batch: int) -> Iterator[Row]:
+    """The figures of a theatre, one by one: finite elements, learners, and the pictures of a player of `deformer`."""
+    scene = player.scene
     nodes = theatre.anatomy.tumour_nodes
     size = f"{len(theatre.anatomy.mesh.nodes)} nodes, {len(theatre.anatomy.mesh.tets)} tetrahedra"
     loads = draw("palpation", theatre.anatomy, solves, seed=20)
@@ -73,9 +72,7 @@ def rows(theatre: Theatre, scene: Scene, solves: int, batch: int) -> Iterator[Ro
         "FEM, a single load", "ms", 1e3, runs, f"from rest, to {TRAIN.tolerance:g}", lambda i: fem.deform(single[i])
     )
 
-    live = Player(
-        Stage(scene, theatre.site, theatre.intensity), Fem(theatre.anatomy, scene.effects, LIVE, theatre.device)
-    )
+    live = Player(player.stage, Fem(theatre.anatomy, scene.effects, LIVE, theatre.device))
     frames = [frame.seconds["deform"] for frame in live.frames()][WARM_UP:]
     yield Row(
         "FEM, live", 1e3 * float(np.median(frames)), 1e3 * float(np.percentile(frames, 95)), "ms", len(frames),
@@ -92,12 +89,10 @@ def rows(theatre: Theatre, scene: Scene, solves: int, batch: int) -> Iterator[Ro
             lambda i, model=model: model.deform(single[i % len(single)], at=nodes),
         )
         yield row
-    name = theatre.best
-    player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
     times = scene.times
     size = f"{scene.viewpoint.width} x {scene.viewpoint.height}"
     yield timed(
-        "frame", "ms", 1e3, len(times), f"deform ({name}), render {size}, composite: {scene.name}",
+        "frame", "ms", 1e3, len(times), f"deform ({deformer}), render {size}, composite: {scene.name}",
         lambda i: player.draw(i, float(times[i]), scene.path(float(times[i]))),
     )  # fmt: skip
 

@@ -24,17 +24,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
     from ..bench import machine, rows
+    from ..play import Player
     from ..scene import find_scene
+    from ..stage import Stage
     from ..theatre import open_theatre
 
     if args.batch < 1:
         raise InputError(f"--batch {args.batch} solves nothing: give a whole number from 1 up.")
+    scene = find_scene(args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
+    name = args.deformer or theatre.best
+    player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
     found = []
     where = machine(args.device)
     table = sys.stderr if args.json else sys.stdout
     print(f"{where}\n\n| stage | median | p95 | | what |\n|---|---|---|---|---|", file=table)
-    for row in rows(theatre, find_scene(args.scene), args.solves, args.batch):
+    for row in rows(theatre, player, name, args.solves, args.batch):
         found.append(row)
         print(f"| {row.name} | {row.median:.3g} | {row.p95:.3g} | {row.unit} | {row.note} |", file=table, flush=True)
     if args.json:

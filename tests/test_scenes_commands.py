@@ -1,0 +1,153 @@
+"""Every scenes command from the outside: a patient in one go, and bad input as one sentence with nothing written."""
+
+import json
+from dataclasses import replace
+
+import nibabel
+import numpy as np
+import pytest
+from boxes import base_held
+from boxes import box as cube
+from theatres import put, theatre_of
+
+from scenes.cli import COMMANDS, main
+from scenes.theatre import model_path
+from sim.intensity import sidecar
+from sim.meshfile import read_anatomy, write_anatomy, write_mesh
+from surrogate.store import load
+
+
+def ball(folder):
+    """Labels: a ball of 55 mm radius with one of 10 mm in it; and intensities."""
+    index = np.moveaxis(np.indices((64, 64, 64)), 0, -1)
+    places = 2.0 * (index - 31.5)
+    labels = np.where(np.linalg.norm(places, axis=-1) < 55.0, 1, 0)
+    labels[np.linalg.norm(places - [20.0, 0.0, 20.0], axis=-1) < 10.0] = 2
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = -63.0
+    nibabel.save(nibabel.Nifti1Image(labels.astype(np.uint8), affine), folder / "labels.nii.gz")
+    nibabel.save(nibabel.Nifti1Image((places[..., 0] + 70.0).astype(np.float32), affine), folder / "t1.nii.gz")
+
+
+def test_a_patient_in_one_go(tmp_path, capsys):
+    ball(tmp_path)
+    out = tmp_path / "me" / "brain.vtu"
+    volumes = [str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--t1", str(tmp_path / "t1.nii.gz")]
+    size = ["--nodes", "2000", "--count", "40", "--device", "cpu"]
+    assert main(["patient", *volumes, *size, "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    for step in ("sulcus anatomy --labels", "sulcus simulate", "sulcus train", "wins", "ready: sulcus demo --anatomy"):
+        assert step in text
+    anatomy = read_anatomy(out)
+    assert set(load(model_path(out), anatomy)) == {"linear", "ann", "svr", "residual"} and sidecar(out).is_file()
+    assert main(["check", "press", "slide", "--anatomy", str(out), "--every", "30", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["passed"] and all(row["motion_mm"] > 0.3 for row in report["scenes"])
+    assert main(["render", "slide", "--anatomy", str(out), "--every", "60", "--out", str(tmp_path / "frames")]) == 0
+    assert len(list((tmp_path / "frames").iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["none.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu"], "no such file"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "7", "--out", "a.vtu"], "no label 7"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.stl"], ".vtu"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "labels.nii.gz/a.vtu"], "folder"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--count", "3"], "--count 3"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--device", "abacus"], "abacus"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--nodes", "3"], "3 nodes"),
+    ],
+)
+def test_a_patient_that_cannot_be_is_a_sentence(tmp_path, monkeypatch, capsys, words, reason):
+    ball(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    assert main(["patient", *words]) == 2
+    error = capsys.readouterr().err
+    assert reason in error.splitlines()[-1] and "Traceback" not in error
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.fixture(scope="module")
+def folder(box, tmp_path_factory):
+    """box.vtu with its models; other.vtu with the models of box; mesh.vtu, a mesh; closed.vtu, without opening."""
+    folder = tmp_path_factory.mktemp("commands")
+    theatre = theatre_of(box)
+    put(theatre, folder / "box.vtu")
+    put(theatre, folder / "other.vtu")
+    write_anatomy(folder / "other.vtu", replace(box, held=box.held | True))
+    write_mesh(folder / "mesh.vtu", box.mesh, {})
+    write_anatomy(folder / "closed.vtu", base_held(cube((2, 2, 2))))
+    (folder / "text.npz").write_text("no model")
+    return folder
+
+
+PLAYING = {
+    "demo": ["demo", "press", "--seconds", "1"],
+    "render": ["render", "press", "--out", "frames"],
+    "collect": ["collect", "press", "--out", "press.h5"],
+    "check": ["check", "press"],
+    "bench": ["bench", "press"],
+}
+ALL = [
+    (["--anatomy", "none.vtu"], "no such file"),
+    (["--anatomy", "text.npz"], "cannot be read"),
+    (["--anatomy", "mesh.vtu"], "not an anatomy"),
+    (["--anatomy", "closed.vtu"], "no open cortex"),
+    (["--anatomy", "other.vtu"], "was taught on"),
+    (["--anatomy", "box.vtu", "--model", "none.npz"], "no such file"),
+    (["--anatomy", "box.vtu", "--model", "text.npz"], "cannot be read as a model"),
+    (["--anatomy", "box.vtu", "--device", "abacus"], "no device 'abacus'"),
+]
+DEFORMER = (["--anatomy", "box.vtu", "--deformer", "oracle"], "'oracle' here: choose one of linear, svr, fem")
+OWN = [
+    ("render", ["--every", "0"], "--every 0"),
+    ("render", ["--every", "-3"], "--every -3"),
+    ("render", ["--film", "film.avi"], ".mp4"),
+    ("render", ["--film", "box.vtu/film.mp4"], "folder"),
+    ("render", ["--out", "box.vtu"], "is a file"),
+    ("render", ["--out", "box.vtu/frames"], "cannot be written"),
+    ("collect", ["--out", "press.txt"], ".h5"),
+    ("collect", ["--out", "box.vtu/press.h5"], "folder"),
+    ("check", ["--every", "0"], "--every 0"),
+    ("demo", ["--port", "70000"], "70000 is no port"),
+    ("demo", ["--port", "-1"], "-1 is no port"),
+    ("demo", ["--host", "no.such.host.invalid"], "no.such.host.invalid"),
+    ("demo", ["--seconds", "nan"], "--seconds nan"),
+    ("bench", ["--batch", "0"], "--batch 0"),
+    ("bench", ["--solves", "0"], "count"),
+]
+CASES = [
+    *((PLAYING[name] + words, reason) for name in PLAYING for words, reason in ALL),
+    *((PLAYING[name] + DEFORMER[0], DEFORMER[1]) for name in PLAYING),
+    *((PLAYING[name] + ["--anatomy", "box.vtu", *words], reason) for name, words, reason in OWN),
+    *(([name, "dance", *PLAYING[name][2:]], "'dance'") for name in PLAYING),
+]
+
+
+@pytest.mark.parametrize(("words", "reason"), CASES, ids=[" ".join(words) for words, _ in CASES])
+def test_bad_input_is_a_sentence_and_nothing_is_written(folder, monkeypatch, capsys, words, reason):
+    monkeypatch.chdir(folder)
+    before = {path: path.stat().st_mtime_ns for path in sorted(folder.rglob("*"))}
+    assert main(words) == 2
+    out, error = capsys.readouterr()
+    sentence = error.splitlines()[-1]
+    assert reason in sentence and sentence.startswith(f"sulcus {words[0]}: ") and sentence.endswith(".")
+    assert "Traceback" not in error and "address" not in out
+    assert {path: path.stat().st_mtime_ns for path in sorted(folder.rglob("*"))} == before
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([name, "--help"])
+    out = capsys.readouterr().out
+    assert end.value.code == 0 and COMMANDS[name][1:20] in " ".join(out.split())
+
+
+@pytest.mark.parametrize("words", [[], ["dance"], ["check", "--every", "often"], ["collect", "press"]])
+def test_words_that_are_no_command_are_refused(words, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 2 and "usage: sulcus" in capsys.readouterr().err
