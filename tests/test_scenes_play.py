@@ -1,16 +1,19 @@
 """The loop: a tool that rests on the tissue, one picture a moment, and a picture that is a function of its moment."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
 from theatres import on_template, player, put, short, small, template_theatre, theatre_of
 
 from ar.camera import project_cv2
+from scenes.cli import main
 from scenes.paths import Touch
 from scenes.play import STAGES, labelled
 from scenes.scene import SCENES, find_scene
 from scenes.stage import CORTEX, TOOL
-from scenes.theatre import model_path, open_theatre
+from scenes.theatre import model_path, open_theatre, template_path
 from sim.errors import InputError
 from sim.intensity import sidecar
 from sim.meshfile import write_anatomy
@@ -188,3 +191,13 @@ def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_pa
         open_theatre(tmp_path / "box.vtu", tmp_path / "none.npz", "cpu")
     with pytest.raises(InputError, match="no device 'abacus'"):
         open_theatre(device="abacus")
+
+
+def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
+    assert model_path(template_path()).stat().st_size <= 5_000_000 and sidecar(template_path()).is_file()
+    theatre = open_theatre(device="cpu")
+    assert {"linear", "ann", "svr"} <= set(theatre.models) and theatre.intensity is not None
+    assert all(model.bound < 1e-3 for model in theatre.models.values()) and theatre.best != "fem"
+    assert main(["check", "--every", "40", "--device", "cpu", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["passed"] and len(report["scenes"]) == len(SCENES)
