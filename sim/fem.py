@@ -27,7 +27,7 @@ from .term import Cases
 LARGEST_FACTOR = 400_000
 SMALLEST_LOAD_STEP = 1.0 / 64.0
 # Load steps of one case may take this many times the outer steps of one load: hopeless cases cost no more.
-STEPPING_BUDGET = 2
+STEPPING_BUDGET = 4
 
 
 class Fem:
