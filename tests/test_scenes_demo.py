@@ -9,8 +9,9 @@ from theatres import small, theatre_of
 from visitor import Visitor, free_port, wait_for
 
 from ar.browser import Browser
-from scenes.demo import HAND, SCRIPT, Demo, Referee, Wish
+from scenes.demo import HAND, SCRIPT, Demo, Wish
 from scenes.paths import Touch, press
+from scenes.referee import Referee
 
 
 @pytest.fixture(scope="module")
