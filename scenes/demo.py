@@ -40,10 +40,11 @@ class Wish:
             for name, value in values.items():
                 setattr(self, name, value)
 
-    def hand(self, **values: object) -> None:
-        """Take the tool over with some of its numbers changed."""
+    def hand(self, right: float | None = None, up: float | None = None, **values: float) -> None:
+        """Take the tool over with some numbers of its touch changed; `right` and `up` tilt its force [rad]."""
         with self.lock:
-            self.touch, self.tool = replace(self.touch, **values), HAND
+            tilt = self.touch.tilt[0] if right is None else right, self.touch.tilt[1] if up is None else up
+            self.touch, self.tool = replace(self.touch, tilt=tilt, **values), HAND
 
     def next(self, frames: int) -> tuple[int, str, Touch | None]:
         """Frame number, deformer and hand-set touch (None: the script's) of the next frame; playing goes on by one."""
@@ -118,8 +119,8 @@ class Demo:
             Choice("deformer", self.theatre.names, wish.deformer, lambda name: wish.set(deformer=name)),
             Choice("tool", (SCRIPT, HAND), SCRIPT, lambda tool: wish.set(tool=tool)),
             Slider("force [N]", 0.0, 0.4, 0.01, wish.touch.force, lambda value: self._take(force=value)),
-            Slider("direction right [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(right=value)),
-            Slider("direction up [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(up=value)),
+            Slider("direction right [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(right=np.radians(value))),
+            Slider("direction up [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(up=np.radians(value))),
             Slider("place right [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(x=1e-3 * value)),
             Slider("place up [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(y=1e-3 * value)),
         ]
@@ -129,13 +130,9 @@ class Demo:
         self.wish.set(number=number, tool=SCRIPT)
         self.browser.put("tool", SCRIPT)
 
-    def _take(self, right: float | None = None, up: float | None = None, **values: float) -> None:
+    def _take(self, **values: float) -> None:
         """A slider was moved: the tool is in the visitor's hand."""
-        tilt = list(self.wish.touch.tilt)
-        for axis, degrees in enumerate((right, up)):
-            if degrees is not None:
-                tilt[axis] = np.radians(degrees)
-        self.wish.hand(**values, tilt=(tilt[0], tilt[1]))
+        self.wish.hand(**values)
         self.browser.put("tool", HAND)
 
     def _bodies(self) -> list[Body]:

@@ -132,6 +132,18 @@ class TestWish:
         wish.set(tool=SCRIPT, deformer="fem")
         assert wish.next(9)[1:] == ("fem", None)
 
+    def test_two_sliders_at_once_both_count(self):
+        """The page calls each slider on a thread of its own."""
+        wish = Wish("linear", Touch(force=0.1))
+        hands = [threading.Thread(target=wish.hand, kwargs=turn) for turn in ({"right": 0.2}, {"up": -0.3})]
+        with wish.lock:  # both are under way before either is heard
+            for hand in hands:
+                hand.start()
+            time.sleep(0.05)
+        for hand in hands:
+            hand.join()
+        assert wish.next(9)[2] == Touch(force=0.1, tilt=(0.2, -0.3))
+
 
 def test_the_referee_answers_the_newest_question(theatre, scene):
     referee = Referee(theatre, scene)
