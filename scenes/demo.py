@@ -12,7 +12,7 @@ from ar.browser import Body, Browser, Choice, Playback, Slider, Viewpoint
 
 from .paths import Touch
 from .play import Frame, Player
-from .referee import Referee
+from .referee import Referee, Truth
 from .scene import Scene
 from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR, Stage
 from .theatre import Theatre
@@ -86,6 +86,8 @@ class Demo:
         frame: Frame | None = None
         end = clock.perf_counter() + seconds
         shown: tuple | None = None
+        judged: tuple[Truth, str] | None = None
+        verdict = "error: the finite elements are being prepared"
         while clock.perf_counter() < end:
             begun = clock.perf_counter()
             number, name, touch = self.wish.next(len(scene.times))
@@ -97,9 +99,12 @@ class Demo:
                 frame = self._player(name).draw(number, time, touch, last if name == previous else None)
                 previous, shown = name, asked
                 self.referee.ask(number, frame.loads)
-                self._show(frame)
+                self._show(frame, name)
                 drawn += 1
-            self.browser.report(self._report(frame, name))
+            truth = self.referee.truth
+            if truth is not None and (truth, name) != judged:
+                verdict, judged = self._judge(truth, name), (truth, name)
+            self.browser.report(self._report(frame, name, verdict))
             clock.sleep(max(0.0, 1.0 / scene.frames_per_second - (clock.perf_counter() - begun)))
         return drawn
 
@@ -152,41 +157,38 @@ class Demo:
         eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
         return Viewpoint(eye, site.origin + 0.015 * site.axis, site.up)
 
-    def _show(self, frame: Frame) -> None:
-        player = next(iter(self.players.values()))
-        positions = player.positions(frame.deformation)
+    def _show(self, frame: Frame, name: str) -> None:
+        positions = self._player(name).positions(frame.deformation)
         self.browser.show(frame.number, frame.shown)
         self.browser.move("cortex", self.stage.cortex(positions).vertices)
         self.browser.move("tumour", self.stage.tumour(positions).vertices)
         tool = self.stage.scene.tool.mesh
         self.browser.move("tool", tool.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
-        truth = self.referee.truth
-        if truth is not None:
-            self.browser.move("finite elements", self.stage.tumour(player.positions(truth.deformation)).vertices)
 
-    def _report(self, frame: Frame, name: str) -> str:
-        """Milliseconds a stage, and the error of the frame that the finite elements answered last."""
+    def _judge(self, truth: Truth, name: str) -> str:
+        """Show what the finite elements answered, and say how far off a deformer is under the same loads."""
+        player = self._player(name)
+        self.browser.move("finite elements", self.stage.tumour(player.positions(truth.deformation)).vertices)
+        nodes = self.stage.site.anatomy.tumour_nodes
+        right = truth.deformation.at(nodes).displacement[0]
+        said = "this is the finite elements' own answer"
+        if name != "fem":
+            guess = player.deformer.deform(truth.loads, at=nodes).displacement[0]
+            error = 1e3 * np.linalg.norm(guess - right, axis=1)
+            said = f"error against FEM: mean {error.mean():.3f}, largest {error.max():.3f} mm"
+        motion = 1e3 * float(np.linalg.norm(right, axis=1).mean())
+        return (
+            f"{said}; tumour moved {motion:.2f} mm (frame {truth.number}, FEM {1e3 * truth.seconds:.0f} ms, "
+            f"{truth.deformation.outcome[0].name.lower()})"
+        )
+
+    def _report(self, frame: Frame, name: str, verdict: str) -> str:
+        """The outcome, milliseconds a stage, and the verdict on the frame that the finite elements answered last."""
         stages = " · ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-        outcome = frame.deformation.outcome[0]
         lines = [
-            f"**{name}**: {outcome.value}",
+            f"**{name}**: {frame.deformation.outcome[0].value}",
             f"frame {frame.number}: force {frame.touch.force:.2f} N, tip to tumour {1e3 * frame.distance:.1f} mm",
             f"ms a stage: {stages}",
+            verdict,
         ]
-        truth = self.referee.truth
-        if truth is None:
-            lines.append("error: the finite elements are being prepared")
-        else:
-            nodes = self.stage.site.anatomy.tumour_nodes
-            guess = self._player(name).deformer.deform(truth.loads, at=nodes).displacement[0] if name != "fem" else None
-            right = truth.deformation.at(nodes).displacement[0]
-            motion = 1e3 * float(np.linalg.norm(right, axis=1).mean())
-            said = "this is the finite elements' own answer"
-            if guess is not None:
-                error = 1e3 * np.linalg.norm(guess - right, axis=1)
-                said = f"error against FEM: mean {error.mean():.3f}, largest {error.max():.3f} mm"
-            lines.append(
-                f"{said}; tumour moved {motion:.2f} mm (frame {truth.number}, FEM {1e3 * truth.seconds:.0f} ms, "
-                f"{truth.deformation.outcome[0].name.lower()})"
-            )
         return "\n\n".join(lines)

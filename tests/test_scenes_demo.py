@@ -12,6 +12,7 @@ from ar.browser import Browser
 from scenes.demo import HAND, SCRIPT, Demo, Wish
 from scenes.paths import Touch, press
 from scenes.referee import Referee
+from surrogate.learned import Learned
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +80,39 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
     assert f"mean {1e3 * np.linalg.norm(off, axis=1).mean():.3f}" in text
     assert demo.browser.picture.image.shape == (240, 320, 3)
     assert len(np.unique(demo.browser.picture.image)) > 50
+
+
+def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypatch):
+    """The frame was drawn before the finite elements answered it: no further one brings their tumour along."""
+    asked = []
+    monkeypatch.setattr(demo.referee, "ask", lambda number, loads: asked.append((number, loads)))
+    demo.wish.set(plays=False, number=90)
+    fem = demo.browser.meshes["finite elements"]
+    rest = np.array(fem.vertices)
+
+    def later():
+        time.sleep(0.5)
+        Referee.ask(demo.referee, *asked[0])
+
+    answer = threading.Thread(target=later)
+    answer.start()
+    assert demo.run(3.0) == 1 and len(asked) == 1
+    answer.join()
+    assert wait_for(lambda: np.linalg.norm(fem.vertices - rest, axis=1).max() > 5e-4)
+
+
+def test_the_error_is_found_once_for_each_answer(demo, monkeypatch):
+    demo.wish.set(plays=False, number=30)
+    answer, asked = Learned.deform, []
+
+    def counted(model, loads, start=None, at=None):
+        asked.append(loads)
+        return answer(model, loads, start, at)
+
+    monkeypatch.setattr(Learned, "deform", counted)
+    demo.run(1.5)
+    assert wait_for(lambda: "error against FEM: mean" in report(demo))
+    assert len(asked) == 2  # for the picture, and for the error
 
 
 def test_the_3d_view_follows(demo, theatre):
