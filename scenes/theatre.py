@@ -19,8 +19,10 @@ from sim.meshfile import read_anatomy
 from surrogate.learned import Learned
 from surrogate.store import load
 
+from .play import Player
 from .scene import Scene
 from .site import Site, site_of
+from .stage import Stage
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +65,16 @@ class Theatre:
                 "`sulcus train` makes the learnt ones."
             )
         return self.models[name]
+
+    def player(self, name: str, scene: Scene) -> Player:
+        """A scene on this anatomy's open cortex with a deformer by name.
+
+        Raises
+        ------
+        InputError
+            As `deformer`; an anatomy without open cortex.
+        """
+        return Player(Stage(scene, self.site, self.intensity), self.deformer(name, scene))
 
 
 def template_path() -> Path:

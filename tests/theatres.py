@@ -81,4 +81,4 @@ def short() -> Scene:
 
 def player(theatre: Theatre, scene: Scene, deformer: str) -> Player:
     """As the commands make it."""
-    return Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(deformer, scene))
+    return theatre.player(deformer, scene)

@@ -24,9 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
     from ..bench import machine, rows
-    from ..play import Player
     from ..scene import find_scene
-    from ..stage import Stage
     from ..theatre import open_theatre
 
     if args.batch < 1:
@@ -34,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     scene = find_scene(args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = args.deformer or theatre.best
-    player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
+    player = theatre.player(name, scene)
     found = []
     where = machine(args.device)
     table = sys.stderr if args.json else sys.stdout

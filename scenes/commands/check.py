@@ -22,9 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check scene by scene. 1: a bound was not kept."""
     from ..check import measure
-    from ..play import Player
     from ..scene import SCENES, find_scene
-    from ..stage import Stage
     from ..theatre import open_theatre
     from ..truth import truth_of
 
@@ -35,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     name = args.deformer or theatre.best
     rows = []
     for scene in scenes:
-        player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
+        player = theatre.player(name, scene)
         frames = list(player.frames(args.every))
         figures = measure(player, player.camera, frames, truth_of(theatre, scene, [frame.loads for frame in frames]))
         broken = figures.broken(scene.bounds)

@@ -25,15 +25,13 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..collect import collect
-    from ..play import Player
     from ..scene import find_scene
-    from ..stage import Stage
     from ..theatre import open_theatre
 
     scene = find_scene(args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = args.deformer or theatre.best
-    player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
+    player = theatre.player(name, scene)
     out = check_output(args.out, ".h5")
     report = collect(
         out, theatre, player, name, lambda frames: tqdm(frames, total=len(scene.times), unit="frame", file=sys.stderr)

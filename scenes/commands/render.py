@@ -29,9 +29,8 @@ def run(args: argparse.Namespace) -> int:
     """Draw, frame by frame. 1: a frame was answered badly."""
     from tqdm import tqdm
 
-    from ..play import Player, labelled
+    from ..play import labelled
     from ..scene import find_scene
-    from ..stage import Stage
     from ..theatre import open_theatre
 
     scene = find_scene(args.scene)
@@ -43,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = args.deformer or theatre.best
-    player = Player(Stage(scene, theatre.site, theatre.intensity), theatre.deformer(name, scene))
+    player = theatre.player(name, scene)
     if args.film is not None:
         check_output(args.film, args.film.suffix)
     written, bad = [], 0
