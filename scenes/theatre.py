@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.resources import files
 from pathlib import Path
 
 from sim.accuracy import LIVE
@@ -21,6 +20,7 @@ from surrogate.store import load
 
 from .play import Player
 from .scene import Scene
+from .shipped import template_path
 from .site import Site, site_of
 from .stage import Stage
 
@@ -75,11 +75,6 @@ class Theatre:
             As `deformer`; an anatomy without open cortex.
         """
         return Player(Stage(scene, self.site, self.intensity), self.deformer(name, scene))
-
-
-def template_path() -> Path:
-    """The anatomy that ships with the package."""
-    return Path(str(files("scenes"))) / "data" / "template.vtu"
 
 
 def model_path(anatomy: Path) -> Path:

@@ -12,8 +12,9 @@ from scenes.cli import main
 from scenes.paths import Touch
 from scenes.play import STAGES, labelled
 from scenes.scene import SCENES, find_scene
+from scenes.shipped import template_path
 from scenes.stage import CORTEX, TOOL
-from scenes.theatre import model_path, open_theatre, template_path
+from scenes.theatre import model_path, open_theatre
 from sim.errors import InputError
 from sim.intensity import sidecar
 from sim.meshfile import write_anatomy

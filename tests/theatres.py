@@ -12,8 +12,9 @@ import numpy as np
 from scenes.paths import press
 from scenes.play import Player
 from scenes.scene import Scene, Viewpoint, find_scene
+from scenes.shipped import template_path
 from scenes.stage import Stage
-from scenes.theatre import Theatre, model_path, template_path
+from scenes.theatre import Theatre, model_path
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolForce

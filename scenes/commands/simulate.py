@@ -6,7 +6,6 @@ import argparse
 import json
 import sys
 from importlib.metadata import version
-from importlib.resources import as_file, files
 
 import h5py
 import numpy as np
@@ -23,6 +22,8 @@ from sim.meshfile import read_anatomy
 from surrogate.dataset import read_outcomes
 from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import simulate
+
+from ..shipped import template_path
 
 INTERRUPTED = 130
 
@@ -53,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Returns 0: the file is complete, whether or not every case converged; it says which did."""
     out = check_output(args.out, ".h5")
-    anatomy = shipped_template() if args.anatomy is None else read_anatomy(args.anatomy)
+    anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
     loads = draw(args.preset, anatomy, args.count, args.seed)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
     effects = _effects(anatomy, _material(args))
@@ -79,12 +80,6 @@ def run(args: argparse.Namespace) -> int:
             return INTERRUPTED
     _report(args, len(loads), solved)
     return 0
-
-
-def shipped_template() -> Anatomy:
-    """The template anatomy of the package."""
-    with as_file(files("scenes") / "data" / "template.vtu") as path:
-        return read_anatomy(path)
 
 
 def _effects(anatomy: Anatomy, material: Material) -> tuple[Effect, ...]:
