@@ -62,8 +62,6 @@ class Layer:
         (V, 3) [m], (F, 3); seen from both sides.
     colour
         (3,) or (V, 3), sRGB in [0, 1].
-    normals
-        (V, 3) unit vertex normals; made from the surface when None.
     gloss, shininess
         Strength of the wet highlight, 0 .. 1, and its Blinn–Phong exponent.
     solid, rest
@@ -82,7 +80,6 @@ class Layer:
     vertices: np.ndarray
     triangles: np.ndarray
     colour: np.ndarray | tuple[float, float, float] = (0.8, 0.8, 0.8)
-    normals: np.ndarray | None = None
     gloss: float = 0.3
     shininess: float = 60.0
     solid: Solid | None = None
@@ -98,7 +95,6 @@ class Layer:
         colour = np.asarray(self.colour, np.float32)
         for what, array, shapes in (
             ("colour", colour, ((3,), vertices.shape)),
-            ("normals", self.normals, (vertices.shape,)),
             ("rest", self.rest, (vertices.shape,)),
         ):
             if array is not None and np.shape(array) not in shapes:

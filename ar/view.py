@@ -157,7 +157,7 @@ def as_light(lamp: Lamp) -> Light:
 @lru_cache(maxsize=16)
 def as_surface(layer: Layer, device: str) -> tuple:
     """The layer as the kernel takes it, from `triangles` to `look`; a layer that stands still is made once."""
-    normals = vertex_normals(layer.vertices, layer.triangles) if layer.normals is None else layer.normals
+    normals = vertex_normals(layer.vertices, layer.triangles)
     look = Look()
     look.id, look.gloss, look.shininess = layer.id, layer.gloss, layer.shininess
     look.textured = layer.solid is not None

@@ -74,8 +74,3 @@ def retract(
         return Touch(*at, force * (smooth(time / rise) - let_go), (tilt * drawn, 0.0))
 
     return path
-
-
-def fixed(touch: Touch) -> Path:
-    """The same touch for ever: what a user set by hand."""
-    return lambda time: touch

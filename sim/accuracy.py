@@ -56,5 +56,3 @@ DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32")
 LIVE = Accuracy(tolerance=2e-3, outer=30, precision="float32")
 TRAIN = Accuracy(tolerance=1e-4, precision="float32")
 REFERENCE = Accuracy(tolerance=1e-8)
-
-PRESETS = {"draft": DRAFT, "live": LIVE, "train": TRAIN, "reference": REFERENCE}

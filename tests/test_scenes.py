@@ -8,7 +8,7 @@ import trimesh
 from theatres import on_template, small, template_theatre
 
 from ar.camera import project_cv2
-from scenes.paths import Touch, fixed, press, retract, slide, smooth
+from scenes.paths import Touch, press, retract, slide, smooth
 from scenes.scene import SCENES, Viewpoint, find_scene
 from scenes.site import site_of
 from scenes.stage import CORTEX, DRAPE, TOOL, Stage, clipped
@@ -87,7 +87,6 @@ class TestPaths:
             first = path(0.7)
             path(2.0)
             assert path(0.7) == first
-        assert fixed(Touch(force=0.1))(0.0) == fixed(Touch(force=0.1))(9.0) == Touch(force=0.1)
 
 
 @pytest.mark.parametrize("name", SCENES)
