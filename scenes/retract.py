@@ -1,15 +1,13 @@
-"""A broad blunt tool lies on the cortex beside the tumour and draws it aside."""
+"""A palpation ball lies on the cortex beside the tumour and draws it aside."""
 
 import numpy as np
 
 from .paths import retract
 from .scene import Scene
-from .tool import Probe
 
 SCENE = Scene(
     "retract",
     __doc__ or "",
     retract(force=0.25, tilt=np.radians(38.0), rise=1.2, hold=0.8, at=(-0.008, 0.0)),
     duration=4.2,
-    tool=Probe(radius=7e-3),
 )

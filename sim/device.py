@@ -13,7 +13,7 @@ from .errors import InputError
 
 # No adjoints are taken anywhere in the house: half the code to compile.
 wp.config.enable_backward = False
-# Start-up notes and the missing-driver warning would stand among a command's own lines; `find_device` reports.
+# Start-up notes would stand among a command's own lines; that no driver is there is said all the same.
 wp.config.log_level = wp.LOG_ERROR
 
 SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}

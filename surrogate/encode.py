@@ -71,7 +71,6 @@ def reduce(nodes: np.ndarray, response: np.ndarray, tolerance: float, most: int)
     No mean is taken off: no force, no motion.
     """
     matrix = response.reshape(len(response), -1).astype(np.float64)
-    # Eigenvectors of the smaller Gram matrix: cheaper than the singular values of a tall matrix.
     _, size, modes = np.linalg.svd(matrix, full_matrices=False)
     left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(size**2) / np.sum(size**2)))
     rank = min(most, int(np.searchsorted(-left, -tolerance)) + 1, len(size))
