@@ -20,6 +20,8 @@ PICTURES_PER_SECOND = 15.0
 PANEL = (676, 320, 0.56)
 # Windows under this width [CSS pixel] get the panel as a sheet at the bottom.
 NARROW = 576
+# Hosts that this machine reaches by the name localhost.
+EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +128,10 @@ class Browser:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
-        return f"http://localhost:{self.server.get_port()}"
+        """Where the page is, as this machine reaches it."""
+        host = self.server.get_host()
+        name = "localhost" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
+        return f"http://{name}:{self.server.get_port()}"
 
     @property
     def visitors(self) -> int:
@@ -154,7 +158,8 @@ class Browser:
 
     def put(self, label: str, value: float | str) -> None:
         """Set a control without calling its `changed`, as when a script moves the tool."""
-        self.note(f"control {label}", lambda: setattr(self.inputs[label], "value", value))
+        control = self.inputs[label]
+        self.note(f"control {label}", lambda: setattr(control, "value", value))
 
     def close(self) -> None:
         """Stop the page."""

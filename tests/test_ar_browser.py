@@ -17,7 +17,7 @@ def told() -> dict[str, list]:
     return {"force": [], "deformer": [], "play": [], "frame": []}
 
 
-def open_page(told: dict[str, list], port: int) -> Browser:
+def open_page(told: dict[str, list], port: int, host: str = "127.0.0.1") -> Browser:
     bodies = [
         Body("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
         Body("brain", TRIANGLE, np.array([[0, 1, 2]]), opacity=0.3),
@@ -30,6 +30,7 @@ def open_page(told: dict[str, list], port: int) -> Browser:
             Choice("deformer", ("FEM", "ANN"), "ANN", told["deformer"].append),
             Slider("force [N]", 0.0, 1.0, 0.01, 0.2, told["force"].append),
         ],
+        host=host,
         port=port,
         size=(64, 48),
     )
@@ -45,6 +46,15 @@ def page(told):
 def test_the_page_is_served(page):
     with urllib.request.urlopen(page.address) as answer:
         assert answer.status == 200 and b"<html" in answer.read().lower()
+
+
+def test_the_address_names_the_host_that_serves(told):
+    """A page on one interface is not to be found at localhost."""
+    page = open_page(told, free_port(), host="127.0.0.2")
+    assert page.address.startswith("http://127.0.0.2:")
+    with urllib.request.urlopen(page.address) as answer:
+        assert answer.status == 200
+    page.close()
 
 
 def test_a_port_that_is_taken_is_left_to_its_owner(page, told):
