@@ -52,7 +52,7 @@ def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) ->
 
 
 def vertex_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Unit outward normals (V, 3), the area-weighted mean of the triangles' own; zero off the surface."""
+    """Unit normals (V, 3) at nodes (V, 3) [m] of outward triangles (S, 3): their area-weighted mean; zero off them."""
     corners = nodes[triangles]
     twice = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(nodes)

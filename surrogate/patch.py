@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from sim.anatomy import Anatomy
+from sim.boundary import vertex_normals
 from sim.errors import InputError
 from sim.footprint import barycentric_lattice
 
@@ -32,22 +33,15 @@ class Patch:
     points: np.ndarray
 
     @cached_property
-    def _doubled(self) -> np.ndarray:
-        a, b, c = (self.points[self.triangles[:, corner]] for corner in range(3))
-        return np.cross(b - a, c - a)
-
-    @cached_property
     def areas(self) -> np.ndarray:
         """Triangle areas (S,) [m^2]."""
-        return 0.5 * np.linalg.norm(self._doubled, axis=1)
+        a, b, c = (self.points[self.triangles[:, corner]] for corner in range(3))
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
     @cached_property
     def inward(self) -> np.ndarray:
         """Unit inward normals (m, 3) at the nodes, area-weighted."""
-        normal = np.zeros_like(self.points)
-        for corner in range(3):
-            np.add.at(normal, self.triangles[:, corner], -self._doubled)
-        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return -vertex_normals(self.points, self.triangles)
 
     @cached_property
     def rim(self) -> np.ndarray:
