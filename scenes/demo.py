@@ -104,6 +104,8 @@ class Demo:
             truth = self.referee.truth
             if truth is not None and (truth, name) != judged:
                 verdict, judged = self._judge(truth, name), (truth, name)
+            if self.referee.failure is not None:
+                verdict = f"error: the finite elements do not answer any more ({self.referee.failure})"
             self.browser.report(self._report(frame, name, verdict))
             clock.sleep(max(0.0, 1.0 / scene.frames_per_second - (clock.perf_counter() - begun)))
         return drawn

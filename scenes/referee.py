@@ -24,14 +24,18 @@ class Truth:
 
 
 class Referee:
-    """A thread that answers the newest loads by finite elements; older ones that it did not reach are dropped."""
+    """A thread that answers the newest loads by finite elements; older ones that it did not reach are dropped.
+
+    Where the finite elements fail, `failure` says why, and no further loads are answered.
+    """
 
     def __init__(self, theatre: Theatre, scene: Scene) -> None:
         self.newest: tuple[int, Loads] | None = None
         self.truth: Truth | None = None
+        self.failure: Exception | None = None
         self.closed = threading.Event()
         self.wake = threading.Condition()
-        self.thread = threading.Thread(target=self._judge, args=(theatre, scene), name="fem", daemon=True)
+        self.thread = threading.Thread(target=self._serve, args=(theatre, scene), name="fem", daemon=True)
         self.thread.start()
 
     def ask(self, number: int, loads: Loads) -> None:
@@ -46,6 +50,13 @@ class Referee:
             self.closed.set()
             self.wake.notify()
         self.thread.join()
+
+    def _serve(self, theatre: Theatre, scene: Scene) -> None:
+        try:
+            self._judge(theatre, scene)
+        except Exception as error:  # the page says it; the thread's own report goes to the terminal
+            self.failure = error
+            raise
 
     def _judge(self, theatre: Theatre, scene: Scene) -> None:
         deformer, last = theatre.deformer("fem", scene), None

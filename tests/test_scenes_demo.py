@@ -12,6 +12,7 @@ from ar.browser import Browser
 from scenes.demo import HAND, SCRIPT, Demo, Wish
 from scenes.paths import Touch, press
 from scenes.referee import Referee
+from sim.fem import Fem
 from surrogate.learned import Learned
 
 
@@ -99,6 +100,16 @@ def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypat
     assert demo.run(3.0) == 1 and len(asked) == 1
     answer.join()
     assert wait_for(lambda: np.linalg.norm(fem.vertices - rest, axis=1).max() > 5e-4)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_finite_elements_that_fail_are_not_waited_for(demo, monkeypatch):
+    def overflowing(fem, loads, start=None, at=None):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(Fem, "deform", overflowing)
+    demo.run(1.0)
+    assert wait_for(lambda: "do not answer any more (out of memory)" in report(demo))
 
 
 def test_the_error_is_found_once_for_each_answer(demo, monkeypatch):
