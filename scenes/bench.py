@@ -1,4 +1,4 @@
-"""What each stage costs: medians over many runs, warm-up excluded, the device waited for before each reading."""
+"""What each stage costs: medians where a stage is short, warm-up excluded, the device waited for at each reading."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class Row:
-    """One figure: `unit` a `runs`-fold median and 95th percentile; `note` says what was done."""
+    """One figure in `unit`: median and 95th percentile of `runs` (None: one reading); `note` says what was done."""
 
     name: str
     median: float
-    p95: float
+    p95: float | None
     unit: str
     runs: int
     note: str
@@ -60,13 +60,13 @@ def rows(theatre: Theatre, player: Player, deformer: str, solves: int, batch: in
     fem = Fem(theatre.anatomy, scene.effects, TRAIN, theatre.device, batch)
     fem.deform(single[0])
     made = clock.perf_counter() - begun
-    yield Row("FEM set-up", made, made, "s", 1, f"compile or load kernels, factorise; {size}")
+    yield Row("FEM set-up", made, None, "s", 1, f"compile or load kernels, factorise; {size}")
     begun = clock.perf_counter()
     answers = fem.deform(loads)
     each = 1e3 * (clock.perf_counter() - begun) / len(loads)
     good = sum(outcome.good for outcome in answers.outcome)
     note = f"{good} of {len(loads)} converged to {TRAIN.tolerance:g}; palpation loads, batches of {batch}"
-    yield Row("FEM, a load in a batch", each, each, "ms", len(loads), note)
+    yield Row("FEM, a load in a batch", each, None, "ms", len(loads), note)
     runs = min(20, len(single))
     yield timed(
         "FEM, a single load", "ms", 1e3, runs, f"from rest, to {TRAIN.tolerance:g}", lambda i: fem.deform(single[i])

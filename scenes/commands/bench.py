@@ -39,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"{where}\n\n| stage | median | p95 | | what |\n|---|---|---|---|---|", file=table)
     for row in rows(theatre, player, name, args.solves, args.batch):
         found.append(row)
-        print(f"| {row.name} | {row.median:.3g} | {row.p95:.3g} | {row.unit} | {row.note} |", file=table, flush=True)
+        p95 = "" if row.p95 is None else f"{row.p95:.3g}"
+        print(f"| {row.name} | {row.median:.3g} | {p95} | {row.unit} | {row.note} |", file=table, flush=True)
     if args.json:
         print(json.dumps({"machine": where, "rows": [asdict(row) for row in found]}))
     return 0
