@@ -196,6 +196,21 @@ def test_what_has_no_equilibrium_exits_with_one_and_writes_a_finite_state(solve)
     assert run.displacement[top, 2].min() >= -0.1  # not inverted
 
 
+@pytest.mark.parametrize(("depth", "inverted"), [(0.05, 0), (0.11, 6)])
+def test_tetrahedra_that_end_inside_out_are_counted_and_printed(solve, depth: float, inverted: int) -> None:
+    """The stable law has a state where the top is pressed through the base: converged, but no tissue."""
+    mesh = box((1, 1, 1), 0.1)
+    top = mesh.nodes[:, 2] > 0.05
+    run = solve(
+        {"fixed": np.ones(8, int), "prescribed": np.where(top[:, None], [0.0, 0.0, -depth], 0.0)},
+        points=mesh.nodes,
+        cells=[("tetra", mesh.tets)],
+    )
+    assert run.code == 0
+    assert run.report["inverted_tetrahedra"] == inverted == (len(mesh.tets) if inverted else 0)
+    assert ("6 tetrahedra are inside out" in run.errors) == bool(inverted)
+
+
 GOOD = {"fixed": BASE.astype(int), "force": FORCE}
 
 

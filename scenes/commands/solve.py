@@ -18,6 +18,7 @@ from sim.fem import Fem
 from sim.files import check_output
 from sim.loads import Cause, Loads, Nodal, Prescribed
 from sim.material import LAWS, Material
+from sim.mesh import signed_volumes
 from sim.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 
 
@@ -63,12 +64,16 @@ def run(args: argparse.Namespace) -> int:
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
     outcome = deformation.outcome[0]
+    inverted = int((signed_volumes(anatomy.mesh.nodes + deformation.displacement[0], anatomy.mesh.tets) <= 0.0).sum())
+    if inverted:  # an equilibrium of every law but `neo-hookean` may lie there: converged, and no tissue
+        print(f"{args.mesh}: {inverted} tetrahedra are inside out: the load is beyond the law's range", file=sys.stderr)
     report = {
         "outcome": outcome.name.lower(),
         "message": outcome.value,
         "iterations": int(deformation.iterations[0]),
         "residual": float(deformation.residual[0]),
         "seconds": round(seconds, 4),
+        "inverted_tetrahedra": inverted,
         "largest_displacement_mm": round(1e3 * float(np.linalg.norm(deformation.displacement[0], axis=1).max()), 6),
         "out": str(out),
     }
