@@ -49,6 +49,12 @@ def volume_subject(
             f"{path}: the labels {_listed(brain)} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
             f"{SMALLEST_BRAIN * 1e6:g} to {LARGEST_BRAIN * 1e6:g} ml. Check the labels and the voxel size."
         )
+    edge = int(solid.sum() - solid[1:-1, 1:-1, 1:-1].sum())
+    if edge:
+        notes.append(
+            f"{edge} voxels of the brain lie on the volume's border: where it is cut there is no cortex, so see that "
+            "the craniotomy lies elsewhere"
+        )
     inside = _inside(path, solid, marked, voxel, notes)
     cortex, interface = rim(solid, volume.affine), rim(inside, volume.affine)
     intensity = None

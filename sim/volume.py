@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .errors import InputError
 
+if TYPE_CHECKING:
+    from nibabel.nifti1 import Nifti1Image
+
 METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
+SAME_PLACE = 1e-3  # [m]; sform and qform that differ by less differ by round-off
 COARSEST = 6e-3  # [m]; larger voxels do not show a brain's surface
 REMEDY = "Give one three-dimensional NIfTI volume (.nii or .nii.gz)."
 
@@ -45,17 +50,34 @@ def read_volume(path: str | Path) -> Volume:
             raise TypeError(f"it is {type(image).__name__}")
         values = np.asanyarray(image.dataobj)
         unit = str(image.header.get_xyzt_units()[0])
-        placed = bool(image.header["sform_code"] or image.header["qform_code"])
     except Exception as error:  # nibabel and zlib raise whatever the damaged byte led to
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise InputError(f"{path}: cannot be read as NIfTI ({reason}). {REMEDY}") from error
     affine = np.array(image.affine, np.float64)
-    affine[:3] *= METRES.get(unit, 1e-3)
+    metre = METRES.get(unit, 1e-3)
+    affine[:3] *= metre
     _check(path, values, affine)
     while values.ndim > 3:
         values = values[..., 0]
-    notes = () if placed else ("has neither sform nor qform: its axes are taken to point right, anterior and superior",)
-    return Volume(values, affine, notes)
+    return Volume(values, affine, _assumed(image, metre))
+
+
+def _assumed(image: Nifti1Image, metre: float) -> tuple[str, ...]:
+    """What had to be assumed about the place of an image whose affine is in units of `metre` [m]."""
+    sform = image.get_sform(coded=True)[0]
+    try:
+        qform = image.get_qform(coded=True)[0]
+    except ValueError:  # no rotation is stored there; where the sform is good, nibabel does not look at it
+        qform = None
+    if sform is None and qform is None:
+        return ("has neither sform nor qform: its axes are taken to point right, anterior and superior",)
+    if sform is None or qform is None:
+        return ()
+    corners = np.stack([*np.ndindex(2, 2, 2)]) * (np.array(image.shape[:3]) - 1)
+    apart = metre * np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1).max()
+    if apart <= SAME_PLACE:
+        return ()
+    return (f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken",)
 
 
 def _check(path: Path, values: np.ndarray, affine: np.ndarray) -> None:

@@ -206,3 +206,37 @@ def test_a_volume_without_orientation_is_taken_as_it_lies_and_says_so(tmp_path):
     labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
     nibabel.save(nibabel.Nifti1Image(labels, None), tmp_path / "l.nii")
     assert any("neither sform nor qform" in note for note in volume_subject(tmp_path / "l.nii", (1,), (3,)).notes)
+
+
+@pytest.mark.parametrize(("apart", "said"), [(0.5, False), (30.0, True)])
+def test_forms_that_disagree_are_said_and_the_sform_is_taken(tmp_path, apart, said):
+    affine, places = grid(AFFINES["oblique and negative"])
+    labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
+    image = nibabel.Nifti1Image(labels, affine)
+    moved = affine.copy()
+    moved[0, 3] += apart
+    image.set_qform(moved, 1)
+    image.set_sform(affine, 1)
+    nibabel.save(image, tmp_path / "l.nii")
+    subject = volume_subject(tmp_path / "l.nii", (1,), (3,))
+    assert any("30 mm apart: the sform is taken" in note for note in subject.notes) == said
+    assert np.linalg.norm(subject.interface.mean(axis=0) - TUMOUR) < 1e-3
+
+
+def test_a_qform_without_rotation_does_not_spoil_a_good_sform(tmp_path):
+    affine, places = grid(AFFINES["straight"])
+    image = nibabel.Nifti1Image(np.where(ball(places), 3, ellipsoid(places)).astype(np.int16), affine)
+    image.set_qform(affine, 1)
+    image.header["quatern_b"] = 3.0
+    nibabel.save(image, tmp_path / "l.nii")
+    assert volume_subject(tmp_path / "l.nii", (1,), (3,)).notes == ()
+
+
+def test_a_brain_that_the_volume_cuts_is_said_to_be_cut(tmp_path):
+    affine, places = grid(AFFINES["straight"])
+    labels = np.where(ball(places), 3, ellipsoid(places))
+    whole = volume_subject(save(tmp_path / "whole.nii", labels, affine), (1,), (3,))
+    assert whole.notes == ()
+    plane = labels.shape[2] // 2 + 18
+    cut = volume_subject(save(tmp_path / "cut.nii", labels[..., :plane], affine), (1,), (3,))
+    assert any(f"{(labels[..., plane - 1] > 0).sum()} voxels of the brain lie on" in note for note in cut.notes)
