@@ -139,9 +139,15 @@ class Player:
 
 
 def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:
-    """The shown picture (H, W, 3) with a panel: deformer, milliseconds by stage, force, and error [m] if known."""
+    """The shown picture (H, W, 3) with a panel: deformer, milliseconds by stage, force, and error [m] if known.
+
+    An answer that may not be relied on looks like any other, so the panel says it.
+    """
     stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
     lines = [f"{name}   {frame.touch.force:.2f} N   t {frame.time:.2f} s", f"ms: {stages}"]
     if error is not None:
         lines.append(f"error against FEM: {1e3 * error:.3f} mm (frame {frame.number})")
+    outcome = frame.deformation.outcome[0]
+    if not outcome.good:
+        lines.append(outcome.value)
     return panel(frame.shown, lines)

@@ -15,6 +15,7 @@ from scenes.scene import SCENES, find_scene
 from scenes.shipped import template_path
 from scenes.stage import CORTEX, TOOL
 from scenes.theatre import model_path, open_theatre
+from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.intensity import sidecar
 from sim.meshfile import write_anatomy
@@ -164,6 +165,16 @@ def test_the_label_tells_name_force_and_error(play):
     assert (plain != frame.shown).any() and (plain != told).any() and (plain[-60:] == frame.shown[-60:]).all()
 
 
+def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
+    told = []
+    monkeypatch.setattr("scenes.play.panel", lambda colour, lines: told.append(list(lines)) or colour)
+    play = player(theatre, short(), "linear")
+    for force in (0.2, 5.0):
+        labelled(play.draw(0, 0.0, Touch(force=force)), "linear")
+    within, beyond = told
+    assert beyond[-1] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
+
+
 def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
 
     again = open_theatre(put(theatre, tmp_path / "box.vtu"), device="cpu")
@@ -173,7 +184,7 @@ def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
     assert again.best == min(theatre.models, key=lambda name: theatre.models[name].bound)
     touch = Touch(force=0.2)
     pictures = [player(each, short(), "linear").draw(0, 0.0, touch).shown for each in (theatre, again)]
-    assert np.array_equal(*pictures)
+    assert np.array_equal(pictures[0], pictures[1])
     sidecar(tmp_path / "box.vtu").unlink()
     model_path(tmp_path / "box.vtu").unlink()
     bare = open_theatre(tmp_path / "box.vtu", device="cpu")
