@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Self
@@ -10,6 +11,19 @@ from typing import Self
 import numpy as np
 
 from .regressor import standardisation
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use one core: for layers this small its threads wait for each other, for minutes on a busy machine."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @dataclass(eq=False)
@@ -76,7 +90,8 @@ class Ann:
             value.backward()
             return value
 
-        search.step(closure)
+        with one_thread():
+            search.step(closure)
         self.weights_ = [weight.detach().numpy().astype(np.float32) for weight in weights]
         self.biases_ = [bias.detach().numpy().astype(np.float32) for bias in biases]
         return self

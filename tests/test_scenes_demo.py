@@ -153,6 +153,7 @@ def test_visitors_take_over_scrub_and_switch(running):
     assert wait_for(lambda: report(demo).startswith("**svr**"))
     visitor.set(page.button, True)
     assert wait_for(lambda: not demo.wish.plays)
+    assert wait_for(lambda: page.frame.value == demo.wish.number)  # at rest: nothing else moves the slider now
     visitor.set(page.frame, 7)
     assert wait_for(lambda: "frame 7:" in report(demo) and page.inputs["tool"].value == SCRIPT)
     assert f"force {demo.stage.scene.path(7 / 60).force:.2f} N" in report(demo)

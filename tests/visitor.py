@@ -20,7 +20,7 @@ def free_port() -> int:
 
 
 def wait_for(reached: Callable[[], bool]) -> bool:
-    until = time.monotonic() + 10.0
+    until = time.monotonic() + 30.0
     while not reached() and time.monotonic() < until:
         time.sleep(0.02)
     return reached()
