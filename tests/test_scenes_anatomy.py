@@ -2,9 +2,9 @@
 
 import json
 
-import nibabel
 import numpy as np
 import pytest
+from balls import ball
 
 from scenes.cli import main
 from sim.intensity import read_intensity, sidecar
@@ -19,15 +19,8 @@ def run(capsys, *words):
 
 @pytest.fixture
 def brain(tmp_path):
-    """A ball of 55 mm radius with a ball of 10 mm in it, 2 mm voxels, and intensities that rise towards the right."""
-    index = np.moveaxis(np.indices((64, 64, 64)), 0, -1)
-    places = 2.0 * (index - 31.5)
-    labels = np.where(np.linalg.norm(places, axis=-1) < 55.0, 1, 0)
-    labels[np.linalg.norm(places - [20.0, 0.0, 20.0], axis=-1) < 10.0] = 2
-    affine = np.diag([2.0, 2.0, 2.0, 1.0])
-    affine[:3, 3] = -63.0
-    nibabel.save(nibabel.Nifti1Image(labels.astype(np.uint8), affine), tmp_path / "labels.nii.gz")
-    nibabel.save(nibabel.Nifti1Image((places[..., 0] + 70.0).astype(np.float32), affine), tmp_path / "t1.nii.gz")
+    """A folder with `labels.nii.gz` and `t1.nii.gz`."""
+    ball(tmp_path)
     return tmp_path
 
 

@@ -3,9 +3,8 @@
 import json
 from dataclasses import replace
 
-import nibabel
-import numpy as np
 import pytest
+from balls import ball
 from boxes import base_held
 from boxes import box as cube
 from theatres import put, theatre_of
@@ -15,18 +14,6 @@ from scenes.theatre import model_path
 from sim.intensity import sidecar
 from sim.meshfile import read_anatomy, write_anatomy, write_mesh
 from surrogate.store import load
-
-
-def ball(folder):
-    """Labels: a ball of 55 mm radius with one of 10 mm in it; and intensities."""
-    index = np.moveaxis(np.indices((64, 64, 64)), 0, -1)
-    places = 2.0 * (index - 31.5)
-    labels = np.where(np.linalg.norm(places, axis=-1) < 55.0, 1, 0)
-    labels[np.linalg.norm(places - [20.0, 0.0, 20.0], axis=-1) < 10.0] = 2
-    affine = np.diag([2.0, 2.0, 2.0, 1.0])
-    affine[:3, 3] = -63.0
-    nibabel.save(nibabel.Nifti1Image(labels.astype(np.uint8), affine), folder / "labels.nii.gz")
-    nibabel.save(nibabel.Nifti1Image((places[..., 0] + 70.0).astype(np.float32), affine), folder / "t1.nii.gz")
 
 
 def test_a_patient_in_one_go(tmp_path, capsys):
