@@ -17,7 +17,7 @@ from .errors import InputError
 from .footprint import footprint_weights
 from .holding import check_held
 from .loads import Displaced, Loads, Nodal, Prescribed, Pushed
-from .material import Material
+from .material import Tissue, coefficients_of
 from .problem import Imposed, Problem
 from .term import Term
 
@@ -128,7 +128,7 @@ def _elasticity(effect: Elasticity, anatomy: Anatomy, device: Device) -> list[Te
     unknown = sorted(set(effect.regions) - set(labels))
     if unknown:
         raise InputError(f"a law is given for region {unknown[0]}, but the mesh has the regions {labels}.")
-    materials: dict[int, Material] = {}
+    materials: dict[int, Tissue] = {}
     for label in labels:
         material = effect.regions.get(label, effect.default)
         if material is None:
@@ -139,7 +139,8 @@ def _elasticity(effect: Elasticity, anatomy: Anatomy, device: Device) -> list[Te
         law = importlib.import_module(f".terms.{name.replace('-', '_')}", __package__).LAW
         obeying = {label: material for label, material in materials.items() if material.law == name}
         chosen = np.isin(mesh.region, list(obeying))
-        lame = np.array([obeying[int(label)].lame for label in mesh.region[chosen]])
+        tissues = [obeying[int(label)] for label in mesh.region[chosen]]
+        lame = np.array([tissue.lame for tissue in tissues])
         elements = linear_elements(mesh, chosen)
-        terms.append(ElasticityTerm(f"elasticity {name}", law, elements, lame[:, 0], lame[:, 1], device))
+        terms.append(ElasticityTerm(f"elasticity {name}", law, elements, coefficients_of(tissues), lame, device))
     return terms

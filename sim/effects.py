@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from .material import BRAIN, Material
+from .material import BRAIN, Tissue
 
 
 @dataclass(frozen=True)
@@ -15,8 +15,8 @@ class Elasticity:
     `default=None` makes a region without a law an error.
     """
 
-    default: Material | None = BRAIN
-    regions: Mapping[int, Material] = field(default_factory=dict)
+    default: Tissue | None = BRAIN
+    regions: Mapping[int, Tissue] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

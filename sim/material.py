@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from .errors import InputError
+
+LAWS = ("linear", "corotational", "neo-hookean", "stable-neo-hookean")
+"""The laws that E and nu determine; `Ogden` has constants of its own."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +38,10 @@ class Material:
     poisson: float
 
     def __post_init__(self) -> None:
+        if self.law == Ogden.law:
+            raise InputError("E and nu do not determine Ogden's law: give its terms (c, m) and its bulk modulus.")
         if self.law not in LAWS:
-            raise InputError(f"no tissue law is called {self.law!r}: choose one of {', '.join(LAWS)}.")
+            raise InputError(f"no tissue law is called {self.law!r}: choose one of {', '.join((*LAWS, Ogden.law))}.")
         if not (np.isfinite(self.young) and self.young > 0.0):
             raise InputError(f"Young's modulus is {self.young} Pa: give a positive number.")
         if not -1.0 < self.poisson < 0.5:
@@ -49,16 +56,102 @@ class Material:
         mu = self.young / (2.0 * (1.0 + self.poisson))
         return mu, self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """What the law's kernels take: Lamé's (mu, lambda) [Pa]."""
+        return self.lame
 
-LAWS = ("linear", "corotational", "neo-hookean", "stable-neo-hookean")
+
+@dataclass(frozen=True)
+class Ogden:
+    """Ogden's law: psi = sum_i c_i / m_i^2 (l1^m_i + l2^m_i + l3^m_i - 3) + K/2 (ln J)^2, l = J^(-1/3) lambda.
+
+    The convention is FEBio's. Papers on brain tissue and Abaqus write 2 mu_i / alpha_i^2 before the bracket: c_i is
+    2 mu_i, m_i is alpha_i. Ogden 1972 writes mu_i / alpha_i: c_i is mu_i alpha_i.
+
+    Parameters
+    ----------
+    terms
+        Pairs (c_i [Pa], m_i), as many as you like.
+    bulk
+        Bulk modulus K [Pa].
+
+    Raises
+    ------
+    InputError
+        No terms, numbers that are not finite, an exponent of zero, no stiffness in shear or in volume.
+    """
+
+    law: ClassVar[str] = "ogden"
+    terms: tuple[tuple[float, float], ...]
+    bulk: float
+
+    def __post_init__(self) -> None:
+        if not self.terms:
+            raise InputError("Ogden's law has no terms: give at least one pair (c, m).")
+        for c, m in self.terms:
+            if not (np.isfinite(c) and np.isfinite(m) and m != 0.0):
+                raise InputError(f"Ogden's term ({c}, {m}) is none: give a finite c [Pa] and a finite m that is not 0.")
+        total = sum(c for c, _ in self.terms)
+        if total <= 0.0:
+            raise InputError(f"Ogden's c sum to {total} Pa, twice the shear modulus: let the sum be positive.")
+        if not (np.isfinite(self.bulk) and self.bulk > 0.0):
+            raise InputError(f"the bulk modulus is {self.bulk} Pa: give a positive number.")
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        """Lamé's (mu, lambda) [Pa] at small strain: mu = sum c / 2, lambda = K - 2 mu / 3."""
+        mu = sum(c for c, _ in self.terms) / 2.0
+        return mu, self.bulk - 2.0 * mu / 3.0
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """What the law's kernels take: (K, c_1, m_1, c_2, m_2, ...)."""
+        return (self.bulk, *(number for term in self.terms for number in term))
+
+
+Tissue = Material | Ogden
+"""What a region may be made of: each has `law`, `lame` and `coefficients`."""
+
+
+def coefficients_of(tissues: Sequence[Tissue]) -> np.ndarray:
+    """Coefficients (n, k) of n tissues of one law; shorter Ogden sums are filled up with terms (0, 1), which add 0."""
+    rows = [tissue.coefficients for tissue in tissues]
+    longest = max(len(row) for row in rows)
+    return np.array([row + (0.0, 1.0) * ((longest - len(row)) // 2) for row in rows])
+
 
 BRAIN = Material("stable-neo-hookean", 3000.0, 0.45)
 """The default tissue: stable under every load, and linear tetrahedra lock little at nu = 0.45."""
 
+
+@dataclass(frozen=True)
+class MaterialSet:
+    """A tissue, the time scale on which it behaves so, and where its constants come from."""
+
+    tissue: Tissue
+    time_scale: str
+    source: str
+
+
 MATERIALS = {
-    "default": BRAIN,
-    # Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47: small-strain equivalent of their two-term Ogden.
-    "seed": Material("neo-hookean", 3330.0, 0.4945),
-    # Time scale of seconds: what a pressing tool meets.
-    "seconds": Material("neo-hookean", 3000.0, 0.49),
+    "default": MaterialSet(BRAIN, "seconds", "`seconds` with a Poisson's ratio at which linear tetrahedra lock little"),
+    "seed": MaterialSet(
+        Material("neo-hookean", 3330.0, 0.4945),
+        "seconds",
+        "small-strain equivalent of the two-term Ogden law of Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47",
+    ),
+    "seconds": MaterialSet(
+        Material("neo-hookean", 3000.0, 0.49),
+        "seconds",
+        "customary in simulating neurosurgery: Wittek, Hawkins, Miller 2009, Biomech. Model. Mechanobiol. 8:77-84",
+    ),
+    # mu is read as the shear modulus, 2 mu / alpha^2 before the bracket, as in the measurements that the paper compares
+    # itself with; if it were FEBio's c_1, the tissue would be half as stiff.
+    "minutes": MaterialSet(
+        Ogden(((1340.0, -19.0),), 148e3),
+        "minutes",
+        "mu 670 Pa, alpha -19, K 148 kPa from brain shift between prone and supine in vivo, PMC9748497",
+    ),
 }
+"""Named tissues."""

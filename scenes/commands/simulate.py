@@ -17,13 +17,14 @@ from sim.deformation import Outcome
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
 from sim.files import check_output
-from sim.material import LAWS, MATERIALS, Material
+from sim.material import Tissue
 from sim.meshfile import read_anatomy
 from surrogate.dataset import read_outcomes
 from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import simulate
 
 from ..shipped import template_path
+from ..tissue import add_tissue_arguments, tissue_of
 
 INTERRUPTED = 130
 
@@ -37,14 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, default=2000, help="loads to draw (default %(default)s)")
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
-    parser.add_argument(
-        "--material",
-        choices=(*MATERIALS, *LAWS),
-        default="default",
-        help="a named tissue, or a law with the default's E, nu",
-    )
-    parser.add_argument("--young", type=float, metavar="PA", help="Young's modulus instead of the material's [Pa]")
-    parser.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio instead of the material's")
+    add_tissue_arguments(parser)
     parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
@@ -57,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
     loads = draw(args.preset, anatomy, args.count, args.seed)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
-    effects = _effects(anatomy, _material(args))
+    effects = _effects(anatomy, tissue_of(args))
     fem = Fem(anatomy, effects, accuracy, args.device, args.batch)
     provenance = {
         "effects": repr(effects),
@@ -82,19 +76,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _effects(anatomy: Anatomy, material: Material) -> tuple[Effect, ...]:
+def _effects(anatomy: Anatomy, tissue: Tissue) -> tuple[Effect, ...]:
     """What pushing tools and unit forces call for on this body."""
     slide = (Slide(),) if anatomy.slide_normal.any() else ()
-    return (Elasticity(material), Held(), *slide, ToolForce(), NodalForce())
-
-
-def _material(args: argparse.Namespace) -> Material:
-    base = MATERIALS.get(args.material, MATERIALS["default"])
-    return Material(
-        base.law if args.material in MATERIALS else args.material,
-        base.young if args.young is None else args.young,
-        base.poisson if args.poisson is None else args.poisson,
-    )
+    return (Elasticity(tissue), Held(), *slide, ToolForce(), NodalForce())
 
 
 def _report(args: argparse.Namespace, asked: int, solved: int) -> None:

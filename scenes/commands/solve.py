@@ -6,7 +6,6 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,9 +16,10 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.files import check_output
 from sim.loads import Cause, Loads, Nodal, Prescribed
-from sim.material import LAWS, Material
 from sim.mesh import signed_volumes
 from sim.meshfile import UNITS, MeshFile, read_mesh, write_mesh
+
+from ..tissue import add_tissue_arguments, regions_of, tissue_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,15 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="tetrahedral mesh with point data `fixed` (V,) or (V, 3), and `force` (V, 3) [N] or `prescribed` (V, 3) "
         "in the file's unit of length; optional `slide_normal` (V, 3) and cell data `region`",
     )
-    parser.add_argument("--material", default="stable-neo-hookean", choices=LAWS, help="tissue law")
-    parser.add_argument("--young", type=float, default=3000.0, help="Young's modulus [Pa]")
-    parser.add_argument("--poisson", type=float, default=0.45, help="Poisson's ratio")
+    add_tissue_arguments(parser)
     parser.add_argument(
         "--region",
         action="append",
         default=[],
         metavar="LABEL:YOUNG,POISSON",
-        help="other constants for one region; may be repeated",
+        help="other constants for one region, LABEL:C1,M1;C2,M2;K for ogden; may be repeated",
     )
     parser.add_argument("--tolerance", type=float, default=1e-6, help="relative residual")
     parser.add_argument("--precision", default="float64", choices=("float32", "float64"))
@@ -50,14 +48,14 @@ def run(args: argparse.Namespace) -> int:
     """Solve, write the displacement, print one JSON line. 0: converged; 1: not converged, last state written."""
     out = check_output(args.out, ".vtu")
     accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision)
-    law = Material(args.material, args.young, args.poisson)
-    regions = parse_regions(args.region, args.material)
+    tissue = tissue_of(args)
+    regions = regions_of(args.region, tissue)
     file = read_mesh(args.mesh, args.unit)
     anatomy, loads, notes = problem_of(file, args.mesh, UNITS[args.unit])
     for note in (*file.notes, *notes):
         print(f"{args.mesh}: {note}", file=sys.stderr)
     clock = time.perf_counter()
-    effects: list[Effect] = [Elasticity(law, regions), Held(), NodalForce()]
+    effects: list[Effect] = [Elasticity(tissue, regions), Held(), NodalForce()]
     if anatomy.slide_normal.any():
         effects.append(Slide())
     deformation = Fem(anatomy, effects, accuracy, args.device).deform(loads)
@@ -79,40 +77,6 @@ def run(args: argparse.Namespace) -> int:
     }
     print(json.dumps(report))
     return 0 if outcome.good else 1
-
-
-def parse_regions(texts: Sequence[str], law: str) -> dict[int, Material]:
-    """Materials by label.
-
-    Raises
-    ------
-    InputError
-        As `parse_region`; and a label that is given twice.
-    """
-    pairs = [parse_region(text, law) for text in texts]
-    labels = [label for label, _ in pairs]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise InputError(f"--region {label} is given twice: give each label once.")
-    return dict(pairs)
-
-
-def parse_region(text: str, law: str) -> tuple[int, Material]:
-    """Read "LABEL:YOUNG,POISSON".
-
-    Raises
-    ------
-    InputError
-        Text of another form, or constants that no tissue has.
-    """
-    try:
-        label, constants = text.split(":")
-        young, poisson = constants.split(",")
-        return int(label), Material(law, float(young), float(poisson))
-    except InputError as error:
-        raise InputError(f"--region {text}: {error}") from error
-    except ValueError as error:
-        raise InputError(f"--region {text}: write LABEL:YOUNG,POISSON, as in 2:9000,0.45.") from error
 
 
 def problem_of(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads, list[str]]:

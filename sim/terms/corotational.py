@@ -84,27 +84,30 @@ def strain_of(H: Any, Q: Any):
 
 
 @wp.func
-def energy(H: Any, mu: Any, lam: Any):
+def energy(H: Any, c: Any):
     """psi [Pa] = mu |S - I|^2 + lambda/2 tr(S - I)^2."""
+    mu, lam = c[0], c[1]
     strain = strain_of(H, rotation_excess(H))
     t = wp.trace(strain)
     return mu * wp.ddot(strain, strain) + type(mu)(0.5) * lam * t * t
 
 
 @wp.func
-def stress(H: Any, mu: Any, lam: Any):
+def stress(H: Any, c: Any):
     """P [Pa] = 2 mu (F - R) + lambda tr(S - I) R."""
+    mu, lam = c[0], c[1]
     Q = rotation_excess(H)
     t = wp.trace(strain_of(H, Q))
     return type(mu)(2.0) * mu * (H - Q) + lam * t * (wp.identity(n=3, dtype=type(mu)) + Q)
 
 
 @wp.func
-def stress_change(H: Any, D: Any, mu: Any, lam: Any):
+def stress_change(H: Any, D: Any, c: Any):
     """dP [Pa] for dF = D: 2 mu D + lambda tr(R^T D) R + (lambda tr(S - I) - 2 mu) dR.
 
     dR = R [w]x with (tr S I - S) w = axial(R^T D): Barbic 2012, "Exact corotational linear FEM stiffness matrix".
     """
+    mu, lam = c[0], c[1]
     two = type(mu)(2.0)
     identity = wp.identity(n=3, dtype=type(mu))
     Q = rotation_excess(H)

@@ -29,9 +29,13 @@ class Kernels:
 
 
 @cache
-def kernels_of(law: Law, device: Device, size: int, points: int) -> Kernels:
-    """Kernels for elements of `size` nodes and `points` quadrature points; each launches over (element, column)."""
+def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> Kernels:
+    """Kernels for elements of `size` nodes and `points` quadrature points, and laws of `count` coefficients.
+
+    Each launches over (element, column).
+    """
     scalar, mat, vec = device.scalar, device.matrix, device.vector
+    constants = wp.types.vector(length=count, dtype=scalar)
     stress, stress_change, density = law.stress, law.stress_change, law.energy
     kept = VOLUME_KEPT
 
@@ -57,8 +61,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int) -> Kernels:
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         weight: wp.array2d(dtype=scalar),
-        mu: wp.array(dtype=scalar),
-        lam: wp.array(dtype=scalar),
+        coefficients: wp.array(dtype=constants),
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
@@ -66,7 +69,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int) -> Kernels:
         e, c = wp.tid()
         for q in range(points):
             H = gradient_of(u, table, gradient, e, q, c)
-            wp.atomic_add(out, c, wp.float64(weight[e, q] * density(H, mu[e], lam[e])))
+            wp.atomic_add(out, c, wp.float64(weight[e, q] * density(H, coefficients[e])))
 
     @wp.kernel(module="unique")
     def add_gradient(
@@ -74,15 +77,14 @@ def kernels_of(law: Law, device: Device, size: int, points: int) -> Kernels:
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         weight: wp.array2d(dtype=scalar),
-        mu: wp.array(dtype=scalar),
-        lam: wp.array(dtype=scalar),
+        coefficients: wp.array(dtype=constants),
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """f_a += sum over points of w P(H) grad N_a."""
         e, c = wp.tid()
         for q in range(points):
-            P = weight[e, q] * stress(gradient_of(u, table, gradient, e, q, c), mu[e], lam[e])
+            P = weight[e, q] * stress(gradient_of(u, table, gradient, e, q, c), coefficients[e])
             for a in range(size):
                 i = 3 * table[e, a]
                 f = P * gradient[e, q, a]
@@ -97,8 +99,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int) -> Kernels:
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         weight: wp.array2d(dtype=scalar),
-        mu: wp.array(dtype=scalar),
-        lam: wp.array(dtype=scalar),
+        coefficients: wp.array(dtype=constants),
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
@@ -109,7 +110,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int) -> Kernels:
             if definite[c] == 0:
                 H = gradient_of(at, table, gradient, e, q, c)
             D = gradient_of(p, table, gradient, e, q, c)
-            P = weight[e, q] * stress_change(H, D, mu[e], lam[e])
+            P = weight[e, q] * stress_change(H, D, coefficients[e])
             for a in range(size):
                 i = 3 * table[e, a]
                 f = P * gradient[e, q, a]
@@ -123,8 +124,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int) -> Kernels:
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         weight: wp.array2d(dtype=scalar),
-        mu: wp.array(dtype=scalar),
-        lam: wp.array(dtype=scalar),
+        coefficients: wp.array(dtype=constants),
         # outputs
         out: wp.array2d(dtype=mat),
     ):
@@ -140,7 +140,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int) -> Kernels:
                 for k in range(3):
                     axis = vec()
                     axis[k] = scalar(1.0)
-                    f = weight[e, q] * (stress_change(H, wp.outer(axis, g), mu[e], lam[e]) * g)
+                    f = weight[e, q] * (stress_change(H, wp.outer(axis, g), coefficients[e]) * g)
                     for m in range(3):
                         block[m, k] = f[m]
                 wp.atomic_add(out, table[e, a], c, block)
@@ -202,20 +202,25 @@ class Elasticity:
         The energy density.
     elements
         T elements.
-    mu, lam
-        (T,) Lamé's constants [Pa].
+    coefficients
+        (T, k) of the law.
+    lame
+        (T, 2) Lamé's mu and lambda at small strain [Pa].
     device
         Where its arrays live.
     """
 
-    def __init__(self, name: str, law: Law, elements: Elements, mu: np.ndarray, lam: np.ndarray, device: Device):
+    def __init__(
+        self, name: str, law: Law, elements: Elements, coefficients: np.ndarray, lame: np.ndarray, device: Device
+    ):
         self.name = name
         self._device = device
-        self._kernels = kernels_of(law, device, elements.table.shape[1], elements.weight.shape[1])
-        self._rest = (elements, mu, lam)
+        size, points, count = elements.table.shape[1], elements.weight.shape[1], coefficients.shape[1]
+        self._kernels = kernels_of(law, device, size, points, count)
+        self._rest = (elements, *lame.T)
         self._shape = [device.array(elements.table, wp.int32), device.array(elements.gradient, device.vector)]
         self._weight = device.array(elements.weight)
-        self._lame = [device.array(mu), device.array(lam)]
+        self._coefficients = device.array(coefficients, wp.types.vector(length=count, dtype=device.scalar))
         self._at: wp.array | None = None
         self._definite: wp.array | None = None
 
@@ -227,11 +232,11 @@ class Elasticity:
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """E += sum of w psi(H)."""
-        self._launch(self._kernels.add_energy, [u, *self._shape, self._weight, *self._lame], out, u)
+        self._launch(self._kernels.add_energy, [u, *self._shape, self._weight, self._coefficients], out, u)
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         """f += internal forces."""
-        self._launch(self._kernels.add_gradient, [u, *self._shape, self._weight, *self._lame], out, u)
+        self._launch(self._kernels.add_gradient, [u, *self._shape, self._weight, self._coefficients], out, u)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
         """Curvature is recomputed from u; where `definite`, Hooke's at rest stands in: positive definite."""
@@ -239,12 +244,12 @@ class Elasticity:
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
         """f += K(u) p."""
-        inputs = [p, self._at, self._definite, *self._shape, self._weight, *self._lame]
+        inputs = [p, self._at, self._definite, *self._shape, self._weight, self._coefficients]
         self._launch(self._kernels.add_curvature, inputs, out, p)
 
     def add_diagonal(self, out: wp.array) -> None:
         """Blocks += diagonal of K(u)."""
-        inputs = [self._at, self._definite, *self._shape, self._weight, *self._lame]
+        inputs = [self._at, self._definite, *self._shape, self._weight, self._coefficients]
         self._launch(self._kernels.add_diagonal, inputs, out, out)
 
     def rest_curvature(self) -> sp.csc_array:

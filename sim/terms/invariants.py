@@ -23,6 +23,16 @@ def volume_change(H: Any):
 
 
 @wp.func
+def log_one_plus(j: Any):
+    """ln(1 + j), exact in the last digits for small j too (Kahan's quotient)."""
+    J = type(j)(1.0) + j
+    change = J - type(j)(1.0)
+    if change == type(j)(0.0):
+        return j
+    return wp.log(J) * (j / change)
+
+
+@wp.func
 def cofactor(A: Any):
     """cof A, the derivative of det A: its rows are cross products of A's rows."""
     return wp.matrix_from_rows(wp.cross(A[1], A[2]), wp.cross(A[2], A[0]), wp.cross(A[0], A[1]))

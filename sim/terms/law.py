@@ -9,10 +9,10 @@ import warp as wp
 
 @dataclass(frozen=True)
 class Law:
-    """An isotropic hyperelastic law in the displacement gradient H = F - I, with Lamé's mu and lambda [Pa].
+    """An isotropic hyperelastic law in the displacement gradient H = F - I, with coefficients c (k,).
 
-    energy(H, mu, lam) -> psi [Pa]; stress(H, mu, lam) -> P (3, 3) [Pa];
-    stress_change(H, D, mu, lam) -> dP (3, 3) [Pa] for dF = D. All are generic in the scalar type.
+    energy(H, c) -> psi [Pa]; stress(H, c) -> P (3, 3) [Pa]; stress_change(H, D, c) -> dP (3, 3) [Pa] for dF = D.
+    All are generic in the scalar type; c is Lamé's (mu, lambda) [Pa] unless the law says otherwise.
     `needs_positive_volume`: the law is infinite where det F <= 0, so steps are bounded.
     """
 

@@ -11,21 +11,22 @@ from .law import Law
 
 
 @wp.func
-def stress(H: Any, mu: Any, lam: Any):
+def stress(H: Any, c: Any):
     """P [Pa] = mu (H + H^T) + lambda tr H I."""
+    mu, lam = c[0], c[1]
     return mu * (H + wp.transpose(H)) + lam * wp.trace(H) * wp.identity(n=3, dtype=type(mu))
 
 
 @wp.func
-def energy(H: Any, mu: Any, lam: Any):
+def energy(H: Any, c: Any):
     """psi [Pa] = P : H / 2."""
-    return wp.ddot(stress(H, mu, lam), H) / type(mu)(2.0)
+    return wp.ddot(stress(H, c), H) / type(c[0])(2.0)
 
 
 @wp.func
-def stress_change(H: Any, D: Any, mu: Any, lam: Any):
+def stress_change(H: Any, D: Any, c: Any):
     """dP [Pa] for dF = D."""
-    return stress(D, mu, lam)
+    return stress(D, c)
 
 
 LAW = Law("linear", energy, stress, stress_change)

@@ -9,19 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from .invariants import cofactor_change, cofactor_excess, second_order_volume, volume_change
+from .invariants import cofactor_change, cofactor_excess, log_one_plus, second_order_volume, volume_change
 from .law import Law
-
-
-@wp.func
-def log_volume(H: Any):
-    """ln J = log1p(j), exact in the last digits at small strain (Kahan's quotient)."""
-    j = volume_change(H)
-    J = type(j)(1.0) + j
-    change = J - type(j)(1.0)
-    if change == type(j)(0.0):
-        return j
-    return wp.log(J) * (j / change)
 
 
 @wp.func
@@ -37,35 +26,39 @@ def log_volume_excess(j: Any):
 
 
 @wp.func
-def energy(H: Any, mu: Any, lam: Any):
+def energy(H: Any, c: Any):
     """psi [Pa] = mu (|H|^2 / 2 + tr H - ln J) + lambda/2 (ln J)^2; +inf where J <= 0."""
+    mu, lam = c[0], c[1]
     half = type(mu)(0.5)
     j = volume_change(H)
     if j <= -type(mu)(1.0):
         return type(mu)(wp.inf)
-    log_J = log_volume(H)
+    log_J = log_one_plus(j)
     return mu * (half * wp.ddot(H, H) - second_order_volume(H) + log_volume_excess(j)) + half * lam * log_J * log_J
 
 
 @wp.func
-def stress(H: Any, mu: Any, lam: Any):
+def stress(H: Any, c: Any):
     """First Piola-Kirchhoff stress P [Pa] = (mu (H - (cof F - I) + j F) + lambda ln J cof F) / J."""
+    mu, lam = c[0], c[1]
     identity = wp.identity(n=3, dtype=type(mu))
     j = volume_change(H)
     excess = cofactor_excess(H)
     shape = H - excess + j * (identity + H)
-    return (mu * shape + lam * log_volume(H) * (identity + excess)) / (type(mu)(1.0) + j)
+    return (mu * shape + lam * log_one_plus(j) * (identity + excess)) / (type(mu)(1.0) + j)
 
 
 @wp.func
-def stress_change(H: Any, D: Any, mu: Any, lam: Any):
+def stress_change(H: Any, D: Any, c: Any):
     """dP [Pa] for dF = D: mu D + (lambda ln J - mu) d(F^-T) + lambda (F^-T : D) F^-T."""
+    mu, lam = c[0], c[1]
     identity = wp.identity(n=3, dtype=type(mu))
-    J = type(mu)(1.0) + volume_change(H)
+    j = volume_change(H)
+    J = type(mu)(1.0) + j
     inverse = (identity + cofactor_excess(H)) / J  # F^-T
     trace = wp.ddot(inverse, D)
     inverse_change = cofactor_change(identity + H, D) / J - trace * inverse
-    return mu * D + (lam * log_volume(H) - mu) * inverse_change + lam * trace * inverse
+    return mu * D + (lam * log_one_plus(j) - mu) * inverse_change + lam * trace * inverse
 
 
 LAW = Law("neo-hookean", energy, stress, stress_change, needs_positive_volume=True)

@@ -15,24 +15,27 @@ from .law import Law
 
 
 @wp.func
-def energy(H: Any, mu: Any, lam: Any):
+def energy(H: Any, c: Any):
     """psi [Pa] = mu (|H|^2 / 2 - (j - tr H)) + (lambda + mu)/2 j^2, with j = J - 1."""
+    mu, lam = c[0], c[1]
     j = volume_change(H)
     half = type(mu)(0.5)
     return mu * (half * wp.ddot(H, H) - second_order_volume(H)) + half * (lam + mu) * j * j
 
 
 @wp.func
-def stress(H: Any, mu: Any, lam: Any):
+def stress(H: Any, c: Any):
     """First Piola-Kirchhoff stress P [Pa] = mu (H - (cof F - I)) + (lambda + mu) j cof F."""
+    mu, lam = c[0], c[1]
     excess = cofactor_excess(H)
     pressure = (lam + mu) * volume_change(H)
     return mu * (H - excess) + pressure * (wp.identity(n=3, dtype=type(mu)) + excess)
 
 
 @wp.func
-def stress_change(H: Any, D: Any, mu: Any, lam: Any):
+def stress_change(H: Any, D: Any, c: Any):
     """dP [Pa] for dF = D: mu (D - dcof) + (lambda + mu) ((cof F : D) cof F + j dcof)."""
+    mu, lam = c[0], c[1]
     identity = wp.identity(n=3, dtype=type(mu))
     cof = identity + cofactor_excess(H)
     change = cofactor_change(identity + H, D)
