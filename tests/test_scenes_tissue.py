@@ -1,0 +1,143 @@
+"""The tissue on the command line: laws, named tissues, regions, and options that contradict each other."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from boxes import box, top_forces
+from oracle import internal_forces
+
+from scenes.cli import main
+from scenes.tissue import add_tissue_arguments, regions_of, tissue_of
+from sim.errors import InputError
+from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
+from sim.mesh import TetMesh
+
+MESH = box((2, 2, 3), 0.1, distortion=0.15)
+UPPER = (MESH.nodes[MESH.tets].mean(axis=1)[:, 2] > 0.05).astype(int)
+BASE = MESH.nodes[:, 2] < 1e-9
+FORCE = top_forces(MESH, np.array([0.02, 0.01, -0.04]))[0]
+TWO_TERMS = "--material", "ogden", "--ogden", "1340,-19;700,2.5", "--bulk", "2e4"
+
+
+def asked(*words: str) -> Tissue:
+    parser = argparse.ArgumentParser()
+    add_tissue_arguments(parser)
+    return tissue_of(parser.parse_args(words))
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ((), BRAIN),
+        (("--young", "5000"), Material(BRAIN.law, 5000.0, BRAIN.poisson)),
+        (("--material", "linear"), Material("linear", 3000.0, 0.45)),
+        (("--material", "corotational", "--poisson", "0.3"), Material("corotational", 3000.0, 0.3)),
+        (("--material", "seconds"), Material("neo-hookean", 3000.0, 0.49)),
+        (("--material", "seconds", "--young", "9000"), Material("neo-hookean", 9000.0, 0.49)),
+        (("--material", "minutes"), MATERIALS["minutes"].tissue),
+        (TWO_TERMS, Ogden(((1340.0, -19.0), (700.0, 2.5)), 2e4)),
+        (("--material", "ogden", "--ogden=-300,2; 1e3 , 4", "--bulk", "2e4"), Ogden(((-300.0, 2.0), (1e3, 4.0)), 2e4)),
+    ],
+)
+def test_what_is_asked_for(words: tuple[str, ...], expected: Tissue) -> None:
+    assert asked(*words) == expected
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--ogden", "1340,-19"), "--ogden says nothing to --material default"),
+        (("--material", "neo-hookean", "--bulk", "1e4"), "--bulk says nothing to --material neo-hookean"),
+        (("--material", "minutes", "--bulk", "1e4"), "--bulk says nothing to --material minutes"),
+        (("--material", "minutes", "--young", "3000"), "--young says nothing to --material minutes"),
+        ((*TWO_TERMS, "--young", "3000"), "--young says nothing to --material ogden"),
+        ((*TWO_TERMS, "--poisson", "0.4"), "--poisson says nothing to --material ogden"),
+        (("--material", "ogden", "--bulk", "1e4"), "lacks --ogden"),
+        (("--material", "ogden", "--ogden", "1340,-19"), "lacks --bulk"),
+        (("--material", "ogden", "--ogden", "1340", "--bulk", "1e4"), "write pairs C,M"),
+        (("--material", "ogden", "--ogden", "1340,-19;", "--bulk", "1e4"), "write pairs C,M"),
+        (("--material", "ogden", "--ogden", "1340,-19,3", "--bulk", "1e4"), "write pairs C,M"),
+        (("--material", "ogden", "--ogden", "soft,-19", "--bulk", "1e4"), "write pairs C,M"),
+        (("--material", "ogden", "--ogden", "1340,0", "--bulk", "1e4"), "finite m that is not 0"),
+        (("--material", "ogden", "--ogden", "nan,2", "--bulk", "1e4"), "finite c"),
+        (("--material", "ogden", "--ogden", "1340,2", "--bulk", "-1"), "bulk modulus is -1.0 Pa"),
+        (("--poisson", "0.5"), "Poisson's ratio is 0.5"),
+    ],
+)
+def test_contradictions_are_refused_in_a_sentence(words: tuple[str, ...], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence.replace("(", r"\(")) as caught:
+        asked(*words)
+    assert str(caught.value).endswith(".")
+
+
+def test_regions_obey_the_same_law() -> None:
+    found = regions_of(["2:9000,0.3", "-1:500,0.49"], MATERIALS["seconds"].tissue)
+    assert found == {2: Material("neo-hookean", 9000.0, 0.3), -1: Material("neo-hookean", 500.0, 0.49)}
+    found = regions_of(["7:500,2;300,-4;1e4"], MATERIALS["minutes"].tissue)
+    assert found == {7: Ogden(((500.0, 2.0), (300.0, -4.0)), 1e4)}
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("2:9000,0.3", "write LABEL:C1,M1;C2,M2;K"),
+        ("2:1e4", "--region 2:1e4: Ogden's law has no terms"),
+        ("2:500,2", "write LABEL:C1,M1;C2,M2;K"),
+        ("2:500,2;0", "bulk modulus is 0.0 Pa"),
+        ("grey:500,2;1e4", "write LABEL"),
+    ],
+)
+def test_regions_of_another_form_are_refused(text: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        regions_of([text], MATERIALS["minutes"].tissue)
+
+
+def solve(folder: Path, *words: str) -> int:
+    data = {"fixed": BASE.astype(int), "force": FORCE}
+    meshio.Mesh(MESH.nodes, [("tetra", MESH.tets)], data, {"region": [UPPER]}).write(folder / "in.vtu")
+    command = ["solve", str(folder / "in.vtu"), "--device", "cpu", "--out", str(folder / "out.vtu"), *words]
+    return main([*command, "--tolerance", "1e-9"])
+
+
+def residual(folder: Path, tissues: dict[int, Tissue]) -> float:
+    """Of the free nodes, relative, by the published formulas."""
+    u = meshio.read(folder / "out.vtu").point_data["displacement"]
+    unbalanced = internal_forces(TetMesh(MESH.nodes, MESH.tets, UPPER), tissues, u) - FORCE
+    return float(np.linalg.norm(unbalanced[~BASE]) / np.linalg.norm(unbalanced))
+
+
+def test_two_terms_and_a_region_by_the_published_formula(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert solve(tmp_path, *TWO_TERMS, "--region", "1:5000,3;9e4") == 0
+    assert json.loads(capsys.readouterr().out)["outcome"] == "converged"
+    tissues: dict[int, Tissue] = {0: Ogden(((1340.0, -19.0), (700.0, 2.5)), 2e4), 1: Ogden(((5000.0, 3.0),), 9e4)}
+    assert residual(tmp_path, tissues) < 1e-8
+    assert residual(tmp_path, {0: tissues[0], 1: tissues[0]}) > 1e-3
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_named_tissues_by_the_published_formulas(name: str, tmp_path: Path) -> None:
+    tissue = MATERIALS[name].tissue
+    assert solve(tmp_path, "--material", name) == 0
+    assert residual(tmp_path, {0: tissue, 1: tissue}) < 1e-8
+
+
+def test_contradictions_are_exit_code_two_and_write_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert solve(tmp_path, *TWO_TERMS, "--young", "3000") == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("sulcus solve: --young says nothing")
+    assert not (tmp_path / "out.vtu").exists()
+
+
+@pytest.mark.parametrize("command", ["solve", "simulate"])
+def test_help_names_every_tissue_with_its_source(command: str, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    said = "".join(capsys.readouterr().out.split())
+    for name, known in MATERIALS.items():
+        assert "".join(f"{name} (holds for {known.time_scale}; {known.source})".split()) in said
+    assert all(law in said for law in LAWS)

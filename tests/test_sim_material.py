@@ -1,0 +1,87 @@
+"""Tissue descriptions: what they mean at small strain, what is refused, and the named ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim.errors import InputError
+from sim.material import LAWS, MATERIALS, Material, Ogden, coefficients_of
+
+
+def test_engineering_constants_come_back_from_lames() -> None:
+    mu, lam = Material("linear", 3000.0, 0.45).lame
+    assert mu * (3.0 * lam + 2.0 * mu) / (lam + mu) == pytest.approx(3000.0)
+    assert lam / (2.0 * (lam + mu)) == pytest.approx(0.45)
+
+
+def test_ogdens_constants_at_small_strain() -> None:
+    """Twice the shear modulus is the sum of c, whatever the exponents."""
+    mu, lam = Ogden(((1000.0, -19.0), (-200.0, 4.0), (600.0, 0.5)), 5e4).lame
+    assert mu == pytest.approx(700.0)
+    assert lam + 2.0 * mu / 3.0 == pytest.approx(5e4)
+
+
+def test_coefficients_of_a_law_have_one_length() -> None:
+    tissues = Ogden(((1.0, 2.0),), 9.0), Ogden(((3.0, 4.0), (5.0, 6.0), (7.0, 8.0)), 10.0)
+    rows = coefficients_of(tissues)
+    np.testing.assert_array_equal(rows, [[9, 1, 2, 0, 1, 0, 1], [10, 3, 4, 5, 6, 7, 8]])
+    np.testing.assert_array_equal(
+        coefficients_of([Material(law, 3000.0, 0.3) for law in LAWS]), [Material(LAWS[0], 3000.0, 0.3).lame] * len(LAWS)
+    )
+
+
+@pytest.mark.parametrize(
+    ("terms", "bulk", "words"),
+    [
+        ((), 1e4, "no terms"),
+        (((1000.0, 0.0),), 1e4, "not 0"),
+        (((np.nan, 2.0),), 1e4, "finite"),
+        (((1000.0, np.inf),), 1e4, "finite"),
+        (((1000.0, 2.0), (-1000.0, 3.0)), 1e4, "sum to 0.0 Pa"),
+        (((-1000.0, 2.0),), 1e4, "positive"),
+        (((1000.0, 2.0),), 0.0, "bulk modulus is 0.0"),
+        (((1000.0, 2.0),), -5.0, "bulk modulus is -5.0"),
+        (((1000.0, 2.0),), np.nan, "bulk modulus is nan"),
+        (((1000.0, 2.0),), np.inf, "bulk modulus is inf"),
+    ],
+)
+def test_ogdens_constants_that_no_tissue_has(terms: tuple, bulk: float, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Ogden(terms, bulk)
+
+
+@pytest.mark.parametrize(
+    ("law", "young", "poisson", "words"),
+    [
+        ("jelly", 3000.0, 0.3, "no tissue law is called 'jelly': choose one of .*ogden"),
+        ("ogden", 3000.0, 0.3, "do not determine Ogden's law"),
+        ("linear", 0.0, 0.3, "Young's modulus is 0.0"),
+        ("linear", np.inf, 0.3, "Young's modulus is inf"),
+        ("linear", 3000.0, 0.5, "Poisson's ratio is 0.5"),
+        ("linear", 3000.0, -1.0, "Poisson's ratio is -1.0"),
+        ("linear", 3000.0, np.nan, "Poisson's ratio is nan"),
+    ],
+)
+def test_engineering_constants_that_no_tissue_has(law: str, young: float, poisson: float, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Material(law, young, poisson)
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_named_tissues_say_when_they_hold_and_where_they_come_from(name: str) -> None:
+    known = MATERIALS[name]
+    assert known.time_scale in ("seconds", "minutes")
+    assert len(known.source) > 20
+    mu, lam = known.tissue.lame
+    assert 300.0 < mu < 3000.0  # brain tissue
+    assert 0.44 < lam / (2.0 * (lam + mu)) < 0.5
+
+
+def test_published_figures_in_the_convention_of_the_house() -> None:
+    """Ogden's mu of 670 Pa before 2 mu / alpha^2 is a shear modulus."""
+    minutes = MATERIALS["minutes"].tissue
+    assert isinstance(minutes, Ogden)
+    assert minutes.lame[0] == pytest.approx(670.0)
+    assert (minutes.bulk, minutes.terms[0][1]) == (148e3, -19.0)
+    assert MATERIALS["seed"].tissue.lame[0] == pytest.approx(1114.0, abs=1.0)
