@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import warp as wp
+from oracle import EVERY_LAW, tissue
 
 from sim.accuracy import TRAIN, Accuracy
 from sim.effects import Elasticity, Held, Slide, ToolDisplacement, ToolForce
 from sim.fem import Fem
 from sim.linear import BlockJacobi
 from sim.loads import Displaced, Loads, push
-from sim.material import LAWS, Material
 
 pytestmark = [
     pytest.mark.gpu,
@@ -27,10 +27,10 @@ def pushes():
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", EVERY_LAW)
 def test_a_batch_of_pushes(box, law, precision):
     accuracy = Accuracy(1e-8) if precision == "float64" else TRAIN
-    effects = (Elasticity(Material(law, 3000.0, 0.45)), Held(), ToolForce())
+    effects = (Elasticity(tissue(law)), Held(), ToolForce())
     on_cpu = Fem(box, effects, accuracy, "cpu").deform(pushes())
     on_cuda = Fem(box, effects, accuracy, "cuda").deform(pushes())
     assert all(outcome.good for outcome in on_cuda.outcome)

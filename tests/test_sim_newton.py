@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from boxes import base_held, box, hold, top_forces
-from oracle import internal_forces
+from oracle import EVERY_LAW, internal_forces, tissue
 from tiny_terms import Spring, Wall
 
 from sim.accuracy import Accuracy, Precision
@@ -21,7 +21,6 @@ from sim.errors import InputError
 from sim.fem import Fem, choose_preconditioner
 from sim.linear import BlockJacobi
 from sim.loads import Loads, Nodal, Prescribed
-from sim.material import LAWS, Material
 from sim.newton import Equilibrium, find_equilibrium
 from sim.problem import Problem
 from sim.term import Cases
@@ -36,7 +35,7 @@ TIGHT = Accuracy(tolerance=1e-10)
 
 def problem_of(device: Device, law: str = "stable-neo-hookean") -> Problem:
     """Elasticity, nodal forces, a spring with history, and a wall 2 mm above the body."""
-    material = Material(law, 3000.0, 0.45)
+    material = tissue(law)
     plain = compile_problem([Elasticity(material), Held(), NodalForce()], ANATOMY, device)
     extra = Spring(device, ROWS, 0.5), Wall(device, MESH.nodes, CEILING, 1.5e-3, 1e4)
     return Problem((*plain.terms, *extra), plain.constraint, device, plain.impose)
@@ -167,10 +166,10 @@ def test_energy_decreases_with_every_step(problem: Problem, device: Device) -> N
     assert (change[0, 2:] < 0.0).all()
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", EVERY_LAW)
 def test_converged_means_converged_by_an_independent_residual(law: str) -> None:
     """The criterion of `Accuracy`, recomputed in NumPy from the answers alone, at several tolerances and precisions."""
-    material = Material(law, 3000.0, 0.45)
+    material = tissue(law)
     force = top_forces(MESH, TOTAL)
     precisions: list[tuple[Precision, float]] = [("float64", 1e-4), ("float64", 1e-9), ("float32", 1e-3)]
     for precision, tolerance in precisions:
@@ -191,10 +190,10 @@ def test_converged_means_converged_by_an_independent_residual(law: str) -> None:
                 assert found.residual[row] == pytest.approx(free / scale, rel=1e-2, abs=2e-12)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", EVERY_LAW)
 def test_single_precision_agrees_with_double(law: str) -> None:
     """Within 1e-3 of the largest motion at a tolerance of 1e-4: a factor ten for the condition of the box."""
-    effects = Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()
+    effects = Elasticity(tissue(law)), Held(), NodalForce()
     loads = Loads((Nodal(top_forces(MESH, TOTAL[1:])),))
     exact = Fem(ANATOMY, effects, TIGHT, "cpu").deform(loads).displacement
     single = Fem(ANATOMY, effects, Accuracy(1e-4, precision="float32"), "cpu").deform(loads).displacement
