@@ -11,13 +11,13 @@ import numpy as np
 from .anatomy import Anatomy
 from .constraint import Constraint
 from .device import Device
+from .discretisation import Discretisation, discretise
 from .effects import Effect, Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
-from .element import linear_elements
 from .errors import InputError
 from .footprint import footprint_weights
 from .holding import check_held
 from .loads import Displaced, Loads, Nodal, Prescribed, Pushed
-from .material import Tissue, coefficients_of
+from .material import Tissue, coefficients_of, portion
 from .problem import Imposed, Problem
 from .term import Term
 
@@ -25,8 +25,10 @@ CAUSES = {ToolForce: Pushed, ToolDisplacement: Displaced, NodalForce: Nodal, Hel
 """The cause that each effect answers; other effects act by themselves."""
 
 
-def compile_problem(effects: Iterable[Effect], anatomy: Anatomy, device: Device) -> Problem:
-    """Build the terms and constraints that `effects` ask for, and nothing else.
+def compile_problem(
+    effects: Iterable[Effect], anatomy: Anatomy, device: Device, space: Discretisation | None = None
+) -> Problem:
+    """Build the terms and constraints that `effects` ask for, and nothing else; on linear tetrahedra without `space`.
 
     Raises
     ------
@@ -40,13 +42,14 @@ def compile_problem(effects: Iterable[Effect], anatomy: Anatomy, device: Device)
             raise InputError(f"the effect {kind.__name__} is asked for {kinds.count(kind)} times: once is enough.")
     if Elasticity not in kinds:
         raise InputError("no effect resists deformation: add Elasticity.")
+    space = space or discretise(anatomy.mesh, "p1")
     terms: list[Term] = []
     held = np.zeros_like(anatomy.held)
     normal = np.zeros_like(anatomy.slide_normal)
     for effect in effects:
         match effect:
             case Elasticity():
-                terms += _elasticity(effect, anatomy, device)
+                terms += _elasticity(effect, space, device)
             case Held():
                 held = anatomy.held
             case Slide():
@@ -54,18 +57,19 @@ def compile_problem(effects: Iterable[Effect], anatomy: Anatomy, device: Device)
             case ToolForce():
                 from .terms.dead_force import DeadForce
 
-                terms.append(DeadForce("tool force", partial(pushed_forces, anatomy), device))
+                terms.append(DeadForce("tool force", partial(pushed_forces, space), device))
             case NodalForce():
                 from .terms.dead_force import DeadForce
 
-                terms.append(DeadForce("nodal force", partial(_nodal_forces, anatomy), device))
+                terms.append(DeadForce("nodal force", partial(_nodal_forces, space), device))
             case ToolDisplacement():
                 pass  # a constraint: `_impose` reads the loads
             case _:
                 allowed = ", ".join(kind.__name__ for kind in Effect.__args__)
                 raise InputError(f"no effect is called {type(effect).__name__}: choose from {allowed}.")
     check_held(anatomy.mesh, held, normal)
-    return Problem(tuple(terms), Constraint(held, normal, device), device, partial(_impose, anatomy))
+    constraint = Constraint(space.held(held), space.sliding(normal, held), device)
+    return Problem(tuple(terms), constraint, device, partial(_impose, space))
 
 
 def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
@@ -83,47 +87,50 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
             raise InputError(f"loads hold {type(cause).__name__}, which nothing answers: add the effect {needed}.")
 
 
-def footprint_of(anatomy: Anatomy, cause: Pushed | Displaced) -> np.ndarray:
-    """Weights (B, V) of a tool's footprint on the vertices; each row sums to one."""
-    mesh = anatomy.mesh
-    return footprint_weights(mesh.nodes, mesh.surface, cause.point, cause.footprint).toarray()
+def footprint_of(space: Discretisation, cause: Pushed | Displaced) -> np.ndarray:
+    """Weights (B, N) of a tool's footprint on the nodes; each row sums to one."""
+    return footprint_weights(space.nodes, space.surface, cause.point, cause.footprint).toarray()
 
 
-def pushed_forces(anatomy: Anatomy, loads: Loads) -> np.ndarray:
-    """Nodal forces (3V, B) [N] of pushing tools."""
+def pushed_forces(space: Discretisation, loads: Loads) -> np.ndarray:
+    """Nodal forces (3N, B) [N] of pushing tools."""
     cause = loads.of(Pushed)
     if cause is None:
-        return np.zeros((3 * len(anatomy.mesh.nodes), len(loads)))
-    weight = footprint_of(anatomy, cause)
+        return np.zeros((3 * space.count, len(loads)))
+    weight = footprint_of(space, cause)
     return (weight[:, :, None] * cause.force[:, None, :]).reshape(len(loads), 3 * weight.shape[1]).T
 
 
-def _nodal_forces(anatomy: Anatomy, loads: Loads) -> np.ndarray:
+def _nodal_forces(space: Discretisation, loads: Loads) -> np.ndarray:
     cause = loads.of(Nodal)
-    if cause is None:
-        return np.zeros((3 * len(anatomy.mesh.nodes), len(loads)))
-    return _whole_field("Nodal.force", cause.force, anatomy)
+    out = np.zeros((len(loads), space.count, 3))
+    if cause is not None:
+        _check_field("Nodal.force", cause.force, space)
+        out[:, : cause.force.shape[1]] = cause.force
+    return out.reshape(len(loads), 3 * space.count).T
 
 
-def _impose(anatomy: Anatomy, loads: Loads) -> Imposed:
+def _impose(space: Discretisation, loads: Loads) -> Imposed:
     prescribed, displaced = loads.of(Prescribed), loads.of(Displaced)
-    value = None if prescribed is None else _whole_field("Prescribed.displacement", prescribed.displacement, anatomy)
+    value = None
+    if prescribed is not None:
+        _check_field("Prescribed.displacement", prescribed.displacement, space)
+        value = space.interpolated(prescribed.displacement).reshape(len(loads), 3 * space.count).T
     if displaced is None:
         return Imposed(value)
-    return Imposed(value, footprint_of(anatomy, displaced).T, displaced.displacement.T)
+    return Imposed(value, footprint_of(space, displaced).T, displaced.displacement.T)
 
 
-def _whole_field(name: str, field: np.ndarray, anatomy: Anatomy) -> np.ndarray:
-    if field.shape[1] != len(anatomy.mesh.nodes):
-        raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {len(anatomy.mesh.nodes)}.")
-    return field.reshape(len(field), 3 * field.shape[1]).T
+def _check_field(name: str, field: np.ndarray, space: Discretisation) -> None:
+    if field.shape[1] != len(space.mesh.nodes):
+        raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {len(space.mesh.nodes)}.")
 
 
-def _elasticity(effect: Elasticity, anatomy: Anatomy, device: Device) -> list[Term]:
-    """One term for each law, over the elements of all regions that obey it."""
+def _elasticity(effect: Elasticity, space: Discretisation, device: Device) -> list[Term]:
+    """One term for each law and kind of element, over the elements of all regions that obey it."""
     from .terms.elasticity import Elasticity as ElasticityTerm
 
-    mesh = anatomy.mesh
+    mesh = space.mesh
     labels = [int(label) for label in np.unique(mesh.region)]
     unknown = sorted(set(effect.regions) - set(labels))
     if unknown:
@@ -139,8 +146,10 @@ def _elasticity(effect: Elasticity, anatomy: Anatomy, device: Device) -> list[Te
         law = importlib.import_module(f".terms.{name.replace('-', '_')}", __package__).LAW
         obeying = {label: material for label, material in materials.items() if material.law == name}
         chosen = np.isin(mesh.region, list(obeying))
-        tissues = [obeying[int(label)] for label in mesh.region[chosen]]
-        lame = np.array([tissue.lame for tissue in tissues])
-        elements = linear_elements(mesh, chosen)
-        terms.append(ElasticityTerm(f"elasticity {name}", law, elements, coefficients_of(tissues), lame, device))
+        for part in space.parts(chosen):
+            tissues = [obeying[int(label)] for label in mesh.region[part.elements.owner]]
+            lame = np.array([portion(tissue, part.carries) for tissue in tissues])
+            coefficients = coefficients_of(tissues, part.carries)
+            term = f"elasticity {name}" if part.carries == "whole" else f"elasticity {name} of {part.carries}"
+            terms.append(ElasticityTerm(term, law, part.elements, coefficients, lame, device))
     return terms

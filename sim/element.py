@@ -7,21 +7,32 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from .mesh import TetMesh
+from .errors import InputError
+from .mesh import QUADRATIC_EDGES, TetMesh
+
+# Of a symmetric four-point rule of degree 2: each point's coordinate to its own corner, and to the other three.
+NEAR, FAR = (5.0 + 3.0 * np.sqrt(5.0)) / 20.0, (5.0 - np.sqrt(5.0)) / 20.0
+FOUR_POINTS = np.full((4, 4), FAR) + (NEAR - FAR) * np.eye(4)
+# Element matrices are summed in parts of so many entries, which bounds the memory that it takes.
+ENTRIES = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """T elements of n nodes with q quadrature points.
+    """T elements of at most n nodes with q quadrature points.
 
     table (T, n) node numbers; gradient (T, q, n, 3) of the shape functions in the rest configuration [1/m];
-    weight (T, q) rest volume of each quadrature point [m^3]; nodes, how many nodes the discretisation has.
+    weight (T, q) rest volume of each quadrature point [m^3]; nodes, how many nodes the discretisation has;
+    owner (T,) the mesh's tetrahedron whose tissue each element has; size (T,) how many of the n places a row uses,
+    the first ones; None: all.
     """
 
     table: np.ndarray
     gradient: np.ndarray
     weight: np.ndarray
     nodes: int
+    owner: np.ndarray
+    size: np.ndarray | None = None
 
 
 def linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
@@ -31,7 +42,48 @@ def linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     jacobian = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     inverse = np.linalg.inv(jacobian)  # rows: gradients of barycentric coordinates 1, 2, 3
     gradient = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
-    return Elements(tets, gradient[:, None], mesh.volumes[chosen][:, None], len(mesh.nodes))
+    weight = mesh.volumes[chosen][:, None]
+    return Elements(tets, gradient[:, None], weight, len(mesh.nodes), np.flatnonzero(chosen))
+
+
+def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> Elements:
+    """Ten-node tetrahedra, straight or curved, four quadrature points of degree 2.
+
+    Zienkiewicz, Taylor 2005, "The Finite Element Method", section 4.7. nodes (N, 3) [m]; table (T, 10): corners, then
+    the middles of `QUADRATIC_EDGES`; `chosen` (T,) bool picks elements.
+
+    Raises
+    ------
+    InputError
+        An element that its mid-edge nodes fold over.
+    """
+    table = table[chosen]
+    slope = quadratic_slopes(FOUR_POINTS)
+    jacobian = np.einsum("tai,qaj->tqij", nodes[table], slope)
+    volume = np.linalg.det(jacobian)
+    folded = np.flatnonzero((volume <= 0.0).any(axis=1))
+    if len(folded):
+        raise InputError(
+            f"quadratic tetrahedron {np.flatnonzero(chosen)[folded[0]]} (and {len(folded) - 1} more) is folded over "
+            "by its mid-edge nodes: move them towards the middles of their edges."
+        )
+    gradient = np.einsum("qaj,tqji->tqai", slope, np.linalg.inv(jacobian))
+    return Elements(table, gradient, volume / 24.0, len(nodes), np.flatnonzero(chosen))
+
+
+def quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Shape functions (..., n) of a quadratic simplex at corner coordinates (..., d): L (2 L - 1), and 4 L_i L_j."""
+    middle = 4.0 * corner[..., edges[:, 0]] * corner[..., edges[:, 1]]
+    return np.concatenate([corner * (2.0 * corner - 1.0), middle], axis=-1)
+
+
+def quadratic_slopes(corner: np.ndarray) -> np.ndarray:
+    """Derivatives (q, 10, 3) of the ten shape functions by corner coordinates 1, 2, 3 at points (q, 4)."""
+    slope = np.zeros((len(corner), 10, 4))
+    slope[:, np.arange(4), np.arange(4)] = 4.0 * corner - 1.0
+    for place, (i, j) in enumerate(QUADRATIC_EDGES, start=4):
+        slope[:, place, i], slope[:, place, j] = 4.0 * corner[:, j], 4.0 * corner[:, i]
+    return slope[:, :, 1:] - slope[:, :, :1]
 
 
 def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray) -> sp.csc_array:
@@ -39,15 +91,27 @@ def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray) -> sp.c
 
     K_ab = integral of mu (g_a . g_b I + g_b (x) g_a) + lambda g_a (x) g_b.
     """
-    count, size = elements.table.shape
-    g, w = elements.gradient, elements.weight
+    rows = 3 * elements.nodes
+    total = sp.csc_array((rows, rows))
+    count, most = elements.table.shape
+    size = np.full(count, most) if elements.size is None else elements.size
+    for places in np.unique(size):
+        alike = np.flatnonzero(size == places)
+        for part in np.array_split(alike, -(-len(alike) * 9 * places**2 // ENTRIES)):
+            total += _assembled(elements, part, int(places), mu[part], lam[part])
+    return total
+
+
+def _assembled(elements: Elements, part: np.ndarray, size: int, mu: np.ndarray, lam: np.ndarray) -> sp.csc_array:
+    g, w = elements.gradient[part, :, :size], elements.weight[part]
     dots = np.einsum("tq,tqai,tqbi->tab", w, g, g)
     outer = np.einsum("tq,tqai,tqbj->taibj", w, g, g)
     blocks = lam[:, None, None, None, None] * outer
     blocks += mu[:, None, None, None, None] * (
         np.einsum("tab,ij->taibj", dots, np.eye(3)) + outer.transpose(0, 1, 4, 3, 2)
     )
-    dof = (3 * elements.table[:, :, None] + np.arange(3)).reshape(count, 3 * size)
+    table = elements.table[part, :size].astype(np.int32)
+    dof = (3 * table[:, :, None] + np.arange(3, dtype=np.int32)).reshape(len(part), 3 * size)
     row = np.repeat(dof, 3 * size, axis=1).ravel()
     column = np.tile(dof, (1, 3 * size)).ravel()
     return sp.csc_array(sp.coo_array((blocks.ravel(), (row, column)), shape=(3 * elements.nodes,) * 2))

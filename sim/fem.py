@@ -15,6 +15,7 @@ from .compile import check_causes, compile_problem, footprint_of
 from .deformation import Cost, Deformation, Outcome
 from .device import find_device
 from .direction import NewtonCG
+from .discretisation import discretise
 from .effects import Effect
 from .errors import InputError
 from .linear import BlockJacobi, Factor, Preconditioner
@@ -25,6 +26,8 @@ from .term import Cases
 
 # Above this many unknowns the factor's memory and time outgrow what it saves.
 LARGEST_FACTOR = 400_000
+# The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
+MIDDLES = "mid-edge nodes"
 SMALLEST_LOAD_STEP = 1.0 / 64.0
 # Load steps of one case may take this many times the outer steps of one load: hopeless cases cost no more.
 STEPPING_BUDGET = 4
@@ -45,11 +48,13 @@ class Fem:
         "auto", "cpu", "cuda" or "cuda:1".
     batch
         Most load cases that are solved together.
+    element
+        One of `discretisation.ELEMENTS`.
 
     Raises
     ------
     InputError
-        Effects that cannot be had, a body that is not held, a device that is not there.
+        Effects or elements that cannot be had, a body that is not held, a device that is not there.
     """
 
     def __init__(
@@ -59,12 +64,14 @@ class Fem:
         accuracy: Accuracy = TRAIN,
         device: str = "auto",
         batch: int = 64,
+        element: str = "p1",
     ):
         self._anatomy = anatomy
         self.effects = tuple(effects)
         self.accuracy = accuracy
         self.batch = batch
-        self.problem = compile_problem(self.effects, anatomy, find_device(device, accuracy.precision))
+        self.space = discretise(anatomy.mesh, element)
+        self.problem = compile_problem(self.effects, anatomy, find_device(device, accuracy.precision), self.space)
         self._direction = NewtonCG(choose_preconditioner(self.problem), accuracy.inner)
 
     @property
@@ -98,16 +105,28 @@ class Fem:
         """First guesses (3V, B). A case without any load starts at rest: its answer is exactly zero."""
         if start is None:
             return np.zeros((self.problem.rows, len(loads)))
-        if start.displacement.shape != (len(loads), self.problem.rows // 3, 3):
+        vertices = len(self._anatomy.mesh.nodes)
+        if start.displacement.shape != (len(loads), vertices, 3):
             raise InputError(
                 f"the start has displacements of shape {start.displacement.shape}: give every vertex of "
-                f"{len(loads)} load cases, ({len(loads)}, {self.problem.rows // 3}, 3)."
+                f"{len(loads)} load cases, ({len(loads)}, {vertices}, 3)."
             )
         loaded = np.zeros(len(loads), bool)
         for cause in loads.causes:
             loaded |= (getattr(cause, MAGNITUDE[type(cause)]) != 0.0).reshape(len(loads), -1).any(axis=1)
-        full = start.at(np.arange(self.problem.rows // 3)).displacement
+        full = self.space.interpolated(start.at(np.arange(vertices)).displacement)
+        if MIDDLES in start.history:
+            full[:, vertices:] += start.history[MIDDLES]
         return np.where(loaded, full.reshape(len(loads), self.problem.rows).T, 0.0)
+
+    def _apart(self, u: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Displacements (B, V, 3) of the mesh's vertices in u (3N, B), and what else a later start needs of u."""
+        field = u.T.reshape(u.shape[1], self.space.count, 3)
+        own, added = np.split(field, [len(self._anatomy.mesh.nodes)], axis=1)
+        own = np.ascontiguousarray(own)
+        if not len(self.space.edges):
+            return own, {}
+        return own, {MIDDLES: added - self.space.interpolated(own)[:, own.shape[1] :]}
 
     def _solve(self, cases: Cases, guess: np.ndarray) -> Deformation:
         clock = time.perf_counter()
@@ -126,16 +145,16 @@ class Fem:
         u = self.problem.device.array(found.u)
         history = self.problem.end(u)
         reaction = self._reaction(cases.loads, self.problem.constraint.force_on_footprint(self.problem.gradient(u)))
-        count = found.u.shape[1]
+        displacement, middles = self._apart(found.u)
         return Deformation(
-            displacement=found.u.T.reshape(count, self.problem.rows // 3, 3),
-            nodes=np.arange(self.problem.rows // 3),
+            displacement=displacement,
+            nodes=np.arange(displacement.shape[1]),
             outcome=tuple(found.outcome),
             iterations=found.iterations,
             residual=found.residual,
             time=cases.loads.times,
             reaction=reaction,
-            history=history,
+            history={**history, **middles},
             cost=Cost(
                 {
                     "loads": begun - clock,
@@ -176,7 +195,7 @@ class Fem:
                 force = cause.force if isinstance(cause, Pushed) else on_footprint
                 assert force is not None
                 force = force if isinstance(cause, Pushed) else force.T
-                arm = footprint_of(self._anatomy, cause) @ self._anatomy.mesh.nodes - cause.point
+                arm = footprint_of(self.space, cause) @ self.space.nodes - cause.point
                 rows.append(np.concatenate([force, np.cross(arm, force)], axis=1))
         return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
+from .element import quadratic_shapes
 from .errors import InputError
+from .mesh import TRIANGLE_EDGES
 
 # Triangles are divided until their longest edge is below this share of the footprint's radius.
 FINENESS = 0.12
@@ -35,7 +37,8 @@ def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarr
     nodes
         (V, 3) [m].
     triangles
-        (S, 3): where the tool may touch.
+        (S, 3), or (S, 6) with the middles of `TRIANGLE_EDGES` if quadratic: where the tool may touch. The corners say
+        where they lie.
     points, radii
         (B, 3) and (B,) [m]. A point off the surface is moved to its nearest point on it, by at most its radius.
 
@@ -44,7 +47,7 @@ def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarr
     InputError
         A footprint that does not touch the surface.
     """
-    corners = nodes[triangles]
+    corners = nodes[triangles[:, :3]]
     centre = corners.mean(axis=1)
     reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
     columns, values, ends = [np.zeros(0, int)], [np.zeros(0)], [0]
@@ -57,10 +60,10 @@ def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarr
                 "which does not touch the surface: choose a point on it."
             )
         near = np.flatnonzero(np.linalg.norm(centre - touched, axis=1) <= reach + radius)
-        weight = _integrate(corners[near], touched, radius)
+        weight = _integrate(corners[near], touched, radius, triangles.shape[1])
         vertices, place = np.unique(triangles[near], return_inverse=True)
         total = np.bincount(place.ravel(), weight.ravel())
-        loaded = total > 0.0
+        loaded = total != 0.0
         columns.append(vertices[loaded])
         values.append(total[loaded] / weight.sum())
         ends.append(ends[-1] + int(loaded.sum()))
@@ -94,13 +97,15 @@ def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     return nearest[np.argmin(np.linalg.norm(nearest - point, axis=1))]
 
 
-def _integrate(corners: np.ndarray, point: np.ndarray, radius: float) -> np.ndarray:
-    """Integral of w N_a over the footprint (S, 3), up to a factor, by one point per subdivided triangle.
+def _integrate(corners: np.ndarray, point: np.ndarray, radius: float, size: int) -> np.ndarray:
+    """Integral of w N_a over the footprint (S, size), up to a factor, by one point per subdivided triangle.
+
+    N_a are the shape functions of triangles of `size` 3 or 6 nodes.
 
     Triangles are quartered until a lattice of `PIECES` rows is fine enough, so that a small tool on a large triangle
     costs no more than a large tool on small ones.
     """
-    out = np.zeros((len(corners), 3))
+    out = np.zeros((len(corners), size))
     owner = np.arange(len(corners))
     bary = np.broadcast_to(np.eye(3), (len(corners), 3, 3))  # corner coordinates of each piece within its owner
     while len(owner):
@@ -115,7 +120,11 @@ def _integrate(corners: np.ndarray, point: np.ndarray, radius: float) -> np.ndar
         samples = LATTICE @ at[done]
         share = np.einsum("pqi,pqi->pq", samples, samples) / radius**2
         weight = area[:, None] * np.sqrt(np.clip(1.0 - share, 0.0, None))
-        np.add.at(out, owner[done], np.einsum("pa,pab->pb", weight @ LATTICE, bary[done]))
+        if size == 3:  # linear in the corner coordinates: they may be summed first
+            np.add.at(out, owner[done], np.einsum("pa,pab->pb", weight @ LATTICE, bary[done]))
+        else:
+            shape = quadratic_shapes(LATTICE @ bary[done], TRIANGLE_EDGES)
+            np.add.at(out, owner[done], np.einsum("pq,pqa->pa", weight, shape))
         split = inside & ~small
         owner = np.repeat(owner[split], 4)
         bary = _quartered(bary[split])

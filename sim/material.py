@@ -61,6 +61,10 @@ class Material:
         """What the law's kernels take: Lamé's (mu, lambda) [Pa]."""
         return self.lame
 
+    def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
+        """The same with other Lamé constants (mu, lambda) [Pa]."""
+        return mu, lam
+
 
 @dataclass(frozen=True)
 class Ogden:
@@ -107,16 +111,38 @@ class Ogden:
     @property
     def coefficients(self) -> tuple[float, ...]:
         """What the law's kernels take: (K, c_1, m_1, c_2, m_2, ...)."""
-        return (self.bulk, *(number for term in self.terms for number in term))
+        return self.coefficients_at(*self.lame)
+
+    def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
+        """The same with other Lamé constants (mu, lambda) [Pa] at small strain."""
+        share = mu / self.lame[0]
+        return (lam + 2.0 * mu / 3.0, *(number for c, m in self.terms for number in (share * c, m)))
 
 
 Tissue = Material | Ogden
 """What a region may be made of: each has `law`, `lame` and `coefficients`."""
 
 
-def coefficients_of(tissues: Sequence[Tissue]) -> np.ndarray:
-    """Coefficients (n, k) of n tissues of one law; shorter Ogden sums are filled up with terms (0, 1), which add 0."""
-    rows = [tissue.coefficients for tissue in tissues]
+# Where shape and volume are carried by different elements, those that carry shape keep a Poisson's ratio of 0.3.
+SOFT = 1.5
+
+
+def portion(tissue: Tissue, carries: str) -> tuple[float, float]:
+    """Lamé's (mu, lambda) [Pa] of the "whole" tissue, of its resistance to a change of "shape", or of "volume".
+
+    The last two sum to the first; in every law lambda weighs the square of one measure of volume.
+    """
+    mu, lam = tissue.lame
+    soft = min(lam, SOFT * mu)
+    return {"whole": (mu, lam), "shape": (mu, soft), "volume": (0.0, lam - soft)}[carries]
+
+
+def coefficients_of(tissues: Sequence[Tissue], carries: str = "whole") -> np.ndarray:
+    """Coefficients (n, k) of a `portion` of n tissues of one law.
+
+    Shorter Ogden sums are filled up with terms (0, 1), which add 0.
+    """
+    rows = [tissue.coefficients_at(*portion(tissue, carries)) for tissue in tissues]
     longest = max(len(row) for row in rows)
     return np.array([row + (0.0, 1.0) * ((longest - len(row)) // 2) for row in rows])
 

@@ -14,6 +14,10 @@ from .errors import InputError
 # Faces of a positively oriented tetrahedron, normals outwards.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+# The order of VTK's and meshio's quadratic tetrahedra, and where each edge goes when corners 2 and 3 change places.
+QUADRATIC_EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
+TURNED_EDGES = [0, 4, 3, 2, 1, 5]
+TRIANGLE_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
 # A volume below this share of the longest edge cubed is round-off, not an element.
 ZERO_VOLUME = 1e-12
 SLIVER_DEGREES = 1.0
@@ -58,7 +62,7 @@ def dihedral_angles(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class TetMesh:
-    """Linear tetrahedra in metres.
+    """Tetrahedra in metres, linear unless they bring mid-edge nodes.
 
     Parameters
     ----------
@@ -68,6 +72,8 @@ class TetMesh:
         (T, 4) node numbers, positively oriented.
     region
         (T,) integer labels; a tissue law is chosen per label.
+    middles
+        (T, 6) node numbers on the `QUADRATIC_EDGES` of quadratic tetrahedra, or None.
 
     Raises
     ------
@@ -84,6 +90,7 @@ class TetMesh:
     nodes: np.ndarray
     tets: np.ndarray
     region: np.ndarray
+    middles: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", np.array(self.nodes, np.float64, order="C"))
@@ -92,6 +99,9 @@ class TetMesh:
         _check_corners(self.nodes, self.tets)
         if self.region.shape != (len(self.tets),):
             raise InputError(f"region has shape {self.region.shape}: give one label for each of {len(self.tets)} tets.")
+        if self.middles is not None:
+            object.__setattr__(self, "middles", np.array(self.middles, np.int32, order="C"))
+            _check_middles(self)
         longest = np.linalg.norm(
             self.nodes[self.tets[:, EDGES[:, 0]]] - self.nodes[self.tets[:, EDGES[:, 1]]], axis=2
         ).max(axis=1)
@@ -102,8 +112,13 @@ class TetMesh:
                 "zero or negative. Remove degenerate elements, or turn negative ones with `oriented`."
             )
         _warn_of_doubtful(self)
-        for array in (self.nodes, self.tets, self.region):
+        for array in self._arrays:
             array.flags.writeable = False
+
+    @property
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        linear = self.nodes, self.tets, self.region
+        return linear if self.middles is None else (*linear, self.middles)
 
     @cached_property
     def volumes(self) -> np.ndarray:
@@ -126,7 +141,7 @@ class TetMesh:
     @cached_property
     def digest(self) -> str:
         """Hash of nodes, tetrahedra and regions (hexadecimal): the same bytes, the same mesh."""
-        return digest_of(self.nodes, self.tets, self.region)
+        return digest_of(*self._arrays)
 
 
 def digest_of(*arrays: np.ndarray) -> str:
@@ -164,6 +179,21 @@ def _check_corners(nodes: np.ndarray, tets: np.ndarray) -> None:
     least, most = tets.min(), tets.max()
     if least < 0 or most >= len(nodes):
         raise InputError(f"tets name node {min(least, 0) or most}, but the mesh has nodes 0 to {len(nodes) - 1}.")
+
+
+def _check_middles(mesh: TetMesh) -> None:
+    middles, count = mesh.middles, len(mesh.tets)
+    assert middles is not None
+    if middles.shape != (count, 6):
+        raise InputError(f"middles have shape {middles.shape}: give six node numbers for each of {count} tets.")
+    if middles.min() < 0 or middles.max() >= len(mesh.nodes):
+        raise InputError(f"middles name a node outside the mesh's, 0 to {len(mesh.nodes) - 1}.")
+    if np.intersect1d(middles, mesh.tets).size:
+        raise InputError(f"node {np.intersect1d(middles, mesh.tets)[0]} is a corner and the middle of an edge at once.")
+    ends = np.sort(mesh.tets[:, QUADRATIC_EDGES].reshape(-1, 2), axis=1)
+    pairs = np.unique(np.column_stack([row_keys(ends), middles.ravel()]), axis=0)
+    if len(pairs) != len(np.unique(pairs[:, 0])) or len(pairs) != len(np.unique(pairs[:, 1])):
+        raise InputError("tetrahedra that share an edge disagree on its middle node: the mesh does not conform.")
 
 
 def _warn_of_doubtful(mesh: TetMesh) -> None:

@@ -15,6 +15,7 @@ from boxes import base_held, box, hold, top_forces
 from sim.accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import pushed_forces
+from sim.discretisation import discretise
 from sim.deformation import Deformer, Outcome
 from sim.effects import Elasticity, Held, NodalForce, ToolDisplacement, ToolForce
 from sim.errors import InputError
@@ -264,7 +265,7 @@ def test_several_causes_act_together() -> None:
     both = Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu")
     top = top_forces(MESH, FORCE / 3.0)
     found = both.deform(Loads((*loads().causes, Nodal(top)))).displacement
-    pushed = pushed_forces(ANATOMY, loads()).T.reshape(5, COUNT, 3)
+    pushed = pushed_forces(discretise(MESH, "p1"), loads()).T.reshape(5, COUNT, 3)
     alone = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], REFERENCE, "cpu").deform(Loads((Nodal(top + pushed),)))
     np.testing.assert_allclose(found, alone.displacement, atol=1e-8)
 

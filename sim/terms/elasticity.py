@@ -32,16 +32,28 @@ class Kernels:
 def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> Kernels:
     """Kernels for elements of `size` nodes and `points` quadrature points, and laws of `count` coefficients.
 
-    Each launches over (element, column).
+    Each launches over (element, column). Elements of `size` 0 have as many nodes as `sizes` says, each its own number.
     """
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
     stress, stress_change, density = law.stress, law.stress_change, law.energy
     kept = VOLUME_KEPT
 
+    # A constant bound lets the compiler unroll the loops over nodes.
+    @wp.func
+    def constant(sizes: wp.array(dtype=wp.int32), e: int):
+        return size
+
+    @wp.func
+    def stored(sizes: wp.array(dtype=wp.int32), e: int):
+        return sizes[e]
+
+    nodes_of = constant if size else stored
+
     @wp.func
     def gradient_of(
         u: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         e: int,
@@ -50,7 +62,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
     ):
         """H = sum over nodes of u_a (x) grad N_a."""
         H = mat()
-        for a in range(size):
+        for a in range(nodes_of(sizes, e)):
             i = 3 * table[e, a]
             H += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]), gradient[e, q, a])
         return H
@@ -58,6 +70,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
     @wp.kernel(module="unique")
     def add_energy(
         u: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         weight: wp.array2d(dtype=scalar),
@@ -68,12 +81,13 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
         """E += sum over points of w psi(H)."""
         e, c = wp.tid()
         for q in range(points):
-            H = gradient_of(u, table, gradient, e, q, c)
+            H = gradient_of(u, sizes, table, gradient, e, q, c)
             wp.atomic_add(out, c, wp.float64(weight[e, q] * density(H, coefficients[e])))
 
     @wp.kernel(module="unique")
     def add_gradient(
         u: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         weight: wp.array2d(dtype=scalar),
@@ -84,8 +98,8 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
         """f_a += sum over points of w P(H) grad N_a."""
         e, c = wp.tid()
         for q in range(points):
-            P = weight[e, q] * stress(gradient_of(u, table, gradient, e, q, c), coefficients[e])
-            for a in range(size):
+            P = weight[e, q] * stress(gradient_of(u, sizes, table, gradient, e, q, c), coefficients[e])
+            for a in range(nodes_of(sizes, e)):
                 i = 3 * table[e, a]
                 f = P * gradient[e, q, a]
                 for k in range(3):
@@ -96,6 +110,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
         p: wp.array2d(dtype=scalar),
         at: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
+        sizes: wp.array(dtype=wp.int32),
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         weight: wp.array2d(dtype=scalar),
@@ -108,10 +123,10 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
         for q in range(points):
             H = mat()
             if definite[c] == 0:
-                H = gradient_of(at, table, gradient, e, q, c)
-            D = gradient_of(p, table, gradient, e, q, c)
+                H = gradient_of(at, sizes, table, gradient, e, q, c)
+            D = gradient_of(p, sizes, table, gradient, e, q, c)
             P = weight[e, q] * stress_change(H, D, coefficients[e])
-            for a in range(size):
+            for a in range(nodes_of(sizes, e)):
                 i = 3 * table[e, a]
                 f = P * gradient[e, q, a]
                 for k in range(3):
@@ -121,6 +136,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
     def add_diagonal(
         at: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
+        sizes: wp.array(dtype=wp.int32),
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         weight: wp.array2d(dtype=scalar),
@@ -133,8 +149,8 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
         for q in range(points):
             H = mat()
             if definite[c] == 0:
-                H = gradient_of(at, table, gradient, e, q, c)
-            for a in range(size):
+                H = gradient_of(at, sizes, table, gradient, e, q, c)
+            for a in range(nodes_of(sizes, e)):
                 g = gradient[e, q, a]
                 block = mat()
                 for k in range(3):
@@ -149,6 +165,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
     def bound_step(
         u: wp.array2d(dtype=scalar),
         du: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
         table: wp.array2d(dtype=wp.int32),
         gradient: wp.array3d(dtype=vec),
         # outputs
@@ -158,8 +175,8 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
         e, c = wp.tid()
         one = scalar(1.0)
         for q in range(points):
-            H = gradient_of(u, table, gradient, e, q, c)
-            D = gradient_of(du, table, gradient, e, q, c)
+            H = gradient_of(u, sizes, table, gradient, e, q, c)
+            D = gradient_of(du, sizes, table, gradient, e, q, c)
             F = wp.identity(n=3, dtype=scalar) + H
             a0 = one + volume_change(H)
             a1 = wp.ddot(cofactor(F), D)
@@ -215,10 +232,16 @@ class Elasticity:
     ):
         self.name = name
         self._device = device
-        size, points, count = elements.table.shape[1], elements.weight.shape[1], coefficients.shape[1]
+        points, count = elements.weight.shape[1], coefficients.shape[1]
+        size = elements.table.shape[1] if elements.size is None else 0
+        sizes = np.zeros(0, np.int32) if elements.size is None else elements.size
         self._kernels = kernels_of(law, device, size, points, count)
         self._rest = (elements, *lame.T)
-        self._shape = [device.array(elements.table, wp.int32), device.array(elements.gradient, device.vector)]
+        self._shape = [
+            device.array(sizes, wp.int32),
+            device.array(elements.table, wp.int32),
+            device.array(elements.gradient, device.vector),
+        ]
         self._weight = device.array(elements.weight)
         self._coefficients = device.array(coefficients, wp.types.vector(length=count, dtype=device.scalar))
         self._at: wp.array | None = None
