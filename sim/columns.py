@@ -19,6 +19,7 @@ class Kernels:
     dot: wp.Kernel
     combine: wp.Kernel
     gather: wp.Kernel
+    scatter: wp.Kernel
 
 
 @cache
@@ -64,7 +65,18 @@ def kernels_of(device: Device) -> Kernels:
         r, c = wp.tid()
         out[r, c] = x[r, columns[c]]
 
-    return Kernels(dot, combine, gather)
+    @wp.kernel(module="unique")
+    def scatter(
+        x: wp.array2d(dtype=scalar),
+        columns: wp.array(dtype=wp.int32),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_r,columns(c) = x_rc."""
+        r, c = wp.tid()
+        out[r, columns[c]] = x[r, c]
+
+    return Kernels(dot, combine, gather, scatter)
 
 
 def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:
@@ -95,3 +107,8 @@ def gathered(device: Device, x: wp.array, columns: np.ndarray) -> wp.array:
     out = wp.empty((x.shape[0], len(columns)), dtype=device.scalar, device=device.name)
     device.launch(kernels_of(device).gather, out.shape, [x, device.array(columns, wp.int32)], [out])
     return out
+
+
+def scattered(device: Device, x: wp.array, columns: np.ndarray, out: wp.array) -> None:
+    """Copy x (rows, k) to some columns (k,) of out (rows, b)."""
+    device.launch(kernels_of(device).scatter, x.shape, [x, device.array(columns, wp.int32)], [out])

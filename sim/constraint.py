@@ -161,10 +161,15 @@ class Constraint:
 
     def project(self, v: wp.array) -> None:
         """Remove from v (3N, b) what the constraints forbid, in place."""
-        self._project_nodes(v)
+        self.project_nodes(v)
         if self._weight is not None:
             self._spread(-self._average(v), v)
-            self._project_nodes(v)
+            self.project_nodes(v)
+
+    def project_nodes(self, v: wp.array) -> None:
+        """Remove from v (3N, b) what held and sliding nodes forbid, in place, whatever the loads."""
+        dim = (len(self.held), v.shape[1])
+        self.device.launch(kernels_of(self.device).project, dim, [self._held, self._normal], [v])
 
     def close_gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
         """The least motion (3N, b) that takes u (3N, b) to the constraints, and its largest component (b,) [m]."""
@@ -176,7 +181,7 @@ class Constraint:
             one, rest = np.ones(u.shape[1]), self.device.zeros(*u.shape)
             reached = self._average(u) + self._average(gap)
             self._spread(self._target - reached, rest)
-            self._project_nodes(rest)
+            self.project_nodes(rest)
             combined(self.device, gap, one, rest, gap)
         return gap, np.abs(gap.numpy()).max(axis=0, initial=0.0)
 
@@ -187,7 +192,7 @@ class Constraint:
         """
         if self._weight is None:
             return None
-        self._project_nodes(gradient)
+        self.project_nodes(gradient)
         return self._solved(self._average(gradient))
 
     def basis(self) -> sp.csc_array:
@@ -208,10 +213,6 @@ class Constraint:
             count += len(free)
         data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
         return sp.csc_array(sp.coo_array(data, shape=(self.held.size, count)))
-
-    def _project_nodes(self, v: wp.array) -> None:
-        dim = (len(self.held), v.shape[1])
-        self.device.launch(kernels_of(self.device).project, dim, [self._held, self._normal], [v])
 
     def _average(self, v: wp.array) -> np.ndarray:
         assert self._weight is not None

@@ -11,7 +11,6 @@ import scipy.sparse as sp
 import torch
 import warp as wp
 
-from .constraint import Constraint
 from .device import Device
 from .problem import Problem
 
@@ -20,7 +19,7 @@ COPIES = 6
 
 
 def fits(rows: int, device: Device) -> bool:
-    """Whether torch sees the card, and the dense matrices of `rows` = 3N unknowns fit into its free memory."""
+    """Whether torch sees the card, and the dense matrices of `rows` unknowns fit into its free memory."""
     if not torch.cuda.is_available():
         return False
     free, _ = torch.cuda.mem_get_info(wp.device_to_torch(device.name))
@@ -28,28 +27,34 @@ def fits(rows: int, device: Device) -> bool:
 
 
 class Dense:
-    """The free rest stiffness, inverted in double precision and kept in the solver's.
+    """A rest stiffness K over some motions L, L (L^T K L)^-1 L^T, inverted in double precision, kept in the solver's.
+
+    stiffness K (3N, 3N) [N/m]; motions L (3N, n), independent columns.
 
     Raises
     ------
     RuntimeError
-        The free stiffness is not positive definite: something is not held.
+        K is not positive definite over these motions: something is not held.
     """
 
-    def __init__(self, stiffness: sp.csc_array, constraint: Constraint, device: Device):
+    def __init__(self, stiffness: sp.csc_array, motions: sp.csc_array, device: Device):
         self._device = device
         where = wp.device_to_torch(device.name)
-        basis = constraint.basis()
-        free = torch.as_tensor((basis.T @ stiffness @ basis).toarray(), device=where)
-        span = torch.as_tensor(basis.toarray(), device=where)
-        inverse = span @ torch.cholesky_inverse(torch.linalg.cholesky(free)) @ span.T
-        self._inverse = inverse.to(getattr(torch, device.precision))
+        precision = getattr(torch, device.precision)
+        free = torch.as_tensor((motions.T @ stiffness @ motions).toarray(), device=where)
+        self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(free)).to(precision)
+        self._motions, self._transposed = (
+            torch.sparse_csr_tensor(
+                *(torch.as_tensor(a, device=where) for a in (m.indptr, m.indices, m.data)), size=m.shape
+            )
+            for m in (sp.csr_array(motions.astype(device.precision)), sp.csr_array(motions.T.astype(device.precision)))
+        )
         torch.cuda.synchronize(where)
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """The rest stiffness serves every state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """One matrix product, in Warp's stream."""
+        """One dense matrix product, in Warp's stream."""
         with torch.cuda.stream(wp.stream_to_torch(self._device.name)):
-            torch.matmul(self._inverse, wp.to_torch(r), out=wp.to_torch(out))
+            wp.to_torch(out).copy_(self._motions @ (self._inverse @ (self._transposed @ wp.to_torch(r))))

@@ -10,9 +10,10 @@ import scipy.sparse as sp
 from .errors import InputError
 from .mesh import QUADRATIC_EDGES, TetMesh
 
-# Of a symmetric four-point rule of degree 2: each point's coordinate to its own corner, and to the other three.
-NEAR, FAR = (5.0 + 3.0 * np.sqrt(5.0)) / 20.0, (5.0 - np.sqrt(5.0)) / 20.0
-FOUR_POINTS = np.full((4, 4), FAR) + (NEAR - FAR) * np.eye(4)
+# Eight points of degree 3, the corners and the middles of the faces. With the four points that quadratic shapes need at
+# rest, elements under a tool fold at their corners, where no point looks.
+EIGHT_POINTS = np.vstack([np.eye(4), (np.ones((4, 4)) - np.eye(4)) / 3.0])
+EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)
 # Element matrices are summed in parts of so many entries, which bounds the memory that it takes.
 ENTRIES = 20_000_000
 
@@ -47,7 +48,7 @@ def linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
 
 
 def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> Elements:
-    """Ten-node tetrahedra, straight or curved, four quadrature points of degree 2.
+    """Ten-node tetrahedra, straight or curved, eight quadrature points of degree 3.
 
     Zienkiewicz, Taylor 2005, "The Finite Element Method", section 4.7. nodes (N, 3) [m]; table (T, 10): corners, then
     the middles of `QUADRATIC_EDGES`; `chosen` (T,) bool picks elements.
@@ -58,7 +59,7 @@ def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray)
         An element that its mid-edge nodes fold over.
     """
     table = table[chosen]
-    slope = quadratic_slopes(FOUR_POINTS)
+    slope = quadratic_slopes(EIGHT_POINTS)
     jacobian = np.einsum("tai,qaj->tqij", nodes[table], slope)
     volume = np.linalg.det(jacobian)
     folded = np.flatnonzero((volume <= 0.0).any(axis=1))
@@ -68,7 +69,7 @@ def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray)
             "by its mid-edge nodes: move them towards the middles of their edges."
         )
     gradient = np.einsum("qaj,tqji->tqai", slope, np.linalg.inv(jacobian))
-    return Elements(table, gradient, volume / 24.0, len(nodes), np.flatnonzero(chosen))
+    return Elements(table, gradient, volume * EIGHT_WEIGHTS / 6.0, len(nodes), np.flatnonzero(chosen))
 
 
 def quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:

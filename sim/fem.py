@@ -18,14 +18,11 @@ from .direction import NewtonCG
 from .discretisation import discretise
 from .effects import Effect
 from .errors import InputError
-from .linear import BlockJacobi, Factor, Preconditioner
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
 from .newton import Equilibrium, find_equilibrium
-from .problem import Problem
+from .precondition import choose_preconditioner
 from .term import Cases
 
-# Above this many unknowns the factor's memory and time outgrow what it saves.
-LARGEST_FACTOR = 400_000
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"
 SMALLEST_LOAD_STEP = 1.0 / 64.0
@@ -72,7 +69,7 @@ class Fem:
         self.batch = batch
         self.space = discretise(anatomy.mesh, element)
         self.problem = compile_problem(self.effects, anatomy, find_device(device, accuracy.precision), self.space)
-        self._direction = NewtonCG(choose_preconditioner(self.problem), accuracy.inner)
+        self._direction = NewtonCG(choose_preconditioner(self.problem, self.space, self._unsmoothed), accuracy.inner)
 
     @property
     def anatomy(self) -> Anatomy:
@@ -100,6 +97,11 @@ class Fem:
             parts.append(self._solve(Cases(loads.rows(rows), begun, history), guess[:, rows]))
         whole = _joined(parts)
         return whole if at is None else whole.at(at)
+
+    def _unsmoothed(self) -> sp.csc_array:
+        """Rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh."""
+        linear = discretise(self._anatomy.mesh, "p1")
+        return compile_problem(self.effects, self._anatomy, self.problem.device, linear).rest_curvature()
 
     def _guess(self, loads: Loads, start: Deformation | None) -> np.ndarray:
         """First guesses (3V, B). A case without any load starts at rest: its answer is exactly zero."""
@@ -198,28 +200,6 @@ class Fem:
                 arm = footprint_of(self.space, cause) @ self.space.nodes - cause.point
                 rows.append(np.concatenate([force, np.cross(arm, force)], axis=1))
         return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))
-
-
-def choose_preconditioner(problem: Problem) -> Preconditioner:
-    """The rest stiffness, inverted (CUDA) or factorised where that pays; block Jacobi beyond.
-
-    Raises
-    ------
-    InputError
-        A free rest stiffness that is singular.
-    """
-    if problem.rows > LARGEST_FACTOR:
-        return BlockJacobi(problem.device)
-    stiffness: sp.csc_array = problem.rest_curvature()
-    try:
-        if problem.device.on_cuda:
-            from .dense import Dense, fits
-
-            if fits(problem.rows, problem.device):
-                return Dense(stiffness, problem.constraint, problem.device)
-        return Factor(stiffness, problem.constraint, problem.device)
-    except RuntimeError as error:
-        raise InputError(f"the stiffness at rest cannot be factorised ({error}): is every part held?") from error
 
 
 def _joined(parts: list[Deformation]) -> Deformation:

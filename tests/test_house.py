@@ -19,7 +19,8 @@ TIERS = (
     {"device", "columns", "term", "constraint"},
     {"terms", "problem"},
     {"linear", "direction", "search", "dense", "compile"},
-    {"newton"},
+    {"newton", "multigrid"},
+    {"precondition"},
     {"fem"},
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""

@@ -15,8 +15,8 @@ from boxes import base_held, box, hold, top_forces
 from sim.accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import pushed_forces
-from sim.discretisation import discretise
 from sim.deformation import Deformer, Outcome
+from sim.discretisation import discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import STEPPING_BUDGET, Fem

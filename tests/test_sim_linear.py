@@ -11,9 +11,9 @@ from sim.compile import compile_problem
 from sim.device import Device, find_device
 from sim.direction import Direction
 from sim.effects import Elasticity, Held, NodalForce
-from sim.fem import choose_preconditioner
 from sim.linear import BlockJacobi, Preconditioner, conjugate_gradients
 from sim.loads import Loads, Nodal
+from sim.precondition import rest_solver
 from sim.problem import Problem
 from sim.search import search
 from sim.term import Cases
@@ -41,7 +41,7 @@ def problem(device: Device) -> Problem:
 
 @pytest.fixture(params=["factor", "block jacobi"])
 def preconditioner(request: pytest.FixtureRequest, problem: Problem) -> Preconditioner:
-    return choose_preconditioner(problem) if request.param == "factor" else BlockJacobi(problem.device)
+    return rest_solver(problem) if request.param == "factor" else BlockJacobi(problem.device)
 
 
 def right_hand_side(problem: Problem) -> np.ndarray:
@@ -92,7 +92,7 @@ def test_needs_no_more_iterations_than_unknowns(problem: Problem, preconditioner
 def test_the_factor_inverts_the_rest_stiffness(problem: Problem) -> None:
     K, r = dense(problem, REST), right_hand_side(problem)
     out = problem.device.zeros(*r.shape)
-    choose_preconditioner(problem).apply(problem.device.array(r), np.ones(2, bool), out)
+    rest_solver(problem).apply(problem.device.array(r), np.ones(2, bool), out)
     np.testing.assert_allclose(out.numpy()[FREE], np.linalg.solve(K, r[FREE]), rtol=1e-9, atol=1e-18)
 
 

@@ -18,10 +18,11 @@ from sim.device import Device, find_device
 from sim.direction import Direction, NewtonCG
 from sim.effects import Elasticity, Held, NodalForce
 from sim.errors import InputError
-from sim.fem import Fem, choose_preconditioner
+from sim.fem import Fem
 from sim.linear import BlockJacobi
 from sim.loads import Loads, Nodal, Prescribed
 from sim.newton import Equilibrium, find_equilibrium
+from sim.precondition import rest_solver
 from sim.problem import Problem
 from sim.term import Cases
 
@@ -61,7 +62,7 @@ def rows_of(cases: Cases, index: np.ndarray) -> Cases:
 
 def solve(problem: Problem, cases: Cases, accuracy: Accuracy = TIGHT, start: np.ndarray | None = None) -> Equilibrium:
     problem.begin(cases)
-    direction = NewtonCG(choose_preconditioner(problem), accuracy.inner)
+    direction = NewtonCG(rest_solver(problem), accuracy.inner)
     guess = np.zeros((ROWS, len(cases.loads))) if start is None else start
     return find_equilibrium(problem, direction, guess, accuracy)
 
@@ -257,7 +258,7 @@ class Contrary:
     """A direction that leads uphill, in every column or only where positive curvature was not asked for."""
 
     def __init__(self, problem: Problem, always: bool):
-        self.plain, self.always = NewtonCG(choose_preconditioner(problem), 400), always
+        self.plain, self.always = NewtonCG(rest_solver(problem), 400), always
 
     def find(self, problem: Problem, *arguments: object) -> Direction:
         definite = arguments[-1]
