@@ -10,6 +10,7 @@ from sim.mesh import TetMesh
 # Kuhn's six tetrahedra of a cube: paths from corner 0 to corner 7 along the axes; neighbours match.
 CORNER = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]])
 KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+VTK_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
 
 
 def box(cells: tuple[int, int, int], size: float = 0.1, distortion: float = 0.0, seed: int = 0) -> TetMesh:
@@ -22,6 +23,25 @@ def box(cells: tuple[int, int, int], size: float = 0.1, distortion: float = 0.0,
     inside = ((grid > 0) & (grid < counts - 1)).all(axis=1)
     shift = np.random.default_rng(seed).uniform(-distortion, distortion, grid.shape) * inside[:, None]
     return TetMesh((grid + shift) * size / max(cells), tets, np.zeros(len(tets), int))
+
+
+def quadratic(mesh: TetMesh, curved: float = 0.0, seed: int = 0) -> TetMesh:
+    """The same body of ten-node tetrahedra; inner middles moved by a share of their edge's length at random."""
+    ends = np.sort(mesh.tets[:, VTK_EDGES], axis=2).reshape(-1, 2)
+    edges, place = np.unique(ends, axis=0, return_inverse=True)
+    outer = np.sort(mesh.surface[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    key = [len(mesh.nodes), 1]
+    length = np.linalg.norm(mesh.nodes[edges[:, 1]] - mesh.nodes[edges[:, 0]], axis=1) * ~np.isin(
+        edges @ key, outer @ key
+    )
+    shift = np.random.default_rng(seed).uniform(-curved, curved, (len(edges), 3)) * length[:, None]
+    nodes = np.vstack([mesh.nodes, mesh.nodes[edges].mean(axis=1) + shift])
+    return TetMesh(nodes, mesh.tets, mesh.region, len(mesh.nodes) + place.reshape(-1, 6))
+
+
+def surface_nodes(mesh: TetMesh) -> np.ndarray:
+    """Nodes (V,) bool of a box that lie on its faces, mid-edge nodes too."""
+    return ((mesh.nodes < 1e-9) | (mesh.nodes > mesh.nodes.max(axis=0) - 1e-9)).any(axis=1)
 
 
 def hold(mesh: TetMesh, held: np.ndarray, normal: np.ndarray | None = None) -> Anatomy:
