@@ -20,9 +20,12 @@ COMMANDS = {
     "demo": "play a scene on a page in the browser",
     "render": "write the frames of a scene as pictures, without display",
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
-    "bench": "measure what each stage costs on this machine",
+    "bench": "measure what each stage costs, what each element is worth, how robust the solver is",
     "check": "play the built-in scenes blank and hold their figures to their bounds",
 }
+
+# Commands with commands of their own; the first is meant where none is named.
+INNER = {"bench": ("stages", "elements", "robust")}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,6 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="sulcus", description=__doc__, epilog="Research only; not a medical device.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     asked = arguments[0] if arguments else None
+    inner = INNER.get(asked or "", ())
+    if inner and (len(arguments) == 1 or arguments[1] not in (*inner, "-h", "--help")):
+        arguments.insert(1, inner[0])
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name == asked:

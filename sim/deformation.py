@@ -83,6 +83,19 @@ class Deformation:
     def __len__(self) -> int:
         return len(self.displacement)
 
+    def rows(self, index: np.ndarray) -> Deformation:
+        """Some of the answers (k,), as a deformation; the cost stays that of all."""
+        return replace(
+            self,
+            displacement=self.displacement[index],
+            outcome=tuple(self.outcome[row] for row in index),
+            iterations=self.iterations[index],
+            residual=self.residual[index],
+            time=self.time[index],
+            reaction=self.reaction[index],
+            history={name: value[index] for name, value in self.history.items()},
+        )
+
     def at(self, nodes: np.ndarray) -> Deformation:
         """The rows of some mesh vertices `nodes` (n,).
 

@@ -30,7 +30,7 @@ class Tool:
     footprint
         Least and greatest radius [m], uniform between; a plate counts as the disc of its area.
     force
-        Least and greatest force [N], log-uniform between.
+        Least and greatest force [N], log-uniform between unless `even`: then uniform.
     pressure
         Least and greatest mean contact pressure F / (pi r^2) [Pa]; a draw outside is repeated.
     depth
@@ -45,6 +45,7 @@ class Tool:
     pressure: tuple[float, float] = (0.0, HARDEST)
     depth: float = DEEPEST
     cone: float = np.pi / 4.0
+    even: bool = False
 
     def admits(self, force: float, footprint: float) -> bool:
         """Whether pressure and estimated depth are those of surgery."""
@@ -63,14 +64,17 @@ TOOLS = {
         Tool("spatula", (8e-3, 16e-3), (0.13, 3.2), pressure=(700.0, 4000.0)),
     )
 }
-PRESETS = (*TOOLS, "mixed", "seed")
+# No surgery: a trial of the solver. 1 N on 3 mm would be a flat punch 40 mm deep.
+BRUTAL = Tool("brutal", (3e-3, 10e-3), (0.02, 1.05), pressure=(0.0, np.inf), depth=np.inf, even=True)
+PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)
 
 
 def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     """Draw `count` loads on the open cortex; load i depends on the preset, the anatomy, the seed and i alone.
 
-    `mixed` draws the tool first. `seed` is the protocol of Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47, in
-    an order shuffled by the seed: at most 6,600 loads, of which fewer are returned when `count` is larger.
+    `mixed` draws the tool first; `brutal` is far beyond surgery. `seed` is the protocol of Tonutti, Gras, Yang 2017,
+    Artif. Intell. Med. 80:39-47, in an order shuffled by the seed: at most 6,600 loads, of which fewer are returned
+    when `count` is larger.
 
     Raises
     ------
@@ -85,7 +89,7 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     patch = open_patch(anatomy)
     if preset == "seed":
         return _published(anatomy, patch, count, seed)
-    tools = list(TOOLS.values()) if preset == "mixed" else [TOOLS[preset]]
+    tools = list(TOOLS.values()) if preset == "mixed" else [{**TOOLS, BRUTAL.name: BRUTAL}[preset]]
     rows = [_one(tools, patch, np.random.default_rng((seed, number))) for number in range(count)]
     point, force, footprint = (np.array(column) for column in zip(*rows, strict=True))
     return Loads((Pushed(point, force, footprint),))
@@ -96,7 +100,7 @@ def _one(tools: list[Tool], patch: Patch, random: np.random.Generator) -> tuple[
     tool = tools[random.integers(len(tools))]
     for _ in range(ATTEMPTS):
         footprint = random.uniform(*tool.footprint)
-        force = float(np.exp(random.uniform(*np.log(tool.force))))
+        force = random.uniform(*tool.force) if tool.even else float(np.exp(random.uniform(*np.log(tool.force))))
         point, normal = patch.place(random.random(3))
         direction = _within_cone(normal, tool.cone, random.random(2))
         if tool.admits(force, footprint) and patch.rim_distance(point[None])[0] >= footprint:

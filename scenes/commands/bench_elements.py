@@ -1,0 +1,64 @@
+"""`sulcus bench elements`: how far each element is from the limit of fine meshes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from sim.anatomy import Anatomy
+from sim.discretisation import ELEMENTS
+from sim.meshfile import read_anatomy
+
+# Of the template, where no anatomy is named.
+NODES = (2500, 5300, 17000)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "anatomies", nargs="*", type=Path, metavar="ANATOMY.vtu",
+        help=f"the same body, meshed ever finer (default: the template at {', '.join(map(str, NODES))} nodes)",
+    )  # fmt: skip
+    parser.add_argument("--elements", nargs="+", default=list(ELEMENTS), choices=ELEMENTS, help="which (default: all)")
+    parser.add_argument("--poisson", nargs="+", type=float, default=[0.30, 0.45, 0.49, 0.495], help="Poisson's ratios")
+    parser.add_argument("--force", type=float, default=0.1, help="of the press, on a 7 mm disc [N] (%(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row; 1 if a solve did not converge."""
+    from ..bench import machine
+    from ..elements import Press, limits, rows
+
+    anatomies = [read_anatomy(path) for path in args.anatomies] or _template()
+    table = sys.stderr if args.json else sys.stdout
+    where = machine(args.device)
+    print(f"{where}\n\n| nu | element | vertices | tumour moves [mm] | set-up [s] | solve [s] | outer |", file=table)
+    print("|---|---|---|---|---|---|---|", file=table)
+    found = []
+    for row in rows(anatomies, args.elements, args.poisson, Press(force=args.force), args.device):
+        found.append(row)
+        moved = f"{row.motion:.4f}" if row.good else f"{row.motion:.4f} (not converged)"
+        cost = f"{row.set_up:.1f} | {row.solve:.2f} | {row.outer}"
+        print(f"| {row.poisson:g} | {row.element} | {row.vertices} | {moved} | {cost} |", file=table, flush=True)
+    limit = limits(found)
+    if limit:
+        print("\n| nu | limit [mm] | of it, by element and vertices |\n|---|---|---|", file=table)
+    for poisson, motion in sorted(limit.items()):
+        shares = (f"{r.element} {r.vertices}: {r.motion / motion:.1%}" for r in found if r.poisson == poisson)
+        print(f"| {poisson:g} | {motion:.4f} | {', '.join(shares)} |", file=table)
+    if args.json:
+        print(json.dumps({"machine": where, "rows": [asdict(row) for row in found], "limit_mm": limit}))
+    return 0 if all(row.good for row in found) else 1
+
+
+def _template() -> list[Anatomy]:
+    from sim.subject import Plan, make_anatomy
+    from sim.template import Tumour, template_subject
+
+    subject = template_subject(Tumour())
+    return [make_anatomy(subject, Plan(nodes)) for nodes in NODES]

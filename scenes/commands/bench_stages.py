@@ -1,0 +1,46 @@
+"""`sulcus bench stages`: what each stage costs, as a table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+
+from sim.errors import InputError
+
+from .demo import add_theatre
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
+    add_theatre(parser)
+    parser.add_argument("--solves", type=int, default=64, help="loads in the batch (default %(default)s)")
+    parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row."""
+    from ..bench import machine, rows
+    from ..scene import find_scene
+    from ..theatre import open_theatre
+
+    if args.batch < 1:
+        raise InputError(f"--batch {args.batch} solves nothing: give a whole number from 1 up.")
+    scene = find_scene(args.scene)
+    theatre = open_theatre(args.anatomy, args.model, args.device)
+    name = args.deformer or theatre.best
+    player = theatre.player(name, scene)
+    found = []
+    where = machine(args.device)
+    table = sys.stderr if args.json else sys.stdout
+    print(f"{where}\n\n| stage | median | p95 | | what |\n|---|---|---|---|---|", file=table)
+    for row in rows(theatre, player, name, args.solves, args.batch):
+        found.append(row)
+        p95 = "" if row.p95 is None else f"{row.p95:.3g}"
+        print(f"| {row.name} | {row.median:.3g} | {p95} | {row.unit} | {row.note} |", file=table, flush=True)
+    if args.json:
+        print(json.dumps({"machine": where, "rows": [asdict(row) for row in found]}))
+    return 0

@@ -1,0 +1,102 @@
+"""The benches: what they measure is what they say, and an interrupted trial goes on."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes.cli import main
+from scenes.elements import Press, Row, limits, rows
+from scenes.robust import SETS, Record, shares, tallies
+from sim.deformation import Outcome
+from sim.meshfile import write_anatomy
+from sim.subject import Plan, make_anatomy
+from sim.template import Tumour, template_subject
+
+
+@pytest.fixture(scope="module")
+def anatomies():
+    subject = template_subject(Tumour())
+    return [make_anatomy(subject, Plan(nodes)) for nodes in (2000, 4000)]
+
+
+def test_soft_tissue_locks_linear_elements_alone(anatomies):
+    """Nearly incompressible: the linear element loses a fifth of the motion, the others hardly any."""
+    found = list(rows(anatomies[1:], ["p1", "smoothed"], [0.495], Press(force=0.02), "cpu"))
+    found += rows(anatomies, ["p2"], [0.495], Press(force=0.02), "cpu")
+    assert all(row.good for row in found)
+    limit = limits(found)[0.495]
+    motion = {(row.element, row.vertices > 3000): row.motion / limit for row in found}
+    assert motion["p1", True] < 0.85
+    assert 0.95 < motion["p2", True] < 1.0
+    assert 0.95 < motion["smoothed", True] < 1.05
+
+
+def test_the_limit_is_that_of_a_second_order_error():
+    row = Row(0.45, "p2", 1000, 7000, 0.0, 1.0, 1.0, 4, True)
+    series = [replace(row, vertices=n, motion=2.0 - 3.0 * n ** (-2.0 / 3.0)) for n in (1000, 8000, 27000)]
+    assert limits(series) == {0.45: pytest.approx(2.0)}
+    assert limits(series[:1]) == {}
+    assert limits([replace(one, element="p1") for one in series]) == {}
+    assert limits([series[0], replace(series[1], good=False)]) == {}
+
+
+def test_half_of_the_loads_are_brutal_and_none_is_lost():
+    for count in (2, 7, 60, 10_000):
+        assert sum(shares(count).values()) == count
+        assert shares(count)["brutal"] == count // 2
+    assert list(shares(100)) == list(SETS)
+
+
+def test_the_tally_counts_what_happened():
+    one = Record("brutal", 0, 1.0, 5e-3, "CONVERGED", 4, 1e-5, np.nan, 0.1)
+    found = [
+        one,
+        replace(one, outer=40, double=3e-5),
+        replace(one, outcome="CONVERGED_IN_STEPS", outer=90, double=8e-5),
+        replace(one, outcome="BUDGET", outer=60, residual=0.3, force=0.7),
+        replace(one, outcome="STALLED", outer=80, residual=0.1),
+    ]
+    (tally,) = tallies(found)
+    assert (tally.loads, tally.converged, tally.rescued) == (5, 3, 1)
+    assert (tally.checked, tally.double) == (2, 8e-5)
+    assert tally.hardest == found[3]
+    assert tallies(found[:3])[0].hardest == found[2]
+    assert all(Outcome[record.outcome] for record in found)
+
+
+def test_an_interrupted_trial_goes_on(tmp_path, anatomies, capsys):
+    write_anatomy(tmp_path / "brain.vtu", anatomies[0])
+    words = ["bench", "robust", "--anatomy", str(tmp_path / "brain.vtu"), "--count", "12", "--batch", "4"]
+    out = tmp_path / "loads.csv"
+    assert main([*words, "--out", str(out), "--json"]) == 0
+    sets = json.loads(capsys.readouterr().out)["sets"]
+    assert sum(item["converged"] for item in sets) == 12
+    whole = out.read_text().splitlines()
+    # Two comment and header lines, and the first seven loads: the rest is solved again.
+    out.write_text("\n".join(whole[:9]) + "\n")
+    assert main([*words, "--out", str(out)]) == 0
+    again = out.read_text().splitlines()
+    assert again[:9] == whole[:9]
+    assert [line.split(",")[:6] for line in again] == [line.split(",")[:6] for line in whole]
+    assert "| brutal | 6 | 6 (100.00%) |" in capsys.readouterr().out
+    assert main([*words, "--seed", "1", "--out", str(out)]) == 2
+    assert "another trial" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["robust", "--count", "1"], "--count 1"),
+        (["robust", "--batch", "0"], "--batch 0"),
+        (["robust", "--out", "loads.txt"], ".csv"),
+        (["robust", "--anatomy", "none.vtu"], "no such file"),
+        (["elements", "none.vtu"], "no such file"),
+    ],
+)
+def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", *words]) == 2
+    assert reason in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
