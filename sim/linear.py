@@ -90,6 +90,8 @@ def dissection(matrix: sp.csc_array, node: np.ndarray) -> np.ndarray | None:
     except ImportError:
         return None
     number, member = np.unique(node, return_inverse=True)
+    if not len(number):  # METIS divides by it
+        return member
     entry = sp.coo_array(matrix)
     first, second = member[entry.row], member[entry.col]
     across = first != second
