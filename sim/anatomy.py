@@ -71,6 +71,4 @@ class Anatomy:
     @cached_property
     def digest(self) -> str:
         """Hash of the mesh and its boundary conditions."""
-        return digest_of(
-            self.mesh.nodes, self.mesh.tets, self.mesh.region, self.held, self.slide_normal, self.craniotomy
-        )
+        return digest_of(*self.mesh.arrays, self.held, self.slide_normal, self.craniotomy)

@@ -125,21 +125,25 @@ class Discretisation:
         return np.concatenate([field, field[..., self.edges, :].mean(axis=-2)], axis=-2)
 
 
-def discretise(mesh: TetMesh, element: str) -> Discretisation:
+def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
     """The nodes and elements of type `element`, one of `ELEMENTS`, over a mesh.
+
+    None: p1, or p2 on a mesh that brings mid-edge nodes of its own.
 
     Raises
     ------
     InputError
         An unknown type; a linear type on a mesh that brings mid-edge nodes of its own.
     """
+    if element is None:
+        element = "p1" if mesh.middles is None else "p2"
     if element not in ELEMENTS:
         raise InputError(f"no element is called {element!r}: choose one of {', '.join(ELEMENTS)}.")
     none = np.zeros((0, 2), np.int32)
     if mesh.middles is not None:
         if element != "p2":
             raise InputError(f"the mesh has quadratic tetrahedra, which are no {element}: take p2, or a linear mesh.")
-        return Discretisation(mesh, element, np.hstack([mesh.tets, mesh.middles]), none)
+        return Discretisation(mesh, element, mesh.table, none)
     if element != "p2":
         return Discretisation(mesh, element, mesh.tets, none)
     ends = np.sort(mesh.tets[:, QUADRATIC_EDGES].reshape(-1, 2), axis=1)

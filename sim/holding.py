@@ -24,13 +24,12 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray) -> None:
         Naming the part and what is missing.
     """
     count = len(mesh.nodes)
-    elements = mesh.tets if mesh.middles is None else np.hstack([mesh.tets, mesh.middles])
     used = np.zeros(count, bool)
-    used[elements] = True
+    used[mesh.table] = True
     loose = np.flatnonzero(~used & ~held.all(axis=1))
     if len(loose):
         raise InputError(f"node {loose[0]} (and {len(loose) - 1} more) belongs to no tetrahedron: remove or hold it.")
-    key = np.unique(np.repeat(_clusters(mesh.tets), elements.shape[1]) * count + elements.ravel())
+    key = np.unique(np.repeat(_clusters(mesh.tets), mesh.table.shape[1]) * count + mesh.table.ravel())
     cluster, node = divmod(key, count)
     piece = _components(cluster, cluster.max() + 1 + node, cluster.max() + 1 + count)[cluster]
     for number in np.unique(piece):

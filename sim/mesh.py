@@ -1,4 +1,4 @@
-"""Tetrahedral meshes: nodes, linear tetrahedra, region labels, and the surface that follows from them."""
+"""Tetrahedral meshes: nodes, linear or quadratic tetrahedra, region labels, and the surface that follows from them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from .errors import InputError
 # Faces of a positively oriented tetrahedron, normals outwards.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-# The order of VTK's and meshio's quadratic tetrahedra, and where each edge goes when corners 2 and 3 change places.
+# The order of VTK's and meshio's quadratic tetrahedra; and corners, then middles, when corners 2 and 3 change places.
 QUADRATIC_EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
-TURNED_EDGES = [0, 4, 3, 2, 1, 5]
+TURNED = [0, 1, 3, 2, 4, 8, 7, 6, 5, 9]
 TRIANGLE_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
 # A volume below this share of the longest edge cubed is round-off, not an element.
 ZERO_VOLUME = 1e-12
@@ -112,36 +112,42 @@ class TetMesh:
                 "zero or negative. Remove degenerate elements, or turn negative ones with `oriented`."
             )
         _warn_of_doubtful(self)
-        for array in self._arrays:
+        for array in self.arrays:
             array.flags.writeable = False
 
     @property
-    def _arrays(self) -> tuple[np.ndarray, ...]:
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """What makes the mesh: nodes, tetrahedra, regions, and middles if there are any."""
         linear = self.nodes, self.tets, self.region
         return linear if self.middles is None else (*linear, self.middles)
 
     @cached_property
+    def table(self) -> np.ndarray:
+        """Every node of every tetrahedron, (T, 4) or, quadratic, (T, 10): corners, then middles."""
+        return self.tets if self.middles is None else np.hstack([self.tets, self.middles])
+
+    @cached_property
     def volumes(self) -> np.ndarray:
-        """Element volumes (T,) [m^3]."""
+        """Element volumes (T,) [m^3], between straight edges."""
         return signed_volumes(self.nodes, self.tets)
 
     @cached_property
     def surface(self) -> np.ndarray:
-        """Outer triangles (S, 3), outwards."""
+        """Outer triangles (S, 3), outwards, by their corners."""
         return faces_once(self.tets)
 
     def boundary_of(self, label: int) -> np.ndarray:
-        """Triangles (S, 3), outwards, round the elements of one region."""
+        """Triangles (S, 3), outwards, by their corners, round the elements of one region."""
         return faces_once(self.tets[self.region == label])
 
     def nodes_of(self, label: int) -> np.ndarray:
         """Sorted node numbers (n,) of the elements of one region."""
-        return np.unique(self.tets[self.region == label])
+        return np.unique(self.table[self.region == label])
 
     @cached_property
     def digest(self) -> str:
-        """Hash of nodes, tetrahedra and regions (hexadecimal): the same bytes, the same mesh."""
-        return digest_of(*self._arrays)
+        """Hash of `arrays` (hexadecimal): the same bytes, the same mesh."""
+        return digest_of(*self.arrays)
 
 
 def digest_of(*arrays: np.ndarray) -> str:
@@ -153,18 +159,21 @@ def digest_of(*arrays: np.ndarray) -> str:
     return sha.hexdigest()[:16]
 
 
-def oriented(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, int]:
+def oriented(nodes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, int]:
     """Tetrahedra with every volume positive, and how many were turned. Zero volumes stay as they are.
+
+    table (T, 4) corners or (T, 10) corners and middles: when corners change places, so do the edges between them.
 
     Raises
     ------
     InputError
         Wrong shapes, non-finite coordinates, node numbers out of range.
     """
+    tets = table[:, :4] if table.shape[1:] == (10,) else table
     _check_corners(nodes, tets)
     negative = signed_volumes(nodes, tets) < 0.0
-    turned = np.array(tets)
-    turned[negative] = turned[negative][:, [0, 1, 3, 2]]
+    turned = np.array(table)
+    turned[negative] = turned[negative][:, TURNED[: table.shape[1]]]
     return turned, int(negative.sum())
 
 

@@ -14,6 +14,8 @@ from .files import written_whole
 from .mesh import TetMesh, oriented
 
 UNITS = {"m": 1.0, "mm": 1e-3}
+# meshio's names of tetrahedra by their nodes; it brings every format's order of mid-edge nodes to VTK's.
+CELLS = {4: "tetra", 10: "tetra10"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +28,15 @@ class MeshFile:
 
 
 def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
-    """Read linear tetrahedra with cell data `region` (absent: one region 0).
+    """Read tetrahedra with cell data `region` (absent: one region 0).
 
-    Cells that are not tetrahedra are dropped and tetrahedra of negative orientation are turned, each with a note.
+    Quadratic ones (`tetra10`) are taken as they are, curved edges too. Cells that are not tetrahedra are dropped and
+    tetrahedra of negative orientation are turned, each with a note.
 
     Raises
     ------
     InputError
-        A file that is missing or unreadable, without tetrahedra, or with data that does not fit.
+        A file that is missing or unreadable, without tetrahedra or with both kinds, or with data that does not fit.
     """
     import meshio  # an optional reader: machines that only train have none
 
@@ -47,16 +50,22 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
     except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parser raises, or exit
         reason = str(error).strip() or type(error).__name__
         raise InputError(f"{path}: cannot be read as a mesh ({reason}). Convert it to .vtu or .msh.") from error
-    blocks = [number for number, block in enumerate(raw.cells) if block.type == "tetra"]
-    if not blocks:
-        kinds = ", ".join(sorted({block.type for block in raw.cells})) or "no cells"
-        raise InputError(f"{path}: holds {kinds}, but no linear tetrahedra (`tetra`). Mesh its volume first.")
+    kinds = {block.type for block in raw.cells}
+    found = kinds.intersection(CELLS.values())
+    if not found:
+        held = ", ".join(sorted(kinds)) or "no cells"
+        raise InputError(f"{path}: holds {held}, but no tetrahedra (`tetra` or `tetra10`). Mesh its volume first.")
+    if len(found) > 1:
+        raise InputError(
+            f"{path}: holds {' and '.join(sorted(found))}, which do not conform: mesh it with one of them."
+        )
+    blocks = [number for number, block in enumerate(raw.cells) if block.type in found]
     notes = []
-    dropped = sorted({f"{len(block.data)} {block.type}" for block in raw.cells if block.type != "tetra"})
+    dropped = sorted({f"{len(block.data)} {block.type}" for block in raw.cells if block.type not in found})
     if dropped:
         notes.append(f"dropped cells that are not tetrahedra: {', '.join(dropped)}")
-    tets = np.concatenate([raw.cells[number].data for number in blocks])
-    region = np.zeros(len(tets), np.int32)
+    table = np.concatenate([raw.cells[number].data for number in blocks])
+    region = np.zeros(len(table), np.int32)
     if "region" in raw.cell_data:
         stored = np.concatenate([raw.cell_data["region"][number] for number in blocks])
         with np.errstate(invalid="ignore"):  # what is no number, or too large for one, does not come back
@@ -64,8 +73,10 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
         if stored.ndim != 1 or not np.array_equal(stored, region):
             raise InputError(f"{path}: cell data `region` must be one whole number for each tetrahedron.")
     try:
-        tets, turned = oriented(raw.points, tets)
-        mesh = TetMesh(np.asarray(raw.points, np.float64) * UNITS[unit], tets, region)
+        table, turned = oriented(raw.points, table)
+        tets, middles = np.split(table, [4], axis=1)
+        nodes = np.asarray(raw.points, np.float64) * UNITS[unit]
+        mesh = TetMesh(nodes, tets, region, middles if middles.size else None)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     if turned:
@@ -74,7 +85,9 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
 
 
 def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray]) -> None:
-    """Write `.vtu` in metres, with cell data `region`; the file appears whole or not at all.
+    """Write `.vtu` in metres, with cell data `region`, `tetra10` cells where the mesh has mid-edge nodes.
+
+    The file appears whole or not at all.
 
     Raises
     ------
@@ -86,7 +99,7 @@ def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndar
     with written_whole(path, ".vtu") as partial:
         meshio.Mesh(
             mesh.nodes,
-            [("tetra", mesh.tets)],
+            [(CELLS[mesh.table.shape[1]], mesh.table)],
             point_data=dict(point_data),
             cell_data={"region": [mesh.region]},
         ).write(partial)

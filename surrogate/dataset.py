@@ -22,6 +22,8 @@ from sim.mesh import TetMesh
 
 CAUSES: dict[str, type[Cause]] = {kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed)}
 FORMAT = "sulcus data 1"
+# The arrays of a mesh; linear ones have no `middles`.
+MESH = ("nodes", "tets", "region", "middles")
 # Rows read at once when only some vertices are wanted.
 CHUNK = 256
 
@@ -114,8 +116,8 @@ def read_dataset(path: str | Path) -> Dataset:
 
 def write_embedded(file: h5py.File, anatomy: Anatomy) -> None:
     """Store the body itself, so that learning needs no other file."""
-    for name in ("nodes", "tets", "region"):
-        file[f"anatomy/{name}"] = getattr(anatomy.mesh, name)
+    for name, array in zip(MESH, anatomy.mesh.arrays, strict=False):
+        file[f"anatomy/{name}"] = array
     for name in ("held", "slide_normal", "craniotomy"):
         file[f"anatomy/{name}"] = getattr(anatomy, name)
     file["anatomy"].attrs["digest"] = anatomy.digest
@@ -129,7 +131,7 @@ def read_embedded(file: h5py.File) -> Anatomy:
     InputError
         Arrays that do not have the digest written beside them.
     """
-    array = {name: stored(file, f"anatomy/{name}")[:] for name in ("nodes", "tets", "region")}
+    array = {name: stored(file, f"anatomy/{name}")[:] for name in MESH if f"anatomy/{name}" in file}
     sets = {name: stored(file, f"anatomy/{name}")[:] for name in ("held", "slide_normal", "craniotomy")}
     anatomy = Anatomy(TetMesh(**array), **sets)
     if anatomy.digest != file["anatomy"].attrs["digest"]:

@@ -9,19 +9,20 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
-from boxes import box, hold
+from boxes import box, hold, quadratic
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.files import check_output
-from sim.mesh import MeshWarning, TetMesh
+from sim.mesh import QUADRATIC_EDGES, MeshWarning, TetMesh
 from sim.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
 
 BOX = box((2, 2, 2), 0.1, distortion=0.2)
 MESH = TetMesh(BOX.nodes, BOX.tets, np.arange(len(BOX.tets)) % 3)
+CURVED = quadratic(MESH, curved=0.05)
 
 
-def write(path: Path, **changes: object) -> Path:
+def write(path: Path, file_format: str | None = None, **changes: object) -> Path:
     """A file by meshio, as another program would write it."""
     fields = {
         "points": MESH.nodes,
@@ -31,7 +32,7 @@ def write(path: Path, **changes: object) -> Path:
     } | changes
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # meshio remarks on what a format cannot hold
-        meshio.Mesh(**fields).write(path)  # pyright: ignore[reportArgumentType]
+        meshio.Mesh(**fields).write(path, file_format)  # pyright: ignore[reportArgumentType]
     return path
 
 
@@ -44,14 +45,54 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     assert file.notes == ()
 
 
-def test_anatomy_round_trip_is_exact(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mesh", [MESH, CURVED], ids=["linear", "quadratic"])
+def test_anatomy_round_trip_is_exact(tmp_path: Path, mesh: TetMesh) -> None:
     rng = np.random.default_rng(1)
-    normal = rng.normal(size=(27, 3))
+    count = len(mesh.nodes)
+    normal = rng.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    whole = hold(MESH, rng.random((27, 3)) < 0.3, normal * (rng.random((27, 1)) < 0.5))
-    anatomy = Anatomy(MESH, whole.held, whole.slide_normal, rng.random(27) < 0.5)
+    whole = hold(mesh, rng.random((count, 3)) < 0.3, normal * (rng.random((count, 1)) < 0.5))
+    anatomy = Anatomy(mesh, whole.held, whole.slide_normal, rng.random(count) < 0.5)
     write_anatomy(tmp_path / "a.vtu", anatomy)
     assert read_anatomy(tmp_path / "a.vtu").digest == anatomy.digest
+
+
+@pytest.mark.parametrize("form", ["vtu", "vtk", "gmsh", "gmsh22", "abaqus", "xdmf"])
+def test_quadratic_tetrahedra_are_taken_as_they_are(tmp_path: Path, form: str) -> None:
+    suffix = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp"}.get(form, form)
+    file = read_mesh(write(tmp_path / f"a.{suffix}", form, points=CURVED.nodes, cells=[("tetra10", CURVED.table)]))
+    np.testing.assert_allclose(file.mesh.nodes, CURVED.nodes, atol=1e-12)
+    np.testing.assert_array_equal(file.mesh.table, CURVED.table)
+    assert file.notes == ()
+
+
+def test_a_curved_mesh_is_written_and_read_exactly(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "a.vtu", CURVED, {"displacement": CURVED.nodes})
+    file = read_mesh(tmp_path / "a.vtu")
+    assert file.mesh.digest == CURVED.digest != TetMesh(CURVED.nodes, CURVED.tets, CURVED.region).digest
+    np.testing.assert_array_equal(file.point_data["displacement"], CURVED.nodes)
+
+
+@pytest.mark.parametrize("version", [2.2, 4.1])
+def test_gmsh_has_its_own_order_of_mid_edge_nodes(tmp_path: Path, version: float) -> None:
+    """Gmsh's manual, "Node ordering": the last two are the middles of edges 2-3 and 1-3. Written without meshio."""
+    corners = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
+    ends = np.array([[0, 1], [1, 2], [2, 0], [3, 0], [2, 3], [1, 3]])
+    points = np.vstack([corners, corners[ends].mean(axis=1)])
+    lines = [" ".join(map(str, point)) for point in points]
+    tags = range(1, 11)
+    if version < 4:
+        nodes = ["10", *(f"{tag} {line}" for tag, line in zip(tags, lines, strict=True))]
+        elements = ["1", "1 11 2 0 1 " + " ".join(map(str, tags))]
+    else:
+        nodes = ["1 10 1 10", "3 1 0 10", *map(str, tags), *lines]
+        elements = ["1 1 1 1", "3 1 11 1", "1 " + " ".join(map(str, tags))]
+    sections = {"MeshFormat": [f"{version} 0 8"], "Nodes": nodes, "Elements": elements}
+    text = "\n".join(f"${name}\n" + "\n".join(body) + f"\n$End{name}" for name, body in sections.items())
+    (tmp_path / "a.msh").write_text(text + "\n")
+    mesh = read_mesh(tmp_path / "a.msh").mesh
+    assert mesh.middles is not None
+    np.testing.assert_allclose(mesh.nodes[mesh.middles], mesh.nodes[mesh.tets[:, QUADRATIC_EDGES]].mean(axis=2))
 
 
 def test_a_mesh_is_not_an_anatomy(tmp_path: Path) -> None:
@@ -91,6 +132,21 @@ def test_negative_tetrahedra_are_turned_with_a_note(tmp_path: Path) -> None:
     assert file.mesh.volumes.min() > 0.0
 
 
+def test_middles_follow_their_edges_when_corners_are_turned(tmp_path: Path) -> None:
+    """A mesh seen in a mirror, and one whose corners another program numbered the other way round."""
+    mirrored = read_mesh(
+        write(tmp_path / "a.vtu", points=CURVED.nodes * [-1.0, 1.0, 1.0], cells=[("tetra10", CURVED.table)])
+    )
+    assert mirrored.notes == ("turned 48 tetrahedra of negative orientation",)
+    middle = {frozenset(edge): node for edge, node in _edges(CURVED)}
+    assert {frozenset(edge): node for edge, node in _edges(mirrored.mesh)} == middle
+
+
+def _edges(mesh: TetMesh) -> list[tuple[np.ndarray, int]]:
+    assert mesh.middles is not None
+    return list(zip(mesh.tets[:, QUADRATIC_EDGES].reshape(-1, 2), mesh.middles.ravel(), strict=True))
+
+
 def test_other_cells_are_dropped_with_a_note(tmp_path: Path) -> None:
     """Regions stay with their tetrahedra, wherever the other cells stand."""
     cells = [("triangle", MESH.surface), ("tetra", MESH.tets[:20]), ("line", [[0, 1]]), ("tetra", MESH.tets[20:])]
@@ -107,8 +163,17 @@ SPLIT = [MESH.tets[:20], MESH.tets[20:]]
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"cells": [("triangle", MESH.surface)], "cell_data": {}}, "holds triangle, but no linear tetrahedra"),
-        ({"cells": [("tetra10", np.arange(10)[None])], "cell_data": {}}, "holds tetra10, but no linear"),
+        ({"cells": [("triangle", MESH.surface)], "cell_data": {}}, "holds triangle, but no tetrahedra"),
+        (
+            {"cells": [("tetra", MESH.tets), ("tetra10", np.arange(10)[None])], "cell_data": {}},
+            "holds tetra and tetra10, which do not conform",
+        ),
+        ({"cells": [("tetra10", np.arange(10)[None])], "cell_data": {}}, "zero or negative"),
+        ({"cells": [("tetra10", np.tile(MESH.tets, 3)[:, :10])], "cell_data": {}}, "a corner and the middle"),
+        (
+            {"cells": [("tetra10", np.hstack([MESH.tets, np.full((48, 6), 27)]))], "cell_data": {}},
+            "middles name a node",
+        ),
         ({"cell_data": {"region": [MESH.region + 0.5]}}, "`region` must be one whole number"),
         ({"cell_data": {"region": [np.where(MESH.region == 1, np.nan, 1.0)]}}, "`region` must be one whole number"),
         ({"cell_data": {"region": [np.zeros((48, 3))]}}, "`region` must be one whole number"),

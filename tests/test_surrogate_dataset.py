@@ -8,11 +8,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from boxes import base_held, quadratic
+from boxes import box as cube
 
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Pushed
-from surrogate.dataset import read_dataset
+from surrogate.dataset import read_dataset, read_embedded, write_embedded
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
 
@@ -38,6 +40,13 @@ def test_what_is_written_is_read(tmp_path, box, pretender, loads):
     assert np.array_equal(data.displacement(box.tumour_nodes), data.displacement(slice(None))[:, box.tumour_nodes])
     assert data.displacement(box.tumour_nodes).dtype == np.float32
     assert data.good.all() and (data.iterations == 4).all() and (data.residual == 1e-5).all()
+
+
+@pytest.mark.parametrize("mesh", [cube((2, 2, 2)), quadratic(cube((2, 2, 2)), curved=0.05)], ids=["p1", "p2"])
+def test_the_body_travels_with_its_data(tmp_path, mesh):
+    with h5py.File(tmp_path / "data.h5", "w") as file:
+        write_embedded(file, base_held(mesh))
+        assert read_embedded(file).digest == base_held(mesh).digest
 
 
 def test_unit_responses_superpose_to_small_loads(tmp_path, box, pretender, loads):
