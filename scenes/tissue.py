@@ -1,10 +1,11 @@
-"""The tissue on the command line: one set of options for every command that solves."""
+"""Tissue and elements on the command line: one set of options for every command that solves."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
 
+from sim.discretisation import ELEMENTS
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
 
@@ -31,6 +32,16 @@ def add_tissue_arguments(parser: argparse.ArgumentParser) -> None:
         "where mu and alpha are given with 2 mu/alpha^2, C is 2 mu",
     )
     parser.add_argument("--bulk", type=float, metavar="K", help="bulk modulus of --material ogden [Pa]")
+
+
+def add_element_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare --element."""
+    parser.add_argument(
+        "--element",
+        choices=ELEMENTS,
+        help="; ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
+        + " (default p1, or p2 where the mesh brings mid-edge nodes of its own)",
+    )
 
 
 def tissue_of(args: argparse.Namespace) -> Tissue:

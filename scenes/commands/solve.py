@@ -16,20 +16,21 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.files import check_output
 from sim.loads import Cause, Loads, Nodal, Prescribed
-from sim.mesh import signed_volumes
 from sim.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 
-from ..tissue import add_tissue_arguments, regions_of, tissue_of
+from ..tissue import add_element_argument, add_tissue_arguments, regions_of, tissue_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
         "mesh",
-        help="tetrahedral mesh with point data `fixed` (V,) or (V, 3), and `force` (V, 3) [N] or `prescribed` (V, 3) "
-        "in the file's unit of length; optional `slide_normal` (V, 3) and cell data `region`",
+        help="mesh of linear or quadratic (`tetra10`) tetrahedra with point data `fixed` (V,) or (V, 3), and `force` "
+        "(V, 3) [N] or `prescribed` (V, 3) in the file's unit of length; optional `slide_normal` (V, 3) and cell data "
+        "`region`. Mid-edge nodes that the file brings are nodes as any other: held only where `fixed` says so",
     )
     add_tissue_arguments(parser)
+    add_element_argument(parser)
     parser.add_argument(
         "--region",
         action="append",
@@ -58,11 +59,12 @@ def run(args: argparse.Namespace) -> int:
     effects: list[Effect] = [Elasticity(tissue, regions), Held(), NodalForce()]
     if anatomy.slide_normal.any():
         effects.append(Slide())
-    deformation = Fem(anatomy, effects, accuracy, args.device).deform(loads)
+    fem = Fem(anatomy, effects, accuracy, args.device, element=args.element)
+    deformation = fem.deform(loads)
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
     outcome = deformation.outcome[0]
-    inverted = int((signed_volumes(anatomy.mesh.nodes + deformation.displacement[0], anatomy.mesh.tets) <= 0.0).sum())
+    inverted = int(fem.inside_out(deformation).sum())
     if inverted:  # an equilibrium of every law but `neo-hookean` may lie there: converged, and no tissue
         print(f"{args.mesh}: {inverted} tetrahedra are inside out: the load is beyond the law's range", file=sys.stderr)
     report = {
@@ -70,6 +72,8 @@ def run(args: argparse.Namespace) -> int:
         "message": outcome.value,
         "iterations": int(deformation.iterations[0]),
         "residual": float(deformation.residual[0]),
+        "element": fem.space.element,
+        "nodes": fem.space.count,
         "seconds": round(seconds, 4),
         "inverted_tetrahedra": inverted,
         "largest_displacement_mm": round(1e3 * float(np.linalg.norm(deformation.displacement[0], axis=1).max()), 6),
@@ -94,7 +98,7 @@ def problem_of(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads,
     fixed = _field(name, "fixed", data["fixed"], {(count,), (count, 1), (count, 3)})
     held = np.broadcast_to(fixed.reshape(count, -1) != 0.0, (count, 3)).copy()
     orphan = np.ones(count, bool)
-    orphan[mesh.tets] = False
+    orphan[mesh.table] = False
     if orphan.any():
         notes.append(f"{orphan.sum()} nodes belong to no tetrahedron: they stay where they are")
         held[orphan] = True
