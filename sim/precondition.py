@@ -26,8 +26,8 @@ def choose_preconditioner(
 ) -> Preconditioner:
     """The rest stiffness, inverted (CUDA) or factorised where that pays; two levels where it has too many entries.
 
-    Block Jacobi where even the coarse level does not fit. `unsmoothed` assembles the rest stiffness (3V, 3V) [N/m] of
-    linear tetrahedra on the same mesh.
+    Block Jacobi where even the coarse level does not fit, or nothing is free to move. `unsmoothed` assembles the rest
+    stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh.
 
     Raises
     ------
@@ -35,7 +35,8 @@ def choose_preconditioner(
         A free rest stiffness that is singular.
     """
     device, constraint = problem.device, problem.constraint
-    if 3 * len(np.unique(space.table[:, :4])) > LARGEST_FACTOR:
+    nothing_free = constraint.basis().nnz == 0
+    if nothing_free or 3 * len(np.unique(space.table[:, :4])) > LARGEST_FACTOR:
         return BlockJacobi(device)
     try:
         if space.element == "p2":
