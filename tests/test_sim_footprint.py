@@ -113,6 +113,46 @@ def test_rows_do_not_depend_on_each_other() -> None:
         np.testing.assert_array_equal(alone, together[row])
 
 
+def quadratic_sheet(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The scattered sheet with a node in the middle of every edge: nodes (V, 3) [m], triangles (S, 6)."""
+    nodes, triangles = sheet(count)
+    ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    edges, place = np.unique(ends, axis=0, return_inverse=True)
+    middles = len(nodes) + place.reshape(-1, 3)
+    return np.vstack([nodes, nodes[edges].mean(axis=1)]), np.hstack([triangles, middles])
+
+
+def test_quadratic_triangles_against_a_sum_over_the_disc() -> None:
+    """Rings of points, each found in its triangle and shared by the six shape functions there."""
+    nodes, triangles = quadratic_sheet(60)
+    share = (np.arange(200) + 0.5) / 200.0
+    angle = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
+    ring = RADIUS * np.outer(share, np.exp(1j * angle)).ravel()
+    points = POINT[:2] + np.column_stack([ring.real, ring.imag])
+    traction = np.repeat(share * np.sqrt(1.0 - share**2), len(angle))
+    a, b, c = np.moveaxis(nodes[triangles[:, :3], :2], 1, 0)
+    inverse = np.linalg.inv(np.stack([b - a, c - a], axis=2))
+    expected = np.zeros(len(nodes))
+    for number, row in enumerate(triangles):
+        y, z = inverse[number] @ (points - a[number]).T
+        x = 1.0 - y - z
+        shapes = [x * (2 * x - 1), y * (2 * y - 1), z * (2 * z - 1), 4 * x * y, 4 * y * z, 4 * z * x]
+        inside = (np.stack([x, y, z]) >= 0.0).all(axis=0)
+        np.add.at(expected, row, np.array(shapes)[:, inside] @ traction[inside])
+    np.testing.assert_allclose(weights(nodes, triangles), expected / traction.sum(), atol=1e-3)
+
+
+@pytest.mark.parametrize("count", [0, 30, 300])
+def test_quadratic_triangles_take_over_force_moment_and_second_moments(count: int) -> None:
+    """Quadratic functions are integrated exactly on any mesh: linear triangles have the first two alone."""
+    nodes, triangles = quadratic_sheet(count)
+    weight = weights(nodes, triangles)
+    assert weight.sum() == pytest.approx(1.0, abs=1e-14)
+    np.testing.assert_allclose(weight @ nodes, POINT, atol=2e-3 * RADIUS)
+    arm = (nodes - POINT)[:, :2] / RADIUS
+    np.testing.assert_allclose(np.einsum("v,vi,vj->ij", weight, arm, arm), np.eye(2) / 5.0, atol=2e-3)
+
+
 def test_no_rows() -> None:
     nodes, triangles = sheet(30)
     assert footprint_weights(nodes, triangles, np.zeros((0, 3)), np.zeros(0)).shape == (0, len(nodes))

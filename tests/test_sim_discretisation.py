@@ -1,0 +1,190 @@
+"""Mid-edge nodes: where they are held and how they slide, by brute force; they never show outside."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from boxes import VTK_EDGES, base_held, box, hold, quadratic
+
+from sim.accuracy import Accuracy
+from sim.compile import compile_problem
+from sim.device import find_device
+from sim.discretisation import Discretisation, discretise
+from sim.effects import Elasticity, Held, NodalForce, ToolForce
+from sim.errors import InputError
+from sim.fem import MIDDLES, Fem
+from sim.loads import push
+from sim.mesh import TetMesh
+
+TIGHT = Accuracy(tolerance=1e-10)
+THIN = box((3, 3, 1), 0.1)
+"""One cell thick: many edges inside join two surface nodes."""
+CUBE = box((3, 3, 3), 0.1)
+ARM = CUBE.nodes - 0.05
+LENGTH = np.maximum(np.linalg.norm(ARM, axis=1, keepdims=True), 1e-9)
+ROUND = replace(CUBE, nodes=ARM * np.abs(ARM).max(axis=1, keepdims=True) / LENGTH)
+"""A cube drawn into a ball: no three of its surface nodes in line."""
+
+
+def triangles_round(mesh: TetMesh, ends: np.ndarray) -> list[list[int]]:
+    """The surface triangles that have the edge with these ends."""
+    return [list(corners) for corners in mesh.surface.tolist() if set(ends.tolist()) <= set(corners)]
+
+
+def test_every_edge_has_one_node_in_its_middle() -> None:
+    space = discretise(THIN, "p2")
+    edges = {pair for tet in THIN.tets.tolist() for pair in combinations(sorted(tet), 2)}
+    assert sorted(edges) == sorted(map(tuple, space.edges.tolist()))
+    assert space.count == len(THIN.nodes) + len(edges)
+    np.testing.assert_array_equal(space.nodes[: len(THIN.nodes)], THIN.nodes)
+    np.testing.assert_allclose(space.nodes[space.table[:, 4:]], THIN.nodes[THIN.tets[:, VTK_EDGES]].mean(axis=2))
+    a, b, c = np.moveaxis(space.nodes[space.surface[:, :3]], 1, 0)
+    halves = np.stack([(a + b) / 2.0, (b + c) / 2.0, (c + a) / 2.0], axis=1)
+    np.testing.assert_allclose(space.nodes[space.surface[:, 3:]], halves)
+    np.testing.assert_array_equal(space.surface[:, :3], THIN.surface)
+
+
+def test_corners_carry_a_linear_field_to_all_nodes() -> None:
+    for space in (discretise(THIN, "p2"), discretise(quadratic(THIN), "p2")):
+        carried = space.corner_interpolation @ space.nodes[np.unique(space.table[:, :4])]
+        np.testing.assert_allclose(carried, space.nodes, atol=1e-16)
+
+
+def test_an_added_node_is_held_where_a_surface_triangle_is() -> None:
+    """Component by component; not where two held nodes are joined through the body."""
+    held = np.random.default_rng(0).uniform(size=THIN.nodes.shape) < 0.8
+    space = discretise(THIN, "p2")
+    found = space.held(held)
+    np.testing.assert_array_equal(found[: len(held)], held)
+    expected = np.array(
+        [np.any([held[t].all(axis=0) for t in triangles_round(THIN, e)] or [[False] * 3], axis=0) for e in space.edges]
+    )
+    np.testing.assert_array_equal(found[len(held) :], expected)
+    both = held[space.edges].all(axis=1)
+    assert (both & ~expected).sum() > 20
+    assert expected.sum() > 20
+
+
+def test_nodes_that_the_mesh_brings_are_held_as_the_mesh_says() -> None:
+    mesh = quadratic(THIN)
+    held = np.zeros((len(mesh.nodes), 3), bool)
+    held[np.unique(mesh.tets)] = True
+    np.testing.assert_array_equal(discretise(mesh, "p2").held(held), held)
+
+
+def sliding() -> tuple[Discretisation, np.ndarray, np.ndarray, np.ndarray]:
+    """A ball with some nodes held, some sliding, some free; normals of the mesh's own nodes, then of all."""
+    kind = np.random.default_rng(1).choice(3, len(ROUND.nodes), p=[0.1, 0.2, 0.7])
+    surface = np.zeros(len(ROUND.nodes), bool)
+    surface[ROUND.surface] = True
+    held = np.repeat((surface & (kind == 1))[:, None], 3, axis=1)
+    normal = np.where((surface & (kind == 2))[:, None], ARM / LENGTH, 0.0)
+    space = discretise(ROUND, "p2")
+    return space, held, normal, space.sliding(normal, held)
+
+
+def test_an_added_node_slides_on_the_triangles_beside_it() -> None:
+    space, held, normal, found = sliding()
+    np.testing.assert_array_equal(found[: len(normal)], normal)
+    slides = (normal != 0.0).any(axis=1)
+    for edge, got in zip(space.edges, found[len(normal) :], strict=True):
+        total = np.zeros(3)
+        for triangle in triangles_round(ROUND, edge):
+            if (slides | held.all(axis=1))[triangle].all() and slides[triangle].any():
+                a, b, c = ROUND.nodes[triangle]
+                total += np.cross(b - a, c - a)
+        np.testing.assert_allclose(got, total / max(np.linalg.norm(total), 1e-30), atol=1e-12)
+    many = (found[len(normal) :] != 0.0).any(axis=1).sum()
+    assert 20 < many < len(space.edges)
+
+
+def test_nothing_flows_through_a_wall_that_slides() -> None:
+    """Integral of u . n over the whole surface, all of which slides: zero, however its nodes move."""
+    surface = np.zeros(len(ROUND.nodes), bool)
+    surface[ROUND.surface] = True
+    normal = np.where(surface[:, None], ARM / LENGTH, 0.0)
+    space = discretise(ROUND, "p2")
+    normals = space.sliding(normal, np.zeros(normal.shape, bool))
+    u = np.random.default_rng(2).normal(size=space.nodes.shape)
+
+    def flow(u: np.ndarray) -> float:
+        """Quadratic shapes on a straight triangle: corners integrate to 0, middles to a third of its area each."""
+        a, b, c = np.moveaxis(space.nodes[space.surface[:, :3]], 1, 0)
+        return float(np.einsum("si,sai->", np.cross(b - a, c - a), u[space.surface[:, 3:]]) / 6.0)
+
+    tangential = u - (u * normals).sum(axis=1, keepdims=True) * normals
+    assert abs(flow(tangential)) < 1e-15
+    assert abs(flow(u)) > 1e-4
+
+
+@pytest.fixture(scope="module")
+def fem() -> Fem:
+    return Fem(base_held(THIN), [Elasticity(), Held(), NodalForce(), ToolForce()], TIGHT, "cpu", element="p2")
+
+
+def test_a_deformation_speaks_of_the_meshs_own_vertices(fem: Fem) -> None:
+    found = fem.deform(push([0.05, 0.05, 0.1 / 3.0], [[0.0, 0.0, -0.3], [0.0, 0.1, 0.0]], 0.02))
+    assert found.displacement.shape == (2, len(THIN.nodes), 3)
+    np.testing.assert_array_equal(found.nodes, np.arange(len(THIN.nodes)))
+    assert found.history[MIDDLES].shape == (2, len(fem.space.edges), 3)
+    assert np.abs(found.history[MIDDLES]).max() > 1e-5
+    assert fem.deform(
+        push([0.05, 0.05, 0.1 / 3.0], [0.0, 0.0, -0.3], 0.02), at=np.array([7, 3])
+    ).displacement.shape == (1, 2, 3)
+
+
+def test_a_start_without_mid_edge_nodes_serves_too(fem: Fem) -> None:
+    """From elements that have none: they begin in the middle between their ends."""
+    loads = push([0.05, 0.05, 0.1 / 3.0], [0.0, 0.0, -0.3], 0.02)
+    found = fem.deform(loads)
+    bare = fem.deform(loads, replace(found, history={}))
+    assert bare.iterations[0] > 0
+    np.testing.assert_allclose(bare.displacement, found.displacement, atol=1e-9)
+
+
+def test_a_start_is_split_with_its_batch() -> None:
+    """Mid-edge nodes of every row travel with it: the answer itself is a start from which nothing is left to do."""
+    fem = Fem(base_held(THIN), [Elasticity(), Held(), ToolForce()], TIGHT, "cpu", batch=2, element="p2")
+    loads = push([0.05, 0.05, 0.1 / 3.0], np.outer([0.1, -0.2, 0.3, 0.2, -0.1], [0.3, 0.1, -1.0]), 0.02)
+    np.testing.assert_array_equal(fem.deform(loads, fem.deform(loads)).iterations, 0)
+
+
+ONE = TetMesh(0.1 * np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 1, 2, 3]]), np.zeros(1, int))
+TWO = quadratic(box((1, 1, 1), 0.1))
+assert TWO.middles is not None
+
+
+@pytest.mark.parametrize(
+    ("mesh", "middles", "sentence"),
+    [
+        (quadratic(ONE), [[4, 5, 6, 7, 8]], r"middles have shape \(1, 5\): give six"),
+        (quadratic(ONE), [[4, 5, 6, 7, 8, 10]], "outside the mesh's, 0 to 9"),
+        (quadratic(ONE), [[4, 5, 6, 7, 8, -1]], "outside the mesh's"),
+        (quadratic(ONE), [[4, 5, 6, 7, 8, 0]], "node 0 is a corner and the middle of an edge at once"),
+        (quadratic(ONE), [[4, 5, 6, 7, 8, 8]], "does not conform"),
+        (TWO, np.where(np.arange(6)[:, None] == 2, TWO.middles[:, [1, 0, 2, 3, 4, 5]], TWO.middles), "disagree"),
+    ],
+)
+def test_middles_that_make_no_mesh_are_refused(mesh: TetMesh, middles: np.ndarray, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        replace(mesh, middles=np.array(middles))
+
+
+def test_elements_that_a_mesh_cannot_have_are_refused() -> None:
+    for element in ("p1", "smoothed"):
+        with pytest.raises(InputError, match=f"quadratic tetrahedra, which are no {element}: take p2"):
+            discretise(quadratic(ONE), element)
+    with pytest.raises(InputError, match="no element is called 'q1': choose one of p1, p2, smoothed"):
+        discretise(ONE, "q1")
+
+
+def test_elements_folded_by_their_middles_are_refused() -> None:
+    mesh = quadratic(ONE)
+    nodes = mesh.nodes.copy()
+    nodes[4] = nodes[[0, 1]].mean(axis=0) + [0.04, 0.0, 0.0]  # past the quarter point
+    body = hold(replace(mesh, nodes=nodes), np.ones(10, bool))
+    with pytest.raises(InputError, match=r"tetrahedron 0 .*folded over by its mid-edge nodes"):
+        compile_problem([Elasticity(), Held()], body, find_device("cpu", "float64"), discretise(body.mesh, "p2"))
