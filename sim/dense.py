@@ -13,6 +13,7 @@ import warp as wp
 
 from .device import Device
 from .problem import Problem
+from .sparse import Sparse
 
 # Stiffness, factor, basis, inverse and a product stand in memory together, in double precision.
 COPIES = 6
@@ -43,12 +44,7 @@ class Dense:
         precision = getattr(torch, device.precision)
         free = torch.as_tensor((motions.T @ stiffness @ motions).toarray(), device=where)
         self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(free)).to(precision)
-        self._motions, self._transposed = (
-            torch.sparse_csr_tensor(
-                *(torch.as_tensor(a, device=where) for a in (m.indptr, m.indices, m.data)), size=m.shape
-            )
-            for m in (sp.csr_array(motions.astype(device.precision)), sp.csr_array(motions.T.astype(device.precision)))
-        )
+        self._motions, self._transposed = (Sparse(sp.csr_array(matrix), device) for matrix in (motions, motions.T))
         torch.cuda.synchronize(where)
 
     def prepare(self, problem: Problem, columns: int) -> None:
@@ -56,5 +52,8 @@ class Dense:
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
         """One dense matrix product, in Warp's stream."""
+        restricted = self._transposed.times(r)
+        solved = self._device.zeros(*restricted.shape)
         with torch.cuda.stream(wp.stream_to_torch(self._device.name)):
-            wp.to_torch(out).copy_(self._motions @ (self._inverse @ (self._transposed @ wp.to_torch(r))))
+            torch.matmul(self._inverse, wp.to_torch(restricted), out=wp.to_torch(solved))
+        wp.copy(out, self._motions.times(solved))

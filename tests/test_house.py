@@ -16,7 +16,7 @@ HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
 """Each room and the rooms that it may import."""
 TIERS = (
-    {"device", "columns", "term", "constraint"},
+    {"device", "columns", "sparse", "term", "constraint"},
     {"terms", "problem"},
     {"linear", "direction", "search", "dense", "compile"},
     {"newton", "multigrid"},
