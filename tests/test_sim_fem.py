@@ -47,8 +47,8 @@ class Candidate:
     error: float
 
 
-def fem(accuracy: Accuracy) -> Callable[[], Deformer]:
-    return lambda: Fem(ANATOMY, EFFECTS, accuracy, "cpu", batch=3)
+def fem(accuracy: Accuracy, element: str = "p1") -> Callable[[], Deformer]:
+    return lambda: Fem(ANATOMY, EFFECTS, accuracy, "cpu", batch=3, element=element)
 
 
 def learned(learner: str) -> Callable[[], Deformer]:
@@ -69,6 +69,9 @@ def learned(learner: str) -> Callable[[], Deformer]:
 DEFORMERS = {
     "fem float64": Candidate(fem(REFERENCE), 1e-6),
     "fem float32": Candidate(fem(TRAIN), 2e-3),
+    "fem p2": Candidate(fem(REFERENCE, "p2"), 1e-6),
+    "fem p2 float32": Candidate(fem(TRAIN, "p2"), 2e-3),
+    "fem smoothed": Candidate(fem(REFERENCE, "smoothed"), 1e-6),
     "learned linear": Candidate(learned("linear"), 1e-5),
     "learned svr": Candidate(learned("svr"), 1e-5),
     "learned residual": Candidate(learned("residual"), 1e-5),
@@ -207,46 +210,6 @@ class TestEveryDeformer:
         found = deformer.deform(loads())
         with pytest.raises(InputError, match=r"start has displacements of shape \(5, "):
             deformer.deform(loads(np.arange(2)), found)
-
-
-class TestLoads:
-    def test_no_cause_or_one_twice_is_refused(self) -> None:
-        with pytest.raises(InputError, match="causes none"):
-            Loads(())
-        with pytest.raises(InputError, match="each kind once"):
-            Loads((loads().causes[0], loads().causes[0]))
-
-    @pytest.mark.parametrize(
-        ("build", "sentence"),
-        [
-            (lambda: push(POINT, np.where(FORCE == 0.1, np.nan, FORCE), 0.02), r"Pushed\.force .*finite"),
-            (lambda: push(POINT, FORCE, 0.0), "positive radii"),
-            (lambda: push(POINT, FORCE, -0.01), "positive radii"),
-            (lambda: Loads((Pushed(POINT, FORCE[:2], np.full(5, 0.01)),)), r"\[2, 5\] rows"),
-            (lambda: Loads((Pushed(POINT[:, :2], FORCE, np.full(5, 0.01)),)), r"point has shape \(5, 2\)"),
-            (lambda: Loads((Nodal(np.zeros((COUNT, 3))),)), r"Nodal\.force has shape"),
-            (lambda: Loads((Nodal(np.zeros((5, COUNT, 3))),), np.zeros(4)), r"\[4, 5\] rows"),
-        ],
-    )
-    def test_bad_numbers_are_refused(self, build: Callable[[], Loads], sentence: str) -> None:
-        with pytest.raises(InputError, match=sentence):
-            build()
-
-    def test_a_whole_field_of_another_mesh_is_refused(self) -> None:
-        body = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TRAIN, "cpu")
-        with pytest.raises(InputError, match=rf"Nodal.force has 8 vertices, but the mesh has {COUNT}"):
-            body.deform(Loads((Nodal(np.zeros((1, 8, 3))),)))
-        with pytest.raises(InputError, match=r"Prescribed\.displacement has 8 vertices"):
-            body.deform(Loads((Prescribed(np.zeros((1, 8, 3))),)))
-
-    def test_scaling_and_rows(self) -> None:
-        half = loads().scaled(0.5).of(Pushed)
-        each = loads().scaled(np.arange(5.0)).rows(np.array([3])).of(Pushed)
-        assert half is not None
-        assert each is not None
-        np.testing.assert_array_equal(half.force, 0.5 * FORCE)
-        np.testing.assert_array_equal(half.point, POINT)
-        np.testing.assert_array_equal(each.force, 3.0 * FORCE[[3]])
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 64])

@@ -1,0 +1,62 @@
+"""What the world does: loads that make no sense are refused, and how rows and magnitudes are taken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from boxes import base_held, box
+
+from sim.accuracy import TRAIN
+from sim.effects import Elasticity, Held, NodalForce
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Nodal, Prescribed, Pushed, push
+
+COUNT = 27
+FORCE = np.array([[0.0, 0.0, -0.05], [0.02, -0.03, -0.3], [0.1, 0.0, -0.6], [0.0, 0.1, 0.2], [0.0, 0.0, -0.9]])
+POINT = np.array([[0.05, 0.05, 0.1], [0.04, 0.06, 0.1], [0.07, 0.05, 0.1], [0.05, 0.03, 0.1], [0.06, 0.06, 0.1]])
+LOADS = push(POINT, FORCE, 0.02)
+
+
+def test_no_cause_or_one_twice_is_refused() -> None:
+    with pytest.raises(InputError, match="causes none"):
+        Loads(())
+    with pytest.raises(InputError, match="each kind once"):
+        Loads((LOADS.causes[0], LOADS.causes[0]))
+
+
+@pytest.mark.parametrize(
+    ("build", "sentence"),
+    [
+        (lambda: push(POINT, np.where(FORCE == 0.1, np.nan, FORCE), 0.02), r"Pushed\.force .*finite"),
+        (lambda: push(POINT, FORCE, 0.0), "positive radii"),
+        (lambda: push(POINT, FORCE, -0.01), "positive radii"),
+        (lambda: Loads((Pushed(POINT, FORCE[:2], np.full(5, 0.01)),)), r"\[2, 5\] rows"),
+        (lambda: Loads((Pushed(POINT[:, :2], FORCE, np.full(5, 0.01)),)), r"point has shape \(5, 2\)"),
+        (lambda: Loads((Nodal(np.zeros((COUNT, 3))),)), r"Nodal\.force has shape"),
+        (lambda: Loads((Nodal(np.zeros((5, COUNT, 3))),), np.zeros(4)), r"\[4, 5\] rows"),
+    ],
+)
+def test_bad_numbers_are_refused(build: Callable[[], Loads], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        build()
+
+
+def test_a_whole_field_of_another_mesh_is_refused() -> None:
+    body = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), NodalForce()], TRAIN, "cpu")
+    with pytest.raises(InputError, match=rf"Nodal.force has 8 vertices, but the mesh has {COUNT}"):
+        body.deform(Loads((Nodal(np.zeros((1, 8, 3))),)))
+    with pytest.raises(InputError, match=r"Prescribed\.displacement has 8 vertices"):
+        body.deform(Loads((Prescribed(np.zeros((1, 8, 3))),)))
+
+
+def test_scaling_and_rows() -> None:
+    half = LOADS.scaled(0.5).of(Pushed)
+    each = LOADS.scaled(np.arange(5.0)).rows(np.array([3])).of(Pushed)
+    assert half is not None
+    assert each is not None
+    np.testing.assert_array_equal(half.force, 0.5 * FORCE)
+    np.testing.assert_array_equal(half.point, POINT)
+    np.testing.assert_array_equal(each.force, 3.0 * FORCE[[3]])
