@@ -14,7 +14,6 @@ import numpy as np
 import warp as wp
 
 from sim.accuracy import LIVE, TRAIN
-from sim.fem import Fem
 from surrogate.sampling import draw
 
 from .play import Player
@@ -57,7 +56,7 @@ def rows(theatre: Theatre, player: Player, deformer: str, solves: int, batch: in
     single = [loads.rows(np.array([row])) for row in range(len(loads))]
 
     begun = clock.perf_counter()
-    fem = Fem(theatre.anatomy, scene.effects, TRAIN, theatre.device, batch)
+    fem = theatre.fem(scene, TRAIN, batch)
     fem.deform(single[0])
     made = clock.perf_counter() - begun
     yield Row("FEM set-up", made, None, "s", 1, f"compile or load kernels, factorise; {size}")
@@ -72,7 +71,7 @@ def rows(theatre: Theatre, player: Player, deformer: str, solves: int, batch: in
         "FEM, a single load", "ms", 1e3, runs, f"from rest, to {TRAIN.tolerance:g}", lambda i: fem.deform(single[i])
     )
 
-    live = Player(player.stage, Fem(theatre.anatomy, scene.effects, LIVE, theatre.device))
+    live = Player(player.stage, theatre.fem(scene, LIVE))
     frames = [frame.seconds["deform"] for frame in live.frames()][WARM_UP:]
     yield Row(
         "FEM, live", 1e3 * float(np.median(frames)), 1e3 * float(np.percentile(frames, 95)), "ms", len(frames),

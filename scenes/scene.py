@@ -62,7 +62,11 @@ PALPATION = Probe()
 
 @dataclass(frozen=True)
 class Scene:
-    """One scripted scene. Times in seconds."""
+    """One scripted scene. Times in seconds.
+
+    `element` is one of `sim.discretisation.ELEMENTS`; None: p1, or p2 on a mesh that brings mid-edge nodes. Learnt
+    models are played and judged with the tissue and the element that they were taught, whatever the scene says.
+    """
 
     name: str
     title: str
@@ -71,6 +75,7 @@ class Scene:
     effects: tuple[Effect, ...] = (Elasticity(), Held(), Slide(), ToolForce())
     tool: Probe = PALPATION
     viewpoint: Viewpoint = Viewpoint()
+    element: str | None = None
     accuracy: Accuracy = LIVE
     bounds: Bounds = Bounds()
     frames_per_second: float = 30.0

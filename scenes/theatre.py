@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from sim.accuracy import LIVE
+from sim.accuracy import LIVE, Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.device import find_device
+from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.intensity import Intensity, read_intensity, sidecar
+from sim.material import tissue_from_json
 from sim.meshfile import read_anatomy
 from surrogate.learned import Learned
 from surrogate.store import load
@@ -27,7 +29,7 @@ from .stage import Stage
 
 @dataclass(frozen=True, eq=False)
 class Theatre:
-    """An anatomy, its T1 scan if there is one, and learnt models by name."""
+    """An anatomy, its T1 scan if there is one, and models by name, learnt from one data set."""
 
     anatomy: Anatomy
     intensity: Intensity | None
@@ -49,8 +51,20 @@ class Theatre:
         """The learnt model of the tightest error bound; the finite elements where nothing was learnt."""
         return min(self.models, key=lambda name: self.models[name].bound, default="fem")
 
+    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64) -> Fem:
+        """Finite elements for a scene's effects, with the tissue and the element that the models here were taught.
+
+        Where nothing was learnt, or the models do not say, tissue and element are the scene's.
+        """
+        taught = next((model.training for model in self.models.values()), {})
+        effects = scene.effects
+        if "tissue" in taught:
+            elasticity = Elasticity(tissue_from_json(taught["tissue"]))
+            effects = tuple(elasticity if isinstance(effect, Elasticity) else effect for effect in effects)
+        return Fem(self.anatomy, effects, accuracy, self.device, batch, taught.get("element", scene.element))
+
     def deformer(self, name: str, scene: Scene) -> Deformer:
-        """A deformer by name; "fem" is made for the scene's effects and accuracy.
+        """A deformer by name; "fem" is made for the scene's accuracy.
 
         Raises
         ------
@@ -58,7 +72,7 @@ class Theatre:
             A name that this theatre does not know.
         """
         if name == "fem":
-            return Fem(self.anatomy, scene.effects, scene.accuracy, self.device)
+            return self.fem(scene, scene.accuracy)
         if name not in self.models:
             raise InputError(
                 f"no deformer is called {name!r} here: choose one of {', '.join(self.names)}; "

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from sim.accuracy import TRAIN
 from sim.deformation import Deformation
-from sim.fem import Fem
 from sim.loads import Loads, stacked
 
 from .scene import Scene
@@ -15,5 +14,4 @@ from .theatre import Theatre
 
 def truth_of(theatre: Theatre, scene: Scene, loads: Sequence[Loads]) -> Deformation:
     """One row per frame's loads, every vertex, at training accuracy."""
-    fem = Fem(theatre.anatomy, scene.effects, TRAIN, theatre.device)
-    return fem.deform(stacked(loads))
+    return theatre.fem(scene, TRAIN).deform(stacked(loads))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -121,6 +122,28 @@ class Ogden:
 
 Tissue = Material | Ogden
 """What a region may be made of: each has `law`, `lame` and `coefficients`."""
+
+
+def tissue_to_json(tissue: Tissue) -> str:
+    """One line that `tissue_from_json` reads."""
+    return json.dumps({"law": tissue.law, **asdict(tissue)})
+
+
+def tissue_from_json(text: str) -> Tissue:
+    """The tissue that `tissue_to_json` wrote.
+
+    Raises
+    ------
+    InputError
+        Text that it did not write, or constants that no tissue has.
+    """
+    try:
+        constants = json.loads(text)
+        if constants["law"] == Ogden.law:
+            return Ogden(tuple((float(c), float(m)) for c, m in constants["terms"]), float(constants["bulk"]))
+        return Material(**constants)
+    except (ValueError, LookupError, TypeError) as error:
+        raise InputError(f"{text!r} is no tissue that this version knows ({error}): simulate anew.") from error
 
 
 # Where shape and volume are carried by different elements, those that carry shape keep a Poisson's ratio of 0.3.

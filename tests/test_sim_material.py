@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from sim.material import LAWS, MATERIALS, Material, Ogden, coefficients_of
+from sim.material import (
+    LAWS,
+    MATERIALS,
+    Material,
+    Ogden,
+    Tissue,
+    coefficients_of,
+    tissue_from_json,
+    tissue_to_json,
+)
 
 
 def test_engineering_constants_come_back_from_lames() -> None:
@@ -66,6 +75,13 @@ def test_ogdens_constants_that_no_tissue_has(terms: tuple, bulk: float, words: s
 def test_engineering_constants_that_no_tissue_has(law: str, young: float, poisson: float, words: str) -> None:
     with pytest.raises(InputError, match=words):
         Material(law, young, poisson)
+
+
+@pytest.mark.parametrize(
+    "tissue", [*(known.tissue for known in MATERIALS.values()), Ogden(((0.1, -19.0), (1e3 / 3.0, 2.5)), 7.0)]
+)
+def test_a_tissue_written_is_the_tissue_read(tissue: Tissue) -> None:
+    assert tissue_from_json(tissue_to_json(tissue)) == tissue
 
 
 @pytest.mark.parametrize("name", MATERIALS)

@@ -17,14 +17,14 @@ from sim.deformation import Outcome
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
 from sim.files import check_output
-from sim.material import Tissue
+from sim.material import Tissue, tissue_to_json
 from sim.meshfile import read_anatomy
 from surrogate.dataset import read_outcomes
 from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import simulate
 
 from ..shipped import template_path
-from ..tissue import add_tissue_arguments, tissue_of
+from ..tissue import add_element_argument, add_tissue_arguments, tissue_of
 
 INTERRUPTED = 130
 
@@ -39,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
     add_tissue_arguments(parser)
+    add_element_argument(parser)
     parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
@@ -51,10 +52,13 @@ def run(args: argparse.Namespace) -> int:
     anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
     loads = draw(args.preset, anatomy, args.count, args.seed)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
-    effects = _effects(anatomy, tissue_of(args))
-    fem = Fem(anatomy, effects, accuracy, args.device, args.batch)
+    tissue = tissue_of(args)
+    effects = _effects(anatomy, tissue)
+    fem = Fem(anatomy, effects, accuracy, args.device, args.batch, args.element)
     provenance = {
         "effects": repr(effects),
+        "tissue": tissue_to_json(tissue),
+        "element": fem.space.element,
         "accuracy": repr(accuracy),
         "device": fem.problem.device.name.split(":")[0],
         "preset": args.preset,
