@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from tiny_terms import Spring, Wall
 
 from sim.compile import compile_problem
 from sim.device import Device, find_device
+from sim.discretisation import discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.loads import Loads, Nodal, Pushed
 from sim.mesh import signed_volumes
@@ -31,23 +33,35 @@ RNG = np.random.default_rng(11)
 class Example:
     """A term to test, with three load cases and the states (3N, 3) [m] at which they are met.
 
-    `bounded`: the term is infinite beyond a limit; `flung` is a motion (3N, 3) that passes it. `crushed` (3N,) is a
-    state where the plain curvature may be indefinite.
+    `nodes` (N, 3) are the element's; `noise` [m] is how far `u` moves them. `bounded`: the term is infinite beyond a
+    limit; `flung` is a motion (3N, 3) that passes it. `crushed` (3N,) is a state where the plain curvature may be
+    indefinite.
     """
 
     build: Callable[[Device], Term]
     cases: Cases
-    u: np.ndarray
     bounded: bool = False
+    nodes: np.ndarray = field(default_factory=lambda: MESH.nodes)
+    noise: float = 4e-3
+
+    @property
+    def rows(self) -> int:
+        """3N."""
+        return self.nodes.size
+
+    @cached_property
+    def u(self) -> np.ndarray:
+        return self.noise * np.random.default_rng(12).normal(size=(self.rows, 3))
 
     @property
     def flung(self) -> np.ndarray:
         """Up through the wall, and inside out."""
-        return np.outer(0.3 * np.sin(37.0 * np.arange(ROWS)) + 0.2, [1.0, 0.9, 2.0])
+        mirrored = self.nodes * [0.0, 0.0, -3.0]
+        return np.outer(0.3 * np.sin(37.0 * np.arange(self.rows)) + 0.2 + mirrored.ravel(), [1.0, 0.9, 2.0])
 
     @property
     def crushed(self) -> np.ndarray:
-        return (MESH.nodes * [0.15, 0.15, -0.55]).ravel()
+        return (self.nodes * [0.15, 0.15, -0.55]).ravel()
 
 
 def of_effects(*effects: object) -> Callable[[Device], Term]:
@@ -58,11 +72,6 @@ def of_effects(*effects: object) -> Callable[[Device], Term]:
     return build
 
 
-def of_law(law: str) -> Callable[[Device], Term]:
-    effects = Elasticity(tissue(law)), Held()
-    return lambda device: compile_problem(effects, ANATOMY, device).terms[0]
-
-
 def cases() -> Cases:
     forces = Nodal(RNG.normal(size=(3, len(MESH.nodes), 3)))
     pushes = Pushed(np.full((3, 3), [0.05, 0.05, 0.1]), RNG.normal(size=(3, 3)), np.array([0.01, 0.02, 0.03]))
@@ -70,14 +79,31 @@ def cases() -> Cases:
     return Cases(Loads((forces, pushes), np.array([1.0, 2.0, 3.0])), np.array([0.5, 0.0, 2.9]), history)
 
 
-STATE = 4e-3 * RNG.normal(size=(ROWS, 3))
 LOGARITHMIC = ("neo-hookean", "ogden")
-EXAMPLES = {law: Example(of_law(law), cases(), STATE, bounded=law in LOGARITHMIC) for law in EVERY_LAW} | {
-    "nodal force": Example(of_effects(NodalForce()), cases(), STATE),
-    "tool force": Example(of_effects(ToolForce()), cases(), STATE),
-    "spring": Example(lambda device: Spring(device, ROWS, 7.0), cases(), STATE),
-    "wall": Example(lambda device: Wall(device, MESH.nodes, 0.12, 0.03, 500.0), cases(), STATE, bounded=True),
-}
+PARTS = ("shape", "volume")
+
+
+def of_law(law: str, element: str = "p1", part: int = 0) -> Example:
+    """The elasticity of a law; smoothed elements have two, of shape and of volume."""
+    effects, space = (Elasticity(tissue(law)), Held()), discretise(MESH, element)
+
+    def build(device: Device) -> Term:
+        return compile_problem(effects, ANATOMY, device, space).terms[part]
+
+    return Example(build, cases(), law in LOGARITHMIC, space.nodes, 1e-3 if element == "p2" else 4e-3)
+
+
+EXAMPLES = (
+    {law: of_law(law) for law in EVERY_LAW}
+    | {f"{law} p2": of_law(law, "p2") for law in EVERY_LAW}
+    | {f"{law} smoothed {part}": of_law(law, "smoothed", i) for law in EVERY_LAW for i, part in enumerate(PARTS)}
+    | {
+        "nodal force": Example(of_effects(NodalForce()), cases()),
+        "tool force": Example(of_effects(ToolForce()), cases()),
+        "spring": Example(lambda device: Spring(device, ROWS, 7.0), cases()),
+        "wall": Example(lambda device: Wall(device, MESH.nodes, 0.12, 0.03, 500.0), cases(), bounded=True),
+    }
+)
 
 
 @pytest.fixture(params=EXAMPLES, scope="module")
@@ -134,7 +160,7 @@ def longest_step(term: Term, device: Device, u: np.ndarray, du: np.ndarray) -> n
 def assembled(term: Term, device: Device, u: np.ndarray, definite: bool = False) -> np.ndarray:
     """Curvature (3N, 3N) at one state u (3N,)."""
     linearise(term, device, u[:, None], definite)
-    return np.hstack([curvature(term, device, unit[:, None]) for unit in np.eye(ROWS)])
+    return np.hstack([curvature(term, device, unit[:, None]) for unit in np.eye(len(u))])
 
 
 def test_name_is_a_word(term: Term) -> None:
@@ -164,9 +190,9 @@ def test_curvature_is_symmetric_and_its_blocks_are_the_diagonal(term: Term, exam
     term.keep(np.array([1]))
     K = assembled(term, device, example.u[:, 1])
     assert np.abs(K - K.T).max() <= 1e-10 * max(np.abs(K).max(), 1.0)
-    out = wp.zeros((ROWS // 3, 1), dtype=device.matrix, device="cpu")
+    out = wp.zeros((example.rows // 3, 1), dtype=device.matrix, device="cpu")
     term.add_diagonal(out)
-    blocks = np.stack([K[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(ROWS // 3)])
+    blocks = np.stack([K[i : i + 3, i : i + 3] for i in range(0, example.rows, 3)])
     np.testing.assert_allclose(out.numpy()[:, 0], blocks, atol=1e-10 * max(np.abs(K).max(), 1.0))
 
 
@@ -204,7 +230,7 @@ def test_plain_curvature_of_crushed_tissue_is_indefinite(law: str, device: Devic
 
 def test_definite_is_asked_column_by_column(term: Term, example: Example, device: Device) -> None:
     u = np.repeat(example.crushed[:, None], 3, axis=1)
-    p = np.repeat(RNG.normal(size=(ROWS, 1)), 3, axis=1)
+    p = np.repeat(RNG.normal(size=(example.rows, 1)), 3, axis=1)
     linearise(term, device, u)
     plain = curvature(term, device, p)
     linearise(term, device, u, definite=True)
@@ -219,7 +245,7 @@ def test_keeping_columns_is_starting_with_them(
     term: Term, example: Example, device: Device, columns: list[int]
 ) -> None:
     index = np.array(columns)
-    u, p = example.u[:, index], RNG.normal(size=(ROWS, len(index)))
+    u, p = example.u[:, index], RNG.normal(size=(example.rows, len(index)))
 
     def answers() -> list[np.ndarray]:
         linearise(term, device, u)
@@ -243,7 +269,7 @@ def test_rest_curvature_is_the_curvature_at_rest(term: Term, example: Example, d
         return
     assert sp.issparse(offered)
     term.keep(np.array([0]))
-    K = assembled(term, device, np.zeros(ROWS))
+    K = assembled(term, device, np.zeros(example.rows))
     np.testing.assert_allclose(offered.toarray(), K, atol=1e-10 * np.abs(K).max())
 
 

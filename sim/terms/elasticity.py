@@ -29,8 +29,8 @@ class Kernels:
 
 
 @cache
-def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> Kernels:
-    """Kernels for elements of `size` nodes and `points` quadrature points, and laws of `count` coefficients.
+def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
+    """Kernels for elements of `size` nodes and laws of `count` coefficients.
 
     Each launches over (element, column). Elements of `size` 0 have as many nodes as `sizes` says, each its own number.
     """
@@ -39,7 +39,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
     stress, stress_change, density = law.stress, law.stress_change, law.energy
     kept = VOLUME_KEPT
 
-    # A constant bound lets the compiler unroll the loops over nodes.
+    # A constant bound lets the compiler unroll the loops over nodes; unrolled over points too, it takes thrice as long.
     @wp.func
     def constant(sizes: wp.array(dtype=wp.int32), e: int):
         return size
@@ -80,7 +80,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
     ):
         """E += sum over points of w psi(H)."""
         e, c = wp.tid()
-        for q in range(points):
+        for q in range(gradient.shape[1]):
             H = gradient_of(u, sizes, table, gradient, e, q, c)
             wp.atomic_add(out, c, wp.float64(weight[e, q] * density(H, coefficients[e])))
 
@@ -97,7 +97,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
     ):
         """f_a += sum over points of w P(H) grad N_a."""
         e, c = wp.tid()
-        for q in range(points):
+        for q in range(gradient.shape[1]):
             P = weight[e, q] * stress(gradient_of(u, sizes, table, gradient, e, q, c), coefficients[e])
             for a in range(nodes_of(sizes, e)):
                 i = 3 * table[e, a]
@@ -120,7 +120,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
     ):
         """f_a += sum over points of w dP(H; D) grad N_a; `definite` columns take the curvature at rest."""
         e, c = wp.tid()
-        for q in range(points):
+        for q in range(gradient.shape[1]):
             H = mat()
             if definite[c] == 0:
                 H = gradient_of(at, sizes, table, gradient, e, q, c)
@@ -132,7 +132,15 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
                 for k in range(3):
                     wp.atomic_add(out, i + k, c, f[k])
 
-    @wp.kernel(module="unique")
+    @wp.func
+    def along(H: mat, of: constants, k: int, m: int):
+        """dP for dF = e_k (x) e_m."""
+        D = mat()
+        D[k, m] = scalar(1.0)
+        return stress_change(H, D, of)
+
+    # Unrolled, its many stress changes take ten seconds to compile.
+    @wp.kernel(module="unique", module_options={"max_unroll": 0})
     def add_diagonal(
         at: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
@@ -144,22 +152,26 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
         # outputs
         out: wp.array2d(dtype=mat),
     ):
-        """K_aa += sum over points of w dP(H; e_k (x) grad N_a) grad N_a, column k of the block."""
+        """K_aa += sum over points of w dP(H; e_k (x) grad N_a) grad N_a, column k of the block.
+
+        Nine stress changes serve all nodes of a point.
+        """
         e, c = wp.tid()
-        for q in range(points):
+        for q in range(gradient.shape[1]):
             H = mat()
             if definite[c] == 0:
                 H = gradient_of(at, sizes, table, gradient, e, q, c)
-            for a in range(nodes_of(sizes, e)):
-                g = gradient[e, q, a]
-                block = mat()
-                for k in range(3):
-                    axis = vec()
-                    axis[k] = scalar(1.0)
-                    f = weight[e, q] * (stress_change(H, wp.outer(axis, g), coefficients[e]) * g)
-                    for m in range(3):
-                        block[m, k] = f[m]
-                wp.atomic_add(out, table[e, a], c, block)
+            for k in range(3):
+                X = along(H, coefficients[e], k, 0)
+                Y = along(H, coefficients[e], k, 1)
+                Z = along(H, coefficients[e], k, 2)
+                for a in range(nodes_of(sizes, e)):
+                    g = gradient[e, q, a]
+                    f = weight[e, q] * ((g[0] * X + g[1] * Y + g[2] * Z) * g)
+                    block = mat()
+                    for i in range(3):
+                        block[i, k] = f[i]
+                    wp.atomic_add(out, table[e, a], c, block)
 
     @wp.kernel(module="unique")
     def bound_step(
@@ -174,7 +186,7 @@ def kernels_of(law: Law, device: Device, size: int, points: int, count: int) -> 
         """Halve t until J(t) = det(F + t D) >= kept J(0) on all of [0, t]; J is a cubic in t."""
         e, c = wp.tid()
         one = scalar(1.0)
-        for q in range(points):
+        for q in range(gradient.shape[1]):
             H = gradient_of(u, sizes, table, gradient, e, q, c)
             D = gradient_of(du, sizes, table, gradient, e, q, c)
             F = wp.identity(n=3, dtype=scalar) + H
@@ -232,10 +244,10 @@ class Elasticity:
     ):
         self.name = name
         self._device = device
-        points, count = elements.weight.shape[1], coefficients.shape[1]
+        count = coefficients.shape[1]
         size = elements.table.shape[1] if elements.size is None else 0
         sizes = np.zeros(0, np.int32) if elements.size is None else elements.size
-        self._kernels = kernels_of(law, device, size, points, count)
+        self._kernels = kernels_of(law, device, size, count)
         self._rest = (elements, *lame.T)
         self._shape = [
             device.array(sizes, wp.int32),
