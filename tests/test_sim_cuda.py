@@ -6,6 +6,7 @@ import warp as wp
 from oracle import EVERY_LAW, tissue
 
 from sim.accuracy import TRAIN, Accuracy
+from sim.discretisation import ELEMENTS
 from sim.effects import Elasticity, Held, Slide, ToolDisplacement, ToolForce
 from sim.fem import Fem
 from sim.linear import BlockJacobi
@@ -27,21 +28,25 @@ def pushes():
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_a_batch_of_pushes(box, law, precision):
+def test_a_batch_of_pushes(box, law, element, precision):
     accuracy = Accuracy(1e-8) if precision == "float64" else TRAIN
     effects = (Elasticity(tissue(law)), Held(), ToolForce())
-    on_cpu = Fem(box, effects, accuracy, "cpu").deform(pushes())
-    on_cuda = Fem(box, effects, accuracy, "cuda").deform(pushes())
+    on_cpu = Fem(box, effects, accuracy, "cpu", element=element).deform(pushes())
+    on_cuda = Fem(box, effects, accuracy, "cuda", element=element).deform(pushes())
     assert all(outcome.good for outcome in on_cuda.outcome)
     off = np.abs(on_cpu.displacement - on_cuda.displacement).max()
     assert off <= BOUND[precision] * np.abs(on_cpu.displacement).max()
 
 
-def test_a_moved_footprint_and_its_reaction(box):
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_a_moved_footprint_and_its_reaction(box, element):
     loads = Loads((Displaced(np.zeros((1, 3)), np.array([[1e-3, 0.0, -4e-3]]), np.array([7e-3])),))
     effects = (Elasticity(), Held(), Slide(), ToolDisplacement())
-    on_cpu, on_cuda = (Fem(box, effects, Accuracy(1e-8), name).deform(loads) for name in ("cpu", "cuda"))
+    on_cpu, on_cuda = (
+        Fem(box, effects, Accuracy(1e-8), name, element=element).deform(loads) for name in ("cpu", "cuda")
+    )
     np.testing.assert_allclose(on_cuda.reaction, on_cpu.reaction, rtol=1e-5, atol=1e-9)
 
 
