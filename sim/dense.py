@@ -15,8 +15,8 @@ from .device import Device
 from .problem import Problem
 from .sparse import Sparse
 
-# Stiffness, factor, basis, inverse and a product stand in memory together, in double precision.
-COPIES = 6
+# Stiffness, factor, inverse and what the factorisation works in stand in memory together, in double precision.
+COPIES = 5
 
 
 def fits(rows: int, device: Device) -> bool:
@@ -42,7 +42,11 @@ class Dense:
         self._device = device
         where = wp.device_to_torch(device.name)
         precision = getattr(torch, device.precision)
-        free = torch.as_tensor((motions.T @ stiffness @ motions).toarray(), device=where)
+        entry = sp.coo_array(motions.T @ stiffness @ motions)
+        place = tuple(torch.as_tensor(index, dtype=torch.int64, device=where) for index in (entry.row, entry.col))
+        count = len(motions.indptr) - 1
+        free = torch.zeros((count, count), dtype=torch.float64, device=where)
+        free.index_put_(place, torch.as_tensor(entry.data, device=where))
         self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(free)).to(precision)
         self._motions, self._transposed = (Sparse(sp.csr_array(matrix), device) for matrix in (motions, motions.T))
         torch.cuda.synchronize(where)

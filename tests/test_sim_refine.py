@@ -1,0 +1,52 @@
+"""A mesh twice as fine is the same body."""
+
+import numpy as np
+import pytest
+from boxes import box as block
+from boxes import hold
+
+from sim.errors import InputError
+from sim.mesh import TetMesh, row_keys
+from sim.refine import refined
+
+
+def test_the_body_stays_and_every_edge_is_halved():
+    mesh = block((2, 2, 3), 0.1, distortion=0.2)
+    mesh = TetMesh(mesh.nodes, mesh.tets, np.arange(len(mesh.tets)) % 3)
+    fine = refined(hold(mesh, mesh.nodes[:, 2] < 1e-9)).mesh
+    assert len(fine.tets) == 8 * len(mesh.tets)
+    np.testing.assert_array_equal(fine.nodes[: len(mesh.nodes)], mesh.nodes)
+    assert (fine.volumes > 0.0).all()
+    for label in range(3):
+        parts = fine.volumes[fine.region == label].reshape(-1, 8)
+        np.testing.assert_allclose(parts, np.repeat(mesh.volumes[mesh.region == label, None] / 8.0, 8, axis=1))
+    # No gaps: each coarse surface triangle became four, and nothing else is surface.
+    assert len(fine.surface) == 4 * len(mesh.surface)
+    faces = np.sort(fine.tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+    assert np.unique(row_keys(faces), return_counts=True)[1].max() == 2
+
+
+def test_what_holds_the_body_holds_it_still(box):
+    fine = refined(box)
+    assert fine.held[: len(box.mesh.nodes)].tolist() == box.held.tolist()
+    # Of the finer surface, what lies inside the opening's triangles is open and the rest is held.
+    assert len(fine.open_surface) == 4 * len(box.open_surface)
+    surface = np.unique(fine.mesh.surface)
+    opening = np.unique(fine.open_surface)
+    rim = ~fine.held[surface].any(axis=1) & ~fine.craniotomy[surface]
+    assert fine.craniotomy[opening].all()
+    assert not (fine.held.any(axis=1) & fine.craniotomy).any()
+    # Free and not to be touched: on edges between an open and a held node.
+    near = np.abs(np.linalg.norm(fine.mesh.nodes[surface[rim]], axis=1) - 25e-3)
+    assert near.max() < 8e-3
+
+
+def test_a_quadratic_mesh_is_refused():
+    mesh = TetMesh(np.vstack([np.zeros(3), np.eye(3), _middles()]), [[0, 1, 2, 3]], [0], [[4, 5, 6, 7, 8, 9]])
+    with pytest.raises(InputError, match="linear one"):
+        refined(hold(mesh, np.ones(10, bool)))
+
+
+def _middles():
+    corner = np.vstack([np.zeros(3), np.eye(3)])
+    return [(corner[i] + corner[j]) / 2.0 for i, j in ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))]
