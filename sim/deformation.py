@@ -21,6 +21,9 @@ class Outcome(Enum):
     CONVERGED_IN_STEPS = "converged to the tolerance asked for, the load applied in steps"
     BUDGET = "stopped when the budget of steps was spent; the last accepted state is returned"
     STALLED = "stopped because no step lowered the energy; the last accepted state is returned"
+    ROUND_OFF = (
+        "stopped because the residual is at the round-off of its number type; float64 or a coarser tolerance goes on"
+    )
     NOT_FINITE = "stopped because a number overflowed; the last finite state is returned"
     PREDICTED = "predicted by a learnt model inside the range that it was taught"
     EXTRAPOLATED = "predicted by a learnt model outside the range that it was taught: do not rely on it"

@@ -1,7 +1,8 @@
 """Preconditioned conjugate gradients on a batch of columns, and the preconditioners.
 
-Steihaug 1983, "The conjugate gradient method and trust regions": at negative curvature the iteration stops with what
-it has, a descent direction; the first direction is the preconditioned gradient itself.
+Steihaug 1983, "The conjugate gradient method and trust regions in large scale optimization", SIAM J. Numer. Anal.
+20:626-637: where the curvature is negative, or the solution leaves a ball in the preconditioner's norm, the iteration
+stops; what it has is a descent direction, and the shorter it is, the more like the preconditioned gradient.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 import warp as wp
 
-from .columns import add_dots, combined
+from .columns import combined, dots, norms
 from .device import Device
 from .problem import Problem
 
@@ -157,67 +158,28 @@ class BlockJacobi:
         self._device.launch(block_kernels_of(self._device)[1], self._blocks.shape, [self._blocks, r], [out])
 
 
-@dataclass(frozen=True)
-class StepKernels:
-    """The column-wise steps of conjugate gradients; coefficients stay on the device."""
-
-    advance: wp.Kernel
-    turn: wp.Kernel
-
-
-@cache
-def step_kernels_of(device: Device) -> StepKernels:
-    """Kernels of a device's scalar type."""
-    scalar = device.scalar
-
-    @wp.kernel(module="unique")
-    def advance(
-        live: wp.array(dtype=wp.int32),
-        rz: wp.array(dtype=wp.float64),
-        pq: wp.array(dtype=wp.float64),
-        p: wp.array2d(dtype=scalar),
-        q: wp.array2d(dtype=scalar),
-        # outputs
-        x: wp.array2d(dtype=scalar),
-        r: wp.array2d(dtype=scalar),
-    ):
-        """x += alpha p, r -= alpha q with alpha = r.z / p.q, in live columns of positive curvature."""
-        i, c = wp.tid()
-        if live[c] == 1 and pq[c] > wp.float64(0.0):
-            alpha = scalar(rz[c] / pq[c])
-            x[i, c] += alpha * p[i, c]
-            r[i, c] -= alpha * q[i, c]
-
-    @wp.kernel(module="unique")
-    def turn(
-        live: wp.array(dtype=wp.int32),
-        rz: wp.array(dtype=wp.float64),
-        rz_new: wp.array(dtype=wp.float64),
-        z: wp.array2d(dtype=scalar),
-        # outputs
-        p: wp.array2d(dtype=scalar),
-    ):
-        """p = z + beta p with beta = new r.z / old r.z."""
-        i, c = wp.tid()
-        if live[c] == 1:
-            p[i, c] = z[i, c] + scalar(rz_new[c] / rz[c]) * p[i, c]
-
-    return StepKernels(advance, turn)
-
-
 @dataclass(frozen=True, eq=False)
 class LinearSolution:
-    """x (3N, b); which columns met negative curvature (b,) bool; iterations of the batch."""
+    """x (3N, b); where the iteration stopped short, at negative curvature or at the radius (b,) bool.
+
+    size (b,): the preconditioner's norm sqrt(x . M x) [J^1/2]; iterations of the batch.
+    """
 
     x: wp.array
     truncated: np.ndarray
+    size: np.ndarray
     iterations: int
 
 
 def conjugate_gradients(
-    problem: Problem, preconditioner: Preconditioner, r: wp.array, tolerance: np.ndarray, most: int
+    problem: Problem,
+    preconditioner: Preconditioner,
+    r: wp.array,
+    tolerance: np.ndarray,
+    most: int,
+    radius: np.ndarray | None = None,
 ) -> LinearSolution:
-    """Solve P K P x = r at the last linearisation, per column until |r| <= tolerance (b,) or curvature is negative.
+    """Solve P K P x = r at the last linearisation, per column until |r| <= tolerance (b,), or truncated.
 
     Parameters
     ----------
@@ -227,45 +189,48 @@ def conjugate_gradients(
         (b,) [N], absolute.
     most
         Largest number of iterations.
+    radius
+        (b,) [J^1/2]: x stays within it in the preconditioner's norm; where the curvature is negative it goes that far.
+        Without a radius x stops there with what it has, or with the first direction.
     """
-    device, kernels = problem.device, step_kernels_of(problem.device)
-    columns = r.shape[1]
+    device, columns = problem.device, r.shape[1]
+    reach = np.full(columns, np.inf) if radius is None else radius
     x, z, q = device.zeros(*r.shape), device.zeros(*r.shape), device.zeros(*r.shape)
-
-    def dot(a: wp.array, b: wp.array) -> wp.array:
-        out = wp.zeros(columns, dtype=wp.float64, device=device.name)
-        add_dots(device, a, b, out)
-        return out
 
     def precondition() -> None:
         preconditioner.apply(r, live, z)
         problem.constraint.project(z)
 
-    live = np.sqrt(dot(r, r).numpy()) > tolerance
+    live = norms(device, r) > tolerance
     precondition()
-    p, rz = wp.clone(z), dot(r, z)
+    p, rz = wp.clone(z), dots(device, r, z)
+    # Inner products x.Mx, x.Mp and p.Mp follow from the coefficients alone: Conn, Gould, Toint 2000, section 7.5.1.
+    xx, xp, pp = np.zeros(columns), np.zeros(columns), rz
     truncated = np.zeros(columns, bool)
     iterations = 0
     while live.any() and iterations < most:
         q.zero_()
         problem.add_curvature(p, q)
         problem.constraint.project(q)
-        pq = dot(p, q)
-        negative = live & ~(pq.numpy() > 0.0)
-        if negative.any():
-            if iterations == 0:  # nothing gathered yet: the preconditioned gradient is a descent direction
-                combined(device, x, negative.astype(np.float64), p, x)
-            truncated |= negative
-            live &= ~negative
-        flags = device.array(live.astype(np.int32), wp.int32)
-        device.launch(kernels.advance, r.shape, [flags, rz, pq, p, q], [x, r])
+        pq = dots(device, p, q)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            longest = np.where(reach < np.inf, (np.sqrt(xp**2 + pp * (reach**2 - xx).clip(0.0)) - xp) / pp, np.inf)
+            alpha = np.where(pq > 0.0, rz / pq, longest)
+        stop = live & (~(pq > 0.0) | (alpha >= longest))
+        alpha = np.minimum(alpha, longest)
+        # Nothing bounds it and nothing is gathered yet: the preconditioned gradient is a descent direction.
+        alpha = np.where(live, np.where(np.isfinite(alpha), alpha, float(iterations == 0)), 0.0)
+        combined(device, x, alpha, p, x)
+        combined(device, r, -alpha, q, r)
+        xx = xx + 2.0 * alpha * xp + alpha**2 * pp
+        truncated |= stop
+        live &= ~stop & (norms(device, r) > tolerance)
         iterations += 1
-        live &= np.sqrt(dot(r, r).numpy()) > tolerance
         if not live.any():
             break
         precondition()
-        rz_new = dot(r, z)
-        flags = device.array(live.astype(np.int32), wp.int32)
-        device.launch(kernels.turn, r.shape, [flags, rz, rz_new, z], [p])
-        rz = rz_new
-    return LinearSolution(x, truncated, iterations)
+        before, rz = np.where(live, rz, 1.0), np.where(live, dots(device, r, z), 0.0)
+        beta = rz / before
+        combined(device, z, beta, p, p)
+        xp, pp = beta * (xp + alpha * pp), rz + beta**2 * pp
+    return LinearSolution(x, truncated, np.sqrt(xx.clip(0.0)), iterations)

@@ -260,11 +260,17 @@ class Contrary:
     def __init__(self, problem: Problem, always: bool):
         self.plain, self.always = NewtonCG(rest_solver(problem), 400), always
 
-    def find(self, problem: Problem, *arguments: object) -> Direction:
-        definite = arguments[-1]
-        assert isinstance(definite, np.ndarray)
-        found = self.plain.find(problem, *arguments)  # pyright: ignore[reportArgumentType]
-        sign = np.where(definite & (not self.always), 1.0, -1.0)
+    def begin(self) -> None:
+        self.plain.begin()
+
+    def keep(self, device: Device, columns: np.ndarray) -> None:
+        self.plain.keep(device, columns)
+
+    def find(
+        self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
+    ) -> Direction:
+        found = self.plain.find(problem, u, g, gap, forcing, taken)
+        sign = np.where((taken == 0.0) & (not self.always), 1.0, -1.0)
         return replace(found, d=problem.device.array(sign * found.d.numpy()))
 
 
@@ -273,7 +279,7 @@ def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, b
     rows = np.array([1, 2, 4])
     problem.begin(rows_of(cases_of(), rows))
     patient = Accuracy(tolerance=1e-7, outer=300)
-    found = find_equilibrium(problem, Contrary(problem, False), np.zeros((ROWS, 3)), patient)  # pyright: ignore
+    found = find_equilibrium(problem, Contrary(problem, False), np.zeros((ROWS, 3)), patient)
     assert all(outcome is Outcome.CONVERGED for outcome in found.outcome)
     assert found.iterations[2] > batch.iterations[4]
     np.testing.assert_allclose(found.u, batch.u[:, rows], atol=1e-6 * np.abs(batch.u).max())
@@ -281,7 +287,7 @@ def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, b
 
 def test_a_search_that_fails_twice_is_told(problem: Problem) -> None:
     problem.begin(cases_of())
-    found = find_equilibrium(problem, Contrary(problem, True), np.zeros((ROWS, len(TOTAL))), TIGHT)  # pyright: ignore
+    found = find_equilibrium(problem, Contrary(problem, True), np.zeros((ROWS, len(TOTAL))), TIGHT)
     assert all(outcome is Outcome.STALLED for outcome in found.outcome)
     assert not found.u.any()
 
