@@ -56,9 +56,10 @@ def matrices(problem: Problem, preconditioner: Preconditioner) -> tuple[np.ndarr
 
 
 def spread(K: np.ndarray, M: np.ndarray) -> float:
-    """Largest over smallest eigenvalue of M K."""
-    values = np.linalg.eigvals(M @ K).real
-    return float(values.max() / values.min())
+    """Largest over smallest eigenvalue of M K, those of C^T M C with K = C C^T."""
+    C = np.linalg.cholesky(K)
+    values = np.linalg.eigvalsh(C.T @ M @ C)
+    return float(values[-1] / values[0])
 
 
 @pytest.fixture(autouse=True)
