@@ -22,11 +22,13 @@ class Accuracy:
         Converged: free gradient <= tolerance x the largest 2-norm among the terms' own gradients and the
         reaction at constrained nodes.
     outer
-        Most Newton steps for one load.
+        Most outer steps for one load.
     inner
         Most conjugate-gradient iterations in one Newton step.
     precision
         Scalar type of the solver.
+    steps
+        Most load steps that are tried when a load has no equilibrium within `outer`; zero gives up there.
 
     Raises
     ------
@@ -35,9 +37,10 @@ class Accuracy:
     """
 
     tolerance: float = 1e-6
-    outer: int = 60
+    outer: int = 200
     inner: int = 400
     precision: Precision = "float64"
+    steps: int = 24
 
     def __post_init__(self) -> None:
         if self.precision not in FLOOR:
@@ -48,11 +51,14 @@ class Accuracy:
                 f"a tolerance of {self.tolerance:g} is outside [{floor:g}, 1): {self.precision} reaches {floor:g}; "
                 "ask for that, or for float64."
             )
-        if self.outer < 1 or self.inner < 1:
-            raise InputError(f"budgets of {self.outer} outer and {self.inner} inner steps allow no work: give >= 1.")
+        if self.outer < 1 or self.inner < 1 or self.steps < 0:
+            raise InputError(
+                f"budgets of {self.outer} outer, {self.inner} inner and {self.steps} load steps allow no work: give at "
+                "least 1, 1 and 0."
+            )
 
 
-DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32")
-LIVE = Accuracy(tolerance=2e-3, outer=30, precision="float32")
+DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32", steps=0)
+LIVE = Accuracy(tolerance=2e-3, outer=30, precision="float32", steps=8)
 TRAIN = Accuracy(tolerance=1e-4, precision="float32")
 REFERENCE = Accuracy(tolerance=1e-8)

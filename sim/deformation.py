@@ -18,20 +18,26 @@ class Outcome(Enum):
     """How an answer came about; the value is the sentence that a user reads."""
 
     CONVERGED = "converged to the tolerance asked for"
+    CONVERGED_ANEW = "converged to the tolerance asked for, from rest: from the given start it failed or was inside out"
     CONVERGED_IN_STEPS = "converged to the tolerance asked for, the load applied in steps"
-    BUDGET = "stopped when the budget of steps was spent; the last accepted state is returned"
-    STALLED = "stopped because no step lowered the energy; the last accepted state is returned"
+    BUDGET = "stopped when the budget of steps was spent"
+    STALLED = "stopped because no step lowered the energy"
     ROUND_OFF = (
         "stopped because the residual is at the round-off of its number type; float64 or a coarser tolerance goes on"
     )
-    NOT_FINITE = "stopped because a number overflowed; the last finite state is returned"
+    NOT_FINITE = "stopped because a number overflowed"
     PREDICTED = "predicted by a learnt model inside the range that it was taught"
     EXTRAPOLATED = "predicted by a learnt model outside the range that it was taught: do not rely on it"
 
     @property
     def good(self) -> bool:
         """Whether the answer may be relied on."""
-        return self in (Outcome.CONVERGED, Outcome.CONVERGED_IN_STEPS, Outcome.PREDICTED)
+        return self in (
+            Outcome.CONVERGED,
+            Outcome.CONVERGED_ANEW,
+            Outcome.CONVERGED_IN_STEPS,
+            Outcome.PREDICTED,
+        )
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,12 @@ class Deformation:
         Per term, opaque: what must travel to the next call.
     cost
         Seconds by stage.
+    reached
+        (B,): the share of the load, or of the prescribed motion, under which the displacement is in equilibrium to the
+        tolerance. 1 when converged; of a case that failed, the largest share found, and 0 where the displacement is
+        merely the last accepted state. NaN from a deformer that does not know.
+    inverted
+        (B,) whole numbers: tetrahedra that lie inside out, or collapsed; -1 from a deformer that does not know.
     """
 
     displacement: np.ndarray
@@ -78,8 +90,12 @@ class Deformation:
     reaction: np.ndarray
     history: Mapping[str, Any] = field(default_factory=dict)
     cost: Cost = Cost()
+    reached: np.ndarray = field(default_factory=lambda: np.array(np.nan))
+    inverted: np.ndarray = field(default_factory=lambda: np.array(-1))
 
     def __post_init__(self) -> None:
+        for name in ("reached", "inverted"):
+            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), len(self)))
         if not np.isfinite(self.displacement).all():
             raise AssertionError("a deformer let a displacement pass that is not finite: a defect of the deformer")
 
@@ -96,6 +112,8 @@ class Deformation:
             residual=self.residual[index],
             time=self.time[index],
             reaction=self.reaction[index],
+            reached=self.reached[index],
+            inverted=self.inverted[index],
             history={name: value[index] for name, value in self.history.items()},
         )
 

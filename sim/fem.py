@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,22 +11,20 @@ import scipy.sparse as sp
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
 from .compile import check_causes, compile_problem, footprint_of
-from .deformation import Cost, Deformation, Outcome
+from .deformation import Cost, Deformation
 from .device import find_device
-from .direction import NewtonCG
+from .direction import LBFGS, NewtonCG
 from .discretisation import discretise
 from .effects import Effect
 from .errors import InputError
+from .inversion import Inversion
+from .ladder import Ladder, shortfall
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
-from .newton import Equilibrium, find_equilibrium
 from .precondition import choose_preconditioner
 from .term import Cases
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"
-SMALLEST_LOAD_STEP = 1.0 / 64.0
-# Load steps of one case may take this many times the outer steps of one load: hopeless cases cost no more.
-STEPPING_BUDGET = 4
 
 
 class Fem:
@@ -69,7 +66,9 @@ class Fem:
         self.batch = batch
         self.space = discretise(anatomy.mesh, element)
         self.problem = compile_problem(self.effects, anatomy, find_device(device, accuracy.precision), self.space)
-        self._direction = NewtonCG(choose_preconditioner(self.problem, self.space, self._unsmoothed), accuracy.inner)
+        preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed)
+        inversion = Inversion(self.space, self.problem.device)
+        self._ladder = Ladder(LBFGS(preconditioner), NewtonCG(preconditioner, accuracy.inner), inversion, accuracy)
 
     @property
     def anatomy(self) -> Anatomy:
@@ -89,12 +88,11 @@ class Fem:
         """
         check_causes(self.effects, loads)
         guess = self._guess(loads, start)
+        cases = Cases(loads, np.zeros(len(loads))) if start is None else Cases(loads, start.time, start.history)
         parts = []
         for first in range(0, max(len(loads), 1), self.batch):
             rows = slice(first, first + self.batch)
-            history = {} if start is None else {name: value[rows] for name, value in start.history.items()}
-            begun = np.zeros(len(loads))[rows] if start is None else start.time[rows]
-            parts.append(self._solve(Cases(loads.rows(rows), begun, history), guess[:, rows]))
+            parts.append(self._solve(cases.rows(rows), guess[:, rows]))
         whole = _joined(parts)
         return whole if at is None else whole.at(at)
 
@@ -106,6 +104,18 @@ class Fem:
         """Rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh."""
         linear = discretise(self._anatomy.mesh, "p1")
         return compile_problem(self.effects, self._anatomy, self.problem.device, linear).rest_curvature()
+
+    def residual(self, loads: Loads, answer: Deformation) -> np.ndarray:
+        """The relative residual (B,), in this solver's precision, of somebody's answers at every vertex.
+
+        Raises
+        ------
+        InputError
+            As `deform`.
+        """
+        check_causes(self.effects, loads)
+        self.problem.begin(Cases(loads, answer.time, answer.history))
+        return shortfall(self.problem, self._guess(loads, answer))
 
     def _guess(self, loads: Loads, start: Deformation | None) -> np.ndarray:
         """First guesses (3V, B). A case without any load starts at rest: its answer is exactly zero."""
@@ -142,17 +152,8 @@ class Fem:
 
     def _solve(self, cases: Cases, guess: np.ndarray) -> Deformation:
         clock = time.perf_counter()
-        self.problem.begin(cases)
-        begun = time.perf_counter()
-        found = find_equilibrium(self.problem, self._direction, guess, self.accuracy)
+        found = self._ladder.climb(self.problem, cases, guess)
         solved = time.perf_counter()
-        for column in [c for c, outcome in enumerate(found.outcome) if not outcome.good]:
-            stepped = self._in_steps(cases, column)
-            found.iterations[column] += stepped.iterations[0]
-            if stepped.outcome[0].good:  # otherwise what was reached under the whole load says more
-                found.u[:, column], found.residual[column] = stepped.u[:, 0], stepped.residual[0]
-                found.outcome[column] = Outcome.CONVERGED_IN_STEPS
-        rescued = time.perf_counter()
         self.problem.begin(cases)
         u = self.problem.device.array(found.u)
         history = self.problem.end(u)
@@ -167,37 +168,10 @@ class Fem:
             time=cases.loads.times,
             reaction=reaction,
             history={**history, **middles},
-            cost=Cost(
-                {
-                    "loads": begun - clock,
-                    "newton": solved - begun,
-                    "load steps": rescued - solved,
-                    "reactions": time.perf_counter() - rescued,
-                }
-            ),
+            cost=Cost({"equilibrium": solved - clock, "reactions": time.perf_counter() - solved}),
+            reached=found.reached,
+            inverted=found.inverted,
         )
-
-    def _in_steps(self, cases: Cases, column: int) -> Equilibrium:
-        """One case from rest, its load raised in steps that halve on failure; the last attempt, and all iterations."""
-        pick = np.array([column])
-        loads = cases.loads.rows(pick)
-        history = {name: value[pick] for name, value in cases.history.items()}
-        reached, step = 0.0, 0.5
-        u, spent = np.zeros((self.problem.rows, 1)), 0
-        while True:
-            aim = min(1.0, reached + step)
-            self.problem.begin(Cases(loads.scaled(aim), cases.start_time[pick], history))
-            found = find_equilibrium(self.problem, self._direction, u, self.accuracy)
-            spent += int(found.iterations[0])
-            good = found.outcome[0].good
-            if (good and aim == 1.0) or (not good and step <= SMALLEST_LOAD_STEP):
-                return replace(found, iterations=np.array([spent]))
-            if spent >= STEPPING_BUDGET * self.accuracy.outer:
-                return replace(found, iterations=np.array([spent]), outcome=np.array([Outcome.BUDGET]))
-            if good:
-                u, reached = found.u, aim
-            else:
-                step /= 2.0
 
     def _reaction(self, loads: Loads, on_footprint: np.ndarray | None) -> np.ndarray:
         """(B, tools, 6): force and moment about its point that each tool exerts [N, N m]."""
@@ -232,4 +206,6 @@ def _joined(parts: list[Deformation]) -> Deformation:
         reaction=stacked("reaction"),
         history=history,
         cost=Cost({stage: sum(part.cost.seconds[stage] for part in parts) for stage in stages}),
+        reached=stacked("reached"),
+        inverted=stacked("inverted"),
     )

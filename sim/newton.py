@@ -55,9 +55,8 @@ def find_equilibrium(problem: Problem, descent: Descent, start: np.ndarray, accu
     for step in range(accuracy.outer + 1):
         g, free, scale = problem.residual(u)
         first[live] = scale if step == 0 else first[live]
-        gap, gap_size = problem.constraint.close_gap(u)
+        gap, open_gap = problem.gap(u)
         values = u.numpy()
-        open_gap = gap_size > 100.0 * last_digit * np.abs(values).max(axis=0, initial=0.0)
         vanished = scale <= last_digit**2 * first[live]
         with np.errstate(invalid="ignore"):
             relative = np.divide(free, scale, out=np.zeros_like(free), where=~vanished)
@@ -85,7 +84,6 @@ def find_equilibrium(problem: Problem, descent: Descent, start: np.ndarray, accu
             live, taken, open_gap, relative = live[stay], taken[stay], open_gap[stay], relative[stay]
         # Superlinear, and never finer than the tolerance needs.
         forcing = np.clip(np.sqrt(relative), 0.3 * accuracy.tolerance / np.maximum(relative, 1e-300), LARGEST_FORCING)
-        combined(device, gap, open_gap - 1.0, gap, gap)
         found = descent.find(problem, u, g, gap if open_gap.any() else None, forcing, taken)
         linear_iterations += found.iterations
         length = search(problem, u, found)

@@ -17,6 +17,9 @@ from .device import Device
 from .loads import Loads
 from .term import Cases, Term
 
+# A gap of so many last digits of the largest displacement is closed.
+CLOSED = 100.0
+
 
 @dataclass(frozen=True, eq=False)
 class Imposed:
@@ -98,6 +101,15 @@ class Problem:
         with np.errstate(invalid="ignore", over="ignore"):  # forces that overflowed: the caller sees it in `free`
             reaction = np.sqrt(np.maximum(whole**2 - free**2, 0.0))  # the projection is orthogonal
         return total, free, np.maximum(scale, reaction)
+
+    def gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
+        """The least motion (3N, b) [m] from u (3N, b) to the constraints, and which columns (b,) are off them at all.
+
+        What round-off leaves open counts as closed, and its motion is zero.
+        """
+        gap, size = self.constraint.close_gap(u)
+        off = size > CLOSED * np.finfo(self.device.precision).eps * np.abs(u.numpy()).max(axis=0, initial=0.0)
+        return combined(self.device, gap, off - 1.0, gap, gap), off
 
     def linearise(self, u: wp.array, definite: np.ndarray) -> None:
         """Fix where `add_curvature` is taken; definite (b,) asks for positive semi-definite curvature."""

@@ -18,6 +18,8 @@ OVERSHOOT = 0.5
 UNDERSHOOT = 0.5
 REFINEMENTS = 4
 TRIALS = 16
+# A shorter step leads nowhere.
+SHORTEST = 1e-8
 
 
 def search(problem: Problem, u: wp.array, direction: Direction) -> np.ndarray:
@@ -50,4 +52,4 @@ def search(problem: Problem, u: wp.array, direction: Direction) -> np.ndarray:
         with np.errstate(invalid="ignore"):
             share = np.clip(slope_low / (slope_low - slope_high), 0.1, 0.7)
             t = np.where(found, low, low + share * (high - low))
-    return low
+    return np.where(low >= SHORTEST, low, 0.0)

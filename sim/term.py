@@ -24,6 +24,11 @@ class Cases:
     start_time: np.ndarray
     history: Mapping[str, Any] = field(default_factory=dict)
 
+    def rows(self, index: slice | np.ndarray) -> Cases:
+        """Some of the cases."""
+        history = {name: value[index] for name, value in self.history.items()}
+        return Cases(self.loads.rows(index), self.start_time[index], history)
+
 
 class Term(Protocol):
     """One summand of the total potential, for b load cases at once.

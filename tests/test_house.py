@@ -19,8 +19,8 @@ TIERS = (
     {"device", "columns", "sparse", "term", "constraint"},
     {"terms", "problem"},
     {"linear", "direction", "search", "dense", "compile"},
-    {"newton", "multigrid"},
-    {"precondition"},
+    {"newton", "multigrid", "inversion"},
+    {"precondition", "ladder"},
     {"fem"},
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""

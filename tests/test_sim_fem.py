@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from boxes import base_held, box, hold, top_forces
+from oracle import internal_forces
 
 from sim.accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
 from sim.anatomy import Anatomy
@@ -19,7 +20,7 @@ from sim.deformation import Deformer, Outcome
 from sim.discretisation import discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolDisplacement, ToolForce
 from sim.errors import InputError
-from sim.fem import STEPPING_BUDGET, Fem
+from sim.fem import Fem
 from sim.footprint import footprint_weights
 from sim.loads import Displaced, Loads, Nodal, Prescribed, Pushed, push
 from sim.material import Material
@@ -296,8 +297,34 @@ def test_a_hopeless_case_returns_its_last_accepted_state(law: str) -> None:
     assert np.isfinite(found.displacement).all()
     assert found.displacement[0].any()
     assert found.residual[0] > 1e-8
-    # Its own budget, that of the load steps, and the step in which that ended: no rescue without end.
-    assert 2 < found.iterations[0] <= 2 + (STEPPING_BUDGET + 1) * 2
+    # Its own budget and that of the load steps: no rescue without end.
+    assert 2 < found.iterations[0] <= 2 + 2 * body.accuracy.steps
+    assert found.reached[0] == 0.0
+    assert found.reached[1] == 1.0
+
+
+def test_a_load_that_is_too_large_stops_at_the_share_that_has_an_equilibrium() -> None:
+    """The top is pressed through the base: under the share that was reached an independent residual vanishes."""
+    mesh = box((2, 2, 2), 0.1)
+    top = mesh.nodes[:, 2] > 0.1 - 1e-9
+    value = np.where(top[:, None], [0.0, 0.0, -0.11], 0.0)
+    material = Material("neo-hookean", 3000.0, 0.45)
+    held = (mesh.nodes[:, 2] < 1e-9) | top
+    body = Fem(hold(mesh, held), [Elasticity(material), Held()], Accuracy(tolerance=1e-8), "cpu")
+    found = body.deform(Loads((Prescribed(value[None]),)))
+    assert not found.outcome[0].good
+    assert 0.7 < found.reached[0] < 10.0 / 11.0
+    np.testing.assert_allclose(found.displacement[0, top], found.reached[0] * value[top], rtol=1e-12)
+    force = internal_forces(mesh, {0: material}, found.displacement[0])
+    assert np.linalg.norm(force[~held]) < 1.1e-8 * np.linalg.norm(force)
+    assert found.inverted[0] == 0
+    assert found.residual[0] > 0.05  # of the motion is missing
+
+
+def test_drafts_do_not_pay_for_load_steps() -> None:
+    found = Fem(ANATOMY, EFFECTS, DRAFT, "cpu").deform(loads(scale=10.0))
+    assert max(found.iterations) == DRAFT.outer
+    assert not all(outcome.good for outcome in found.outcome)
 
 
 def test_numbers_that_overflow_are_an_outcome_not_an_answer() -> None:
