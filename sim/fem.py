@@ -20,6 +20,7 @@ from .errors import InputError
 from .inversion import Inversion
 from .ladder import Ladder, shortfall
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
+from .memory import check_fits
 from .precondition import choose_preconditioner
 from .term import Cases
 
@@ -84,9 +85,11 @@ class Fem:
         Raises
         ------
         InputError
-            Loads that no effect answers, or that do not touch the body; a start that does not fit.
+            Loads that no effect answers, or that do not touch the body; a start that does not fit; memory that would
+            not.
         """
         check_causes(self.effects, loads)
+        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device)
         guess = self._guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads))) if start is None else Cases(loads, start.time, start.history)
         parts = []

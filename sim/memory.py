@@ -1,0 +1,76 @@
+"""Whether a batch fits into memory: said before it is solved, with the batch that would."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import warp as wp
+
+from .device import Device
+from .errors import InputError
+
+# Columns of the solver at its widest: pairs of L-BFGS, vectors of conjugate gradients, trials of the line search.
+WORK_COLUMNS = 40
+# Copies of the answer on the host while batches are joined, in double precision.
+ANSWER_COPIES = 3
+# Of what is free, this share may be used: other programs live too.
+SHARE = 0.9
+COARSER = "take a coarser mesh, or a larger machine."
+
+
+def free_bytes(device: Device) -> int:
+    """Memory that is free: the card's, or what the host and its control group still give."""
+    if device.on_cuda:
+        return int(wp.get_device(device.name).free_memory)
+    return host_bytes()
+
+
+def host_bytes() -> int:
+    """Memory that the host and its control group still give; without bound where neither says."""
+    found = [2**62]
+    for line in _lines(Path("/proc/meminfo")):
+        if line.startswith("MemAvailable:"):
+            found.append(1024 * int(line.split()[1]))
+    group = Path("/sys/fs/cgroup")
+    most, used = (_lines(group / name) for name in ("memory.max", "memory.current"))
+    if most and used and most[0].strip().isdigit():
+        found.append(int(most[0]) - int(used[0]))
+    return min(found)
+
+
+def check_fits(rows: int, batch: int, count: int, device: Device) -> None:
+    """Refuse `count` load cases of `rows` = 3N unknowns, `batch` together, that would not fit.
+
+    Raises
+    ------
+    InputError
+        Naming what it takes, what is free, and what would fit.
+    """
+    answers, host = ANSWER_COPIES * 8 * rows * count, SHARE * host_bytes()
+    if answers > host:
+        fitting = int(host / (answers / count))
+        raise InputError(
+            f"the answers to {count} loads take about {_gigabytes(answers)}, and {_gigabytes(host)} are free: "
+            + (f"solve at most {fitting} at a time." if fitting else COARSER)
+        )
+    column = WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
+    room = SHARE * free_bytes(device) - (0 if device.on_cuda else answers)
+    columns = min(batch, count)
+    if column * columns > room:
+        fitting = int(room / column)
+        remedy = f"a --batch of {fitting} fits." if fitting else COARSER
+        raise InputError(
+            f"a batch of {columns} loads takes about {_gigabytes(column * columns)}, and {_gigabytes(max(room, 0.0))} "
+            f"are free: {remedy}"
+        )
+
+
+def _gigabytes(amount: float) -> str:
+    return f"{amount / 2**30:.3g} GiB"
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text().splitlines()
+    except OSError:
+        return []
