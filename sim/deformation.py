@@ -26,6 +26,7 @@ class Outcome(Enum):
         "stopped because the residual is at the round-off of its number type; float64 or a coarser tolerance goes on"
     )
     NOT_FINITE = "stopped because a number overflowed"
+    GUESSED = "a first guess: nothing was solved"
     PREDICTED = "predicted by a learnt model inside the range that it was taught"
     EXTRAPOLATED = "predicted by a learnt model outside the range that it was taught: do not rely on it"
 
@@ -134,6 +135,14 @@ class Deformation:
                 f"{len(self.nodes)} vertices."
             )
         return replace(self, displacement=self.displacement[:, position], nodes=np.asarray(nodes))
+
+
+def guess(displacement: np.ndarray) -> Deformation:
+    """A start for a deformer: displacements (B, V, 3) [m] of every vertex that somebody has thought of."""
+    count, vertices, _ = displacement.shape
+    unknown, none = np.full(count, np.nan), np.zeros(count)
+    every, outcomes = np.arange(vertices), (Outcome.GUESSED,) * count
+    return Deformation(displacement, every, outcomes, none.astype(int), unknown, none, np.zeros((count, 0, 6)))
 
 
 @runtime_checkable

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from .element import Elements, jacobians, linear_elements, quadratic_elements
+from .element import Elements, linear_elements, quadratic_elements
 from .errors import InputError
 from .mesh import QUADRATIC_EDGES, TRIANGLE_EDGES, TetMesh, row_keys
 from .smoothed import edge_elements, node_elements
@@ -88,10 +88,6 @@ class Discretisation:
         if self.element == "p2":
             return (Part(quadratic_elements(self.nodes, self.table, chosen), "whole"),)
         return Part(edge_elements(self.mesh, chosen), "shape"), Part(node_elements(self.mesh, chosen), "volume")
-
-    def inside_out(self, u: np.ndarray) -> np.ndarray:
-        """(T,) bool: tetrahedra that displacements u (N, 3) [m] turn inside out, wholly or at a quadrature point."""
-        return (np.linalg.det(jacobians(self.nodes + u, self.table)) <= 0.0).any(axis=1)
 
     def held(self, held: np.ndarray) -> np.ndarray:
         """Held components (N, 3) from the mesh's own (V, 3).

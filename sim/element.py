@@ -59,7 +59,8 @@ def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray)
         An element that its mid-edge nodes fold over.
     """
     table = table[chosen]
-    slope, jacobian = slopes_of(table), jacobians(nodes, table)
+    slope = quadratic_slopes(EIGHT_POINTS)
+    jacobian = np.einsum("tai,qaj->tqij", nodes[table], slope)
     volume = np.linalg.det(jacobian)
     folded = np.flatnonzero((volume <= 0.0).any(axis=1))
     if len(folded):
@@ -69,21 +70,6 @@ def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray)
         )
     gradient = np.einsum("qaj,tqji->tqai", slope, np.linalg.inv(jacobian))
     return Elements(table, gradient, volume * EIGHT_WEIGHTS / 6.0, len(nodes), np.flatnonzero(chosen))
-
-
-def slopes_of(table: np.ndarray) -> np.ndarray:
-    """Derivatives (q, n, 3) of the n shape functions of tetrahedra (T, n) by corner coordinates 1, 2, 3.
-
-    At one point for linear tetrahedra, whose slopes are constant, at `EIGHT_POINTS` for quadratic ones.
-    """
-    if table.shape[1] == 4:
-        return np.vstack([np.full(3, -1.0), np.eye(3)])[None]
-    return quadratic_slopes(EIGHT_POINTS)
-
-
-def jacobians(nodes: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Derivatives (T, q, 3, 3) [m] of the place in tetrahedra (T, n) over nodes (N, 3) [m], where `slopes_of` is."""
-    return np.einsum("tai,qaj->tqij", nodes[table], slopes_of(table))
 
 
 def quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:

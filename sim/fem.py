@@ -99,10 +99,6 @@ class Fem:
         whole = _joined(parts)
         return whole if at is None else whole.at(at)
 
-    def inside_out(self, answer: Deformation) -> np.ndarray:
-        """(B, T) bool: tetrahedra that are inside out, wholly or in part, in an answer of this deformer."""
-        return np.array([self.space.inside_out(u) for u in self._every_node(answer)])
-
     def _unsmoothed(self) -> sp.csc_array:
         """Rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh."""
         linear = discretise(self._anatomy.mesh, "p1")
@@ -121,7 +117,7 @@ class Fem:
         return shortfall(self.problem, self._guess(loads, answer))
 
     def _guess(self, loads: Loads, start: Deformation | None) -> np.ndarray:
-        """First guesses (3V, B). A case without any load starts at rest: its answer is exactly zero."""
+        """First guesses (3N, B). A case without any load starts at rest: its answer is exactly zero."""
         if start is None:
             return np.zeros((self.problem.rows, len(loads)))
         vertices = len(self._anatomy.mesh.nodes)
@@ -133,16 +129,10 @@ class Fem:
         loaded = np.zeros(len(loads), bool)
         for cause in loads.causes:
             loaded |= (getattr(cause, MAGNITUDE[type(cause)]) != 0.0).reshape(len(loads), -1).any(axis=1)
-        full = self._every_node(start)
+        full = self.space.interpolated(start.at(np.arange(vertices)).displacement)
+        if len(self.space.edges) and MIDDLES in start.history:
+            full[:, vertices:] += start.history[MIDDLES]
         return np.where(loaded, full.reshape(len(loads), self.problem.rows).T, 0.0)
-
-    def _every_node(self, known: Deformation) -> np.ndarray:
-        """Displacements (B, N, 3) [m] of all nodes, from every vertex's; mid-edge nodes as the history knows them."""
-        vertices = len(self._anatomy.mesh.nodes)
-        full = self.space.interpolated(known.at(np.arange(vertices)).displacement)
-        if len(self.space.edges) and MIDDLES in known.history:
-            full[:, vertices:] += known.history[MIDDLES]
-        return full
 
     def _apart(self, u: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Displacements (B, V, 3) of the mesh's vertices in u (3N, B), and what else a later start needs of u."""

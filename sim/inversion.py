@@ -46,7 +46,7 @@ def kernel_of(device: Device, size: int, points: int) -> wp.Kernel:
 class Inversion:
     """Counts tetrahedra that lie inside out, or collapsed, at some quadrature point.
 
-    Linear tetrahedra have one point, quadratic ones four. Smoothed strains are averages: there too every tetrahedron
+    Linear tetrahedra have one point, quadratic ones eight. Smoothed strains are averages: there too every tetrahedron
     is looked at by itself.
     """
 

@@ -14,8 +14,9 @@ from .newton import find_equilibrium
 from .problem import Problem
 from .term import Cases
 
-# The first descent has so many outer steps; what it does not bring to its end is left to the second.
-QUICK = 20
+# The first descent has so many outer steps; what it does not bring to its end is left to the second. On CUDA, where
+# products with the curvature cost little, the second alone is faster by up to a half.
+QUICK, QUICK_ON_CUDA = 20, 0
 # Load steps as shares of the load: the first, the least, and what is left of one that failed.
 FIRST_STEP, LEAST_STEP, CUT = 1.0 / 4.0, 1.0 / 64.0, 1.0 / 4.0
 # The next load step is as long as lets expect so many outer steps; one that takes more than the most is too long.
@@ -107,7 +108,8 @@ class Ladder:
         """
         problem.begin(cases)
         _, imposed = problem.gap(problem.device.array(guess))
-        quick = 0 if imposed.any() else min(self.accuracy.outer, QUICK)
+        quick = 0 if imposed.any() else QUICK_ON_CUDA if problem.device.on_cuda else QUICK
+        quick = min(self.accuracy.outer, quick)
         return self._attempt(problem, cases, guess, ((self.quick, quick), (self.thorough, self.accuracy.outer - quick)))
 
     def _attempt(

@@ -18,7 +18,7 @@ ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim"
 TIERS = (
     {"device", "columns", "sparse", "term", "constraint"},
     {"terms", "problem"},
-    {"linear", "direction", "search", "dense", "compile"},
+    {"linear", "direction", "search", "dense", "memory", "compile"},
     {"newton", "multigrid", "inversion"},
     {"precondition", "ladder"},
     {"fem"},

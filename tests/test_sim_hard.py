@@ -16,7 +16,7 @@ from oracle import EVERY_LAW, internal_forces, tissue
 
 from sim.accuracy import TRAIN, Accuracy
 from sim.anatomy import Anatomy
-from sim.deformation import Deformation, Outcome
+from sim.deformation import Deformation, Outcome, guess
 from sim.device import find_device
 from sim.effects import Elasticity, Held, NodalForce
 from sim.errors import InputError
@@ -61,7 +61,7 @@ class Hard:
             self.anatomy, [Elasticity(first, self.tissues), Held(), NodalForce()], self.accuracy, "cpu",
             element=self.element,
         )  # fmt: skip
-        return fem.deform(Loads((Nodal(self.force[None]),)), None if self.start is None else guess(self.start))
+        return fem.deform(Loads((Nodal(self.force[None]),)), None if self.start is None else guess(self.start[None]))
 
     def residual(self, u: np.ndarray) -> float:
         """Of the whole load at u (V, 3) [m], against the larger of the load and the internal forces."""
@@ -71,14 +71,6 @@ class Hard:
         )
         scale = max(np.linalg.norm(inner), np.linalg.norm(self.force))
         return float(np.linalg.norm((inner - self.force)[free]) / scale) if scale else 0.0
-
-
-def guess(u: np.ndarray) -> Deformation:
-    """A start at u (V, 3) [m]."""
-    one = np.zeros(1)
-    return Deformation(
-        u[None], np.arange(len(u)), (Outcome.CONVERGED,), np.zeros(1, int), one, one, np.zeros((1, 0, 6))
-    )
 
 
 def pressed(mesh: TetMesh = BLOCK, push: np.ndarray = PUSH) -> np.ndarray:
@@ -309,7 +301,7 @@ REFUSED = {
     ),
     "a tolerance below double precision's floor": (lambda: Accuracy(tolerance=1e-15), "float64 reaches 1e-11"),
     "a start of another mesh": (
-        lambda: fem(base_held(BLOCK)).deform(Loads((Nodal(pressed()[None]),)), guess(np.zeros((7, 3)))),
+        lambda: fem(base_held(BLOCK)).deform(Loads((Nodal(pressed()[None]),)), guess(np.zeros((1, 7, 3)))),
         "start has displacements of shape",
     ),
     "more loads than memory holds": (lambda: _too_many(64), "at most"),

@@ -194,6 +194,20 @@ def test_what_has_no_equilibrium_exits_with_one_and_writes_a_finite_state(solve)
     assert run.report["outcome"] not in ("converged", "converged_in_steps")
     assert np.isfinite(run.displacement).all()
     assert run.displacement[top, 2].min() >= -0.1  # not inverted
+    # What is written is the equilibrium under the share that is named, in words too.
+    assert 0.5 < run.report["load_fraction"] < 0.1 / 0.11
+    np.testing.assert_allclose(run.displacement[top, 2], -0.11 * run.report["load_fraction"])
+    assert "of the load" in run.errors
+
+
+def test_a_first_guess_shortens_the_way(solve) -> None:
+    """In the file's unit; the answer is the same."""
+    first = solve(GOOD)
+    assert first.report["load_fraction"] == 1.0
+    mm = {**GOOD, "start": 1e3 * first.displacement}
+    again = solve(mm, "--unit", "mm", points=1e3 * MESH.nodes)
+    assert again.report["iterations"] == 0 < first.report["iterations"]
+    np.testing.assert_allclose(again.displacement, first.displacement, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("depth", "inverted"), [(0.05, 0), (0.11, 6)])
@@ -236,6 +250,8 @@ GOOD = {"fixed": BASE.astype(int), "force": FORCE}
         ),
         (GOOD | {"slide_normal": np.full((COUNT, 3), 0.5)}, ["normalise"]),
         (GOOD | {"slide_normal": np.zeros(COUNT)}, ["`slide_normal` has shape"]),
+        (GOOD | {"start": np.zeros(COUNT)}, ["`start` has shape"]),
+        (GOOD | {"start": np.full((COUNT, 3), np.nan)}, ["`start` is not finite"]),
     ],
 )
 def test_bad_point_data_is_refused(solve, data: dict, words: list[str]) -> None:

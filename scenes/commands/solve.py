@@ -11,6 +11,7 @@ import numpy as np
 
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
+from sim.deformation import Deformation, guess
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide
 from sim.errors import InputError
 from sim.fem import Fem
@@ -26,8 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "mesh",
         help="mesh of linear or quadratic (`tetra10`) tetrahedra with point data `fixed` (V,) or (V, 3), and `force` "
-        "(V, 3) [N] or `prescribed` (V, 3) in the file's unit of length; optional `slide_normal` (V, 3) and cell data "
-        "`region`. Mid-edge nodes that the file brings are nodes as any other: held only where `fixed` says so",
+        "(V, 3) [N] or `prescribed` (V, 3) in the file's unit of length; optional `slide_normal` (V, 3), `start` "
+        "(V, 3), a first guess in the file's unit, and cell data `region`. Mid-edge nodes that the file brings are "
+        "nodes as any other: held only where `fixed` says so",
     )
     add_tissue_arguments(parser)
     add_element_argument(parser)
@@ -46,7 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve, write the displacement, print one JSON line. 0: converged; 1: not converged, last state written."""
+    """Solve, write the displacement, print one JSON line. 0: converged; 1: not converged.
+
+    Then the equilibrium under the largest share of the load that has one is written, or the last state where none has.
+    """
     out = check_output(args.out, ".vtu")
     accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision)
     tissue = tissue_of(args)
@@ -60,11 +65,14 @@ def run(args: argparse.Namespace) -> int:
     if anatomy.slide_normal.any():
         effects.append(Slide())
     fem = Fem(anatomy, effects, accuracy, args.device, element=args.element)
-    deformation = fem.deform(loads)
+    deformation = fem.deform(loads, start_of(file, args.mesh, UNITS[args.unit]))
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
     outcome = deformation.outcome[0]
-    inverted = int(fem.inside_out(deformation).sum())
+    reached, inverted = float(deformation.reached[0]), int(deformation.inverted[0])
+    if reached < 1.0:
+        what = f"in equilibrium under {reached:.1%} of the load" if reached else "in equilibrium under no share of it"
+        print(f"{args.mesh}: {outcome.value}; what is written is {what}", file=sys.stderr)
     if inverted:  # an equilibrium of every law but `neo-hookean` may lie there: converged, and no tissue
         print(f"{args.mesh}: {inverted} tetrahedra are inside out: the load is beyond the law's range", file=sys.stderr)
     report = {
@@ -72,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
         "message": outcome.value,
         "iterations": int(deformation.iterations[0]),
         "residual": float(deformation.residual[0]),
+        "load_fraction": reached,
         "element": fem.space.element,
         "nodes": fem.space.count,
         "seconds": round(seconds, 4),
@@ -81,6 +90,19 @@ def run(args: argparse.Namespace) -> int:
     }
     print(json.dumps(report))
     return 0 if outcome.good else 1
+
+
+def start_of(file: MeshFile, name: str, metre: float) -> Deformation | None:
+    """The first guess in a file's point data `start`, if there is one. `metre`: the file's unit of length in m.
+
+    Raises
+    ------
+    InputError
+        Of the wrong shape, or not finite.
+    """
+    if "start" not in file.point_data:
+        return None
+    return guess(metre * _field(name, "start", file.point_data["start"], {(len(file.mesh.nodes), 3)})[None])
 
 
 def problem_of(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads, list[str]]:
