@@ -18,7 +18,7 @@ class Outcome(Enum):
     """How an answer came about; the value is the sentence that a user reads."""
 
     CONVERGED = "converged to the tolerance asked for"
-    CONVERGED_ANEW = "converged to the tolerance asked for, from rest: from the given start it failed or was inside out"
+    CONVERGED_ANEW = "converged to the tolerance asked for, from rest: the start lay inside out, led there, or nowhere"
     CONVERGED_IN_STEPS = "converged to the tolerance asked for, the load applied in steps"
     BUDGET = "stopped when the budget of steps was spent"
     STALLED = "stopped because no step lowered the energy"

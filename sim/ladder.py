@@ -85,18 +85,19 @@ class Ladder:
     def climb(self, problem: Problem, cases: Cases, guess: np.ndarray) -> Answer:
         """The equilibria of B cases, from guess (3N, B) [m].
 
-        A state that a start led to is not accepted where tetrahedra lie inside out: a collapsed body may be in
-        equilibrium with itself. From rest the same state is taken as the load's doing.
+        A start that lies inside out is left alone, and so is a state that does to which a start led: a body turned
+        over or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing.
         """
-        answer = self._whole(problem, cases, guess)
-        lost = ~answer.good & (self.accuracy.steps > 0)
-        astray = np.flatnonzero(guess.any(axis=0) & (lost | (answer.good & (answer.inverted > 0))))
-        if len(astray):
-            rest = np.zeros((len(guess), len(astray)))
-            anew = self._whole(problem, cases.rows(astray), rest)
-            anew.outcome[anew.good] = Outcome.CONVERGED_ANEW
-            answer.put(astray, anew)
-        lost = np.flatnonzero(~answer.good & (self.accuracy.steps > 0))
+        rescues = self.accuracy.steps > 0
+        started = guess.any(axis=0)
+        astray = started & (self.inversion.count(guess) > 0)
+        answer = self._whole(problem, cases, np.where(astray, 0.0, guess))
+        again = np.flatnonzero(started & ~astray & np.where(answer.good, answer.inverted > 0, rescues))
+        if len(again):
+            astray[again] = True
+            answer.put(again, self._whole(problem, cases.rows(again), np.zeros((len(guess), len(again)))))
+        answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
+        lost = np.flatnonzero(~answer.good & rescues)
         if len(lost):
             answer.put(lost, self._in_steps(problem, cases.rows(lost), answer.rows(lost)))
         return answer
