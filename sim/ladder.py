@@ -88,29 +88,34 @@ class Ladder:
         A start that lies inside out is left alone, and so is a state that does to which a start led: a body turned
         over or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing.
         """
-        rescues = self.accuracy.steps > 0
         started = guess.any(axis=0)
         astray = started & (self.inversion.count(guess) > 0)
         answer = self._whole(problem, cases, np.where(astray, 0.0, guess))
-        again = np.flatnonzero(started & ~astray & np.where(answer.good, answer.inverted > 0, rescues))
+        again = np.flatnonzero(started & ~astray & np.where(answer.good, answer.inverted > 0, self._lost(answer)))
         if len(again):
             astray[again] = True
             answer.put(again, self._whole(problem, cases.rows(again), np.zeros((len(guess), len(again)))))
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
-        lost = np.flatnonzero(~answer.good & rescues)
+        lost = np.flatnonzero(self._lost(answer))
         if len(lost):
             answer.put(lost, self._in_steps(problem, cases.rows(lost), answer.rows(lost)))
         return answer
 
+    def _lost(self, answer: Answer) -> np.ndarray:
+        """Which cases (B,) another rung may save: at round-off none is nearer to equilibrium."""
+        return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
+
     def _whole(self, problem: Problem, cases: Cases, guess: np.ndarray) -> Answer:
         """The whole load at once: the quick descent, and the thorough one from where that ended.
 
-        Motions that are imposed are left to the thorough one: it knows how the free nodes follow them.
+        Motions that are imposed are left to the thorough one: it knows how the free nodes follow them. So is a small
+        budget: its steps lead farther.
         """
         problem.begin(cases)
         _, imposed = problem.gap(problem.device.array(guess))
-        quick = 0 if imposed.any() else QUICK_ON_CUDA if problem.device.on_cuda else QUICK
-        quick = min(self.accuracy.outer, quick)
+        quick = QUICK_ON_CUDA if problem.device.on_cuda else QUICK
+        if imposed.any() or self.accuracy.outer <= quick:
+            quick = 0
         return self._attempt(problem, cases, guess, ((self.quick, quick), (self.thorough, self.accuracy.outer - quick)))
 
     def _attempt(

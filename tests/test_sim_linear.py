@@ -159,3 +159,56 @@ def test_search_does_not_move_what_it_is_given(problem: Problem) -> None:
     search(problem, u, direction)
     assert not u.numpy().any()
     np.testing.assert_array_equal(direction.d.numpy(), before)
+
+
+def test_a_radius_bounds_the_solution_in_the_preconditioners_norm(problem: Problem) -> None:
+    """Half of what the whole solution takes, and less where the curvature is negative; a large one changes nothing."""
+    K, r = dense(problem, 1e-2 * CRUSHED), right_hand_side(problem)
+    rest, solver = dense(problem, REST), rest_solver(problem)
+    tolerance = 1e-10 * np.linalg.norm(r, axis=0)
+
+    def size(x: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.einsum("ic,ij,jc->c", x[FREE], rest, x[FREE]))
+
+    def solution(at: np.ndarray, radius: np.ndarray | None):
+        problem.linearise(problem.device.array(at), np.zeros(2, bool))
+        return conjugate_gradients(problem, solver, problem.device.array(r), tolerance, 400, radius)
+
+    whole = solution(1e-2 * CRUSHED, None)
+    np.testing.assert_allclose(whole.size, size(whole.x.numpy()), rtol=1e-9)
+    same = solution(1e-2 * CRUSHED, 2.0 * whole.size)
+    np.testing.assert_array_equal(same.x.numpy(), whole.x.numpy())
+    half = solution(1e-2 * CRUSHED, 0.5 * whole.size)
+    assert half.truncated.all()
+    np.testing.assert_allclose(size(half.x.numpy()), 0.5 * whole.size, rtol=1e-9)
+    negative = solution(CRUSHED, 0.1 * whole.size)
+    np.testing.assert_allclose(size(negative.x.numpy()), 0.1 * whole.size, rtol=1e-9)
+    assert ((negative.x.numpy() * r).sum(axis=0) > 0.0).all()
+    # Within the ball the model falls with every iteration: the shorter solution is the worse one.
+    model = [0.5 * np.einsum("ic,ij,jc->c", x[FREE], K, x[FREE]) - (x * r).sum(axis=0) for x in
+             (half.x.numpy(), whole.x.numpy())]  # fmt: skip
+    assert (model[1] < model[0]).all()
+
+
+def test_search_lengthens_what_it_cut_too_much(problem: Problem) -> None:
+    """Along a direction far too long it comes near the minimum, not to a tenth of a tenth of the way."""
+    u, direction = downhill(problem, np.ones(2))
+    far = 37.0 / search(problem, u, direction)
+    long = Direction(problem.device.array(far * direction.d.numpy()), far * direction.promised, 0)
+    length = search(problem, u, long)
+
+    def slope(t: np.ndarray) -> np.ndarray:
+        g = problem.gradient(problem.device.array(t * long.d.numpy()))
+        problem.constraint.project(g)
+        return (g.numpy() * long.d.numpy()).sum(axis=0)
+
+    assert (np.abs(slope(length)) <= 0.5 * long.promised).all()
+
+
+def test_a_step_of_nothing_is_none(problem: Problem) -> None:
+    """Only a billionth of the way descends: it is not worth a step."""
+    u, direction = downhill(problem, np.ones(2))
+    length = search(problem, u, direction)
+    far = 1e10 * length
+    endless = Direction(problem.device.array(far * direction.d.numpy()), far * direction.promised, 0)
+    assert not search(problem, u, endless).any()

@@ -21,6 +21,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.linear import BlockJacobi
 from sim.loads import Loads, Nodal, Prescribed
+from sim.mesh import TetMesh
 from sim.newton import Equilibrium, find_equilibrium
 from sim.precondition import rest_solver
 from sim.problem import Problem
@@ -299,3 +300,42 @@ def test_a_spent_budget_is_told(problem: Problem) -> None:
     assert found.residual[-1] > 1e-10
     with pytest.raises(InputError, match="allow no work"):
         Accuracy(outer=0)
+
+
+SPACING = 0.1 / 3
+LOST = {
+    "mirrored": MESH.nodes * [1.0, 1.0, -1.0],
+    "flattened onto a plane": MESH.nodes * [1.0, 1.0, 0.0],
+    "flattened sideways": MESH.nodes * [0.0, 1.0, 1.0],
+    "scattered": MESH.nodes + 0.5 * SPACING * np.random.default_rng(5).uniform(-1.0, 1.0, MESH.nodes.shape),
+}
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("law", ["stable-neo-hookean", "corotational"])
+@pytest.mark.parametrize("name", LOST)
+def test_a_lost_body_comes_back_by_itself(name: str, law: str, precision: Precision) -> None:
+    """Without any load, to a millionth of its size. No force is left to measure a residual against: that is rest."""
+    problem = compile_problem([Elasticity(tissue(law)), Held(), NodalForce()], ANATOMY, find_device("cpu", precision))
+    start = np.where(FREE, LOST[name] - MESH.nodes, 0.0).reshape(-1, 1)
+    accuracy = Accuracy(tolerance=1e-4, outer=100, precision=precision)
+    found = solve(problem, Cases(Loads((Nodal(np.zeros((1, COUNT, 3))),)), np.zeros(1)), accuracy, start)
+    assert found.outcome[0] is Outcome.CONVERGED
+    assert found.iterations[0] > 1
+    assert np.abs(found.u).max() <= 1e-6 * 0.1
+
+
+def test_round_off_is_told_and_ends_the_iteration() -> None:
+    """A core ten thousand times stiffer in single precision: the residual stays above the tolerance; double goes on."""
+    core = np.linalg.norm(MESH.nodes[MESH.tets].mean(axis=1) - [0.033, 0.033, 0.07], axis=1) < 0.03
+    mesh = TetMesh(MESH.nodes, MESH.tets, core.astype(int))
+    effects = Elasticity(tissue("stable-neo-hookean"), {1: tissue("stable-neo-hookean", 3e7)}), Held(), NodalForce()
+    loads = Loads((Nodal(top_forces(MESH, TOTAL[2:5])),))
+    single = Fem(base_held(mesh), effects, Accuracy(tolerance=2e-5, precision="float32"), "cpu").deform(loads)
+    double = Fem(base_held(mesh), effects, Accuracy(tolerance=2e-5), "cpu").deform(loads)
+    assert all(outcome is Outcome.ROUND_OFF for outcome in single.outcome)
+    assert (single.residual > 2e-5).all()
+    assert (single.iterations < 45).all()  # of 60, and no load steps
+    assert all(outcome is Outcome.CONVERGED for outcome in double.outcome)
+    largest = np.abs(double.displacement).max(axis=(1, 2))
+    assert (np.abs(single.displacement - double.displacement).max(axis=(1, 2)) < 2e-2 * largest).all()

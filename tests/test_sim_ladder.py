@@ -1,0 +1,135 @@
+"""What is tried when an attempt fails, and what a case that nothing helps still says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boxes import base_held, box, top_forces
+from oracle import internal_forces, tissue
+
+from sim.accuracy import DRAFT, Accuracy
+from sim.deformation import Deformation, Outcome, guess
+from sim.device import find_device
+from sim.discretisation import ELEMENTS, discretise
+from sim.effects import Elasticity, Held, NodalForce
+from sim.fem import Fem
+from sim.inversion import Inversion
+from sim.loads import Loads, Nodal
+
+MESH = box((2, 2, 3), 0.1, distortion=0.15)
+ANATOMY = base_held(MESH)
+FREE = ~ANATOMY.held
+ACCURACY = Accuracy(tolerance=1e-8)
+# Easy, hopeless in so few steps, easy, nothing, and hard enough for load steps.
+TOTAL = np.array([[0.0, 0.0, -0.1], [0.0, 0.0, -40.0], [0.02, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.0, 0.9]])
+HASTY = replace(ACCURACY, outer=6)
+CRUSHED = np.where(FREE, MESH.nodes * [0.0, 0.0, -1.5], 0.0)
+
+
+def fem(accuracy: Accuracy = ACCURACY, law: str = "stable-neo-hookean") -> Fem:
+    return Fem(ANATOMY, [Elasticity(tissue(law)), Held(), NodalForce()], accuracy, "cpu")
+
+
+def loads(total: np.ndarray = TOTAL) -> Loads:
+    return Loads((Nodal(top_forces(MESH, total)),))
+
+
+def residual(found: Deformation, row: int, share: float = 1.0) -> float:
+    force = share * top_forces(MESH, TOTAL[row])[0]
+    inner = internal_forces(MESH, {0: tissue("stable-neo-hookean")}, found.displacement[row])
+    return float(np.linalg.norm((inner - force)[FREE]) / np.linalg.norm(inner))
+
+
+@pytest.fixture(scope="module")
+def hasty() -> Deformation:
+    return fem(HASTY).deform(loads())
+
+
+def test_every_case_climbs_as_far_as_it_must(hasty: Deformation) -> None:
+    assert hasty.outcome == (
+        Outcome.CONVERGED, Outcome.BUDGET, Outcome.CONVERGED, Outcome.CONVERGED, Outcome.CONVERGED_IN_STEPS,
+    )  # fmt: skip
+    np.testing.assert_array_equal(hasty.reached[[0, 2, 3, 4]], 1.0)
+    assert 0.0 < hasty.reached[1] < 1.0
+    assert hasty.iterations[4] > HASTY.outer
+    for row in (0, 2, 4):
+        assert residual(hasty, row) <= 1.01e-8
+
+
+def test_what_fails_is_in_equilibrium_under_its_share(hasty: Deformation) -> None:
+    assert residual(hasty, 1, hasty.reached[1]) <= 1.01e-8
+    assert hasty.residual[1] == pytest.approx(1.0 - hasty.reached[1], rel=0.2)  # of the load, nobody bears
+
+
+def test_rows_climb_alone_as_together(hasty: Deformation) -> None:
+    for row in range(len(TOTAL)):
+        alone = fem(HASTY).deform(loads(TOTAL[[row]]))
+        assert alone.outcome[0] is hasty.outcome[row]
+        assert alone.reached[0] == hasty.reached[row]
+        np.testing.assert_allclose(alone.displacement[0], hasty.displacement[row], atol=1e-8)
+
+
+def test_no_load_steps_if_none_are_asked_for() -> None:
+    found = fem(replace(HASTY, steps=0)).deform(loads())
+    assert found.outcome[4] is Outcome.BUDGET
+    assert (found.iterations <= HASTY.outer).all()
+    np.testing.assert_array_equal(found.reached, [1.0, 0.0, 1.0, 1.0, 0.0])
+    assert found.displacement[1].any()  # the last accepted state
+    assert DRAFT.steps == 0
+
+
+@pytest.mark.parametrize("steps", [0, 24])
+def test_a_start_inside_out_is_left_for_rest(steps: int) -> None:
+    """Whatever rescue costs: one row of it among others."""
+    start = np.zeros((5, *MESH.nodes.shape))
+    start[[0, 4]] = CRUSHED
+    cold = fem(replace(ACCURACY, steps=steps)).deform(loads(TOTAL[[0, 2, 0, 3, 2]]))
+    found = fem(replace(ACCURACY, steps=steps)).deform(loads(TOTAL[[0, 2, 0, 3, 2]]), guess(start))
+    assert found.outcome == (Outcome.CONVERGED_ANEW, *[Outcome.CONVERGED] * 3, Outcome.CONVERGED_ANEW)
+    assert all(outcome.good for outcome in found.outcome)
+    np.testing.assert_array_equal(found.displacement, cold.displacement)
+
+
+def test_a_start_that_leads_inside_out_is_not_followed() -> None:
+    """Turned over by half it is not inside out yet; what it leads to is compared with what rest leads to."""
+    twisted = MESH.nodes.copy()
+    angle = np.pi * 1.5 * MESH.nodes[:, 2] / MESH.nodes[:, 2].max()
+    middle = MESH.nodes[:, :2].mean(axis=0)
+    x, y = (MESH.nodes[:, :2] - middle).T
+    twisted[:, 0] = middle[0] + np.cos(angle) * x - np.sin(angle) * y
+    twisted[:, 1] = middle[1] + np.sin(angle) * x + np.cos(angle) * y
+    body = fem()
+    found = body.deform(loads(TOTAL[[0]]), guess(np.where(FREE, twisted - MESH.nodes, 0.0)[None]))
+    assert found.outcome[0].good
+    assert found.inverted[0] == 0
+
+
+def test_from_rest_what_lies_inside_out_is_the_loads_doing_and_counted() -> None:
+    """A brutal push: an equilibrium of the law, but no tissue's."""
+    found = fem().deform(loads(np.array([[0.0, 0.0, -20.0]])))
+    warm = fem().deform(loads(np.array([[0.0, 0.0, -20.0]])), found)
+    assert found.outcome[0].good
+    assert found.inverted[0] > 0
+    assert warm.outcome[0] is Outcome.CONVERGED_ANEW
+    np.testing.assert_array_equal(warm.displacement, found.displacement)
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_tetrahedra_inside_out_are_counted(element: str, precision: str) -> None:
+    """None at rest, nor in a turned or crushed body; one whose corner is pushed through; all of a mirrored body."""
+    space = discretise(MESH, element)
+    inversion = Inversion(space, find_device("cpu", precision))  # pyright: ignore[reportArgumentType]
+    turn = MESH.nodes @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    through = MESH.nodes.copy()
+    alone = np.flatnonzero(np.bincount(MESH.tets.ravel()) == np.bincount(MESH.tets.ravel()).min())[0]
+    touching = (MESH.tets == alone).any(axis=1)
+    through[alone] += 3.0 * (MESH.nodes.mean(axis=0) - MESH.nodes[alone])
+    places = [MESH.nodes, turn, 1e-1 * MESH.nodes, MESH.nodes * [1.0, 1.0, -1.0], 0.0 * MESH.nodes, through]
+    u = np.stack([space.interpolated(place - MESH.nodes).ravel() for place in places], axis=1)
+    count = inversion.count(u)
+    every = len(MESH.tets)
+    np.testing.assert_array_equal(count[:5], [0, 0, 0, every, every])
+    assert 1 <= count[5] <= touching.sum()
