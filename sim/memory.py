@@ -15,6 +15,8 @@ WORK_COLUMNS = 40
 ANSWER_COPIES = 3
 # Of what is free, this share may be used: other programs live too.
 SHARE = 0.9
+# Where Linux says what a group of processes, a container say, may have and has.
+GROUP = Path("/sys/fs/cgroup")
 COARSER = "take a coarser mesh, or a larger machine."
 
 
@@ -31,10 +33,11 @@ def host_bytes() -> int:
     for line in _lines(Path("/proc/meminfo")):
         if line.startswith("MemAvailable:"):
             found.append(1024 * int(line.split()[1]))
-    group = Path("/sys/fs/cgroup")
-    most, used = (_lines(group / name) for name in ("memory.max", "memory.current"))
+    most, used, parts = (_lines(GROUP / name) for name in ("memory.max", "memory.current", "memory.stat"))
     if most and used and most[0].strip().isdigit():
-        found.append(int(most[0]) - int(used[0]))
+        # Cached files count as used, and are given up when memory is asked for.
+        cached = sum(int(line.split()[1]) for line in parts if line.startswith("inactive_file "))
+        found.append(int(most[0]) - int(used[0]) + cached)
     return min(found)
 
 
@@ -46,14 +49,15 @@ def check_fits(rows: int, batch: int, count: int, device: Device) -> None:
     InputError
         Naming what it takes, what is free, and what would fit.
     """
-    answers, host = ANSWER_COPIES * 8 * rows * count, SHARE * host_bytes()
-    if answers > host:
-        fitting = int(host / (answers / count))
+    column = WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
+    each, host = ANSWER_COPIES * 8 * rows, SHARE * host_bytes()
+    answers, alone = each * count, 0 if device.on_cuda else column
+    if answers + alone > host:
+        fitting = int((host - alone) / each)
         raise InputError(
             f"the answers to {count} loads take about {_gigabytes(answers)}, and {_gigabytes(host)} are free: "
-            + (f"solve at most {fitting} at a time." if fitting else COARSER)
+            + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
         )
-    column = WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
     room = SHARE * free_bytes(device) - (0 if device.on_cuda else answers)
     columns = min(batch, count)
     if column * columns > room:

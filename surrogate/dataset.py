@@ -41,7 +41,7 @@ class Dataset:
     loads
         n load cases.
     outcome
-        n outcomes; the rows of failed cases hold the last accepted state.
+        n outcomes; the rows of failed cases hold no equilibrium under the whole load.
     iterations, residual
         (n,).
     unit_good

@@ -210,6 +210,15 @@ def test_a_first_guess_shortens_the_way(solve) -> None:
     np.testing.assert_allclose(again.displacement, first.displacement, rtol=1e-12)
 
 
+def test_numbers_that_overflow_leave_no_infinity_in_the_report(solve) -> None:
+    run = solve({"fixed": BASE.astype(int), "force": 1e300 * FORCE})
+    assert run.code == 1
+    assert run.report["outcome"] == "not_finite"
+    assert run.report["residual"] is None
+    assert run.report["load_fraction"] == 0.0
+    assert np.isfinite(run.displacement).all()
+
+
 @pytest.mark.parametrize(("depth", "inverted"), [(0.05, 0), (0.11, 6)])
 def test_tetrahedra_that_end_inside_out_are_counted_and_printed(solve, depth: float, inverted: int) -> None:
     """The stable law has a state where the top is pressed through the base: converged, but no tissue."""

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     deformation = fem.deform(loads, start_of(file, args.mesh, UNITS[args.unit]))
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
-    outcome = deformation.outcome[0]
+    outcome, residual = deformation.outcome[0], float(deformation.residual[0])
     reached, inverted = float(deformation.reached[0]), int(deformation.inverted[0])
     if reached < 1.0:
         what = f"in equilibrium under {reached:.1%} of the load" if reached else "in equilibrium under no share of it"
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         "outcome": outcome.name.lower(),
         "message": outcome.value,
         "iterations": int(deformation.iterations[0]),
-        "residual": float(deformation.residual[0]),
+        "residual": residual if np.isfinite(residual) else None,  # JSON knows no infinity
         "load_fraction": reached,
         "element": fem.space.element,
         "nodes": fem.space.count,
