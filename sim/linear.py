@@ -10,8 +10,6 @@ from functools import cache
 from typing import Protocol
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg as spl
 import warp as wp
 
 from .columns import combined, dots, norms
@@ -29,77 +27,6 @@ class Preconditioner(Protocol):
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
         """out (3N, b) = M^-1 r (3N, b), in the columns that are `live` (b,); the others may hold anything finite."""
         ...
-
-
-class Factor:
-    """A rest stiffness K over some motions, L (L^T K L)^-1 L^T, factorised once on the host (SuperLU).
-
-    Parameters
-    ----------
-    stiffness
-        K (3N, 3N) [N/m].
-    motions
-        L (3N, n): independent motions as columns. Their own unknowns, three to a node, are numbered by `node` (n,).
-    device
-        Where the right-hand sides live; many are solved together.
-
-    Raises
-    ------
-    RuntimeError
-        K is singular over these motions: something is not held.
-    """
-
-    def __init__(self, stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device):
-        free = sp.csc_array(motions.T @ stiffness @ motions)
-        order = dissection(free, node)
-        if order is not None:
-            free, motions = free[order][:, order], motions[:, order]
-        self._motions = sp.csr_array(motions.astype(device.precision))
-        self._transposed = sp.csr_array(self._motions.T)
-        # Symmetric ordering without pivoting: the matrix is positive definite.
-        self._factor = spl.splu(
-            sp.csc_matrix(free.astype(device.precision)),
-            permc_spec="MMD_AT_PLUS_A" if order is None else "NATURAL",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-
-    def prepare(self, problem: Problem, columns: int) -> None:
-        """The rest stiffness serves every state."""
-
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Two triangular solves for each live column: the others would cost as much."""
-        values = r.numpy()
-        solved = np.zeros_like(values)
-        solved[:, live] = self._motions @ self._factor.solve(np.asfortranarray(self._transposed @ values[:, live]))
-        out.assign(solved)
-
-
-def node_of(basis: sp.csc_array) -> np.ndarray:
-    """The node (n,) that each column of a constraint's basis (3N, n) moves."""
-    return np.asarray(basis.indices[basis.indptr[:-1]] // 3)
-
-
-def dissection(matrix: sp.csc_array, node: np.ndarray) -> np.ndarray | None:
-    """An order (n,) of a matrix's unknowns with little fill: nested dissection of the graph of their nodes by METIS.
-
-    Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. None without pymetis: SuperLU's own order then costs twice the
-    time at 5,000 nodes, and forty times at 17,000.
-    """
-    try:
-        import pymetis
-    except ImportError:
-        return None
-    number, member = np.unique(node, return_inverse=True)
-    if not len(number):  # METIS divides by it
-        return member
-    entry = sp.coo_array(matrix)
-    first, second = member[entry.row], member[entry.col]
-    across = first != second
-    links = np.ones(int(across.sum()), np.int8), (first[across], second[across])
-    graph = sp.csr_array(sp.coo_array(links, shape=(len(number),) * 2))
-    _, place = pymetis.nested_dissection(pymetis.CSRAdjacency(np.ravel(graph.indptr), np.ravel(graph.indices)))
-    return np.argsort(np.asarray(place)[member], kind="stable")
 
 
 @cache

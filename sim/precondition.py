@@ -11,7 +11,8 @@ from .constraint import Constraint
 from .device import Device
 from .discretisation import Discretisation
 from .errors import InputError
-from .linear import BlockJacobi, Factor, Preconditioner, node_of
+from .factor import Factor, node_of
+from .linear import BlockJacobi, Preconditioner
 from .multigrid import TwoLevel
 from .problem import Problem
 

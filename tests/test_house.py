@@ -16,9 +16,9 @@ HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
 """Each room and the rooms that it may import."""
 TIERS = (
-    {"device", "columns", "sparse", "term", "constraint"},
+    {"device", "columns", "sparse", "sweep", "term", "constraint"},
     {"terms", "problem"},
-    {"linear", "direction", "search", "dense", "memory", "compile"},
+    {"linear", "factor", "direction", "search", "dense", "memory", "compile"},
     {"newton", "multigrid", "inversion"},
     {"precondition", "ladder"},
     {"fem"},

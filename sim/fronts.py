@@ -1,0 +1,148 @@
+"""Which unknowns of a sparse matrix are eliminated together, and in what order.
+
+Duff, Reid 1983, "The multifrontal solution of indefinite sparse symmetric linear equations", ACM Trans. Math. Softw.
+9:302-325; the elimination tree is Liu's: 1990, SIAM J. Matrix Anal. Appl. 11:134-172.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse import csgraph
+
+# Whole subtrees of at most so many unknowns are one front.
+LEAF = 96
+# Two fronts are joined while that stores at most so many zeros: another dense product costs as much.
+ZEROS = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """The unknowns first, ..., stop - 1, and the later ones (m,), ascending, that their elimination couples."""
+
+    first: int
+    stop: int
+    border: np.ndarray
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Its own unknowns, then the border's."""
+        return np.concatenate([np.arange(self.first, self.stop), self.border])
+
+
+def fronts_of(matrix: sp.csc_array, node: np.ndarray) -> tuple[np.ndarray, list[Front]]:
+    """An order (n,) of a matrix's unknowns with little fill, and its fronts; every front comes before those it touches.
+
+    `node` (n,): unknowns of one node stay together.
+    """
+    number, member, weight = np.unique(node, return_inverse=True, return_counts=True)
+    entry = sp.coo_array(matrix)
+    first, second = member[entry.row], member[entry.col]
+    across = first != second
+    links = np.ones(int(across.sum()), np.int8), (first[across], second[across])
+    graph = sp.csr_array(sp.coo_array(links, shape=(len(number),) * 2))
+    order = dissection(graph)
+    groups = _groups(sp.csr_array(graph[order][:, order]), weight[order])
+    inner = np.concatenate([np.zeros(0, int), *(own for own, _ in groups)])
+    order, place = order[inner], np.argsort(inner)
+    weight = weight[order]
+    start = np.cumsum(weight) - weight
+    fronts, stop = [], 0
+    for own, border in groups:
+        first, stop = stop, stop + int(weight[place[own]].sum())
+        later = np.sort(place[border])
+        fronts.append(Front(first, stop, _spread(start[later], weight[later])))
+    return np.argsort(np.argsort(order)[member], kind="stable"), fronts
+
+
+def dissection(graph: sp.csr_array) -> np.ndarray:
+    """An order (N,) of a symmetric graph's nodes with little fill: nested dissection.
+
+    By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. Without pymetis by levels, with more fill: George,
+    Liu 1978, SIAM J. Numer. Anal. 15:1053-1069.
+    """
+    count = len(graph.indptr) - 1
+    if count == 0:  # METIS divides by it
+        return np.zeros(0, int)
+    try:
+        import pymetis
+    except ImportError:
+        return dissection_by_levels(graph, np.arange(count))
+    order, _ = pymetis.nested_dissection(pymetis.CSRAdjacency(np.ravel(graph.indptr), np.ravel(graph.indices)))
+    return np.asarray(order)
+
+
+def dissection_by_levels(graph: sp.csr_array, nodes: np.ndarray) -> np.ndarray:
+    """The same nodes (k,), the middle level between two far ends last; both sides likewise."""
+    if 3 * len(nodes) <= LEAF:
+        return nodes
+    inside = graph[nodes][:, nodes]
+    count, part = csgraph.connected_components(inside, directed=False)
+    if count > 1:
+        return np.concatenate([dissection_by_levels(graph, nodes[part == number]) for number in range(count)])
+    end = csgraph.breadth_first_order(inside, 0, return_predecessors=False)[-1]
+    level = csgraph.dijkstra(inside, indices=end, unweighted=True)
+    middle = np.median(level)
+    sides = [nodes[level < middle], nodes[level > middle]]
+    return np.concatenate([*(dissection_by_levels(graph, side) for side in sides), nodes[level == middle]])
+
+
+def _spread(start: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """start, ..., start + count - 1 of each, one after the other."""
+    return np.repeat(start - (np.cumsum(count) - count), count) + np.arange(count.sum())
+
+
+def _parents(graph: sp.csr_array) -> list[int]:
+    """The elimination tree (N,) of a graph in its order; -1 at roots. Liu 1990, algorithm 4.2."""
+    count = len(graph.indptr) - 1
+    parent, ancestor = [-1] * count, [-1] * count
+    starts, neighbours = np.ravel(graph.indptr).tolist(), np.ravel(graph.indices).tolist()
+    for node in range(count):
+        for below in neighbours[starts[node] : starts[node + 1]]:
+            while below != -1 and below < node:
+                above, ancestor[below] = ancestor[below], node
+                if above == -1:
+                    parent[below] = node
+                below = above
+    return parent
+
+
+def _groups(graph: sp.csr_array, weight: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Nodes that are eliminated together, and the later nodes that these couple, group by group.
+
+    graph (N, N) in its order; weight (N,) unknowns a node.
+    """
+    parent, count = _parents(graph), len(weight)
+    below, top = weight.tolist(), list(range(count))
+    for node, above in enumerate(parent):
+        if above != -1:
+            below[above] += below[node]
+    for node in reversed(range(count)):
+        if parent[node] != -1 and below[parent[node]] <= LEAF:
+            top[node] = top[parent[node]]
+    members: dict[int, list[int]] = {}
+    for node in range(count):
+        members.setdefault(top[node], []).append(node)
+
+    def entries(own: int, border: int) -> float:
+        return own * (0.5 * own + border)
+
+    groups: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    size: dict[int, tuple[int, int]] = {}
+    children: dict[int, list[int]] = {last: [] for last in members}
+    for last in sorted(members):
+        own = np.array(members[last])
+        touched = [graph.indices[graph.indptr[node] : graph.indptr[node + 1]] for node in own]
+        touched = np.unique(np.concatenate([*touched, *(groups[child][1] for child in children[last])]))
+        border = touched[touched > last]
+        k, m = int(weight[own].sum()), int(weight[border].sum())
+        for child in children[last]:
+            j, n = size[child]
+            if entries(j + k, m) <= entries(k, m) + entries(j, n) + ZEROS:
+                own, k = np.concatenate([groups.pop(child)[0], own]), k + j
+        groups[last], size[last] = (own, border), (k, m)
+        if len(border):
+            children[int(border[0])].append(last)
+    return [groups[last] for last in sorted(groups)]

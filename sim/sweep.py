@@ -1,0 +1,144 @@
+"""One right-hand side through all fronts of a factor: native loops, at the speed of memory."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from .accuracy import Precision
+from .device import Device
+from .fronts import Front
+
+# Upwards: t = panel^T x_own, then x_own = the first k of t, and the border takes the rest. Four rows of a panel at a
+# time read and write t once.
+UP = """
+    real* x = xs.data + (size_t)column * xs.shape[1];
+    real* t = work.data + (size_t)column * work.shape[1];
+    for (int f = 0; f < fronts.shape[0]; ++f) {
+        const wp::int64* front = fronts.data + 5 * f;
+        const int first = front[0], k = front[1], n = k + front[2];
+        const int* b = border.data + front[3];
+        const real* p = panel.data + front[4];
+        for (int i = 0; i < n; ++i) t[i] = 0;
+        int c = 0;
+        for (; c + 4 <= k; c += 4) {
+            const real* __restrict p0 = p + (size_t)c * n;
+            const real* __restrict p1 = p0 + n;
+            const real* __restrict p2 = p1 + n;
+            const real* __restrict p3 = p2 + n;
+            const real x0 = x[first + c], x1 = x[first + c + 1], x2 = x[first + c + 2], x3 = x[first + c + 3];
+            for (int i = 0; i < n; ++i) t[i] += x0 * p0[i] + x1 * p1[i] + x2 * p2[i] + x3 * p3[i];
+        }
+        for (; c < k; ++c) {
+            const real* __restrict p0 = p + (size_t)c * n;
+            for (int i = 0; i < n; ++i) t[i] += x[first + c] * p0[i];
+        }
+        for (int i = 0; i < k; ++i) x[first + i] = t[i];
+        for (int i = k; i < n; ++i) x[b[i - k]] -= t[i];
+    }
+"""
+# Downwards: x_own -= (the panel's border part) x_border. Sixteen sums let the compiler use vector registers.
+DOWN = """
+    real* x = xs.data + (size_t)column * xs.shape[1];
+    real* t = work.data + (size_t)column * work.shape[1];
+    for (int f = fronts.shape[0] - 1; f >= 0; --f) {
+        const wp::int64* front = fronts.data + 5 * f;
+        const int first = front[0], k = front[1], m = front[2];
+        const int* b = border.data + front[3];
+        for (int i = 0; i < m; ++i) t[i] = x[b[i]];
+        for (int c = 0; c < k; ++c) {
+            const real* p = panel.data + front[4] + (size_t)c * (k + m) + k;
+            real sum[16] = {};
+            int i = 0;
+            for (; i + 16 <= m; i += 16)
+                for (int l = 0; l < 16; ++l) sum[l] += p[i + l] * t[i + l];
+            for (; i < m; ++i) sum[0] += p[i] * t[i];
+            for (int l = 1; l < 16; ++l) sum[0] += sum[l];
+            x[first + c] -= sum[0];
+        }
+    }
+"""
+
+
+@cache
+def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
+    """The sweeps up and down of a device's scalar type, over columns."""
+    scalar = device.scalar
+    real = {"float32": "float", "float64": "double"}[device.precision]
+
+    @wp.func_native(UP.replace("real", real))
+    def climb(
+        column: int,
+        fronts: wp.array2d(dtype=wp.int64),
+        border: wp.array(dtype=wp.int32),
+        panel: wp.array(dtype=scalar),
+        work: wp.array2d(dtype=scalar),
+        xs: wp.array2d(dtype=scalar),
+    ): ...
+
+    @wp.func_native(DOWN.replace("real", real))
+    def descend(
+        column: int,
+        fronts: wp.array2d(dtype=wp.int64),
+        border: wp.array(dtype=wp.int32),
+        panel: wp.array(dtype=scalar),
+        work: wp.array2d(dtype=scalar),
+        xs: wp.array2d(dtype=scalar),
+    ): ...
+
+    @wp.kernel(module="unique")
+    def up(
+        fronts: wp.array2d(dtype=wp.int64),
+        border: wp.array(dtype=wp.int32),
+        panel: wp.array(dtype=scalar),
+        # outputs
+        work: wp.array2d(dtype=scalar),
+        xs: wp.array2d(dtype=scalar),
+    ):
+        """Eliminate front by front in each row of xs (b, n)."""
+        climb(wp.tid(), fronts, border, panel, work, xs)
+
+    @wp.kernel(module="unique")
+    def down(
+        fronts: wp.array2d(dtype=wp.int64),
+        border: wp.array(dtype=wp.int32),
+        panel: wp.array(dtype=scalar),
+        # outputs
+        work: wp.array2d(dtype=scalar),
+        xs: wp.array2d(dtype=scalar),
+    ):
+        """Substitute back in each row of xs (b, n)."""
+        descend(wp.tid(), fronts, border, panel, work, xs)
+
+    return up, down
+
+
+class Sweep:
+    """The panels of a factor, one after the other in memory."""
+
+    def __init__(self, fronts: Sequence[Front], panels: Sequence[np.ndarray], precision: Precision):
+        self._device = Device("cpu", precision)
+        borders = [np.zeros(0, int), *(front.border for front in fronts)]
+        first, size, border, entries = (
+            np.array(column, int)
+            for column in (
+                [front.first for front in fronts],
+                [front.stop - front.first for front in fronts],
+                [len(front.border) for front in fronts],
+                [panel.size for panel in panels],
+            )
+        )
+        table = first, size, border, np.cumsum(border) - border, np.cumsum(entries) - entries
+        self._fronts = self._device.array(np.column_stack(table), wp.int64)
+        self._border = self._device.array(np.concatenate(borders), wp.int32)
+        self._panel = self._device.array(np.concatenate([np.zeros(0), *(panel.ravel() for panel in panels)]))
+        self._longest = int((size + border).max(initial=0))
+
+    def solved(self, x: np.ndarray) -> np.ndarray:
+        """x (n, b) after both sweeps, column by column."""
+        rows = self._device.array(x.T)
+        work = self._device.zeros(x.shape[1], self._longest)
+        for kernel in kernels_of(self._device):
+            self._device.launch(kernel, (x.shape[1],), [self._fronts, self._border, self._panel], [work, rows])
+        return rows.numpy().T

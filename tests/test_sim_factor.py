@@ -1,0 +1,142 @@
+"""The sparse factor against dense algebra: every order, precision and number of right-hand sides."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from boxes import base_held, box, hold
+
+from sim.anatomy import Anatomy
+from sim.compile import compile_problem
+from sim.device import Precision, find_device
+from sim.effects import Elasticity, Held, Slide
+from sim.factor import FEW, Factor, node_of
+from sim.fronts import dissection, fronts_of
+
+CELLS = (6, 6, 6)
+EXACT = {"float32": 2e-5, "float64": 1e-12}
+
+
+@pytest.fixture(params=["metis", "levels"])
+def order(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every order that may be had: without pymetis there is one too."""
+    if request.param == "levels":
+        monkeypatch.setitem(sys.modules, "pymetis", None)
+
+
+def sliding() -> Anatomy:
+    """A block on a held base whose sides slide: nodes of three, two and one unknowns."""
+    mesh = box(CELLS, 0.1, distortion=0.15)
+    base = mesh.nodes[:, 2] < 1e-9
+    normal = np.zeros((len(mesh.nodes), 3))
+    normal[mesh.nodes[:, 0] < 1e-9] = [0.6, 0.0, 0.8]
+    return hold(mesh, base, np.where(base[:, None], 0.0, normal))
+
+
+def system(anatomy: Anatomy) -> tuple[sp.csc_array, sp.csc_array]:
+    """Stiffness at rest and free motions."""
+    problem = compile_problem([Elasticity(), Held(), Slide()], anatomy, find_device("cpu", "float64"))
+    return problem.rest_curvature(), problem.constraint.basis()
+
+
+def applied(factor: Factor, r: np.ndarray, precision: Precision, live: np.ndarray | None = None) -> np.ndarray:
+    device = find_device("cpu", precision)
+    out = device.zeros(*r.shape)
+    factor.apply(device.array(r), np.ones(r.shape[1], bool) if live is None else live, out)
+    return out.numpy()
+
+
+@pytest.mark.parametrize("precision", EXACT)
+@pytest.mark.usefixtures("order")
+def test_it_is_the_inverse_over_the_free_motions(precision: Precision) -> None:
+    stiffness, motions = system(sliding())
+    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", precision))
+    L, r = motions.toarray(), np.random.default_rng(0).normal(size=(stiffness.shape[0], FEW + 2))
+    expected = L @ np.linalg.solve(L.T @ stiffness @ L, L.T @ r)
+    for columns in (1, FEW, FEW + 2):  # sweeps, and products of matrices
+        found = applied(factor, r[:, :columns], precision)
+        error = np.linalg.norm(found - expected[:, :columns], axis=0) / np.linalg.norm(expected[:, :columns], axis=0)
+        assert (error < EXACT[precision]).all()
+
+
+@pytest.mark.parametrize("columns", [FEW, FEW + 2])
+def test_it_is_symmetric_in_single_precision(columns: int) -> None:
+    """Conjugate gradients ask it of every preconditioner, to round-off."""
+    stiffness, motions = system(sliding())
+    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", "float32"))
+    r = np.random.default_rng(1).normal(size=(stiffness.shape[0], columns))
+    gram = r.T @ applied(factor, r, "float32")
+    np.testing.assert_allclose(gram, gram.T, atol=1e-6 * np.abs(gram).max())
+
+
+@pytest.mark.parametrize("count", [2, FEW + 3])
+def test_only_live_columns_are_solved(count: int) -> None:
+    stiffness, motions = system(sliding())
+    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", "float64"))
+    r = np.random.default_rng(2).normal(size=(stiffness.shape[0], count))
+    live = np.arange(count) != 1
+    found, whole = applied(factor, r, "float64", live), applied(factor, r, "float64")
+    np.testing.assert_allclose(found[:, live], whole[:, live], rtol=1e-12, atol=1e-12 * np.abs(whole).max())
+    assert np.isfinite(found).all()
+
+
+@pytest.mark.usefixtures("order")
+def test_a_front_touches_later_unknowns_alone() -> None:
+    """And every entry of the matrix lies within the front of its earlier unknown."""
+    stiffness, motions = system(sliding())
+    free = sp.csc_array(motions.T @ stiffness @ motions)
+    order, fronts = fronts_of(free, node_of(motions))
+    assert sorted(order) == list(range(free.shape[0]))
+    assert len(fronts) > 4
+    assert [front.first for front in fronts[1:]] == [front.stop for front in fronts[:-1]]
+    assert fronts[-1].stop == free.shape[0]
+    matrix = sp.csc_array(free[order][:, order])
+    for front in fronts:
+        assert (np.diff(front.border) > 0).all()
+        assert (front.border >= front.stop).all()
+        touched = matrix[:, np.arange(front.first, front.stop)].nonzero()[0]
+        assert set(touched[touched >= front.first]) <= set(front.rows)
+
+
+@pytest.mark.usefixtures("order")
+def test_dissection_leaves_little_fill() -> None:
+    """A chain of a thousand nodes: an order that ignores the graph fills it."""
+    chain = sp.csr_array(sp.diags_array([np.ones(999), np.ones(999)], offsets=[-1, 1]).astype(np.int8))
+    assert sorted(dissection(chain)) == list(range(1000))
+    matrix = sp.csc_array(sp.diags_array([-np.ones(999), np.full(1000, 3.0), -np.ones(999)], offsets=[-1, 0, 1]))
+    _, fronts = fronts_of(matrix, np.arange(1000))
+    assert max(len(front.border) for front in fronts) <= 4
+
+
+@pytest.mark.usefixtures("order")
+def test_pieces_that_do_not_touch_are_solved_together() -> None:
+    matrix = sp.csc_array(sp.block_diag([np.array([[2.0, -1.0], [-1.0, 2.0]])] * 200))
+    factor = Factor(matrix, sp.csc_array(sp.eye_array(400)), np.arange(400), find_device("cpu", "float64"))
+    r = np.random.default_rng(3).normal(size=(400, 1))
+    np.testing.assert_allclose(matrix @ applied(factor, r, "float64"), r, rtol=1e-12)
+
+
+def test_a_single_unknown_and_none() -> None:
+    one = Factor(sp.csc_array([[4.0]]), sp.csc_array([[1.0]]), np.zeros(1, int), find_device("cpu", "float64"))
+    assert applied(one, np.array([[2.0, 6.0]]), "float64").tolist() == [[0.5, 1.5]]
+    none = Factor(sp.csc_array(np.eye(3)), sp.csc_array((3, 0)), np.zeros(0, int), find_device("cpu", "float64"))
+    for columns in (1, FEW + 1):
+        assert not applied(none, np.ones((3, columns)), "float64").any()
+
+
+@pytest.mark.usefixtures("order")
+def test_what_is_not_held_cannot_be_factorised() -> None:
+    """Rigid motions have no stiffness; neither has a node of no element."""
+    anatomy = base_held(box(CELLS, 0.1, distortion=0.15))
+    stiffness, _ = system(anatomy)
+    every = sp.csc_array(sp.eye_array(stiffness.shape[0]))
+    with pytest.raises(RuntimeError, match="positive definite"):
+        Factor(stiffness, every, node_of(every), find_device("cpu", "float32"))
+    with pytest.raises(RuntimeError, match="positive definite"):
+        Factor(sp.csc_array(-stiffness), every, node_of(every), find_device("cpu", "float64"))
+    nothing = sp.csc_array((3, 3))
+    with pytest.raises(RuntimeError, match="positive definite"):
+        Factor(nothing, sp.csc_array(sp.eye_array(3)), np.zeros(3, int), find_device("cpu", "float64"))
