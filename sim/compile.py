@@ -14,9 +14,9 @@ from .device import Device
 from .discretisation import Discretisation, discretise
 from .effects import Effect, Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
 from .errors import InputError
-from .footprint import footprint_weights
+from .footprint import Skin
 from .holding import check_held
-from .loads import Displaced, Loads, Nodal, Prescribed, Pushed
+from .loads import Displaced, Loads, Nodal, Prescribed, Pushed, check_field
 from .material import Tissue, coefficients_of, portion
 from .problem import Imposed, Problem
 from .term import Term
@@ -43,6 +43,7 @@ def compile_problem(
     if Elasticity not in kinds:
         raise InputError("no effect resists deformation: add Elasticity.")
     space = space or discretise(anatomy.mesh, "p1")
+    skin = Skin(space.nodes, space.surface, device)
     terms: list[Term] = []
     held = np.zeros_like(anatomy.held)
     normal = np.zeros_like(anatomy.slide_normal)
@@ -55,13 +56,13 @@ def compile_problem(
             case Slide():
                 normal = anatomy.slide_normal
             case ToolForce():
-                from .terms.dead_force import DeadForce
+                from .terms.dead_force import DeadForce, pushed_forces
 
-                terms.append(DeadForce("tool force", partial(pushed_forces, space), device))
+                terms.append(DeadForce("tool force", partial(pushed_forces, skin, device), device))
             case NodalForce():
-                from .terms.dead_force import DeadForce
+                from .terms.dead_force import DeadForce, nodal_forces
 
-                terms.append(DeadForce("nodal force", partial(_nodal_forces, space), device))
+                terms.append(DeadForce("nodal force", partial(nodal_forces, len(anatomy.mesh.nodes), device), device))
             case ToolDisplacement():
                 pass  # a constraint: `_impose` reads the loads
             case _:
@@ -69,7 +70,7 @@ def compile_problem(
                 raise InputError(f"no effect is called {type(effect).__name__}: choose from {allowed}.")
     check_held(anatomy.mesh, held, normal)
     constraint = Constraint(space.held(held), space.sliding(normal, held), device)
-    return Problem(tuple(terms), constraint, device, partial(_impose, space))
+    return Problem(tuple(terms), constraint, device, partial(_impose, space, skin))
 
 
 def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
@@ -87,43 +88,16 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
             raise InputError(f"loads hold {type(cause).__name__}, which nothing answers: add the effect {needed}.")
 
 
-def footprint_of(space: Discretisation, cause: Pushed | Displaced) -> np.ndarray:
-    """Weights (B, N) of a tool's footprint on the nodes; each row sums to one."""
-    return footprint_weights(space.nodes, space.surface, cause.point, cause.footprint).toarray()
-
-
-def pushed_forces(space: Discretisation, loads: Loads) -> np.ndarray:
-    """Nodal forces (3N, B) [N] of pushing tools."""
-    cause = loads.of(Pushed)
-    if cause is None:
-        return np.zeros((3 * space.count, len(loads)))
-    weight = footprint_of(space, cause)
-    return (weight[:, :, None] * cause.force[:, None, :]).reshape(len(loads), 3 * weight.shape[1]).T
-
-
-def _nodal_forces(space: Discretisation, loads: Loads) -> np.ndarray:
-    cause = loads.of(Nodal)
-    out = np.zeros((len(loads), space.count, 3))
-    if cause is not None:
-        _check_field("Nodal.force", cause.force, space)
-        out[:, : cause.force.shape[1]] = cause.force
-    return out.reshape(len(loads), 3 * space.count).T
-
-
-def _impose(space: Discretisation, loads: Loads) -> Imposed:
+def _impose(space: Discretisation, skin: Skin, loads: Loads) -> Imposed:
     prescribed, displaced = loads.of(Prescribed), loads.of(Displaced)
     value = None
     if prescribed is not None:
-        _check_field("Prescribed.displacement", prescribed.displacement, space)
+        check_field("Prescribed.displacement", prescribed.displacement, len(space.mesh.nodes))
         value = space.interpolated(prescribed.displacement).reshape(len(loads), 3 * space.count).T
     if displaced is None:
         return Imposed(value)
-    return Imposed(value, footprint_of(space, displaced).T, displaced.displacement.T)
-
-
-def _check_field(name: str, field: np.ndarray, space: Discretisation) -> None:
-    if field.shape[1] != len(space.mesh.nodes):
-        raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {len(space.mesh.nodes)}.")
+    weight = skin.press(displaced.point, displaced.footprint).rows(space.count)
+    return Imposed(value, weight.toarray().T, displaced.displacement.T)
 
 
 def _elasticity(effect: Elasticity, space: Discretisation, device: Device) -> list[Term]:

@@ -10,13 +10,14 @@ import scipy.sparse as sp
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
-from .compile import check_causes, compile_problem, footprint_of
+from .compile import check_causes, compile_problem
 from .deformation import Cost, Deformation
 from .device import find_device
 from .direction import LBFGS, NewtonCG
 from .discretisation import discretise
 from .effects import Effect
 from .errors import InputError
+from .footprint import Skin
 from .inversion import Inversion
 from .ladder import Ladder, shortfall
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
@@ -67,6 +68,7 @@ class Fem:
         self.batch = batch
         self.space = discretise(anatomy.mesh, element)
         self.problem = compile_problem(self.effects, anatomy, find_device(device, accuracy.precision), self.space)
+        self._skin = Skin(self.space.nodes, self.space.surface, self.problem.device)
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed)
         inversion = Inversion(self.space, self.problem.device)
         self._ladder = Ladder(LBFGS(preconditioner), NewtonCG(preconditioner, accuracy.inner), inversion, accuracy)
@@ -174,7 +176,7 @@ class Fem:
                 force = cause.force if isinstance(cause, Pushed) else on_footprint
                 assert force is not None
                 force = force if isinstance(cause, Pushed) else force.T
-                arm = footprint_of(self.space, cause) @ self.space.nodes - cause.point
+                arm = self._skin.press(cause.point, cause.footprint).centres() - cause.point
                 rows.append(np.concatenate([force, np.cross(arm, force)], axis=1))
         return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))
 

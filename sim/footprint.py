@@ -4,136 +4,284 @@ The traction w(s) = sqrt(1 - s^2), s = |x - c| / r, is that of a flat punch's sm
 over triangles subdivided until they are small against the footprint: force and moment do not depend on the mesh.
 """
 
-from __future__ import annotations
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+import warp as wp
 
-from .element import quadratic_shapes
+from .device import Device, find_device
 from .errors import InputError
-from .mesh import TRIANGLE_EDGES
 
 # Triangles are divided until their longest edge is below this share of the footprint's radius.
 FINENESS = 0.12
+# Each edge in so many pieces at least, and then in twice as many until that is fine enough.
 PIECES = 8
+# Triangles that one thread searches.
+CHUNK = 64
 
 
-def barycentric_lattice(rows: int) -> np.ndarray:
-    """Corner coordinates (rows^2, 3) of the centres of a triangle's equal pieces, `rows` along each edge."""
-    upright = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(rows) for j in range(rows - i)]
-    turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(rows - 1) for j in range(rows - 1 - i)]
-    share = np.array(upright + turned) / rows
-    return np.column_stack([1.0 - share.sum(axis=1), share])
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Weights of B tools on M nodes: a force F puts weight x F on every node.
+
+    nodes (M,) numbers; weight (M, B) float64 on the device, each column sums to one; centre (B,) of 3-vectors [m], the
+    weighted mean position.
+    """
+
+    nodes: np.ndarray
+    weight: wp.array
+    centre: wp.array
+
+    def rows(self, count: int) -> sp.csr_array:
+        """The weights (B, `count`) on all nodes of a mesh, on the host."""
+        weight = self.weight.numpy()
+        tool, place = np.nonzero(weight.T)
+        return sp.csr_array((weight[place, tool], (tool, self.nodes[place])), shape=(weight.shape[1], count))
+
+    def centres(self) -> np.ndarray:
+        """Where each force acts (B, 3) [m], on the host."""
+        return self.centre.numpy().reshape(-1, 3)
 
 
-LATTICE = barycentric_lattice(PIECES)
-
-
-def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:
-    """Weights (B, V), each row summing to one: a force F at `points` (B, 3) puts weight x F on every vertex.
+class Skin:
+    """A surface that tools touch, on a device.
 
     Parameters
     ----------
     nodes
-        (V, 3) [m].
+        (N, 3) [m].
     triangles
-        (S, 3), or (S, 6) with the middles of `TRIANGLE_EDGES` if quadratic: where the tool may touch. The corners say
-        where they lie.
-    points, radii
-        (B, 3) and (B,) [m]. A point off the surface is moved to its nearest point on it, by at most its radius.
-
-    Raises
-    ------
-    InputError
-        A footprint that does not touch the surface.
+        (S, 3), or (S, 6) with the middles of `TRIANGLE_EDGES` if quadratic. The corners say where they lie.
+    device
+        Where its arrays live.
     """
-    corners = nodes[triangles[:, :3]]
-    centre = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
-    columns, values, ends = [np.zeros(0, int)], [np.zeros(0)], [0]
-    for number, (point, radius) in enumerate(zip(points, radii, strict=True)):
-        near = np.flatnonzero(np.linalg.norm(centre - point, axis=1) <= reach + radius)
-        touched = nearest_on(corners[near], point) if len(near) else None
-        if touched is None or np.linalg.norm(touched - point) > radius:
+
+    def __init__(self, nodes: np.ndarray, triangles: np.ndarray, device: Device):
+        self.device = device
+        self.nodes, table = np.unique(triangles, return_inverse=True)
+        corners = nodes[triangles[:, :3]]
+        centre = corners.mean(axis=1)
+        reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+        self._corners = device.array(corners, wp.vec3d)
+        self._ball = device.array(np.column_stack([centre, reach]), wp.vec4d)
+        self._table = device.array(table.reshape(triangles.shape), wp.int32)
+        self._position = device.array(nodes[self.nodes], wp.vec3d)
+
+    def nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[wp.array, wp.array]:
+        """The nearest points (B,) [m] to `points` (B, 3) and how far they are; inf if not `within` (B,) [m]."""
+        chunks, count = -(-len(self._ball) // CHUNK), len(points)
+        found, distance = self._empty(wp.vec3d, chunks, count), self._empty(wp.float64, chunks, count)
+        inputs = [self._corners, self._ball, self.device.array(points, wp.vec3d), self.device.array(within, wp.float64)]
+        self.device.launch(_search, (chunks, count), inputs, [found, distance])
+        nearest, least = self._empty(wp.vec3d, count), self._empty(wp.float64, count)
+        self.device.launch(_settle, (count,), [found, distance], [nearest, least])
+        return nearest, least
+
+    def press(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
+        """Footprints of tools at `points` (B, 3) with `radii` (B,) [m].
+
+        A point off the surface is moved to its nearest point on it, by at most its radius.
+
+        Raises
+        ------
+        InputError
+            A footprint that does not touch the surface.
+        """
+        touched, distance = self.nearest(points, radii)
+        missed = np.flatnonzero(np.isinf(distance.numpy()))
+        if len(missed):
+            number = missed[0]
             raise InputError(
-                f"load {number} presses at {np.round(1e3 * point, 1)} mm with a footprint of {1e3 * radius:.3g} mm, "
-                "which does not touch the surface: choose a point on it."
+                f"load {number} presses at {np.round(1e3 * points[number], 1)} mm with a footprint of "
+                f"{1e3 * radii[number]:.3g} mm, which does not touch the surface: choose a point on it."
             )
-        near = np.flatnonzero(np.linalg.norm(centre - touched, axis=1) <= reach + radius)
-        weight = _integrate(corners[near], touched, radius, triangles.shape[1])
-        vertices, place = np.unique(triangles[near], return_inverse=True)
-        total = np.bincount(place.ravel(), weight.ravel())
-        loaded = total != 0.0
-        columns.append(vertices[loaded])
-        values.append(total[loaded] / weight.sum())
-        ends.append(ends[-1] + int(loaded.sum()))
-    return sp.csr_array((np.concatenate(values), np.concatenate(columns), ends), shape=(len(points), len(nodes)))
+        count = len(points)
+        weight, total = (
+            wp.zeros(shape, dtype=wp.float64, device=self.device.name) for shape in ((len(self.nodes), count), count)
+        )
+        centre = wp.zeros(count, dtype=wp.vec3d, device=self.device.name)
+        inputs = [self._corners, self._ball, self._table, touched, self.device.array(radii, wp.float64)]
+        self.device.launch(_press, (len(self._ball), count), inputs, [weight, total])
+        self.device.launch(_share, (len(self.nodes), count), [self._position, total], [weight, centre])
+        return Footprints(self.nodes, weight, centre)
+
+    def _empty(self, dtype: type, *shape: int) -> wp.array:
+        return wp.empty(shape, dtype=dtype, device=self.device.name)
+
+
+def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:
+    """Weights (B, N), each row summing to one; parameters and errors as `Skin` and `Skin.press`, on the host."""
+    return Skin(nodes, triangles, find_device("cpu", "float64")).press(points, radii).rows(len(nodes))
 
 
 def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """The point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m].
+    """The point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m]."""
+    apart = np.arange(3 * len(corners)).reshape(-1, 3)
+    skin = Skin(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))
+    return skin.nearest(point[None], np.array([np.inf]))[0].numpy()[0]
+
+
+@wp.func
+def _on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+    """The point nearest to `point` between a and b."""
+    edge = b - a
+    square = wp.dot(edge, edge)
+    along = wp.float64(0.0)
+    if square > wp.float64(0.0):
+        along = wp.clamp(wp.dot(point - a, edge) / square, wp.float64(0.0), wp.float64(1.0))
+    return a + along * edge
+
+
+@wp.func
+def _nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+    """Whichever is nearer to `point`."""
+    return wp.where(wp.length_sq(one - point) <= wp.length_sq(other - point), one, other)
+
+
+@wp.func
+def _on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+    """The point nearest to `point` on a triangle.
 
     Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the plane's foot where it lies inside, else the
-    nearest of the three edges.
+    nearest of the three edges. A needle has no foot to round-off: its edges serve.
     """
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    nearest = _nearer(_nearer(_on_edge(a, b, point), _on_edge(b, c, point), point), _on_edge(c, a, point), point)
     first, second, offset = b - a, c - a, point - a
     # Corner coordinates of the foot from the Gram matrix of two edges.
-    aa, ab, bb = (
-        np.einsum("si,si->s", one, other) for one, other in ((first, first), (first, second), (second, second))
-    )
-    pa, pb = np.einsum("si,si->s", offset, first), np.einsum("si,si->s", offset, second)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a needle has no foot to round-off: its edges serve
-        v, w = (bb * pa - ab * pb) / (aa * bb - ab * ab), (aa * pb - ab * pa) / (aa * bb - ab * ab)
-        foot = a + v[:, None] * first + w[:, None] * second
-        inside = (v >= 0.0) & (w >= 0.0) & (v + w <= 1.0)
-    candidates = []
-    for start, end in ((a, b), (b, c), (c, a)):
-        edge = end - start
-        along = np.einsum("si,si->s", point - start, edge) / np.einsum("si,si->s", edge, edge)
-        candidates.append(start + along.clip(0.0, 1.0)[:, None] * edge)
-    candidates.append(foot[inside])
-    nearest = np.concatenate(candidates)
-    return nearest[np.argmin(np.linalg.norm(nearest - point, axis=1))]
+    aa, ab, bb = wp.dot(first, first), wp.dot(first, second), wp.dot(second, second)
+    pa, pb = wp.dot(offset, first), wp.dot(offset, second)
+    area = aa * bb - ab * ab
+    v, w = bb * pa - ab * pb, aa * pb - ab * pa
+    if area > wp.float64(0.0) and v >= wp.float64(0.0) and w >= wp.float64(0.0) and v + w <= area:
+        nearest = _nearer(a + (v / area) * first + (w / area) * second, nearest, point)
+    return nearest
 
 
-def _integrate(corners: np.ndarray, point: np.ndarray, radius: float, size: int) -> np.ndarray:
-    """Integral of w N_a over the footprint (S, size), up to a factor, by one point per subdivided triangle.
+@wp.kernel
+def _search(
+    corners: wp.array2d(dtype=wp.vec3d),
+    ball: wp.array(dtype=wp.vec4d),
+    points: wp.array(dtype=wp.vec3d),
+    within: wp.array(dtype=wp.float64),
+    # outputs
+    found: wp.array2d(dtype=wp.vec3d),
+    distance: wp.array2d(dtype=wp.float64),
+):
+    """The nearest point of a chunk of triangles, and how far it is; inf where none is near enough."""
+    chunk, c = wp.tid()
+    point = points[c]
+    best = within[c]
+    distance[chunk, c] = wp.float64(wp.inf)
+    for s in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, ball.shape[0])):
+        round = ball[s]
+        offset = wp.vec3d(round[0], round[1], round[2]) - point
+        if wp.length_sq(offset) <= (round[3] + best) * (round[3] + best):
+            nearest = _on_triangle(corners[s, 0], corners[s, 1], corners[s, 2], point)
+            far = wp.length(nearest - point)
+            if far <= best:
+                best = far
+                distance[chunk, c] = far
+                found[chunk, c] = nearest
 
-    N_a are the shape functions of triangles of `size` 3 or 6 nodes.
 
-    Triangles are quartered until a lattice of `PIECES` rows is fine enough, so that a small tool on a large triangle
-    costs no more than a large tool on small ones.
+@wp.kernel
+def _settle(
+    found: wp.array2d(dtype=wp.vec3d),
+    distance: wp.array2d(dtype=wp.float64),
+    # outputs
+    nearest: wp.array(dtype=wp.vec3d),
+    least: wp.array(dtype=wp.float64),
+):
+    """The nearest of all chunks."""
+    c = wp.tid()
+    least[c] = wp.float64(wp.inf)
+    for chunk in range(found.shape[0]):
+        if distance[chunk, c] < least[c]:
+            least[c] = distance[chunk, c]
+            nearest[c] = found[chunk, c]
+
+
+@wp.kernel
+def _press(
+    corners: wp.array2d(dtype=wp.vec3d),
+    ball: wp.array(dtype=wp.vec4d),
+    table: wp.array2d(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3d),
+    radii: wp.array(dtype=wp.float64),
+    # outputs
+    weight: wp.array2d(dtype=wp.float64),
+    total: wp.array(dtype=wp.float64),
+):
+    """Add the integral of w N_a over a triangle, up to a factor, by the centres of n^2 equal pieces.
+
+    A row of pieces, y constant, meets the footprint in an interval: where A j^2 + 2 B j + C < 0 at its j-th piece.
     """
-    out = np.zeros((len(corners), size))
-    owner = np.arange(len(corners))
-    bary = np.broadcast_to(np.eye(3), (len(corners), 3, 3))  # corner coordinates of each piece within its owner
-    while len(owner):
-        at = bary @ corners[owner] - point
-        edges = at - at[:, [2, 0, 1]]
-        longest = np.sqrt(np.einsum("pci,pci->pc", edges, edges).max(axis=1))
-        centre = at.mean(axis=1)
-        inside = np.sqrt(np.einsum("pi,pi->p", centre, centre)) <= radius + longest
-        small = longest <= PIECES * FINENESS * radius
-        done = small & inside
-        area = np.linalg.norm(np.cross(edges[done, 0], edges[done, 1]), axis=1)
-        samples = LATTICE @ at[done]
-        share = np.einsum("pqi,pqi->pq", samples, samples) / radius**2
-        weight = area[:, None] * np.sqrt(np.clip(1.0 - share, 0.0, None))
-        if size == 3:  # linear in the corner coordinates: they may be summed first
-            np.add.at(out, owner[done], np.einsum("pa,pab->pb", weight @ LATTICE, bary[done]))
-        else:
-            shape = quadratic_shapes(LATTICE @ bary[done], TRIANGLE_EDGES)
-            np.add.at(out, owner[done], np.einsum("pq,pqa->pa", weight, shape))
-        split = inside & ~small
-        owner = np.repeat(owner[split], 4)
-        bary = _quartered(bary[split])
-    return out
+    s, c = wp.tid()
+    radius = radii[c]
+    round = ball[s]
+    offset = wp.vec3d(round[0], round[1], round[2]) - points[c]
+    if wp.length_sq(offset) > (round[3] + radius) * (round[3] + radius):
+        return
+    zero, one, two, four = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0), wp.float64(4.0)
+    start, first, second = corners[s, 0] - points[c], corners[s, 1] - corners[s, 0], corners[s, 2] - corners[s, 0]
+    longest = wp.max(wp.max(wp.length(first), wp.length(second)), wp.length(first - second))
+    n = int(PIECES)
+    while longest > wp.float64(FINENESS) * radius * wp.float64(n):
+        n *= 2
+    h = one / wp.float64(n)
+    step = h * second
+    A = wp.length_sq(step)
+    # Moments of w over the triangle for corner coordinates (1 - y - z, y, z): of 1, y, z, and of y^2, y z, z^2.
+    m, mm = wp.vec3d(), wp.vec3d()
+    # Upright pieces have their centres a third of the way, those turned round two thirds.
+    for turned in range(2):
+        third = wp.float64(turned + 1) / wp.float64(3.0)
+        for i in range(n - turned):
+            b = (wp.float64(i) + third) * h
+            at = start + b * first + third * step
+            B = wp.dot(at, step)
+            C = wp.length_sq(at) - radius * radius
+            if B * B > A * C:
+                root = wp.sqrt(B * B - A * C)
+                low = int(wp.max((-B - root) / A, zero))
+                high = int(wp.clamp((root - B) / A, -one, wp.float64(n - i - turned - 1)))
+                row = wp.vec3d()
+                for j in range(low, high + 1):
+                    k = wp.float64(j)
+                    a = (k + third) * h
+                    row += wp.sqrt(wp.max(-((A * k + two * B) * k + C), zero)) * wp.vec3d(one, a, a * a)
+                m += wp.vec3d(row[0], b * row[0], row[1])
+                mm += wp.vec3d(b * b * row[0], b * row[1], row[2])
+    if m[0] == zero:
+        return
+    scale = wp.length(wp.cross(first, second)) * h * h / radius
+    wp.atomic_add(total, c, scale * m[0])
+    x, y, z = m[0] - m[1] - m[2], m[1], m[2]
+    if table.shape[1] == 3:
+        wp.atomic_add(weight, table[s, 0], c, scale * x)
+        wp.atomic_add(weight, table[s, 1], c, scale * y)
+        wp.atomic_add(weight, table[s, 2], c, scale * z)
+    else:  # L (2 L - 1) at corners, 4 L_i L_j between them
+        xy, yz, zx = y - mm[0] - mm[1], mm[1], z - mm[1] - mm[2]
+        wp.atomic_add(weight, table[s, 0], c, scale * (x - two * (xy + zx)))
+        wp.atomic_add(weight, table[s, 1], c, scale * (y - two * (xy + yz)))
+        wp.atomic_add(weight, table[s, 2], c, scale * (z - two * (yz + zx)))
+        wp.atomic_add(weight, table[s, 3], c, scale * four * xy)
+        wp.atomic_add(weight, table[s, 4], c, scale * four * yz)
+        wp.atomic_add(weight, table[s, 5], c, scale * four * zx)
 
 
-def _quartered(bary: np.ndarray) -> np.ndarray:
-    """Each triangle (n, 3, 3) cut at its mid-edges: (4n, 3, 3)."""
-    a, b, c = bary[:, 0], bary[:, 1], bary[:, 2]
-    ab, bc, ca = (a + b) / 2.0, (b + c) / 2.0, (c + a) / 2.0
-    pieces = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
-    return np.stack([np.stack(piece, axis=1) for piece in pieces], axis=1).reshape(-1, 3, 3)
+@wp.kernel
+def _share(
+    position: wp.array(dtype=wp.vec3d),
+    total: wp.array(dtype=wp.float64),
+    # outputs
+    weight: wp.array2d(dtype=wp.float64),
+    centre: wp.array(dtype=wp.vec3d),
+):
+    """Shares of the whole, and their mean position."""
+    i, c = wp.tid()
+    if weight[i, c] != wp.float64(0.0):
+        weight[i, c] /= total[c]
+        wp.atomic_add(centre, c, weight[i, c] * position[i])

@@ -158,6 +158,18 @@ def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) ->
     )
 
 
+def check_field(name: str, field: np.ndarray, vertices: int) -> None:
+    """Refuse a whole field (B, V, 3) of another mesh.
+
+    Raises
+    ------
+    InputError
+        Naming the field, its vertices and the mesh's.
+    """
+    if field.shape[1] != vertices:
+        raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {vertices}.")
+
+
 def _checked(cause: Cause) -> Cause:
     name = type(cause).__name__
     arrays = {item.name: np.asarray(getattr(cause, item.name), np.float64) for item in fields(cause)}

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.footprint import footprint_weights
 from sim.loads import Pushed
 
 from .patch import Patch
@@ -23,7 +22,7 @@ def directions(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
 
 def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Forces (B, 3 m) at the patch's nodes, for one newton: the finite elements' own integral over the footprint."""
-    weights = footprint_weights(patch.points, patch.triangles, pushed.point, pushed.footprint)
+    weights = patch.skin.press(pushed.point, pushed.footprint).rows(len(patch.points))
     shares = np.einsum("bm,bi->bmi", weights.toarray(), directions(pushed)[1])
     return shares.reshape(len(shares), 3 * len(patch.points))
 

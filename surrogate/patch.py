@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -11,7 +12,17 @@ from scipy.spatial.distance import cdist
 from sim.anatomy import Anatomy
 from sim.boundary import vertex_normals
 from sim.errors import InputError
-from sim.footprint import barycentric_lattice
+
+if TYPE_CHECKING:
+    from sim.footprint import Skin
+
+
+def barycentric_lattice(rows: int) -> np.ndarray:
+    """Corner coordinates (rows^2, 3) of the centres of a triangle's equal pieces, `rows` along each edge."""
+    upright = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(rows) for j in range(rows - i)]
+    turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(rows - 1) for j in range(rows - 1 - i)]
+    share = np.array(upright + turned) / rows
+    return np.column_stack([1.0 - share.sum(axis=1), share])
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +53,15 @@ class Patch:
     def inward(self) -> np.ndarray:
         """Unit inward normals (m, 3) at the nodes, area-weighted."""
         return -vertex_normals(self.points, self.triangles)
+
+    @cached_property
+    def skin(self) -> Skin:
+        """The patch as tools press it."""
+        # Warp is loaded where a tool is pressed, not where a model is read.
+        from sim.device import find_device
+        from sim.footprint import Skin
+
+        return Skin(self.points, self.triangles, find_device("cpu", "float64"))
 
     @cached_property
     def rim(self) -> np.ndarray:

@@ -16,7 +16,7 @@ HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
 """Each room and the rooms that it may import."""
 TIERS = (
-    {"device", "columns", "sparse", "sweep", "term", "constraint"},
+    {"device", "columns", "sparse", "sweep", "term", "constraint", "footprint"},
     {"terms", "problem"},
     {"linear", "factor", "direction", "search", "dense", "memory", "compile"},
     {"newton", "multigrid", "inversion"},

@@ -15,9 +15,7 @@ from oracle import internal_forces
 
 from sim.accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
 from sim.anatomy import Anatomy
-from sim.compile import pushed_forces
 from sim.deformation import Deformer, Outcome
-from sim.discretisation import discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
@@ -229,7 +227,8 @@ def test_several_causes_act_together() -> None:
     both = Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu")
     top = top_forces(MESH, FORCE / 3.0)
     found = both.deform(Loads((*loads().causes, Nodal(top)))).displacement
-    pushed = pushed_forces(discretise(MESH, "p1"), loads()).T.reshape(5, COUNT, 3)
+    share = footprint_weights(MESH.nodes, MESH.surface, POINT, np.full(5, 0.02)).toarray()
+    pushed = share[:, :, None] * FORCE[:, None]
     alone = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], REFERENCE, "cpu").deform(Loads((Nodal(top + pushed),)))
     np.testing.assert_allclose(found, alone.displacement, atol=1e-8)
 

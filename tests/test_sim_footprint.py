@@ -6,11 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import warp as wp
 from boxes import box
 from scipy.spatial import Delaunay
 
+from sim.device import find_device
 from sim.errors import InputError
-from sim.footprint import footprint_weights, nearest_on
+from sim.footprint import CHUNK, Skin, footprint_weights, nearest_on
 
 RADIUS, POINT = 0.012, np.array([0.003, -0.002, 0.0])
 
@@ -172,3 +174,34 @@ def test_nearest_point_against_a_search(aspect: float) -> None:
         length = np.linalg.norm(found - point)
         assert length <= best + 1e-9
         assert np.linalg.norm(samples - found, axis=1).min() < 0.15  # and it lies on one of them
+
+
+def test_the_nearest_point_is_found_in_any_chunk() -> None:
+    """Many more triangles than one thread searches; every point stands above its own."""
+    nodes, triangles = sheet(400)
+    assert len(triangles) > 8 * CHUNK
+    above = nodes[triangles].mean(axis=1) + [0.0, 0.0, 1e-3]
+    skin = Skin(nodes, triangles, find_device("cpu", "float64"))
+    found, distance = skin.nearest(above, np.full(len(above), 2e-3))
+    np.testing.assert_allclose(found.numpy(), above * [1.0, 1.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(distance.numpy(), 1e-3, rtol=1e-12)
+    assert np.isinf(skin.nearest(above, np.full(len(above), 0.9e-3))[1].numpy()).all()
+
+
+@pytest.mark.parametrize("mesh", [sheet(300), quadratic_sheet(60)], ids=["linear", "quadratic"])
+def test_the_centre_is_where_the_force_acts(mesh: tuple[np.ndarray, np.ndarray]) -> None:
+    points, radii = np.array([POINT, [0.03, 0.0, 0.0]]), np.array([RADIUS, 0.007])
+    pressed = Skin(*mesh, find_device("cpu", "float64")).press(points, radii)
+    np.testing.assert_allclose(pressed.centres(), pressed.rows(len(mesh[0])) @ mesh[0], atol=1e-17)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("mesh", [sheet(3000), quadratic_sheet(300)], ids=["linear", "quadratic"])
+def test_a_graphics_card_gives_the_same_weights(mesh: tuple[np.ndarray, np.ndarray]) -> None:
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform(-0.03, 0.03, (200, 2)), rng.uniform(-3e-4, 3e-4, 200)])
+    radii = rng.uniform(5e-4, 0.016, 200)
+    here, there = (Skin(*mesh, find_device(name, "float64")).press(points, radii) for name in ("cpu", "cuda"))
+    np.testing.assert_allclose(there.weight.numpy(), here.weight.numpy(), atol=1e-12)
+    np.testing.assert_allclose(there.centres(), here.centres(), atol=1e-14)

@@ -114,6 +114,16 @@ def test_an_effect_that_is_not_asked_for_is_not_launched(launches: list[str]) ->
     assert any("add_gradient" in name for name in launches)
 
 
+def test_a_cause_that_does_not_act_is_not_launched(launches: list[str]) -> None:
+    """Both effects are asked for, nodal forces alone act: no tool is integrated, and no force is subtracted twice."""
+    fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce(), NodalForce()], TIGHT, "cpu")
+    launches.clear()
+    fem.problem.begin(Cases(Loads((Nodal(top_forces(MESH, np.array([[0.1, 0.0, 0.0]]))),)), np.zeros(1)))
+    fem.problem.gradient(fem.problem.device.zeros(fem.problem.rows, 1))
+    assert len([name for name in launches if "subtract" in name]) == 1
+    assert not [name for name in launches if "press" in name or "spread" in name]
+
+
 @pytest.mark.parametrize(
     ("effects", "sentence"),
     [

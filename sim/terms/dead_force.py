@@ -1,54 +1,163 @@
 """Forces that keep size and direction while the tissue moves: nodal forces, and tractions on a footprint."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import warp as wp
 
-from ..columns import add_dots, combined, gathered
+from ..columns import CHUNK, gathered
 from ..device import Device
-from ..loads import Loads
+from ..footprint import Skin
+from ..loads import Loads, Nodal, Pushed, check_field
 from ..term import Cases
 
 
+@dataclass(frozen=True)
+class Kernels:
+    """Arithmetic on the loaded nodes in one scalar type."""
+
+    spread: wp.Kernel
+    subtract: wp.Kernel
+    subtract_work: wp.Kernel
+
+
+@cache
+def kernels_of(device: Device) -> Kernels:
+    """Kernels of a device's scalar type."""
+    scalar = device.scalar
+    chunk = CHUNK
+
+    @wp.kernel(module="unique")
+    def spread(
+        weight: wp.array2d(dtype=wp.float64),
+        total: wp.array2d(dtype=wp.float64),
+        # outputs
+        force: wp.array2d(dtype=scalar),
+    ):
+        """f_(3i+k)c = w_ic F_ck."""
+        i, c = wp.tid()
+        for k in range(3):
+            force[3 * i + k, c] = scalar(weight[i, c] * total[c, k])
+
+    @wp.kernel(module="unique")
+    def subtract(
+        nodes: wp.array(dtype=wp.int32),
+        force: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """g -= f."""
+        i, c = wp.tid()
+        for k in range(3):
+            out[3 * nodes[i] + k, c] -= force[3 * i + k, c]
+
+    @wp.kernel(module="unique")
+    def subtract_work(
+        nodes: wp.array(dtype=wp.int32),
+        force: wp.array2d(dtype=scalar),
+        u: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array(dtype=wp.float64),
+    ):
+        """E_c -= sum over a chunk of nodes of f . u, in double precision."""
+        block, c = wp.tid()
+        total = wp.float64(0.0)
+        for i in range(block * chunk, wp.min((block + 1) * chunk, nodes.shape[0])):
+            for k in range(3):
+                total += wp.float64(force[3 * i + k, c]) * wp.float64(u[3 * nodes[i] + k, c])
+        wp.atomic_sub(out, c, total)
+
+    return Kernels(spread, subtract, subtract_work)
+
+
+@dataclass(frozen=True, eq=False)
+class Forces:
+    """Forces on k nodes, on the device: nodes (k,) int32, each once, and force (3k, b) [N]."""
+
+    nodes: wp.array
+    force: wp.array
+
+
+def pushed_forces(skin: Skin, device: Device, loads: Loads) -> Forces | None:
+    """Nodal forces of pushing tools on a body's surface; None without any.
+
+    Raises
+    ------
+    InputError
+        A footprint that does not touch the surface.
+    """
+    cause = loads.of(Pushed)
+    if cause is None:
+        return None
+    footprints = skin.press(cause.point, cause.footprint)
+    force = device.zeros(3 * len(skin.nodes), len(loads))
+    inputs = [footprints.weight, device.array(cause.force, wp.float64)]
+    device.launch(kernels_of(device).spread, footprints.weight.shape, inputs, [force])
+    return Forces(device.array(skin.nodes, wp.int32), force)
+
+
+def nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | None:
+    """Forces given at a mesh's own vertices, of those that carry any; None without any.
+
+    Raises
+    ------
+    InputError
+        Forces of another mesh.
+    """
+    cause = loads.of(Nodal)
+    if cause is None:
+        return None
+    check_field("Nodal.force", cause.force, vertices)
+    nodes = np.flatnonzero(cause.force.any(axis=(0, 2)))
+    force = cause.force[:, nodes].reshape(len(loads), 3 * len(nodes)).T
+    return Forces(device.array(nodes, wp.int32), device.array(force))
+
+
 class DeadForce:
-    """A Term: E = -f . u, with f (3N, b) [N] assembled from the loads once a batch.
+    """A Term: E = -f . u, with f assembled from the loads once a batch.
 
     Parameters
     ----------
     name
         Unique in its problem.
     assemble
-        Loads -> nodal forces (3N, B) [N].
+        Loads -> `Forces`, or None where nothing acts: then nothing is launched.
     device
         Where its arrays live.
     """
 
-    def __init__(self, name: str, assemble: Callable[[Loads], np.ndarray], device: Device):
+    constant = True
+
+    def __init__(self, name: str, assemble: Callable[[Loads], Forces | None], device: Device):
         self.name = name
         self._assemble = assemble
         self._device = device
-        self._force = device.zeros(0, 0)
+        self._forces: Forces | None = None
 
     def begin(self, cases: Cases) -> None:
         """Assemble the nodal forces of every column."""
-        self._force = self._device.array(self._assemble(cases.loads))
+        self._forces = self._assemble(cases.loads)
 
     def keep(self, columns: np.ndarray) -> None:
         """Drop the forces of the others."""
-        self._force = gathered(self._device, self._force, columns)
+        if self._forces is not None:
+            self._forces = Forces(self._forces.nodes, gathered(self._device, self._forces.force, columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """E -= f . u."""
-        dot = wp.zeros(u.shape[1], dtype=wp.float64, device=self._device.name)
-        add_dots(self._device, self._force, u, dot)
-        out.assign(out.numpy() - dot.numpy())
+        if self._forces is not None:
+            dim = (-(-len(self._forces.nodes) // CHUNK), u.shape[1])
+            inputs = [self._forces.nodes, self._forces.force, u]
+            self._device.launch(kernels_of(self._device).subtract_work, dim, inputs, [out])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         """g -= f."""
-        combined(self._device, out, np.full(u.shape[1], -1.0), self._force, out)
+        if self._forces is not None:
+            dim = (len(self._forces.nodes), u.shape[1])
+            inputs = [self._forces.nodes, self._forces.force]
+            self._device.launch(kernels_of(self._device).subtract, dim, inputs, [out])
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
         """A dead force has no curvature."""
