@@ -79,13 +79,13 @@ class Patch:
         return np.sqrt(np.einsum("bei,bei->be", offset, offset).min(axis=1))
 
     def place(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A point (3,) [m] and its unit inward normal (3,) from three uniform numbers; uniform by area."""
+        """Points (n, 3) [m] and their unit inward normals (n, 3) from uniform numbers (n, 3); uniform by area."""
         total = np.cumsum(self.areas)
-        triangle = self.triangles[np.searchsorted(total, uniform[0] * total[-1], side="right")]
-        root = np.sqrt(uniform[1])
-        share = np.array([1.0 - root, root * (1.0 - uniform[2]), root * uniform[2]])
-        normal = share @ self.inward[triangle]
-        return share @ self.points[triangle], normal / np.linalg.norm(normal)
+        triangle = self.triangles[np.searchsorted(total, uniform[:, 0] * total[-1], side="right")]
+        root = np.sqrt(uniform[:, 1])
+        share = np.stack([1.0 - root, root * (1.0 - uniform[:, 2]), root * uniform[:, 2]], axis=1)
+        point, normal = (np.einsum("nc,nci->ni", share, field[triangle]) for field in (self.points, self.inward))
+        return point, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def normal_near(self, points: np.ndarray) -> np.ndarray:
         """Unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""

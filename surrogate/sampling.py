@@ -13,6 +13,8 @@ from sim.loads import Loads, Pushed
 from .patch import Patch, nearest, open_patch
 
 ATTEMPTS = 2000
+# Loads drawn together: more would only take more memory.
+BLOCK = 1024
 # Deeper than this the tool has gone through the tissue; tissue harm begins at 2.7-4 kPa mean contact pressure.
 DEEPEST, HARDEST = 15e-3, 8e3
 # E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) judges a load before it is solved.
@@ -47,11 +49,11 @@ class Tool:
     cone: float = np.pi / 4.0
     even: bool = False
 
-    def admits(self, force: float, footprint: float) -> bool:
-        """Whether pressure and estimated depth are those of surgery."""
+    def admits(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+        """Whether (n,) pressure and estimated depth are those of surgery; forces (n,) [N], radii (n,) [m]."""
         pressure = force / (np.pi * footprint**2)
         depth = 3.0 * force / (4.0 * PLANE_MODULUS * footprint)
-        return self.pressure[0] <= pressure <= self.pressure[1] and depth <= self.depth
+        return (self.pressure[0] <= pressure) & (pressure <= self.pressure[1]) & (depth <= self.depth)
 
 
 TOOLS = {
@@ -90,33 +92,53 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     if preset == "seed":
         return _published(anatomy, patch, count, seed)
     tools = list(TOOLS.values()) if preset == "mixed" else [{**TOOLS, BRUTAL.name: BRUTAL}[preset]]
-    rows = [_one(tools, patch, np.random.default_rng((seed, number))) for number in range(count)]
-    point, force, footprint = (np.array(column) for column in zip(*rows, strict=True))
-    return Loads((Pushed(point, force, footprint),))
+    blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
+    rows = np.concatenate([_drawn(tools, patch, [np.random.default_rng((seed, i)) for i in block]) for block in blocks])
+    return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
 
 
-def _one(tools: list[Tool], patch: Patch, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, float]:
-    """Point (3,) [m], force (3,) [N] and footprint [m] of one load."""
-    tool = tools[random.integers(len(tools))]
+def _drawn(tools: list[Tool], patch: Patch, random: list[np.random.Generator]) -> np.ndarray:
+    """Point [m], force [N] and footprint [m] of one load from each generator: (n, 7)."""
+    kind = np.array([one.integers(len(tools)) for one in random])
+    out = np.zeros((len(random), 7))
+    for number, tool in enumerate(tools):
+        rows = np.flatnonzero(kind == number)
+        out[rows] = _drawn_of(tool, patch, [random[row] for row in rows])
+    return out
+
+
+def _drawn_of(tool: Tool, patch: Patch, random: list[np.random.Generator]) -> np.ndarray:
+    """As `_drawn`, of one tool: who does not fit draws again."""
+    out, waiting = np.zeros((len(random), 7)), np.arange(len(random))
     for _ in range(ATTEMPTS):
-        footprint = random.uniform(*tool.footprint)
-        force = random.uniform(*tool.force) if tool.even else float(np.exp(random.uniform(*np.log(tool.force))))
-        point, normal = patch.place(random.random(3))
-        direction = _within_cone(normal, tool.cone, random.random(2))
-        if tool.admits(force, footprint) and patch.rim_distance(point[None])[0] >= footprint:
-            return point, force * direction, footprint
+        if not len(waiting):
+            return out
+        uniform = np.array([random[row].random(7) for row in waiting])
+        footprint = _between(tool.footprint, uniform[:, 0])
+        force = (
+            _between(tool.force, uniform[:, 1]) if tool.even else np.exp(_between(np.log(tool.force), uniform[:, 1]))
+        )
+        point, normal = patch.place(uniform[:, 2:5])
+        direction = _within_cone(normal, tool.cone, uniform[:, 5:])
+        fits = tool.admits(force, footprint) & (patch.rim_distance(point) >= footprint)
+        out[waiting[fits]] = np.column_stack([point, force[:, None] * direction, footprint])[fits]
+        waiting = waiting[~fits]
     raise InputError(
         f"in {ATTEMPTS} draws no {tool.name} of radius {1e3 * tool.footprint[0]:g}-{1e3 * tool.footprint[1]:g} mm "
         "fitted into the open cortex: widen the --craniotomy, or choose a smaller tool with --preset."
     )
 
 
+def _between(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    return ends[0] + (ends[1] - ends[0]) * uniform
+
+
 def _within_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
-    """A unit vector (3,) within `angle` [rad] of the unit vector `axis` (3,), uniform by solid angle."""
-    cosine = 1.0 - uniform[0] * (1.0 - np.cos(angle))
-    turn = 2.0 * np.pi * uniform[1]
-    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    first /= np.linalg.norm(first)
+    """Unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniform by solid angle."""
+    cosine = (1.0 - uniform[:, 0] * (1.0 - np.cos(angle)))[:, None]
+    turn = (2.0 * np.pi * uniform[:, 1])[:, None]
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
     sideways = np.cos(turn) * first + np.sin(turn) * np.cross(axis, first)
     return cosine * axis + np.sqrt(1.0 - cosine**2) * sideways
 
@@ -149,7 +171,7 @@ def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
     golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(DIRECTIONS) / (2.0 * np.pi)
     lattice = np.column_stack([(np.arange(DIRECTIONS) + 0.5) / DIRECTIONS, golden % 1.0])
     direction = np.array(
-        [[_within_cone(patch.inward[node], PUBLISHED_CONE, uniform) for uniform in lattice] for node in near]
+        [_within_cone(np.broadcast_to(patch.inward[node], (DIRECTIONS, 3)), PUBLISHED_CONE, lattice) for node in near]
     )
     whole = np.random.default_rng(seed).permutation(len(near) * DIRECTIONS * len(MAGNITUDES))[:count]
     position, way, magnitude = np.unravel_index(whole, (len(near), DIRECTIONS, len(MAGNITUDES)))

@@ -9,6 +9,7 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
+from sim.stages import stage
 
 from .ann import Ann
 from .dataset import Dataset
@@ -69,17 +70,20 @@ def train(
     if not len(nodes):
         raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
     split = leave_discs_out(pushed.point, patch)
-    truth = data.displacement(nodes)[data.good]
-    table = _compliance(data, nodes)
-    open_nodes = np.setdiff1d(patch.nodes, nodes)
-    cortex = (_compliance(data, open_nodes),) if len(open_nodes) else ()
+    with stage("table"):
+        truth = data.displacement(nodes)[data.good]
+        table = _compliance(data, nodes)
+        open_nodes = np.setdiff1d(patch.nodes, nodes)
+        cortex = (_compliance(data, open_nodes),) if len(open_nodes) else ()
     taught, held_out = (_pushed(loads.rows(np.flatnonzero(rows))) for rows in (~split.test, split.test))
     envelope = envelope_of(patch, taught, held_out)
     models, scores = {}, []
     for name in dict.fromkeys(learners):
-        parts = (*_parts(name, table, patch, taught, truth[~split.test]), *cortex)
+        with stage(f"learn {name}"):
+            parts = (*_parts(name, table, patch, taught, truth[~split.test]), *cortex)
         model = Learned(data.anatomy, parts, envelope, training={"learner": name, **data.provenance})
-        models[name], row = _judged(name, model, loads.rows(np.flatnonzero(split.test)), truth[split.test], nodes)
+        with stage("score"):
+            models[name], row = _judged(name, model, loads.rows(np.flatnonzero(split.test)), truth[split.test], nodes)
         scores.append(row)
         progress(name)
     return Trained(models, tuple(scores), split, float(np.linalg.norm(truth[split.test], axis=2).mean()))

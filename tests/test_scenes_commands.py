@@ -13,6 +13,7 @@ from scenes.cli import COMMANDS, main
 from scenes.theatre import model_path
 from sim.intensity import sidecar
 from sim.meshfile import read_anatomy, write_anatomy, write_mesh
+from sim.stages import stage
 from surrogate.store import load
 
 
@@ -25,6 +26,8 @@ def test_a_patient_in_one_go(tmp_path, capsys):
     text = capsys.readouterr().out
     for step in ("sulcus anatomy --labels", "sulcus simulate", "sulcus train", "wins", "ready: sulcus demo --anatomy"):
         assert step in text
+    for part in ("labels", "mesh", "set-up", "unit responses", "loads", "learn residual", "score", "save", "rest"):
+        assert f"\n  {part} " in text
     anatomy = read_anatomy(out)
     assert set(load(model_path(out), anatomy)) == {"linear", "ann", "svr", "residual"} and sidecar(out).is_file()
     assert main(["check", "press", "slide", "--anatomy", str(out), "--every", "30", "--json"]) == 0
@@ -32,6 +35,20 @@ def test_a_patient_in_one_go(tmp_path, capsys):
     assert report["passed"] and all(row["motion_mm"] > 0.3 for row in report["scenes"])
     assert main(["render", "slide", "--anatomy", str(out), "--every", "60", "--out", str(tmp_path / "frames")]) == 0
     assert len(list((tmp_path / "frames").iterdir())) == 3
+
+
+def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsys):
+    def step(words):
+        assert words[-1] == "--json"
+        with stage(words[0]):
+            return 0
+
+    monkeypatch.setattr("scenes.cli.main", step)
+    words = ["labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu", "--json"]
+    assert main(["patient", *words, "--out", str(tmp_path / "me.vtu")]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert list(said["seconds"]) == ["anatomy", "simulate", "train", "rest"]
+    assert sum(said["seconds"].values()) == pytest.approx(said["total"]) and min(said["seconds"].values()) >= 0.0
 
 
 @pytest.mark.parametrize(

@@ -29,9 +29,11 @@ def loads(box):
 def test_what_is_written_is_read(tmp_path, box, pretender, loads):
     path = tmp_path / "data.h5"
     seen = []
-    solved = simulate(path, pretender, loads, SAID, 8, lambda done, total: seen.append((done, total)))
+    said = simulate(path, pretender, loads, SAID, 8, lambda done, total: seen.append((done, total)))
     data = read_dataset(path)
     units = 3 * int(box.craniotomy.sum())
+    solved = said.rows
+    assert (said.loads, said.units) == (len(loads), units) and min(said.unit_seconds, said.load_seconds) > 0.0
     assert solved == len(loads) + units and seen[-1] == (solved, solved) and not list(tmp_path.glob("*.partial"))
     assert data.anatomy.digest == box.digest and data.provenance["preset"] == "palpation"
     assert np.array_equal(data.loads.of(Pushed).force, loads.of(Pushed).force)
@@ -104,7 +106,7 @@ def test_a_killed_run_ends_with_the_bytes_of_an_uninterrupted_one(tmp_path, pret
         assert not killed.exists()
     with pytest.raises(InputError, match="unfinished run"):
         read_dataset(killed)
-    solved = simulate(killed, pretender, loads, SAID, 8)
+    solved = simulate(killed, pretender, loads, SAID, 8).rows
     assert 0 < solved < len(loads) + 3 * int(pretender.anatomy.craniotomy.sum())
     assert killed.read_bytes() == whole.read_bytes()
 
@@ -113,12 +115,12 @@ def test_a_finished_file_is_left_alone_and_extended(tmp_path, box, pretender, lo
     path, direct = tmp_path / "data.h5", tmp_path / "direct.h5"
     simulate(path, pretender, loads, SAID, 8)
     before = path.read_bytes()
-    assert simulate(path, pretender, loads, SAID, 8) == 0 and path.read_bytes() == before
+    assert simulate(path, pretender, loads, SAID, 8).rows == 0 and path.read_bytes() == before
     more = draw("palpation", box, 30, 0)
-    assert simulate(path, pretender, more, SAID, 8) == 30 - 16  # the last, short batch is solved again
+    assert simulate(path, pretender, more, SAID, 8).rows == 30 - 16  # the last, short batch is solved again
     simulate(direct, pretender, more, SAID, 8)
     assert path.read_bytes() == direct.read_bytes()
-    assert simulate(path, pretender, loads, SAID, 8) == 0 and path.read_bytes() == direct.read_bytes()
+    assert simulate(path, pretender, loads, SAID, 8).rows == 0 and path.read_bytes() == direct.read_bytes()
 
 
 def test_other_parameters_are_refused(tmp_path, box, pretender, loads):

@@ -18,6 +18,7 @@ from sim.labels import volume_subject
 from sim.mesh import dihedral_angles
 from sim.meshfile import write_anatomy
 from sim.meshing import surface_errors
+from sim.stages import stage
 from sim.subject import Plan, Subject, make_anatomy
 from sim.template import SITES, Tumour, template_subject
 
@@ -74,18 +75,21 @@ def run(args: argparse.Namespace) -> int:
     check_output(args.out, ".vtu")
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
     plan = Plan(args.nodes, 1e-3 * chosen["craniotomy"], chosen["skull"])
-    subject = _subject(args, chosen)
+    with stage("labels" if args.labels else "template"):
+        subject = _subject(args, chosen)
     for note in subject.notes:
         print(f"{args.labels}: {note}", file=sys.stderr)
     print(f"sulcus anatomy: meshing with about {plan.nodes} nodes ...", file=sys.stderr)
-    anatomy = make_anatomy(subject, plan)
-    intensity = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy])
-    write_anatomy(args.out, anatomy)
-    beside = sidecar(args.out)
-    if intensity is None:
-        beside.unlink(missing_ok=True)  # of an earlier mesh of this name
-    else:
-        write_intensity(beside, intensity)
+    with stage("mesh"):
+        anatomy = make_anatomy(subject, plan)
+    with stage("write the mesh"):
+        intensity = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy])
+        write_anatomy(args.out, anatomy)
+        beside = sidecar(args.out)
+        if intensity is None:
+            beside.unlink(missing_ok=True)  # of an earlier mesh of this name
+        else:
+            write_intensity(beside, intensity)
     figures = _figures(anatomy, subject)
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
     summary = {**files, **figures, "seconds": round(time.perf_counter() - began, 2)}

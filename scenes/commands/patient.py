@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import json
+import time
+from collections.abc import Mapping
 from pathlib import Path
 
 from sim.accuracy import TRAIN
 from sim.device import find_device
 from sim.errors import InputError
 from sim.files import check_output
+from sim.stages import listened
 from surrogate.sampling import PRESETS
 from surrogate.split import FEWEST
 
@@ -28,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
     add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
+    parser.add_argument("--json", action="store_true", help="a JSON line of each step, then one of the seconds")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -50,10 +55,24 @@ def run(args: argparse.Namespace) -> int:
          "--device", args.device, *element],
         ["train", str(data), "--out", str(model)],
     ]  # fmt: skip
-    for step in steps:
-        print(f"sulcus {' '.join(step)}", flush=True)
-        code = main(step)
-        if code != 0:
-            return code
-    print(f"ready: sulcus demo --anatomy {args.out}")
+    began = time.perf_counter()
+    with listened() as seconds:
+        for step in steps:
+            if not args.json:
+                print(f"sulcus {' '.join(step)}", flush=True)
+            code = main([*step, "--json"] if args.json else step)
+            if code != 0:
+                return code
+    whole = time.perf_counter() - began
+    # Imports, checks and figures: what no stage claims.
+    seconds["rest"] = whole - sum(seconds.values())
+    if args.json:
+        print(json.dumps({"anatomy": str(args.out), "model": str(model), "seconds": seconds, "total": whole}))
+    else:
+        print(f"{_shares(seconds, whole)}\nready: sulcus demo --anatomy {args.out}")
     return 0
+
+
+def _shares(seconds: Mapping[str, float], whole: float) -> str:
+    rows = [f"  {name:<16}{took:8.1f} s{100.0 * took / whole:6.1f} %" for name, took in seconds.items()]
+    return "\n".join([f"label volume to surrogate in {whole:.1f} s:", *rows])

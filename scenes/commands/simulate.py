@@ -19,9 +19,10 @@ from sim.fem import Fem
 from sim.files import check_output
 from sim.material import Tissue, tissue_to_json
 from sim.meshfile import read_anatomy
+from sim.stages import stage
 from surrogate.dataset import read_outcomes
 from surrogate.sampling import PRESETS, draw
-from surrogate.simulate import simulate
+from surrogate.simulate import Solved, simulate
 
 from ..shipped import template_path
 from ..tissue import add_element_argument, add_tissue_arguments, tissue_of
@@ -49,12 +50,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Returns 0: the file is complete, whether or not every case converged; it says which did."""
     out = check_output(args.out, ".h5")
-    anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
-    loads = draw(args.preset, anatomy, args.count, args.seed)
+    with stage("draw"):
+        anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
+        loads = draw(args.preset, anatomy, args.count, args.seed)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
     tissue = tissue_of(args)
     effects = _effects(anatomy, tissue)
-    fem = Fem(anatomy, effects, accuracy, args.device, args.batch, args.element)
+    with stage("set-up"):
+        fem = Fem(anatomy, effects, accuracy, args.device, args.batch, args.element)
     provenance = {
         "effects": repr(effects),
         "tissue": tissue_to_json(tissue),
@@ -86,17 +89,23 @@ def _effects(anatomy: Anatomy, tissue: Tissue) -> tuple[Effect, ...]:
     return (Elasticity(tissue), Held(), *slide, ToolForce(), NodalForce())
 
 
-def _report(args: argparse.Namespace, asked: int, solved: int) -> None:
+def _report(args: argparse.Namespace, asked: int, solved: Solved) -> None:
     with h5py.File(args.out, "r") as file:
         outcomes, units = read_outcomes(file, "answers"), len(read_outcomes(file, "unit"))
     counts = {outcome.name.lower(): outcomes.count(outcome) for outcome in Outcome if outcome in outcomes}
     failed = int(np.sum([not outcome.good for outcome in outcomes]))
+    rate = solved.loads / solved.load_seconds if solved.loads else None
     if args.json:
-        print(
-            json.dumps(
-                {"out": args.out, "loads": len(outcomes), "unit": units, "solved_now": solved, "outcome": counts}
-            )
-        )
+        said = {
+            "out": args.out,
+            "loads": len(outcomes),
+            "unit": units,
+            "solved_now": solved.rows,
+            "outcome": counts,
+            "seconds": {"unit responses": solved.unit_seconds, "loads": solved.load_seconds},
+            "loads_per_second": rate,
+        }
+        print(json.dumps(said))
         return
     if asked < args.count:
         print(f"the preset {args.preset} has {asked} loads: all of them were taken.")
@@ -105,6 +114,8 @@ def _report(args: argparse.Namespace, asked: int, solved: int) -> None:
             f"{args.out} already holds {len(outcomes)} loads, more than the {asked} asked for: nothing was taken away."
         )
     listed = ", ".join(f"{number} {name}" for name, number in counts.items())
-    print(f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved} solved now.")
+    print(f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved.rows} solved now.")
+    if rate is not None:
+        print(f"{rate:.4g} loads a second, from their footprints to the file.")
     if failed:
         print(f"{failed} cases did not converge; they stay in the file, marked, and are not learnt from.")

@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.files import check_output
+from sim.stages import stage
 from surrogate.dataset import read_dataset
 from surrogate.score import table, winner
 from surrogate.store import save
@@ -30,11 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Returns 0 when the models are written."""
     out = check_output(args.out, ".npz")
-    data = read_dataset(args.data)
+    with stage("read the data"):
+        data = read_dataset(args.data)
     learners = [name.strip() for name in args.learners.split(",")]
     with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
         trained = train(data, learners, lambda learner: bar.update())
-    save(out, trained.models)
+    with stage("save"):
+        save(out, trained.models)
     failed = int(np.sum(~data.good))
     print(_for_machines(trained, args.out, failed) if args.json else _for_people(trained, args.out, failed))
     return 0
