@@ -20,12 +20,12 @@ COMMANDS = {
     "demo": "play a scene on a page in the browser",
     "render": "write the frames of a scene as pictures, without display",
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
-    "bench": "measure what each stage costs, what each element is worth, how robust the solver is",
+    "bench": "measure what each stage costs, what each element is worth, how robust and how fast the solver is",
     "check": "play the built-in scenes blank and hold their figures to their bounds",
 }
 
 # Commands with commands of their own; the first is meant where none is named.
-INNER = {"bench": ("stages", "elements", "robust")}
+INNER = {"bench": ("stages", "elements", "robust", "live")}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -74,3 +74,20 @@ def retract(
         return Touch(*at, force * (smooth(time / rise) - let_go), (tilt * drawn, 0.0))
 
     return path
+
+
+def wander(force: float, radius: float, speed: float) -> Path:
+    """Straight strokes without a pause at `speed` [m/s] from point to point of a circle of `radius` [m].
+
+    Each point is the golden angle on from the last: no stroke repeats another, and they cover the circle evenly.
+    """
+    turn = np.pi * (3.0 - np.sqrt(5.0))
+    stroke = 2.0 * radius * np.sin(turn / 2.0)
+
+    def path(time: float) -> Touch:
+        number, share = divmod(speed * time / stroke, 1.0)
+        start, end = (radius * np.array([np.cos(k * turn), np.sin(k * turn)]) for k in (number, number + 1.0))
+        x, y = (1.0 - share) * start + share * end
+        return Touch(float(x), float(y), force)
+
+    return path

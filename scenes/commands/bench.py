@@ -9,6 +9,7 @@ BENCHES = {
     "stages": "what each stage costs on this machine (this one if none is named)",
     "elements": "how far each element is from the limit of fine meshes, and what it costs",
     "robust": "how many of thousands of random loads converge",
+    "live": "what a frame of a moving tool takes, warm-started, and how far off it is",
 }
 
 

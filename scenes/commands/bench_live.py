@@ -1,0 +1,79 @@
+"""`sulcus bench live`: what a frame of a moving tool takes, and how far off it is."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from sim.discretisation import ELEMENTS
+from sim.effects import Elasticity, Held, Slide, ToolForce
+from sim.errors import InputError
+from sim.meshfile import read_anatomy
+
+from ..shipped import template_path
+from ..tissue import add_tissue_arguments, tissue_of
+
+if TYPE_CHECKING:
+    from ..live import Tally
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument("--frames", type=int, default=1000, help="frames of each tool (default %(default)s)")
+    parser.add_argument(
+        "--checked", type=int, default=20, help="frames held against the converged solution (default %(default)s)"
+    )
+    add_tissue_arguments(parser)
+    parser.add_argument("--element", choices=ELEMENTS, default="p1", help="(default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play every tool; 1 if a frame did not converge, or was farther off than promised."""
+    from ..bench import machine
+    from ..live import PROMISED, RIDES, errors, frames_of, live_fem, loads_of, tally
+    from ..scene import find_scene
+    from ..site import site_of
+
+    if not 1 <= args.checked <= args.frames:
+        raise InputError(
+            f"--frames {args.frames} --checked {args.checked} measures nothing: give 1 <= --checked <= --frames."
+        )
+    site = site_of(read_anatomy(args.anatomy or template_path()))
+    slide = (Slide(),) if site.anatomy.slide_normal.any() else ()
+    scene = replace(find_scene("press"), effects=(Elasticity(tissue_of(args)), Held(), *slide, ToolForce()))
+    fem = live_fem(scene, site, args.device, args.element)
+    found = []
+    for ride in RIDES:
+        loads = loads_of(ride, scene, site, args.frames)
+        frames = list(tqdm(frames_of(fem, loads), ride.name, args.frames, unit="frame", file=sys.stderr))
+        sample = frames[:: args.frames // args.checked][: args.checked]
+        found.append(tally(ride, frames, errors(sample, scene, site, args.element)))
+    where = f"{machine(args.device)}; {len(site.anatomy.mesh.nodes)} nodes, {args.element}"
+    if args.json:
+        print(json.dumps({"machine": where, "promised_mm": 1e3 * PROMISED, "rides": [asdict(item) for item in found]}))
+    else:
+        _print(where, found)
+    return 0 if all(item.good and item.error <= 1e3 * PROMISED for item in found) else 1
+
+
+def _print(where: str, rides: Sequence[Tally]) -> None:
+    names = ("tool", "frames", "ms: median", "p95", "p99", "worst", "outer steps: mean", "most", "outcomes", "off [mm]")
+    print(f"{where}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}")
+    for item in rides:
+        outcomes = ", ".join(f"{count} {name.lower()}" for name, count in item.outcomes.items())
+        times = (f"{value:.3g}" for value in (item.median, item.p95, item.p99, item.worst))
+        cells = (
+            item.ride, item.frames, *times, f"{item.steps:.1f}", item.most_steps, outcomes,
+            f"<= {item.error:.4f} of {item.checked}",
+        )  # fmt: skip
+        print(f"| {' | '.join(map(str, cells))} |")

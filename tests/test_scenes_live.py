@@ -1,0 +1,112 @@
+"""The bench of live frames: the tool moves as it says, each frame starts from the last, errors are seen."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+
+from scenes import live
+from scenes.cli import main
+from scenes.live import RIDES, WARM_UP, Frame, Ride, errors, frames_of, loads_of, tally
+from scenes.paths import wander
+from scenes.scene import find_scene
+from scenes.site import site_of
+from sim.deformation import Outcome
+from sim.effects import Elasticity, Held, ToolForce
+from sim.loads import Pushed
+from sim.meshfile import write_anatomy
+
+SCENE = replace(find_scene("press"), effects=(Elasticity(), Held(), ToolForce()))
+
+
+@pytest.fixture(scope="module")
+def site():
+    return site_of(make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3))
+
+
+def test_it_wanders_at_one_speed_within_its_circle_and_everywhere():
+    times = np.arange(0.0, 60.0, 0.01)
+    path = wander(0.25, 10e-3, 20e-3)
+    places = np.array([(touch.x, touch.y) for touch in map(path, times.tolist())])
+    moved = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    # A sample that spans a corner is cut short.
+    assert np.median(moved) == pytest.approx(0.2e-3)
+    assert moved.max() < 0.2e-3 * (1.0 + 1e-9)
+    assert (moved < 0.19e-3).mean() < 0.02
+    assert np.linalg.norm(places, axis=1).max() < 10e-3 * (1.0 + 1e-9)
+    assert path(7.0).force == 0.25
+    sector = np.unique(np.floor(np.arctan2(*places.T) / (np.pi / 8.0)))
+    assert len(sector) == 16
+
+
+def test_the_tool_presses_where_it_moves(site):
+    found = loads_of(RIDES[0], SCENE, site, 20)
+    assert len(found) == WARM_UP + 20
+    pushed = [load.of(Pushed) for load in found]
+    assert all(np.linalg.norm(one.force) == pytest.approx(0.25) for one in pushed)
+    steps = np.linalg.norm(np.diff([one.point[0] for one in pushed], axis=0), axis=1)
+    assert np.median(steps) == pytest.approx(20e-3 / 30.0, rel=0.01)
+
+
+def test_each_frame_starts_from_the_last_and_the_first_do_not_count(site, pretender, monkeypatch):
+    monkeypatch.setattr(live, "WARM_UP", 2)
+    starts = []
+
+    class Watched:
+        def deform(self, loads, start=None):
+            starts.append(start)
+            return pretender.deform(loads)
+
+    loads = loads_of(RIDES[0], SCENE, site_of(pretender.anatomy), 3)
+    frames = list(frames_of(Watched(), loads))
+    assert [frame.loads for frame in frames] == loads[2:]
+    assert starts[0] is None and all(start is not None for start in starts[1:])
+    np.testing.assert_array_equal(starts[-1].displacement, frames[-2].answer.displacement)
+    assert all(frame.seconds > 0.0 for frame in frames)
+
+
+def test_an_error_is_seen(site):
+    fem = live.live_fem(SCENE, site, "cpu", "p1")
+    load = loads_of(Ride("weak", 0.1, 10e-3), SCENE, site, 1)[-1]
+    answer = fem.deform(load)
+    moved = answer.displacement.copy()
+    moved[0, 5] += [0.0, 3e-4, 4e-4]
+    off = errors([Frame(load, answer, 0.1), Frame(load, replace(answer, displacement=moved), 0.1)], SCENE, site, "p1")
+    assert off[0] < live.PROMISED
+    assert off[1] == pytest.approx(5e-4, abs=off[0])
+
+
+def test_the_tally_counts_what_happened(site, pretender):
+    load = loads_of(RIDES[0], SCENE, site_of(pretender.anatomy), 1)[-1]
+    answer = pretender.deform(load)
+    frames = [Frame(load, answer, 1e-3 * number) for number in range(1, 101)]
+    item = tally(RIDES[0], frames, np.array([1e-5, 3e-5]))
+    assert (item.frames, item.median, item.worst) == (100, pytest.approx(50.5), pytest.approx(100.0))
+    assert item.p95 < item.p99 < item.worst
+    assert (item.steps, item.most_steps, item.outcomes, item.good) == (4.0, 4, {"CONVERGED": 100}, True)
+    assert (item.checked, item.error) == (2, pytest.approx(0.03))
+    lost = replace(answer, outcome=(Outcome.STALLED,))
+    assert not tally(RIDES[0], [*frames, Frame(load, lost, 1.0)], np.zeros(1)).good
+
+
+def test_the_command_tells_every_tool(site, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(live, "WARM_UP", 1)
+    write_anatomy(tmp_path / "box.vtu", site.anatomy)
+    words = ["bench", "live", "--anatomy", str(tmp_path / "box.vtu"), "--frames", "3", "--checked", "2"]
+    assert main([*words, "--device", "cpu", "--json"]) == 0
+    rides = json.loads(capsys.readouterr().out)["rides"]
+    assert [item["ride"] for item in rides] == [ride.name for ride in RIDES]
+    assert all(item["frames"] == 3 and item["checked"] == 2 and item["error"] <= 0.05 for item in rides)
+    monkeypatch.setattr(live, "PROMISED", 1e-12)
+    assert main([*words, "--device", "cpu"]) == 1
+    assert "| palpation | 3 |" in capsys.readouterr().out
+
+
+def test_bad_input_is_a_sentence(tmp_path, capsys):
+    assert main(["bench", "live", "--frames", "3", "--checked", "4"]) == 2
+    assert "--checked 4" in capsys.readouterr().err
+    write_anatomy(tmp_path / "small.vtu", make_box(opening=9e-3))
+    assert main(["bench", "live", "--anatomy", str(tmp_path / "small.vtu")]) == 2
+    assert "larger craniotomy" in capsys.readouterr().err
