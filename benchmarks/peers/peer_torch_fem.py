@@ -1,0 +1,35 @@
+"""torch-fem: Newton on increments that are cut back where it fails, a direct solver (PARDISO where it is installed)."""
+
+import numpy as np
+import torch
+from torchfem import Solid
+from torchfem.materials import Hyperelastic3D
+
+from scenes.serving import Case, Solve, serve
+
+
+def psi(F: torch.Tensor, lame: torch.Tensor) -> torch.Tensor:
+    """Energy density [Pa] of the log neo-Hookean law, as torch-fem's own benchmark writes it."""
+    C = F.transpose(-1, -2) @ F
+    log_J = 0.5 * torch.logdet(C)
+    return lame[0] / 2 * (torch.trace(C) - 3.0) - lame[0] * log_J + lame[1] / 2 * log_J**2
+
+
+def set_up(case: Case) -> Solve:
+    """A solid with its assembly maps, kept for all loads."""
+    torch.set_default_dtype(torch.float64)
+    law = Hyperelastic3D(psi, [case.mu, case.lam])
+    body = Solid(torch.tensor(case.nodes), torch.tensor(case.tets, dtype=torch.int64), law)
+    body.constraints = torch.tensor(np.repeat(case.held[:, None], 3, axis=1))
+
+    @torch.no_grad()
+    def solve(force: np.ndarray) -> np.ndarray:
+        body.forces = torch.tensor(force)
+        # Its residual is measured against the load, which is at most our scale.
+        return body.solve(rtol=case.tolerance, atol=0.0, method="direct")[0].numpy()
+
+    return solve
+
+
+if __name__ == "__main__":
+    serve(set_up)

@@ -1,0 +1,110 @@
+"""`sulcus bench solver`: the first load and a further one on a mesh, beside other finite-element packages."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from sim.errors import InputError
+from sim.meshfile import read_anatomy
+
+from ..shipped import template_path
+
+if TYPE_CHECKING:
+    from ..solver_bench import Row
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--peers", action="store_true", help="torch-fem, scikit-fem and FElupe too (extra `peers`)")
+    parser.add_argument(
+        "--mesh", nargs="+", type=Path, metavar="MESH.vtu", help="made by `sulcus anatomy` (default: the template)"
+    )
+    parser.add_argument("--loads", type=int, default=20, help="palpation loads, each from rest (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
+    parser.add_argument("--starts", type=int, default=3, help="first answers of each engine (default %(default)s)")
+    parser.add_argument("--threads", type=int, default=2, help="of every engine (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compare; 1 if one of our answers is off."""
+    from ..bench import machine
+    from ..solver_bench import OWN, PEERS, TOLERANCE, case_of, compare
+
+    if args.loads < 2 or args.starts < 1 or args.threads < 1:
+        raise InputError(
+            f"--loads {args.loads} --starts {args.starts} --threads {args.threads} compares nothing: give "
+            "--loads >= 2, --starts >= 1, --threads >= 1."
+        )
+    engines = (OWN, *PEERS) if args.peers else (OWN,)
+    cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [template_path()]]
+    table = sys.stderr if args.json else sys.stdout
+    where = machine("cpu")
+    print(
+        f"{where}\n\nLog neo-Hookean, E 3 kPa, nu 0.45, linear tetrahedra, skull nodes held (not sliding: not every "
+        f"peer can); {args.loads} palpation loads as nodal forces, each from rest and alone, to {TOLERANCE:g}, all "
+        f"residuals by one routine; {args.threads} threads; imports not counted, compiled code in its cache.",
+        file=table,
+    )
+    found, each = [], args.starts + args.loads
+    for case in cases:
+        started = sum(not engine.missing for engine in engines)
+        with tqdm(total=started * each, unit="answer", file=sys.stderr) as bar:
+            rows = compare(case, engines, args.starts, args.threads, bar.update)
+        _print(f"{len(case.nodes)} nodes, {len(case.tets)} tetrahedra", rows, table)
+        found.append({"nodes": len(case.nodes), "tets": len(case.tets), "rows": [_plain(row) for row in rows]})
+    if args.json:
+        print(json.dumps({"machine": where, "threads": args.threads, "tolerance": TOLERANCE, "meshes": found}))
+    return 0 if all(answer["good"] for mesh in found for answer in mesh["rows"][0]["answers"]) else 1
+
+
+def _print(title: str, rows: Sequence[Row], table: Any) -> None:
+    names = ("engine", "first [s]", "/ ours", "further [s]", "/ ours", "converged", "residual", "off ours [mm]")
+    print(f"\n{title}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}", file=table)
+    for row in rows:
+        if row.missing:
+            print(f"| {row.engine} | {row.missing} |{' |' * (len(names) - 2)}", file=table)
+            continue
+        good = [answer for answer in row.answers if answer.good]
+        bad = next((answer for answer in row.answers if not answer.good), None)
+        why = f"; not converged: {bad.reason or f'residual {bad.residual:.1e}'}" if bad else ""
+        cells = (
+            f"{row.engine} ({row.setting})",
+            _figure(row.first, ".2f"),
+            _figure(row.first_ratio, ".2f"),
+            _figure(row.further, ".3f"),
+            _figure(row.ratio, ".1f"),
+            f"{len(good)} of {len(row.answers)}{why}",
+            f"<= {max(answer.residual for answer in good):.0e}" if good else "",
+            f"<= {max(answer.apart for answer in good):.1e}" if good else "",
+        )
+        print(f"| {' | '.join(cells)} |", file=table, flush=True)
+
+
+def _figure(value: float, form: str) -> str:
+    return format(value, form) if np.isfinite(value) else ""
+
+
+def _plain(row: Row) -> dict[str, Any]:
+    """As JSON has it: what is not finite is null."""
+    answers = [
+        {"good": one.good, "reason": one.reason}
+        | {name: _finite(getattr(one, name)) for name in ("seconds", "residual", "apart")}
+        for one in row.answers
+    ]
+    figures = {name: _finite(getattr(row, name)) for name in ("first", "first_ratio", "further", "ratio")}
+    firsts = [_finite(seconds) for seconds in row.firsts]
+    named = {"engine": row.engine, "setting": row.setting, "missing": row.missing}
+    return named | figures | {"firsts": firsts, "answers": answers}
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,35 @@
+"""sulcus as an engine in a process of its own, beside its peers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim.accuracy import Accuracy
+from sim.anatomy import Anatomy
+from sim.effects import Effect, Elasticity, Held, NodalForce
+from sim.fem import Fem
+from sim.loads import Loads, Nodal
+from sim.material import Material
+from sim.mesh import TetMesh
+
+from .serving import Case, Solve, serve
+
+
+def fem_of(case: Case) -> Fem:
+    """The finite elements of a case, in double precision on the CPU."""
+    mesh = TetMesh(case.nodes, case.tets, np.zeros(len(case.tets), int))
+    held = np.repeat(case.held[:, None], 3, axis=1)
+    anatomy = Anatomy(mesh, held, np.zeros_like(mesh.nodes), ~case.held)
+    tissue = Material("neo-hookean", case.young, case.poisson)
+    effects: tuple[Effect, ...] = (Elasticity(tissue), Held(), NodalForce())
+    return Fem(anatomy, effects, Accuracy(case.tolerance), "cpu")
+
+
+def set_up(case: Case) -> Solve:
+    """Kernels and the factor, kept for all loads."""
+    fem = fem_of(case)
+    return lambda force: fem.deform(Loads((Nodal(force[None]),))).displacement[0]
+
+
+if __name__ == "__main__":
+    serve(set_up)

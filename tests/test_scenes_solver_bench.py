@@ -1,0 +1,106 @@
+"""sulcus beside other packages: one routine judges all, and who is not there is said to be missing."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import make_box
+
+from scenes.cli import main
+from scenes.solver_bench import OWN, PEERS, TOLERANCE, Engine, case_of, compare
+from sim.meshfile import write_anatomy
+
+WRONG = """
+from scenes.served import set_up
+from scenes.serving import serve
+
+def spoilt(case):
+    solve = set_up(case)
+    return lambda force: 1.00001 * solve(force)
+
+serve(spoilt)
+"""
+FAILING = "from scenes.serving import serve; serve(lambda case: lambda force: 1 / 0)"
+DYING = "import os; from scenes.serving import serve; serve(lambda case: lambda force: os._exit(3))"
+
+
+@pytest.fixture(scope="module")
+def box():
+    return make_box(cells=(5, 5, 4), spacing=14e-3, tumour=14e-3, opening=50e-3)
+
+
+@pytest.fixture(scope="module")
+def case(box):
+    return case_of(box, 3, 0)
+
+
+def engine(folder, name, code):
+    script = folder / f"{name}.py"
+    script.write_text(code)
+    return Engine(name, "spoilt", (), (str(script),))
+
+
+def test_a_case_holds_what_slides_and_carries_the_whole_push(box, case):
+    assert case.held.sum() == (box.held.any(axis=1) | box.slide_normal.any(axis=1)).sum() > 0
+    assert not case.held.all()
+    total = np.linalg.norm(case.force.sum(axis=1), axis=1)
+    assert ((total > 0.04) & (total < 0.41)).all()
+
+
+def test_every_answer_is_judged_by_one_routine(case, tmp_path):
+    """An engine that is wrong, one that fails and one that dies count for nothing, and do not stop the others."""
+    engines = (
+        OWN,
+        engine(tmp_path, "wrong", WRONG),
+        engine(tmp_path, "failing", FAILING),
+        engine(tmp_path, "dying", DYING),
+        Engine("absent", "", ("no_module_of_this_name",), ("-m", "absent")),
+        Engine("elsewhere", "", (), (str(tmp_path / "elsewhere.py"),)),
+    )
+    calls = []
+    rows = compare(case, engines, starts=1, threads=1, done=lambda: calls.append(1))
+    ours, wrong, failing, dying, absent, elsewhere = rows
+    assert len(calls) == 4 * (1 + len(case.force))
+    assert all(answer.good and answer.apart == 0.0 for answer in ours.answers)
+    assert ours.first > 0.0 and ours.further > 0.0 and np.isnan(ours.ratio)
+    assert all(TOLERANCE < answer.residual < 1e-3 and answer.apart > 0.0 for answer in wrong.answers)
+    assert all("ZeroDivisionError" in answer.reason for answer in failing.answers)
+    assert all("process ended" in answer.reason for answer in dying.answers)
+    for row in (wrong, failing, dying):
+        assert not any(answer.good for answer in row.answers)
+        assert np.isnan([row.first, row.further, row.first_ratio, row.ratio]).all()
+    assert "pip install" in absent.missing and not absent.answers
+    assert "checkout" in elsewhere.missing
+
+
+def test_the_command_says_it_in_json(box, tmp_path, capsys):
+    write_anatomy(tmp_path / "box.vtu", box)
+    words = ["bench", "solver", "--mesh", str(tmp_path / "box.vtu"), "--loads", "2", "--starts", "1", "--json"]
+    assert main(words) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    (mesh,) = found["meshes"]
+    (row,) = mesh["rows"]
+    assert row["engine"].startswith("sulcus") and row["missing"] == "" and row["ratio"] is None
+    assert mesh["nodes"] == len(box.mesh.nodes) and len(row["answers"]) == 2 and len(row["firsts"]) == 1
+    assert all(answer["good"] and answer["residual"] <= found["tolerance"] for answer in row["answers"])
+    assert "2 of 2" in said.err
+
+
+def test_a_peer_finds_the_same_field(case):
+    peer = next(peer for peer in PEERS if peer.name == "scikit-fem")
+    if peer.missing:
+        pytest.skip(peer.missing)
+    ours, theirs = compare(case, (OWN, peer), starts=1, threads=1, done=lambda: None)
+    assert [answer.reason for answer in theirs.answers] == [""] * len(case.force)
+    assert all(answer.good for answer in theirs.answers)
+    assert max(answer.apart for answer in theirs.answers) < 1e-3
+    assert theirs.ratio == pytest.approx(
+        np.median([b.seconds / a.seconds for a, b in zip(ours.answers[1:], theirs.answers[1:], strict=True)])
+    )
+
+
+@pytest.mark.parametrize("words", [("--loads", "1"), ("--starts", "0"), ("--threads", "0"), ("--mesh", "none.vtu")])
+def test_bad_input_is_a_sentence(words, capsys):
+    assert main(["bench", "solver", *words]) == 2
+    assert words[1] in capsys.readouterr().err
