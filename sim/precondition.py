@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,11 +14,11 @@ from .discretisation import Discretisation
 from .errors import InputError
 from .factor import Factor, node_of
 from .linear import BlockJacobi, Preconditioner
-from .multigrid import TwoLevel
+from .multigrid import Lifted, TwoLevel, over_free
 from .problem import Problem
 
-# Above this many unknowns the factor's memory and time outgrow what it saves.
-LARGEST_FACTOR = 400_000
+# On the CPU, above this many unknowns the factor's memory and time outgrow what it saves; CUDA inverts what fits.
+LARGEST_FACTOR = 150_000
 # Smoothed strains link the neighbours of neighbours: their own factor pays up to this many unknowns.
 LARGEST_SMOOTHED_FACTOR = 40_000
 
@@ -27,8 +28,8 @@ def choose_preconditioner(
 ) -> Preconditioner:
     """The rest stiffness, inverted (CUDA) or factorised where that pays; two levels where it has too many entries.
 
-    Block Jacobi where even the coarse level does not fit, or nothing is free to move. `unsmoothed` assembles the rest
-    stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh.
+    Algebraic multigrid where even the coarse level does not fit; block Jacobi where nothing is free to move.
+    `unsmoothed` assembles the rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh.
 
     Raises
     ------
@@ -36,21 +37,35 @@ def choose_preconditioner(
         A free rest stiffness that is singular.
     """
     device, constraint = problem.device, problem.constraint
-    nothing_free = constraint.basis().nnz == 0
-    if nothing_free or 3 * len(np.unique(space.table[:, :4])) > LARGEST_FACTOR:
+    if constraint.basis().nnz == 0:
         return BlockJacobi(device)
     try:
         if space.element == "p2":
-            stiffness, (motions, node) = problem.rest_curvature(), _coarse_motions(space, constraint)
-            return TwoLevel(_solver(stiffness, motions, node, device), stiffness, constraint, device)
+            stiffness = problem.rest_curvature()
+            lifted = _on_corners(stiffness, space, constraint, device)
+            name = f"p-multigrid on {name_of(lifted.coarse)}"
+            return TwoLevel(lifted, over_free(stiffness, constraint), device, name)
         if space.element == "smoothed" and problem.rows > LARGEST_SMOOTHED_FACTOR:
             # An average resists less than what is averaged, so that the coarse solver never overshoots.
-            basis = constraint.basis()
-            coarse = _solver(unsmoothed(), basis, node_of(basis), device)
-            return TwoLevel(coarse, problem.rest_curvature(), constraint, device)
-        return rest_solver(problem)
+            coarse = _solver(unsmoothed(), constraint, space.nodes, device)
+            name = f"two levels on {name_of(coarse)}"
+            return TwoLevel(coarse, over_free(problem.rest_curvature(), constraint), device, name)
+        return _solver(problem.rest_curvature(), constraint, space.nodes, device)
     except RuntimeError as error:
         raise InputError(f"the stiffness at rest cannot be factorised ({error}): is every part held?") from error
+
+
+def name_of(preconditioner: Preconditioner) -> str:
+    """What a person calls it."""
+    match preconditioner:
+        case TwoLevel():
+            return preconditioner.name
+        case Factor():
+            return "sparse factor"
+        case BlockJacobi():
+            return "block Jacobi"
+        case _:
+            return "dense inverse"
 
 
 def rest_solver(problem: Problem) -> Preconditioner:
@@ -62,22 +77,40 @@ def rest_solver(problem: Problem) -> Preconditioner:
         It is singular.
     """
     basis = problem.constraint.basis()
-    return _solver(problem.rest_curvature(), basis, node_of(basis), problem.device)
+    return _direct(problem.rest_curvature(), basis, node_of(basis), problem.device)
 
 
-def _solver(stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device) -> Preconditioner:
-    if device.on_cuda:
-        from .dense import Dense, fits
+def _on_corners(stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device) -> Lifted:
+    """What linear tetrahedra on the same corners can do, as far as it is free."""
+    corner, free = np.unique(space.table[:, :4]), constraint.basis()
+    every = sp.csc_array(free @ (free.T @ sp.kron(space.corner_interpolation, sp.eye_array(3))))
+    own = Constraint(constraint.held[corner], constraint.normal[corner], device)
+    coarse = _solver(sp.csc_array(every.T @ stiffness @ every), own, space.nodes[corner], device)
+    return Lifted(sp.bsr_array(sp.csr_array(every), blocksize=(3, 3)), coarse, device)
 
-        if fits(len(node), device):
-            return Dense(stiffness, motions, device)
+
+def _solver(stiffness: sp.csc_array, constraint: Constraint, points: np.ndarray, device: Device) -> Preconditioner:
+    """K (3N, 3N) over what is free of nodes at points (N, 3): inverted or factorised where that pays."""
+    basis = constraint.basis()
+    if _direct_pays(len(basis.indptr) - 1, device):
+        return _direct(stiffness, basis, node_of(basis), device)
+    from .amg import algebraic, rigid_motions
+
+    motions = basis @ (basis.T @ rigid_motions(points))
+    return algebraic(over_free(stiffness, constraint), motions, partial(_direct, device=device), device)
+
+
+def _direct_pays(count: int, device: Device) -> bool:
+    if not device.on_cuda:
+        return count <= LARGEST_FACTOR
+    from .dense import fits
+
+    return fits(count, device)
+
+
+def _direct(stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device) -> Preconditioner:
+    if device.on_cuda and _direct_pays(len(node), device):
+        from .dense import Dense
+
+        return Dense(stiffness, motions, device)
     return Factor(stiffness, motions, node, device)
-
-
-def _coarse_motions(space: Discretisation, constraint: Constraint) -> tuple[sp.csc_array, np.ndarray]:
-    """What linear tetrahedra on the same corners can do (3N, n), as far as it is free, and the corner (n,) of each."""
-    every = space.corner_interpolation
-    corner = np.unique(space.table[:, :4])
-    basis = Constraint(constraint.held[corner], constraint.normal[corner], constraint.device).basis()
-    free = constraint.basis()
-    return sp.csc_array(free @ (free.T @ (sp.kron(every, sp.eye_array(3)) @ basis))), node_of(basis)

@@ -19,7 +19,7 @@ TIERS = (
     {"device", "columns", "sparse", "sweep", "term", "constraint", "footprint"},
     {"terms", "problem"},
     {"linear", "factor", "direction", "search", "dense", "memory", "compile"},
-    {"newton", "multigrid", "inversion"},
+    {"newton", "multigrid", "amg", "inversion"},
     {"precondition", "ladder"},
     {"fem"},
 )
@@ -31,6 +31,7 @@ OWNERS = {
     "meshio": {"sim/meshfile.py"},
     "viser": {"ar/browser.py"},
     "nilearn": {"sim/template.py"},
+    "pyamg": {"sim/amg.py"},
     "nibabel": {"sim/intensity.py", "sim/volume.py"},
 }
 """Libraries that nobody else imports."""

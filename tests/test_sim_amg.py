@@ -1,0 +1,88 @@
+"""Algebraic multigrid against dense algebra and under refinement, and which preconditioner is chosen when."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from boxes import base_held, box
+from test_sim_multigrid import built, matrices, spread
+
+from sim import amg, precondition
+from sim.amg import rigid_motions
+from sim.compile import compile_problem
+from sim.device import find_device
+from sim.discretisation import discretise
+from sim.effects import Elasticity, Held
+from sim.linear import BlockJacobi, conjugate_gradients
+from sim.material import Material
+from sim.precondition import name_of
+
+
+@pytest.fixture
+def too_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every mesh is too large for a factor, and ten nodes are enough for the last level."""
+    monkeypatch.setattr(precondition, "LARGEST_FACTOR", 0)
+    monkeypatch.setattr(precondition, "LARGEST_SMOOTHED_FACTOR", 0)
+    monkeypatch.setattr(amg, "LARGEST_LAST", 10)
+
+
+@pytest.mark.usefixtures("too_large")
+@pytest.mark.parametrize("poisson", [0.3, 0.49])
+@pytest.mark.parametrize("kind", ["p1", "p2", "tetra10", "smoothed"])
+def test_symmetric_positive_and_close(kind: str, poisson: float) -> None:
+    problem, preconditioner = built(kind, poisson, (3, 3, 4))
+    K, M = matrices(problem, preconditioner)
+    assert np.abs(M - M.T).max() < 1e-11 * np.abs(M).max()
+    assert np.linalg.eigvalsh((M + M.T) / 2.0).min() > 0.0
+    assert spread(K, M) < (12.0 if poisson == 0.3 else 150.0)
+
+
+@pytest.mark.usefixtures("too_large")
+def test_refining_costs_few_iterations() -> None:
+    """Eight times as many unknowns and one level more; block Jacobi would take twice the iterations."""
+    count = []
+    for cells in (4, 8):
+        problem, preconditioner = built("p1", 0.45, (cells, cells, cells))
+        free, device = problem.constraint.basis(), problem.device
+        r = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 2))
+        problem.linearise(device.zeros(*r.shape), np.zeros(2, bool))
+        preconditioner.prepare(problem, 2)
+        tolerance = 1e-6 * np.linalg.norm(r, axis=0)
+        count.append(conjugate_gradients(problem, preconditioner, device.array(r), tolerance, 400).iterations)
+    assert count[1] <= 25
+    assert count[1] <= count[0] + 8
+
+
+@pytest.mark.usefixtures("too_large")
+def test_the_same_mesh_gives_the_same_cycle() -> None:
+    first, second = (matrices(*built("p1", 0.45, (3, 3, 4)))[1] for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("kind", "largest", "name"),
+    [
+        ("p1", 10_000, "sparse factor"),
+        ("p1", 0, "algebraic multigrid, 3 levels"),
+        ("p2", 10_000, "p-multigrid on sparse factor"),
+        ("p2", 0, "p-multigrid on algebraic multigrid, 3 levels"),
+        ("smoothed", 10_000, "sparse factor"),
+    ],
+)
+def test_the_choice_goes_by_size_and_element(
+    kind: str, largest: int, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(precondition, "LARGEST_FACTOR", largest)
+    monkeypatch.setattr(amg, "LARGEST_LAST", 5)
+    problem, preconditioner = built(kind, 0.45, (5, 5, 5))
+    assert name_of(preconditioner) == name
+    assert name_of(BlockJacobi(problem.device)) == "block Jacobi"
+
+
+def test_rigid_motions_strain_nothing() -> None:
+    anatomy = base_held(box((2, 2, 3), distortion=0.2))
+    space, device = discretise(anatomy.mesh, "p1"), find_device("cpu", "float64")
+    problem = compile_problem((Elasticity(Material("linear", 3000.0, 0.3)), Held()), anatomy, device, space)
+    K, R = problem.rest_curvature(), rigid_motions(anatomy.mesh.nodes)
+    assert np.linalg.matrix_rank(R) == 6
+    assert np.abs(K @ R).max() < 1e-12 * np.abs(K).max() * np.abs(R).max()
