@@ -20,28 +20,32 @@ PIECES = 8
 # Triangles that one thread searches.
 CHUNK = 64
 
+vec6d = wp.types.vector(length=6, dtype=wp.float64)
+
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Weights of B tools on M nodes: a force F puts weight x F on every node.
+    """How B tools press M nodes: a force F puts weight / total x F on every node.
 
-    nodes (M,) numbers; weight (M, B) float64 on the device, each column sums to one; centre (B,) of 3-vectors [m], the
-    weighted mean position.
+    nodes (M,) numbers; weight (M, B) float64 and sums (B,) of 4-vectors on the device: the total, and the sum of
+    weight x position [m].
     """
 
     nodes: np.ndarray
     weight: wp.array
-    centre: wp.array
+    sums: wp.array
 
     def rows(self, count: int) -> sp.csr_array:
-        """The weights (B, `count`) on all nodes of a mesh, on the host."""
-        weight = self.weight.numpy()
-        tool, place = np.nonzero(weight.T)
-        return sp.csr_array((weight[place, tool], (tool, self.nodes[place])), shape=(weight.shape[1], count))
+        """Shares (B, `count`) of all nodes of a mesh, each row summing to one, on the host."""
+        weight, total = self.weight.numpy().T, self.sums.numpy().reshape(-1, 4)[:, 0]
+        tool, place = np.nonzero(weight)
+        share = weight[tool, place] / total[tool]
+        return sp.csr_array((share, (tool, self.nodes[place])), shape=(len(weight), count))
 
     def centres(self) -> np.ndarray:
         """Where each force acts (B, 3) [m], on the host."""
-        return self.centre.numpy().reshape(-1, 3)
+        sums = self.sums.numpy().reshape(-1, 4)
+        return sums[:, 1:] / sums[:, :1]
 
 
 class Skin:
@@ -60,6 +64,7 @@ class Skin:
     def __init__(self, nodes: np.ndarray, triangles: np.ndarray, device: Device):
         self.device = device
         self.nodes, table = np.unique(triangles, return_inverse=True)
+        self.numbers = device.array(self.nodes, wp.int32)
         corners = nodes[triangles[:, :3]]
         centre = corners.mean(axis=1)
         reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
@@ -67,47 +72,55 @@ class Skin:
         self._ball = device.array(np.column_stack([centre, reach]), wp.vec4d)
         self._table = device.array(table.reshape(triangles.shape), wp.int32)
         self._position = device.array(nodes[self.nodes], wp.vec3d)
+        self._last: tuple[bytes, Footprints] | None = None
 
-    def nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[wp.array, wp.array]:
-        """The nearest points (B,) [m] to `points` (B, 3) and how far they are; inf if not `within` (B,) [m]."""
-        chunks, count = -(-len(self._ball) // CHUNK), len(points)
-        found, distance = self._empty(wp.vec3d, chunks, count), self._empty(wp.float64, chunks, count)
-        inputs = [self._corners, self._ball, self.device.array(points, wp.vec3d), self.device.array(within, wp.float64)]
-        self.device.launch(_search, (chunks, count), inputs, [found, distance])
-        nearest, least = self._empty(wp.vec3d, count), self._empty(wp.float64, count)
-        self.device.launch(_settle, (count,), [found, distance], [nearest, least])
-        return nearest, least
+    def nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest points (B, 3) [m] to `points` (B, 3) and how far they are; inf if not `within` (B,) [m]."""
+        touched = self._touched(self._tools(points, within)).numpy().reshape(-1, 4)
+        return touched[:, :3], touched[:, 3]
 
     def press(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
         """Footprints of tools at `points` (B, 3) with `radii` (B,) [m].
 
-        A point off the surface is moved to its nearest point on it, by at most its radius.
+        A point off the surface is moved to its nearest point on it, by at most its radius. The last answer is kept: a
+        solve asks for its tools more than once.
 
         Raises
         ------
         InputError
             A footprint that does not touch the surface.
         """
-        touched, distance = self.nearest(points, radii)
-        missed = np.flatnonzero(np.isinf(distance.numpy()))
+        key = np.column_stack([points, radii]).tobytes()
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._pressed(points, radii)
+        return self._last[1]
+
+    def _pressed(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
+        tools, count = self._tools(points, radii), len(points)
+        touched = self._touched(tools)
+        missed = np.flatnonzero(np.isinf(touched.numpy().reshape(-1, 4)[:, 3]))
         if len(missed):
             number = missed[0]
             raise InputError(
                 f"load {number} presses at {np.round(1e3 * points[number], 1)} mm with a footprint of "
                 f"{1e3 * radii[number]:.3g} mm, which does not touch the surface: choose a point on it."
             )
-        count = len(points)
-        weight, total = (
-            wp.zeros(shape, dtype=wp.float64, device=self.device.name) for shape in ((len(self.nodes), count), count)
-        )
-        centre = wp.zeros(count, dtype=wp.vec3d, device=self.device.name)
-        inputs = [self._corners, self._ball, self._table, touched, self.device.array(radii, wp.float64)]
-        self.device.launch(_press, (len(self._ball), count), inputs, [weight, total])
-        self.device.launch(_share, (len(self.nodes), count), [self._position, total], [weight, centre])
-        return Footprints(self.nodes, weight, centre)
+        weight = wp.zeros((len(self.nodes), count), dtype=wp.float64, device=self.device.name)
+        sums = wp.zeros(count, dtype=wp.vec4d, device=self.device.name)
+        inputs = [self._corners, self._ball, self._table, self._position, tools, touched]
+        self.device.launch(_press, (len(self._ball), count), inputs, [weight, sums])
+        return Footprints(self.nodes, weight, sums)
 
-    def _empty(self, dtype: type, *shape: int) -> wp.array:
-        return wp.empty(shape, dtype=dtype, device=self.device.name)
+    def _tools(self, points: np.ndarray, radii: np.ndarray) -> wp.array:
+        return self.device.array(np.column_stack([points, radii]), wp.vec4d)
+
+    def _touched(self, tools: wp.array) -> wp.array:
+        """Where (B,) each tool touches first, and how far that is from its point; inf if beyond its radius."""
+        found = wp.empty((-(-len(self._ball) // CHUNK), len(tools)), dtype=wp.vec4d, device=self.device.name)
+        touched = wp.empty(len(tools), dtype=wp.vec4d, device=self.device.name)
+        self.device.launch(_search, found.shape, [self._corners, self._ball, tools], [found])
+        self.device.launch(_settle, touched.shape, [found], [touched])
+        return touched
 
 
 def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:
@@ -119,7 +132,7 @@ def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     """The point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m]."""
     apart = np.arange(3 * len(corners)).reshape(-1, 3)
     skin = Skin(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))
-    return skin.nearest(point[None], np.array([np.inf]))[0].numpy()[0]
+    return skin.nearest(point[None], np.array([np.inf]))[0][0]
 
 
 @wp.func
@@ -158,48 +171,52 @@ def _on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.v
     return nearest
 
 
+@wp.func
+def _place(of: wp.vec4d) -> wp.vec3d:
+    """Centre of a ball, point of a tool; the fourth component is its radius."""
+    return wp.vec3d(of[0], of[1], of[2])
+
+
+@wp.func
+def _joined(place: wp.vec3d, length: wp.float64) -> wp.vec4d:
+    return wp.vec4d(place[0], place[1], place[2], length)
+
+
 @wp.kernel
 def _search(
     corners: wp.array2d(dtype=wp.vec3d),
     ball: wp.array(dtype=wp.vec4d),
-    points: wp.array(dtype=wp.vec3d),
-    within: wp.array(dtype=wp.float64),
+    tools: wp.array(dtype=wp.vec4d),
     # outputs
-    found: wp.array2d(dtype=wp.vec3d),
-    distance: wp.array2d(dtype=wp.float64),
+    found: wp.array2d(dtype=wp.vec4d),
 ):
     """The nearest point of a chunk of triangles, and how far it is; inf where none is near enough."""
     chunk, c = wp.tid()
-    point = points[c]
-    best = within[c]
-    distance[chunk, c] = wp.float64(wp.inf)
+    point = _place(tools[c])
+    best = tools[c][3]
+    found[chunk, c] = _joined(point, wp.float64(wp.inf))
     for s in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, ball.shape[0])):
-        round = ball[s]
-        offset = wp.vec3d(round[0], round[1], round[2]) - point
-        if wp.length_sq(offset) <= (round[3] + best) * (round[3] + best):
+        near = ball[s][3] + best
+        if wp.length_sq(_place(ball[s]) - point) <= near * near:
             nearest = _on_triangle(corners[s, 0], corners[s, 1], corners[s, 2], point)
             far = wp.length(nearest - point)
             if far <= best:
                 best = far
-                distance[chunk, c] = far
-                found[chunk, c] = nearest
+                found[chunk, c] = _joined(nearest, far)
 
 
 @wp.kernel
 def _settle(
-    found: wp.array2d(dtype=wp.vec3d),
-    distance: wp.array2d(dtype=wp.float64),
+    found: wp.array2d(dtype=wp.vec4d),
     # outputs
-    nearest: wp.array(dtype=wp.vec3d),
-    least: wp.array(dtype=wp.float64),
+    touched: wp.array(dtype=wp.vec4d),
 ):
     """The nearest of all chunks."""
     c = wp.tid()
-    least[c] = wp.float64(wp.inf)
-    for chunk in range(found.shape[0]):
-        if distance[chunk, c] < least[c]:
-            least[c] = distance[chunk, c]
-            nearest[c] = found[chunk, c]
+    touched[c] = found[0, c]
+    for chunk in range(1, found.shape[0]):
+        if found[chunk, c][3] < touched[c][3]:
+            touched[c] = found[chunk, c]
 
 
 @wp.kernel
@@ -207,24 +224,24 @@ def _press(
     corners: wp.array2d(dtype=wp.vec3d),
     ball: wp.array(dtype=wp.vec4d),
     table: wp.array2d(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec3d),
-    radii: wp.array(dtype=wp.float64),
+    position: wp.array(dtype=wp.vec3d),
+    tools: wp.array(dtype=wp.vec4d),
+    touched: wp.array(dtype=wp.vec4d),
     # outputs
     weight: wp.array2d(dtype=wp.float64),
-    total: wp.array(dtype=wp.float64),
+    sums: wp.array(dtype=wp.vec4d),
 ):
     """Add the integral of w N_a over a triangle, up to a factor, by the centres of n^2 equal pieces.
 
     A row of pieces, y constant, meets the footprint in an interval: where A j^2 + 2 B j + C < 0 at its j-th piece.
     """
     s, c = wp.tid()
-    radius = radii[c]
-    round = ball[s]
-    offset = wp.vec3d(round[0], round[1], round[2]) - points[c]
-    if wp.length_sq(offset) > (round[3] + radius) * (round[3] + radius):
+    point, radius = _place(touched[c]), tools[c][3]
+    near = ball[s][3] + radius
+    if wp.length_sq(_place(ball[s]) - point) > near * near:
         return
-    zero, one, two, four = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0), wp.float64(4.0)
-    start, first, second = corners[s, 0] - points[c], corners[s, 1] - corners[s, 0], corners[s, 2] - corners[s, 0]
+    zero, one, two = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0)
+    start, first, second = corners[s, 0] - point, corners[s, 1] - corners[s, 0], corners[s, 2] - corners[s, 0]
     longest = wp.max(wp.max(wp.length(first), wp.length(second)), wp.length(first - second))
     n = int(PIECES)
     while longest > wp.float64(FINENESS) * radius * wp.float64(n):
@@ -256,32 +273,14 @@ def _press(
     if m[0] == zero:
         return
     scale = wp.length(wp.cross(first, second)) * h * h / radius
-    wp.atomic_add(total, c, scale * m[0])
     x, y, z = m[0] - m[1] - m[2], m[1], m[2]
-    if table.shape[1] == 3:
-        wp.atomic_add(weight, table[s, 0], c, scale * x)
-        wp.atomic_add(weight, table[s, 1], c, scale * y)
-        wp.atomic_add(weight, table[s, 2], c, scale * z)
-    else:  # L (2 L - 1) at corners, 4 L_i L_j between them
+    share = vec6d(x, y, z, zero, zero, zero)
+    if table.shape[1] == 6:  # L (2 L - 1) at corners, 4 L_i L_j between them
         xy, yz, zx = y - mm[0] - mm[1], mm[1], z - mm[1] - mm[2]
-        wp.atomic_add(weight, table[s, 0], c, scale * (x - two * (xy + zx)))
-        wp.atomic_add(weight, table[s, 1], c, scale * (y - two * (xy + yz)))
-        wp.atomic_add(weight, table[s, 2], c, scale * (z - two * (yz + zx)))
-        wp.atomic_add(weight, table[s, 3], c, scale * four * xy)
-        wp.atomic_add(weight, table[s, 4], c, scale * four * yz)
-        wp.atomic_add(weight, table[s, 5], c, scale * four * zx)
-
-
-@wp.kernel
-def _share(
-    position: wp.array(dtype=wp.vec3d),
-    total: wp.array(dtype=wp.float64),
-    # outputs
-    weight: wp.array2d(dtype=wp.float64),
-    centre: wp.array(dtype=wp.vec3d),
-):
-    """Shares of the whole, and their mean position."""
-    i, c = wp.tid()
-    if weight[i, c] != wp.float64(0.0):
-        weight[i, c] /= total[c]
-        wp.atomic_add(centre, c, weight[i, c] * position[i])
+        halves = vec6d(xy + zx, xy + yz, yz + zx, -two * xy, -two * yz, -two * zx)
+        share -= two * halves
+    moment = wp.vec3d()
+    for a in range(table.shape[1]):
+        wp.atomic_add(weight, table[s, a], c, scale * share[a])
+        moment += share[a] * position[table[s, a]]
+    wp.atomic_add(sums, c, scale * wp.vec4d(m[0], moment[0], moment[1], moment[2]))

@@ -32,14 +32,15 @@ def kernels_of(device: Device) -> Kernels:
     @wp.kernel(module="unique")
     def spread(
         weight: wp.array2d(dtype=wp.float64),
-        total: wp.array2d(dtype=wp.float64),
+        sums: wp.array(dtype=wp.vec4d),
+        whole: wp.array2d(dtype=wp.float64),
         # outputs
         force: wp.array2d(dtype=scalar),
     ):
-        """f_(3i+k)c = w_ic F_ck."""
+        """f_(3i+k)c = w_ic / (sum of w)_c F_ck."""
         i, c = wp.tid()
         for k in range(3):
-            force[3 * i + k, c] = scalar(weight[i, c] * total[c, k])
+            force[3 * i + k, c] = scalar(weight[i, c] / sums[c][0] * whole[c, k])
 
     @wp.kernel(module="unique")
     def subtract(
@@ -92,10 +93,10 @@ def pushed_forces(skin: Skin, device: Device, loads: Loads) -> Forces | None:
     if cause is None:
         return None
     footprints = skin.press(cause.point, cause.footprint)
-    force = device.zeros(3 * len(skin.nodes), len(loads))
-    inputs = [footprints.weight, device.array(cause.force, wp.float64)]
+    force = wp.empty((3 * len(skin.nodes), len(loads)), dtype=device.scalar, device=device.name)
+    inputs = [footprints.weight, footprints.sums, device.array(cause.force, wp.float64)]
     device.launch(kernels_of(device).spread, footprints.weight.shape, inputs, [force])
-    return Forces(device.array(skin.nodes, wp.int32), force)
+    return Forces(skin.numbers, force)
 
 
 def nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | None:
