@@ -13,9 +13,9 @@ import scipy.sparse as sp
 from scipy.sparse import csgraph
 
 # Whole subtrees of at most so many unknowns are one front.
-LEAF = 96
+LEAF = 64
 # Two fronts are joined while that stores at most so many zeros: another dense product costs as much.
-ZEROS = 2000
+ZEROS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,23 +126,44 @@ def _groups(graph: sp.csr_array, weight: np.ndarray) -> list[tuple[np.ndarray, n
     for node in range(count):
         members.setdefault(top[node], []).append(node)
 
+    # Sets of nodes are the bits of whole numbers: a union is one operation.
+    alike = {int(unknowns): _bits(np.flatnonzero(weight == unknowns), count) for unknowns in np.unique(weight)}
+
+    def size(nodes: int) -> int:
+        return sum(unknowns * (nodes & which).bit_count() for unknowns, which in alike.items())
+
     def entries(own: int, border: int) -> float:
         return own * (0.5 * own + border)
 
-    groups: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    size: dict[int, tuple[int, int]] = {}
+    groups: dict[int, tuple[list[int], int, int, int]] = {}
     children: dict[int, list[int]] = {last: [] for last in members}
     for last in sorted(members):
-        own = np.array(members[last])
-        touched = [graph.indices[graph.indptr[node] : graph.indptr[node + 1]] for node in own]
-        touched = np.unique(np.concatenate([*touched, *(groups[child][1] for child in children[last])]))
-        border = touched[touched > last]
-        k, m = int(weight[own].sum()), int(weight[border].sum())
+        own = members[last]
+        spans = [graph.indices[graph.indptr[node] : graph.indptr[node + 1]] for node in own]
+        border = _bits(np.concatenate(spans), count)
         for child in children[last]:
-            j, n = size[child]
+            border |= groups[child][1]
+        border = border >> last + 1 << last + 1
+        k, m = int(weight[own].sum()), size(border)
+        for child in children[last]:
+            inner, _, j, n = groups[child]
             if entries(j + k, m) <= entries(k, m) + entries(j, n) + ZEROS:
-                own, k = np.concatenate([groups.pop(child)[0], own]), k + j
-        groups[last], size[last] = (own, border), (k, m)
-        if len(border):
-            children[int(border[0])].append(last)
-    return [groups[last] for last in sorted(groups)]
+                own, k = inner + own, k + j
+                del groups[child]
+        groups[last] = own, border, k, m
+        if border:
+            children[(border & -border).bit_length() - 1].append(last)
+    return [(np.array(own), _nodes(border, count)) for own, border, _, _ in groups.values()]
+
+
+def _bits(nodes: np.ndarray, count: int) -> int:
+    """Some of `count` nodes as the bits of a whole number."""
+    flags = np.zeros(count, bool)
+    flags[nodes] = True
+    return int.from_bytes(np.packbits(flags, bitorder="little").tobytes(), "little")
+
+
+def _nodes(bits: int, count: int) -> np.ndarray:
+    """The nodes again, ascending."""
+    packed = np.frombuffer(bits.to_bytes(-(-count // 8), "little"), np.uint8)
+    return np.flatnonzero(np.unpackbits(packed, bitorder="little"))
