@@ -22,7 +22,7 @@ from .inversion import Inversion
 from .ladder import Ladder, shortfall
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
 from .memory import check_fits
-from .precondition import choose_preconditioner
+from .precondition import choose_preconditioner, name_of
 from .term import Cases
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
@@ -70,6 +70,7 @@ class Fem:
         self.problem = compile_problem(self.effects, anatomy, find_device(device, accuracy.precision), self.space)
         self._skin = Skin(self.space.nodes, self.space.surface, self.problem.device)
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed)
+        self.preconditioner = name_of(preconditioner)
         inversion = Inversion(self.space, self.problem.device)
         self._ladder = Ladder(LBFGS(preconditioner), NewtonCG(preconditioner, accuracy.inner), inversion, accuracy)
 

@@ -15,7 +15,7 @@ from .field import Field
 from .intensity import Intensity
 from .meshing import Solids, mesh_solids
 
-FEWEST_NODES, MOST_NODES = 2_000, 60_000
+FEWEST_NODES, MOST_NODES = 2_000, 250_000
 SMALLEST_CRANIOTOMY, LARGEST_CRANIOTOMY = 0.015, 0.120  # [m]
 
 
@@ -26,7 +26,7 @@ class Plan:
     Raises
     ------
     InputError
-        Nodes outside 2,000 to 60,000, or a craniotomy outside 15 to 120 mm.
+        Nodes outside 2,000 to 250,000, or a craniotomy outside 15 to 120 mm.
     """
 
     nodes: int = 5300

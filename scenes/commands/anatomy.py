@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("--out", required=True, type=Path, metavar="MESH.vtu", help="mesh to write [m, RAS]")
     parser.add_argument(
-        "--nodes", type=int, default=5300, metavar="N", help="nodes wanted, 2000 to 60000 (%(default)s)"
+        "--nodes", type=int, default=5300, metavar="N", help="nodes wanted, 2000 to 250000 (%(default)s)"
     )
     parser.add_argument("--craniotomy", type=float, metavar="MM", help="diameter along the cortex [mm] (50)")
     parser.add_argument("--skull", choices=("slide", "held"), help="how the brain's surface meets the skull (slide)")

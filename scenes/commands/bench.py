@@ -10,6 +10,7 @@ BENCHES = {
     "elements": "how far each element is from the limit of fine meshes, and what it costs",
     "robust": "how many of thousands of random loads converge",
     "live": "what a frame of a moving tool takes, warm-started, and how far off it is",
+    "growth": "what a load takes in seconds and memory, the finer the mesh the more, and what preconditions it",
     "solver": "the first load on a mesh and a further one, beside other packages",
 }
 

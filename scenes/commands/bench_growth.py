@@ -1,0 +1,84 @@
+"""`sulcus bench growth`: what a load takes in seconds and memory as the mesh grows, as a table and a plot."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from sim.discretisation import ELEMENTS
+from sim.errors import InputError
+from sim.files import check_output
+
+if TYPE_CHECKING:
+    from ..growth import Row
+
+SIZES = (2000, 5300, 17_000, 50_000, 100_000, 200_000)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES), metavar="N", help="nodes (default: six)")
+    parser.add_argument("--batch", nargs="+", type=int, default=[1, 8], metavar="B", help="loads together (1 8)")
+    parser.add_argument("--element", choices=ELEMENTS, default="p1", help="(default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("growth.png"), metavar="PLOT.png",
+        help="the plot; rows and meshes are kept beside it, and an unfinished run goes on (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row; 1 if a load did not converge."""
+    from ar.chart import drawn
+    from ar.screen import write_png
+    from sim.device import find_device
+    from sim.subject import Plan
+
+    from ..bench import machine
+    from ..growth import Trial, append_row, panels, read_rows, rows
+
+    if min(args.batch) < 1:
+        raise InputError(f"--batch {min(args.batch)} solves nothing: give whole numbers from 1 up.")
+    for size in args.sizes:
+        Plan(size)
+    find_device(args.device, "float32")
+    out = check_output(args.out, ".png")
+    where, record = machine(args.device), out.with_suffix(".jsonl")
+    trial = Trial(args.element, args.device, out.parent)
+    stated = f"{where.split(';')[0]}, {args.device} {args.element}"
+    found = [row for row in read_rows(record, stated) if row.size in args.sizes and row.asked in args.batch]
+    table = sys.stderr if args.json else sys.stdout
+    print(where, file=table)
+    with tqdm(total=len(args.sizes) * len(args.batch), initial=len(found), unit="row", file=sys.stderr) as bar:
+        for row in rows(trial, args.sizes, args.batch, tuple(found)):
+            append_row(record, stated, row)
+            found.append(row)
+            bar.update()
+    found.sort(key=lambda row: (row.nodes, row.batch))
+    write_png(out, drawn(panels(found)))
+    _print(found, table)
+    if args.json:
+        print(json.dumps({"machine": where, "rows": [asdict(row) for row in found], "plot": str(out)}))
+    return 0 if all(row.converged == row.loads for row in found) else 1
+
+
+def _print(found: Sequence[Row], table) -> None:
+    names = (
+        "nodes", "tetrahedra", "preconditioner", "set-up [s]", "batch", "a load [s]", "outer", "converged",
+        "host [GiB]", "card [GiB]",
+    )  # fmt: skip
+    print(f"\n| {' | '.join(names)} |\n|{'---|' * len(names)}", file=table)
+    for row in found:
+        cells = (
+            row.nodes, row.tets, row.preconditioner, f"{row.set_up:.3g}", row.batch, f"{row.load:.3g}",
+            f"{row.outer:g}", f"{row.converged} of {row.loads}", f"{row.memory:.3g}", f"{row.card:.3g}",
+        )  # fmt: skip
+        print(f"| {' | '.join(map(str, cells))} |", file=table)

@@ -1,0 +1,91 @@
+"""`sulcus bench growth`: rows, the plot, and a run that goes on where it was stopped."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ar.screen import read_png
+from scenes import growth
+from scenes.cli import main
+from scenes.growth import Row, Trial, measured, panels, rows
+from sim.errors import InputError
+
+ROW = Row(2000, 1, 1977, 8987, "sparse factor", 1, 1.0, 0.05, 8.0, 12, 12, 0.3, 0.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where the smallest template's mesh is kept."""
+    folder = tmp_path_factory.mktemp("growth")
+    Trial("p1", "cpu", folder).mesh(2000)
+    return folder
+
+
+def test_a_row_is_what_was_solved(folder, monkeypatch):
+    monkeypatch.setattr(growth, "LOADS", 4)
+    row = measured(Trial("p1", "cpu", folder), 2000, 2)
+    assert (row.preconditioner, row.batch, row.loads, row.converged) == ("sparse factor", 2, 4, 4)
+    assert 1900 < row.nodes < 2100 and row.tets > 4 * row.nodes
+    assert row.set_up > 0.0 and row.load > 0.0 and row.outer >= 1
+    assert 0.05 < row.memory < 20.0 and row.card == 0.0
+
+
+def test_what_is_measured_is_not_measured_again(folder, tmp_path, monkeypatch, capsys):
+    """The first row is taken from the record; the other is measured in a process of its own."""
+    words = ["bench", "growth", "--sizes", "2000", "--batch", "1", "2", "--device", "cpu"]
+    out = folder / "growth.png"
+    asked = []
+
+    def instead(trial, sizes, batches, done):
+        asked.append([row.asked for row in done])
+        yield from (replace(ROW, asked=b, batch=b) for b in batches if b not in asked[-1])
+
+    monkeypatch.setattr(growth, "rows", instead)
+    assert main([*words[:-3], "--device", "cpu", "--out", str(out)]) == 0
+    assert main([*words, "--out", str(out), "--json"]) == 0
+    assert asked == [[], [1]]
+    captured = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert [row["batch"] for row in captured["rows"]] == [1, 2]
+    assert read_png(out).std() > 5.0
+    monkeypatch.undo()
+    assert len((folder / "growth.jsonl").read_text().splitlines()) == 3
+    assert main([*words, "--out", str(out)]) == 0
+    assert main([*words, "--element", "p2", "--out", str(out)]) == 2
+    assert "another trial" in capsys.readouterr().err
+    (folder / "growth.jsonl").write_text((folder / "growth.jsonl").read_text()[:-9])
+    assert main([*words, "--out", str(out)]) == 2
+    assert "not whole" in capsys.readouterr().err
+
+
+def test_each_row_has_a_process_of_its_own(folder):
+    """What it refuses comes back as it is."""
+    with pytest.raises(InputError, match="no element"):
+        list(rows(Trial("abacus", "cpu", folder), [2000], [1], []))
+
+
+def test_the_switch_is_marked_between_the_sizes_beside_it():
+    large = replace(ROW, size=8000, nodes=8000, preconditioner="algebraic multigrid, 3 levels")
+    larger = replace(large, nodes=32000, preconditioner="algebraic multigrid, 4 levels")
+    seconds, memory = panels([ROW, large, larger])
+    assert seconds.marks == memory.marks == ((pytest.approx(np.sqrt(1977 * 8000)), "algebraic multigrid"),)
+    assert [curve.name for curve in seconds.curves] == ["one load", "set-up"]
+    assert [curve.name for curve in memory.curves] == ["host, batch of 1"]
+    assert "card, batch of 1" in [curve.name for curve in panels([replace(ROW, card=2.0)])[1].curves]
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--sizes", "3"], "3 nodes"),
+        (["--batch", "0"], "--batch 0"),
+        (["--device", "abacus"], "abacus"),
+        (["--out", "growth.txt"], ".png"),
+    ],
+)
+def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", "growth", *words]) == 2
+    assert reason in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
