@@ -55,8 +55,8 @@ class Factor:
         self._blas = ThreadpoolController()
         self._fronts = fronts
         with self._blas.limit(limits=1, user_api="blas"):
-            self._panels = panels_of(sp.csc_array(free[order][:, order]), fronts, device.precision)
-        self._sweep = Sweep(fronts, self._panels, device.precision)
+            whole, self._panels = panels_of(sp.csc_array(free[order][:, order]), fronts, device.precision)
+        self._sweep = Sweep(fronts, whole, device.precision)
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """The rest stiffness serves every state."""
@@ -89,8 +89,8 @@ def node_of(basis: sp.csc_array) -> np.ndarray:
     return np.asarray(basis.indices[basis.indptr[:-1]] // 3)
 
 
-def panels_of(matrix: sp.csc_array, fronts: list[Front], precision: Precision) -> list[np.ndarray]:
-    """Per front of k own and m border unknowns the panel (k, k + m) [S^-1, S^-1 C^T].
+def panels_of(matrix: sp.csc_array, fronts: list[Front], precision: Precision) -> tuple[np.ndarray, list[np.ndarray]]:
+    """All panels in one array, and its parts: of a front of k own and m border unknowns (k, k + m) [S^-1, S^-1 C^T].
 
     S (k, k) and C (m, k) are the rows of the matrix at the front's own and border unknowns, what was eliminated before
     them subtracted. Solving is then, upwards, x_border -= (S^-1 C^T)^T x_own and x_own = S^-1 x_own, and downwards
@@ -105,8 +105,11 @@ def panels_of(matrix: sp.csc_array, fronts: list[Front], precision: Precision) -
     diagonal = matrix.diagonal()
     owner = np.repeat(np.arange(len(fronts)), [front.stop - front.first for front in fronts])
     waiting: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    panels = []
-    for number, front in enumerate(fronts):
+    shapes = [(front.stop - front.first, len(front.rows)) for front in fronts]
+    ends = np.cumsum([0, *(k * n for k, n in shapes)])
+    together = np.zeros(ends[-1], precision)
+    panels = [part.reshape(shape) for part, shape in zip(np.split(together, ends[1:-1]), shapes, strict=False)]
+    for number, (front, panel) in enumerate(zip(fronts, panels, strict=True)):
         rows, size = front.rows, front.stop - front.first
         whole = np.zeros((len(rows), len(rows)))
         entries = slice(matrix.indptr[front.first], matrix.indptr[front.stop])
@@ -123,8 +126,8 @@ def panels_of(matrix: sp.csc_array, fronts: list[Front], precision: Precision) -
         if len(front.border):
             above = int(owner[front.border[0]])
             waiting.setdefault(above, []).append((front.border, whole[size:, size:] - across @ coupling.T))
-        panels.append(np.concatenate([inverse, across.T], axis=1).astype(precision))
-    return panels
+        panel[:, :size], panel[:, size:] = inverse, across.T
+    return together, panels
 
 
 def _inverse(block: np.ndarray, diagonal: np.ndarray) -> np.ndarray:

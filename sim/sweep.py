@@ -115,24 +115,19 @@ def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
 
 
 class Sweep:
-    """The panels of a factor, one after the other in memory."""
+    """The fronts of a factor, and its panels one after the other."""
 
-    def __init__(self, fronts: Sequence[Front], panels: Sequence[np.ndarray], precision: Precision):
+    def __init__(self, fronts: Sequence[Front], panels: np.ndarray, precision: Precision):
         self._device = Device("cpu", precision)
         borders = [np.zeros(0, int), *(front.border for front in fronts)]
-        first, size, border, entries = (
-            np.array(column, int)
-            for column in (
-                [front.first for front in fronts],
-                [front.stop - front.first for front in fronts],
-                [len(front.border) for front in fronts],
-                [panel.size for panel in panels],
-            )
-        )
+        first = np.array([front.first for front in fronts], int)
+        size = np.array([front.stop - front.first for front in fronts], int)
+        border = np.array([len(front.border) for front in fronts], int)
+        entries = size * (size + border)
         table = first, size, border, np.cumsum(border) - border, np.cumsum(entries) - entries
         self._fronts = self._device.array(np.column_stack(table), wp.int64)
         self._border = self._device.array(np.concatenate(borders), wp.int32)
-        self._panel = self._device.array(np.concatenate([np.zeros(0), *(panel.ravel() for panel in panels)]))
+        self._panel = wp.array(panels, dtype=self._device.scalar, device=self._device.name, copy=False)
         self._longest = int((size + border).max(initial=0))
 
     def solved(self, x: np.ndarray) -> np.ndarray:
