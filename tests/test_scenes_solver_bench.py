@@ -7,6 +7,7 @@ import pytest
 from conftest import make_box
 
 from scenes.cli import main
+from scenes.commands.bench_solver import NAMES
 from scenes.solver_bench import OWN, PEERS, TOLERANCE, Engine, case_of, compare
 from sim.meshfile import write_anatomy
 
@@ -38,6 +39,11 @@ def engine(folder, name, code):
     script = folder / f"{name}.py"
     script.write_text(code)
     return Engine(name, "spoilt", (), (str(script),))
+
+
+def test_every_peer_can_be_named():
+    assert tuple(peer.name for peer in PEERS) == NAMES
+    assert all(peer.words[0].endswith(".py") and "checkout" not in peer.missing for peer in PEERS)
 
 
 def test_a_case_holds_what_slides_and_carries_the_whole_push(box, case):

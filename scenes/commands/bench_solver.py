@@ -20,10 +20,12 @@ from ..shipped import template_path
 if TYPE_CHECKING:
     from ..solver_bench import Row
 
+NAMES = ("torch-fem", "scikit-fem", "felupe")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--peers", action="store_true", help="torch-fem, scikit-fem and FElupe too (extra `peers`)")
+    parser.add_argument("--peers", nargs="*", choices=NAMES, help="these too, or all of them (extra `peers`)")
     parser.add_argument(
         "--mesh", nargs="+", type=Path, metavar="MESH.vtu", help="made by `sulcus anatomy` (default: the template)"
     )
@@ -44,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
             f"--loads {args.loads} --starts {args.starts} --threads {args.threads} compares nothing: give "
             "--loads >= 2, --starts >= 1, --threads >= 1."
         )
-    engines = (OWN, *PEERS) if args.peers else (OWN,)
+    asked = () if args.peers is None else args.peers or NAMES
+    engines = (OWN, *(peer for peer in PEERS if peer.name in asked))
     cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [template_path()]]
     table = sys.stderr if args.json else sys.stdout
     where = machine("cpu")
