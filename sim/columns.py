@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -18,8 +19,7 @@ class Kernels:
 
     dot: wp.Kernel
     combine: wp.Kernel
-    gather: wp.Kernel
-    scatter: wp.Kernel
+    unstack: wp.Kernel
 
 
 @cache
@@ -55,11 +55,30 @@ def kernels_of(device: Device) -> Kernels:
         out[r, c] = x[r, c] + factor[c] * y[r, c]
 
     @wp.kernel(module="unique")
-    def gather(
+    def unstack(
         x: wp.array2d(dtype=scalar),
+        nodes: wp.array(dtype=wp.int32),
+        # outputs
+        out: wp.array3d(dtype=wp.float64),
+    ):
+        """out_cnk = x_(3 node(n) + k)c."""
+        c, n = wp.tid()
+        for k in range(3):
+            out[c, n, k] = wp.float64(x[3 * nodes[n] + k, c])
+
+    return Kernels(dot, combine, unstack)
+
+
+@cache
+def moving_kernels_of(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
+    """Kernels that take columns out of arrays of any type, and put them back."""
+
+    @wp.kernel(module="unique")
+    def gather(
+        x: wp.array2d(dtype=dtype),
         columns: wp.array(dtype=wp.int32),
         # outputs
-        out: wp.array2d(dtype=scalar),
+        out: wp.array2d(dtype=dtype),
     ):
         """out_rc = x_r,columns(c)."""
         r, c = wp.tid()
@@ -67,16 +86,16 @@ def kernels_of(device: Device) -> Kernels:
 
     @wp.kernel(module="unique")
     def scatter(
-        x: wp.array2d(dtype=scalar),
+        x: wp.array2d(dtype=dtype),
         columns: wp.array(dtype=wp.int32),
         # outputs
-        out: wp.array2d(dtype=scalar),
+        out: wp.array2d(dtype=dtype),
     ):
         """out_r,columns(c) = x_rc."""
         r, c = wp.tid()
         out[r, columns[c]] = x[r, c]
 
-    return Kernels(dot, combine, gather, scatter)
+    return gather, scatter
 
 
 def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:
@@ -102,13 +121,32 @@ def combined(device: Device, x: wp.array, factor: np.ndarray, y: wp.array, out: 
     return out
 
 
-def gathered(device: Device, x: wp.array, columns: np.ndarray) -> wp.array:
-    """A copy (rows, k) of some columns (k,) of x (rows, b)."""
-    out = wp.empty((x.shape[0], len(columns)), dtype=device.scalar, device=device.name)
-    device.launch(kernels_of(device).gather, out.shape, [x, device.array(columns, wp.int32)], [out])
+def gathered(device: Device, x: wp.array, columns: np.ndarray | wp.array) -> wp.array:
+    """A copy (..., k) of some columns (k,) of x (..., b)."""
+    index = _index(device, columns)
+    out = wp.empty((*x.shape[:-1], len(index)), dtype=x.dtype, device=device.name)
+    gather, _ = moving_kernels_of(x.dtype)
+    device.launch(gather, _flat(out).shape, [_flat(x), index], [_flat(out)])
     return out
 
 
-def scattered(device: Device, x: wp.array, columns: np.ndarray, out: wp.array) -> None:
-    """Copy x (rows, k) to some columns (k,) of out (rows, b)."""
-    device.launch(kernels_of(device).scatter, x.shape, [x, device.array(columns, wp.int32)], [out])
+def scattered(device: Device, x: wp.array, columns: np.ndarray | wp.array, out: wp.array) -> None:
+    """Copy x (..., k) to some columns (k,) of out (..., b)."""
+    _, scatter = moving_kernels_of(x.dtype)
+    device.launch(scatter, _flat(x).shape, [_flat(x), _index(device, columns)], [_flat(out)])
+
+
+def unstacked(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:
+    """Vectors (b, n, 3) at some nodes (n,) of x (3N, b), in double precision on the host."""
+    out = wp.empty((x.shape[1], len(nodes), 3), dtype=wp.float64, device=device.name)
+    device.launch(kernels_of(device).unstack, out.shape[:2], [x, device.array(nodes, wp.int32)], [out])
+    return out.numpy()
+
+
+def _index(device: Device, columns: np.ndarray | wp.array) -> wp.array:
+    return columns if isinstance(columns, wp.array) else device.array(columns, wp.int32)
+
+
+def _flat(x: wp.array) -> wp.array:
+    """A view (rows, b) of x (..., b)."""
+    return x.reshape((int(np.prod(x.shape[:-1])), x.shape[-1]))

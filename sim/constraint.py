@@ -159,6 +159,16 @@ class Constraint:
             self._weight = gathered(self.device, self._weight, columns)
             self._target, self._gram = self._target[:, columns], self._gram[columns]
 
+    @property
+    def nodes(self) -> tuple[wp.array, wp.array]:
+        """What `project_nodes` needs, on the device: held components (N, 3) int8 and normals (N,)."""
+        return self._held, self._normal
+
+    @property
+    def imposes(self) -> bool:
+        """Whether the batch moves held components or footprints."""
+        return self._value is not None or self._weight is not None
+
     def project(self, v: wp.array) -> None:
         """Remove from v (3N, b) what the constraints forbid, in place."""
         self.project_nodes(v)

@@ -1,22 +1,20 @@
-"""Search directions of the outer iteration: small classes, chosen by measurement."""
+"""Search directions of the outer iteration that the host steers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import warp as wp
 
-from .columns import combined, dots, gathered, norms
+from .columns import combined, dots, norms
 from .device import Device
 from .linear import Preconditioner, conjugate_gradients
 from .problem import Problem
 
 # The next step may be so many times as long as the one that was taken.
 GROWTH = 2.0
-# Pairs along which the gradient hardly changes, or against the step, say nothing of a positive definite curvature.
-LEAST_CURVATURE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,79 +93,6 @@ class NewtonCG:
             return np.full(len(taken), np.inf)
         step = GROWTH * taken * self._size
         return np.where((taken == 1.0) & ~self._truncated, np.maximum(self._radius, step), step)
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """A step s (3N, b) [m], the change y (3N, b) [N] of the free gradient along it, 1 / s.y (b,); 0 passes it by."""
-
-    s: wp.array
-    y: wp.array
-    inverse: np.ndarray
-
-    def keep(self, device: Device, columns: np.ndarray) -> Pair:
-        """The pair of these columns (k,)."""
-        return Pair(gathered(device, self.s, columns), gathered(device, self.y, columns), self.inverse[columns])
-
-
-class LBFGS:
-    """Limited-memory BFGS that starts from the inverse of the rest stiffness.
-
-    Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4; one application of the preconditioner a step. Only
-    pairs of positive curvature count: the direction always descends.
-    """
-
-    def __init__(self, preconditioner: Preconditioner, most: int = 8):
-        self._preconditioner, self._most = preconditioner, most
-        self.begin()
-
-    def begin(self) -> None:
-        """No pairs yet."""
-        self._pairs: list[Pair] = []
-        self._open: Pair | None = None
-
-    def keep(self, device: Device, columns: np.ndarray) -> None:
-        """Keep the pairs of these columns (k,)."""
-        self._pairs = [pair.keep(device, columns) for pair in self._pairs]
-        self._open = None if self._open is None else self._open.keep(device, columns)
-
-    def find(
-        self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
-    ) -> Direction:
-        """As `Descent`; `forcing` has no meaning here."""
-        device, columns = problem.device, u.shape[1]
-        self._learn(device, g, taken)
-        problem.linearise(u, taken == 0.0)
-        self._preconditioner.prepare(problem, columns)
-        rhs, pulled = right_hand_side(problem, g, gap)
-        q, x = wp.clone(rhs), device.zeros(*g.shape)
-        weights: list[np.ndarray] = []
-        for pair in reversed(self._pairs):
-            weights.append(pair.inverse * dots(device, pair.s, q))
-            combined(device, q, -weights[-1], pair.y, q)
-        self._preconditioner.apply(q, np.ones(columns, bool), x)
-        problem.constraint.project(x)
-        for pair, weight in zip(self._pairs, reversed(weights), strict=True):
-            combined(device, x, weight - pair.inverse * dots(device, pair.y, x), pair.s, x)
-        promised = dots(device, rhs, x)
-        d = closing(device, x, gap)
-        # A step that closes a gap leaves the free motions: its pair would say nothing of them.
-        self._open = Pair(d, g, (~pulled).astype(np.float64))
-        return Direction(d, promised, 1)
-
-    def _learn(self, device: Device, g: wp.array, taken: np.ndarray) -> None:
-        """Complete the open pair by the gradient g (3N, b); where nothing was taken, forget all pairs."""
-        if self._open is None:
-            return
-        last = self._open
-        s = combined(device, device.zeros(*g.shape), taken, last.s, wp.empty_like(g))
-        y = combined(device, g, np.full(len(taken), -1.0), last.y, wp.empty_like(g))
-        curvature = dots(device, s, y)
-        least = LEAST_CURVATURE * norms(device, s) * norms(device, y)
-        counts = (last.inverse != 0.0) & (curvature > least)
-        inverse = np.divide(1.0, curvature, out=np.zeros_like(curvature), where=counts)
-        known = [replace(pair, inverse=np.where(taken == 0.0, 0.0, pair.inverse)) for pair in self._pairs]
-        self._pairs = [*known, Pair(s, y, inverse)][-self._most :]
 
 
 def right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None) -> tuple[wp.array, np.ndarray]:

@@ -10,10 +10,10 @@ import scipy.sparse as sp
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
+from .columns import unstacked
 from .compile import check_causes, compile_problem
 from .deformation import Cost, Deformation
 from .device import find_device
-from .direction import LBFGS, NewtonCG
 from .discretisation import discretise
 from .effects import Effect
 from .errors import InputError
@@ -71,8 +71,7 @@ class Fem:
         self._skin = Skin(self.space.nodes, self.space.surface, self.problem.device)
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed)
         self.preconditioner = name_of(preconditioner)
-        inversion = Inversion(self.space, self.problem.device)
-        self._ladder = Ladder(LBFGS(preconditioner), NewtonCG(preconditioner, accuracy.inner), inversion, accuracy)
+        self._ladder = Ladder(preconditioner, Inversion(self.space, self.problem.device), accuracy)
 
     @property
     def anatomy(self) -> Anatomy:
@@ -89,18 +88,24 @@ class Fem:
         ------
         InputError
             Loads that no effect answers, or that do not touch the body; a start that does not fit; memory that would
-            not.
+            not; a vertex that the mesh does not have.
         """
         check_causes(self.effects, loads)
+        self._check_vertices(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device)
-        guess = self._guess(loads, start)
+        guess = None if start is None else self._guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads))) if start is None else Cases(loads, start.time, start.history)
         parts = []
         for first in range(0, max(len(loads), 1), self.batch):
             rows = slice(first, first + self.batch)
-            parts.append(self._solve(cases.rows(rows), guess[:, rows]))
-        whole = _joined(parts)
-        return whole if at is None else whole.at(at)
+            parts.append(self._solve(cases.rows(rows), None if guess is None else guess[:, rows], at))
+        return _joined(parts)
+
+    def _check_vertices(self, at: np.ndarray | None) -> None:
+        count = len(self._anatomy.mesh.nodes)
+        beyond = np.zeros(0) if at is None else at[(at < 0) | (at >= count)]
+        if len(beyond):
+            raise InputError(f"the mesh has no vertex {beyond[0]}: ask for some of 0 to {count - 1}.")
 
     def _unsmoothed(self) -> sp.csc_array:
         """Rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh."""
@@ -117,12 +122,10 @@ class Fem:
         """
         check_causes(self.effects, loads)
         self.problem.begin(Cases(loads, answer.time, answer.history))
-        return shortfall(self.problem, self._guess(loads, answer))
+        return shortfall(self.problem, self.problem.device.array(self._guess(loads, answer)))
 
-    def _guess(self, loads: Loads, start: Deformation | None) -> np.ndarray:
+    def _guess(self, loads: Loads, start: Deformation) -> np.ndarray:
         """First guesses (3N, B). A case without any load starts at rest: its answer is exactly zero."""
-        if start is None:
-            return np.zeros((self.problem.rows, len(loads)))
         vertices = len(self._anatomy.mesh.nodes)
         if start.displacement.shape != (len(loads), vertices, 3):
             raise InputError(
@@ -137,33 +140,33 @@ class Fem:
             full[:, vertices:] += start.history[MIDDLES]
         return np.where(loaded, full.reshape(len(loads), self.problem.rows).T, 0.0)
 
-    def _apart(self, u: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Displacements (B, V, 3) of the mesh's vertices in u (3N, B), and what else a later start needs of u."""
-        field = u.T.reshape(u.shape[1], self.space.count, 3)
-        own, added = np.split(field, [len(self._anatomy.mesh.nodes)], axis=1)
-        own = np.ascontiguousarray(own)
-        if not len(self.space.edges):
-            return own, {}
-        return own, {MIDDLES: added - self.space.interpolated(own)[:, own.shape[1] :]}
-
-    def _solve(self, cases: Cases, guess: np.ndarray) -> Deformation:
+    def _solve(self, cases: Cases, guess: np.ndarray | None, at: np.ndarray | None) -> Deformation:
         clock = time.perf_counter()
         found = self._ladder.climb(self.problem, cases, guess)
         solved = time.perf_counter()
         self.problem.begin(cases)
-        u = self.problem.device.array(found.u)
-        history = self.problem.end(u)
-        reaction = self._reaction(cases.loads, self.problem.constraint.force_on_footprint(self.problem.gradient(u)))
-        displacement, middles = self._apart(found.u)
+        history = dict(self.problem.end(found.u))
+        on_footprint = None
+        if cases.loads.of(Displaced) is not None:
+            on_footprint = self.problem.constraint.force_on_footprint(self.problem.gradient(found.u))
+        reaction = self._reaction(cases.loads, on_footprint)
+        vertices = len(self._anatomy.mesh.nodes)
+        nodes = np.arange(vertices) if at is None else at
+        if at is None and len(self.space.edges):
+            whole = unstacked(self.problem.device, found.u, np.arange(self.space.count))
+            displacement = np.ascontiguousarray(whole[:, :vertices])
+            history[MIDDLES] = whole[:, vertices:] - self.space.interpolated(displacement)[:, vertices:]
+        else:
+            displacement = unstacked(self.problem.device, found.u, nodes)
         return Deformation(
             displacement=displacement,
-            nodes=np.arange(displacement.shape[1]),
+            nodes=nodes,
             outcome=tuple(found.outcome),
             iterations=found.iterations,
             residual=found.residual,
             time=cases.loads.times,
             reaction=reaction,
-            history={**history, **middles},
+            history=history,
             cost=Cost({"equilibrium": solved - clock, "reactions": time.perf_counter() - solved}),
             reached=found.reached,
             inverted=found.inverted,

@@ -60,10 +60,10 @@ class Inversion:
         self._table = device.array(elements.table, wp.int32)
         self._gradient = device.array(elements.gradient, device.vector)
 
-    def count(self, u: np.ndarray) -> np.ndarray:
-        """How many (B,) in u (3N, B) [m]."""
+    def count(self, u: wp.array) -> np.ndarray:
+        """How many (B,) in u (3N, B) [m], on the device."""
         _, points, size = self._gradient.shape
         out = wp.zeros(u.shape[1], dtype=wp.int32, device=self._device.name)
-        inputs = [self._device.array(u), self._table, self._gradient]
+        inputs = [u, self._table, self._gradient]
         self._device.launch(kernel_of(self._device, size, points), (len(self._table), u.shape[1]), inputs, [out])
         return out.numpy()

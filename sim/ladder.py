@@ -5,18 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import warp as wp
 
 from .accuracy import Accuracy
+from .columns import gathered, scattered
 from .deformation import Outcome
-from .direction import Descent
+from .device import Device
+from .direction import NewtonCG
 from .inversion import Inversion
+from .lbfgs import descend
+from .linear import Preconditioner
 from .newton import find_equilibrium
 from .problem import Problem
+from .steering import BROKEN, DONE
 from .term import Cases
 
-# The first descent has so many outer steps; what it does not bring to its end is left to the second. On CUDA, where
-# products with the curvature cost little, the second alone is faster by up to a half.
-QUICK, QUICK_ON_CUDA = 20, 0
+# L-BFGS has so many turns; what it does not bring to its end is left to Newton.
+QUICK, QUICK_ON_CUDA = 20, 100
 # Load steps as shares of the load: the first, the least, and what is left of one that failed.
 FIRST_STEP, LEAST_STEP, CUT = 1.0 / 4.0, 1.0 / 64.0, 1.0 / 4.0
 # The next load step is as long as lets expect so many outer steps; one that takes more than the most is too long.
@@ -27,12 +32,12 @@ PATIENCE = 4
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """u (3N, B) [m] on the host; (B,): outcomes, outer steps, residuals, shares of the load reached, inverted tets.
+    """u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, shares of the load reached, inverted tets.
 
     And the linear iterations of the batch.
     """
 
-    u: np.ndarray
+    u: wp.array
     outcome: np.ndarray
     iterations: np.ndarray
     residual: np.ndarray
@@ -45,21 +50,9 @@ class Answer:
         """(B,) bool."""
         return np.array([outcome.good for outcome in self.outcome], bool)
 
-    def rows(self, index: np.ndarray) -> Answer:
-        """Some of the cases (k,)."""
-        return Answer(
-            self.u[:, index],
-            self.outcome[index],
-            self.iterations[index],
-            self.residual[index],
-            self.reached[index],
-            self.inverted[index],
-            0,
-        )
-
-    def put(self, index: np.ndarray, other: Answer) -> None:
+    def put(self, index: np.ndarray, other: Answer, device: Device) -> None:
         """Write the answer of other cases over some of these (k,); outer steps add up."""
-        self.u[:, index] = other.u
+        scattered(device, other.u, index, self.u)
         self.iterations[index] += other.iterations
         for name in ("outcome", "residual", "reached", "inverted"):
             getattr(self, name)[index] = getattr(other, name)
@@ -69,111 +62,119 @@ class Answer:
 class Ladder:
     """The rungs: each takes what the one before it did not bring to equilibrium.
 
-    quick, thorough
-        Descents: the first for a few outer steps, the second for the rest.
+    preconditioner
+        Of the problem: L-BFGS starts from it, Newton's linear systems are solved with it.
     inversion
         Of the discretisation that the problem is posed on.
     accuracy
         Tolerance and budgets.
     """
 
-    quick: Descent
-    thorough: Descent
+    preconditioner: Preconditioner
     inversion: Inversion
     accuracy: Accuracy
 
-    def climb(self, problem: Problem, cases: Cases, guess: np.ndarray) -> Answer:
-        """The equilibria of B cases, from guess (3N, B) [m].
+    def climb(self, problem: Problem, cases: Cases, guess: np.ndarray | None) -> Answer:
+        """The equilibria of B cases, from guess (3N, B) [m]; from rest without one.
 
         A start that lies inside out is left alone, and so is a state that does to which a start led: a body turned
         over or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing.
         """
-        started = guess.any(axis=0)
-        astray = started & (self.inversion.count(guess) > 0)
-        answer = self._whole(problem, cases, np.where(astray, 0.0, guess))
-        again = np.flatnonzero(started & ~astray & np.where(answer.good, answer.inverted > 0, self._lost(answer)))
-        if len(again):
-            astray[again] = True
-            answer.put(again, self._whole(problem, cases.rows(again), np.zeros((len(guess), len(again)))))
+        device, count = problem.device, len(cases.loads)
+        problem.begin(cases)
+        if guess is None:
+            answer, astray = self._whole(problem, cases, device.zeros(problem.rows, count), True), np.zeros(count, bool)
+        else:
+            started = guess.any(axis=0)
+            astray = started & (self.inversion.count(device.array(guess)) > 0)
+            answer = self._whole(problem, cases, device.array(np.where(astray, 0.0, guess)), False)
+            lost = np.where(answer.good, answer.inverted > 0, self._lost(answer))
+            again = np.flatnonzero(started & ~astray & lost)
+            if len(again):
+                astray[again] = True
+                some = cases.rows(again)
+                problem.begin(some)
+                answer.put(again, self._whole(problem, some, device.zeros(problem.rows, len(again)), True), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
         lost = np.flatnonzero(self._lost(answer))
         if len(lost):
-            answer.put(lost, self._in_steps(problem, cases.rows(lost), answer.rows(lost)))
+            answer.put(lost, self._in_steps(problem, cases.rows(lost), answer, lost), device)
         return answer
 
     def _lost(self, answer: Answer) -> np.ndarray:
         """Which cases (B,) another rung may save: at round-off none is nearer to equilibrium."""
         return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
-    def _whole(self, problem: Problem, cases: Cases, guess: np.ndarray) -> Answer:
-        """The whole load at once: the quick descent, and the thorough one from where that ended.
+    def _whole(self, problem: Problem, cases: Cases, start: wp.array, rest: bool) -> Answer:
+        """The whole load at once, of a batch that has begun: L-BFGS, and Newton from where that ended.
 
-        Motions that are imposed are left to the thorough one: it knows how the free nodes follow them. So is a small
-        budget: its steps lead farther.
+        Motions that are imposed are left to Newton: it knows how the free nodes follow them. So is a small budget: its
+        steps lead farther.
         """
-        problem.begin(cases)
-        _, imposed = problem.gap(problem.device.array(guess))
-        quick = QUICK_ON_CUDA if problem.device.on_cuda else QUICK
-        if imposed.any() or self.accuracy.outer <= quick:
-            quick = 0
-        return self._attempt(problem, cases, guess, ((self.quick, quick), (self.thorough, self.accuracy.outer - quick)))
+        device, count = problem.device, start.shape[1]
+        most = QUICK_ON_CUDA if device.on_cuda else QUICK
+        # Rest satisfies whatever the batch does not move.
+        imposed = problem.constraint.imposes or (not rest and problem.gap(start)[1].any())
+        if imposed or self.accuracy.outer <= most:
+            return self._thorough(problem, start, self.accuracy.outer)
+        tolerance = np.full(count, self.accuracy.tolerance)
+        found = descend(problem, self.preconditioner, start, tolerance, most)
+        outcome = np.full(count, Outcome.BUDGET, object)
+        outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
+        answer = self._answer(found.u, outcome, found.steps, found.residual, 0)
+        if len(found.left):
+            problem.begin(cases.rows(found.left))
+            some = gathered(device, found.u, found.left)
+            answer.put(found.left, self._thorough(problem, some, self.accuracy.outer - most), device)
+        return answer
 
-    def _attempt(
-        self, problem: Problem, cases: Cases, guess: np.ndarray, budgets: tuple[tuple[Descent, int], ...]
+    def _thorough(self, problem: Problem, start: wp.array, outer: int) -> Answer:
+        """Newton, in at most so many outer steps, of a batch that has begun."""
+        newton = NewtonCG(self.preconditioner, self.accuracy.inner)
+        found = find_equilibrium(problem, newton, start, replace(self.accuracy, outer=outer))
+        return self._answer(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
+
+    def _answer(
+        self, u: wp.array, outcome: np.ndarray, steps: np.ndarray, residual: np.ndarray, linear_iterations: int
     ) -> Answer:
-        """Descents, each with its outer steps, one after the other on the cases that the last did not finish."""
-        count = guess.shape[1]
-        u, left = guess.copy(), np.arange(count)
-        outcome, residual = np.full(count, Outcome.BUDGET, object), np.full(count, np.inf)
-        iterations, linear_iterations = np.zeros(count, int), 0
-        for descent, outer in budgets:
-            if len(left) == 0 or outer == 0:
-                continue
-            problem.begin(cases.rows(left))
-            found = find_equilibrium(problem, descent, u[:, left], replace(self.accuracy, outer=outer))
-            u[:, left], outcome[left], residual[left] = found.u, found.outcome, found.residual
-            iterations[left] += found.iterations
-            linear_iterations += found.linear_iterations
-            left = left[[ended in (Outcome.BUDGET, Outcome.STALLED) for ended in found.outcome]]
-        good = np.array([ended.good for ended in outcome], bool)
-        return Answer(u, outcome, iterations, residual, good.astype(float), self.inversion.count(u), linear_iterations)
+        reached = np.array([ended.good for ended in outcome], float)
+        return Answer(u, outcome, steps, residual, reached, self.inversion.count(u), linear_iterations)
 
-    def _in_steps(self, problem: Problem, cases: Cases, failed: Answer) -> Answer:
-        """From rest, the load raised in steps that grow and shrink; the equilibrium under the largest share found."""
-        count = len(cases.loads)
-        answer = replace(failed, iterations=np.zeros(count, int))
-        u, step, spent = np.zeros_like(failed.u), np.full(count, FIRST_STEP), 0
+    def _in_steps(self, problem: Problem, cases: Cases, failed: Answer, index: np.ndarray) -> Answer:
+        """From rest, the load raised in steps that grow and shrink; the equilibrium under the largest share found.
+
+        Of cases that are the rows `index` (k,) of what failed; where no share is found that stands.
+        """
+        device, count = problem.device, len(index)
+        u, step, spent = device.zeros(problem.rows, count), np.full(count, FIRST_STEP), 0
+        reached, iterations, residual = np.zeros(count), np.zeros(count, int), failed.residual[index]
         for _ in range(self.accuracy.steps):
-            live = np.flatnonzero((answer.reached < 1.0) & (step >= LEAST_STEP))
+            live = np.flatnonzero((reached < 1.0) & (step >= LEAST_STEP))
             if len(live) == 0 or spent > PATIENCE * self.accuracy.inner:
                 break
-            aim = np.minimum(answer.reached[live] + step[live], 1.0)
+            aim = np.minimum(reached[live] + step[live], 1.0)
             part = cases.rows(live)
-            part = replace(part, loads=part.loads.scaled(aim))
-            found = self._attempt(
-                problem, part, u[:, live], ((self.thorough, min(MOST_STEP_OUTER, self.accuracy.outer)),)
-            )
+            problem.begin(replace(part, loads=part.loads.scaled(aim)))
+            found = self._thorough(problem, gathered(device, u, live), min(MOST_STEP_OUTER, self.accuracy.outer))
             good, spent = found.good, spent + found.linear_iterations
-            answer.iterations[live] += found.iterations
+            iterations[live] += found.iterations
             step[live] *= np.where(good, np.clip(STEP_OUTER / np.maximum(found.iterations, 1), 0.5, 2.0), CUT)
-            u[:, live[good]] = found.u[:, good]
-            answer.reached[live[good]] = aim[good]
-            answer.residual[live[good]] = found.residual[good]
-        answer.outcome[answer.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
-        stepped = answer.reached > 0.0
-        answer.u[:, stepped] = u[:, stepped]
-        short = np.flatnonzero(stepped & (answer.reached < 1.0))
+            scattered(device, gathered(device, found.u, np.flatnonzero(good)), live[good], u)
+            reached[live[good]], residual[live[good]] = aim[good], found.residual[good]
+        outcome = failed.outcome[index]
+        outcome[reached == 1.0] = Outcome.CONVERGED_IN_STEPS
+        none, short = np.flatnonzero(reached == 0.0), np.flatnonzero((reached > 0.0) & (reached < 1.0))
+        scattered(device, gathered(device, failed.u, index[none]), none, u)
         if len(short):
             problem.begin(cases.rows(short))
-            answer.residual[short] = shortfall(problem, u[:, short])
-        return replace(answer, inverted=self.inversion.count(answer.u))
+            residual[short] = shortfall(problem, gathered(device, u, short))
+        return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent)
 
 
-def shortfall(problem: Problem, u: np.ndarray) -> np.ndarray:
+def shortfall(problem: Problem, u: wp.array) -> np.ndarray:
     """The relative residual (b,) of u (3N, b) under the whole load, or the share of imposed motion that is missing."""
-    array = problem.device.array(u)
-    _, free, scale = problem.residual(array)
-    gap, size = problem.constraint.close_gap(array)
-    largest = np.abs(u + gap.numpy()).max(axis=0, initial=0.0)
+    _, free, scale = problem.residual(u)
+    gap, size = problem.constraint.close_gap(u)
+    largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)
     share = [np.divide(a, b, out=np.zeros(len(b)), where=b > 0.0) for a, b in ((free, scale), (size, largest))]
     return np.maximum(*share)

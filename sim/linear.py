@@ -20,6 +20,11 @@ from .problem import Problem
 class Preconditioner(Protocol):
     """An approximate inverse of the free curvature, symmetric and positive definite."""
 
+    @property
+    def on_device(self) -> bool:
+        """Whether `apply` only launches work on the device, whatever is `live`: a graphics card replays it."""
+        ...
+
     def prepare(self, problem: Problem, columns: int) -> None:
         """Use the last linearisation, if it matters; the batch has so many columns."""
         ...
@@ -68,6 +73,8 @@ def block_kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
 
 class BlockJacobi:
     """The 3 x 3 diagonal blocks of the current curvature, inverted: for meshes too large to factorise."""
+
+    on_device = True
 
     def __init__(self, device: Device):
         self._device = device

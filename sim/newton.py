@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from .accuracy import Accuracy
-from .columns import combined, gathered, norms
+from .columns import combined, gathered, norms, scattered
 from .deformation import Outcome
 from .direction import Descent
 from .problem import Problem
@@ -27,26 +27,26 @@ ROUND_OFF = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
-    """Where the iteration ended: u (3N, B) [m] on the host, outcomes, outer steps, relative residuals (B,)."""
+    """Where the iteration ended: u (3N, B) [m] on the device; outcomes, outer steps, relative residuals (B,)."""
 
-    u: np.ndarray
+    u: wp.array
     outcome: np.ndarray
     iterations: np.ndarray
     residual: np.ndarray
     linear_iterations: int
 
 
-def find_equilibrium(problem: Problem, descent: Descent, start: np.ndarray, accuracy: Accuracy) -> Equilibrium:
+def find_equilibrium(problem: Problem, descent: Descent, start: wp.array, accuracy: Accuracy) -> Equilibrium:
     """Minimise the potential of a problem that has begun a batch, from start (3N, B) [m].
 
     The last finite, accepted state of every case is returned, whatever its outcome. A case whose forces all vanish
     beside those of its start is at rest again: no share of them is left to measure a residual against.
     """
     device, count = problem.device, start.shape[1]
-    result = start.copy()
     outcome = np.full(count, Outcome.BUDGET, object)
     iterations, residual = np.zeros(count, int), np.full(count, np.inf)
-    u, live = device.array(start), np.arange(count)
+    result, u, before, live = wp.clone(start), wp.clone(start), start, np.arange(count)
+    gap, open_gap = problem.gap(u)
     taken, failed = np.ones(count), np.zeros(count, bool)
     first, best, idle = np.zeros(count), np.full(count, np.inf), np.zeros(count, int)
     last_digit = np.finfo(device.precision).eps
@@ -55,8 +55,8 @@ def find_equilibrium(problem: Problem, descent: Descent, start: np.ndarray, accu
     for step in range(accuracy.outer + 1):
         g, free, scale = problem.residual(u)
         first[live] = scale if step == 0 else first[live]
-        gap, open_gap = problem.gap(u)
-        values = u.numpy()
+        if step and open_gap.any():  # what is closed stays closed: directions are projected
+            gap, open_gap = problem.gap(u)
         vanished = scale <= last_digit**2 * first[live]
         with np.errstate(invalid="ignore"):
             relative = np.divide(free, scale, out=np.zeros_like(free), where=~vanished)
@@ -73,11 +73,14 @@ def find_equilibrium(problem: Problem, descent: Descent, start: np.ndarray, accu
         outcome[live[done]] = Outcome.CONVERGED
         outcome[live[bad]] = Outcome.NOT_FINITE
         iterations[live], residual[live] = step, np.where(bad, np.inf, relative)
-        result[:, live[~bad]] = values[:, ~bad]
-        stay = np.flatnonzero(~(done | bad | failed))
-        if len(stay) == 0 or step == accuracy.outer:
+        leave = done | bad | failed
+        last = leave.all() or step == accuracy.outer
+        for state, columns in ((u, ~bad & (leave | last)), (before, bad)):
+            scattered(device, gathered(device, state, np.flatnonzero(columns)), live[columns], result)
+        if last:
             break
-        if len(stay) < len(live):
+        if leave.any():
+            stay = np.flatnonzero(~leave)
             problem.keep(stay)
             descent.keep(device, stay)
             u, g, gap = (gathered(device, array, stay) for array in (u, g, gap))
@@ -87,7 +90,7 @@ def find_equilibrium(problem: Problem, descent: Descent, start: np.ndarray, accu
         found = descent.find(problem, u, g, gap if open_gap.any() else None, forcing, taken)
         linear_iterations += found.iterations
         length = search(problem, u, found)
-        combined(device, u, length, found.d, u)
+        before, u = u, combined(device, u, length, found.d, wp.empty_like(u))
         # A search that fails is repeated once along a direction of positive definite curvature.
         failed = (length == 0.0) & (taken == 0.0)
         taken = length

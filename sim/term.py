@@ -42,6 +42,11 @@ class Term(Protocol):
         """Unique in a problem; the key of its history."""
         ...
 
+    @property
+    def constant(self) -> bool:
+        """Whether the gradient depends on the cases alone, not on where the nodes are."""
+        ...
+
     def begin(self, cases: Cases) -> None:
         """Take the loads, times and history of every column."""
         ...
@@ -55,7 +60,10 @@ class Term(Protocol):
         ...
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """Add the energy's gradient [N] at u (3N, b) to out (3N, b)."""
+        """Add the energy's gradient [N] at u (3N, b) to out (3N, b); not finite outside the domain.
+
+        On the device alone, if it is not `constant`: a graphics card replays it.
+        """
         ...
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
@@ -75,7 +83,7 @@ class Term(Protocol):
         ...
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Lower out (b,) to the longest fraction of du (3N, b) that stays inside the domain."""
+        """Lower out (b,) to the longest fraction of du (3N, b) that stays inside the domain; on the device alone."""
         ...
 
     def end(self, u: wp.array) -> Any:

@@ -18,8 +18,8 @@ ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim"
 TIERS = (
     {"device", "columns", "sparse", "sweep", "term", "constraint", "footprint"},
     {"terms", "problem"},
-    {"linear", "factor", "direction", "search", "dense", "memory", "compile"},
-    {"newton", "multigrid", "amg", "inversion"},
+    {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering"},
+    {"newton", "lbfgs", "multigrid", "amg", "inversion"},
     {"precondition", "ladder"},
     {"fem"},
 )

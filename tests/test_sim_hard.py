@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from boxes import base_held, box, hold, quadratic, top_forces
+from on_host import equilibrium_of
 from oracle import EVERY_LAW, internal_forces, tissue
 
 from sim.accuracy import TRAIN, Accuracy
@@ -27,7 +28,6 @@ from sim.loads import Loads, Nodal
 from sim.material import Material, Tissue
 from sim.memory import check_fits, host_bytes
 from sim.mesh import MeshWarning, TetMesh, dihedral_angles
-from sim.newton import find_equilibrium
 from sim.precondition import rest_solver
 from sim.term import Cases
 
@@ -240,7 +240,7 @@ def test_newton_itself_brings_a_lost_body_back(law: str, name: str) -> None:
     problem = compile_problem(effects, base_held(BLOCK), find_device("cpu", "float64"))
     problem.begin(Cases(Loads((Nodal(0.0 * pressed()[None]),)), np.zeros(1)))
     descent = NewtonCG(rest_solver(problem), ACCURACY.inner)
-    found = find_equilibrium(problem, descent, LOST[name].reshape(-1, 1), ACCURACY)
+    found = equilibrium_of(problem, descent, LOST[name].reshape(-1, 1), ACCURACY)
     assert found.outcome[0] is Outcome.CONVERGED
     assert np.abs(found.u).max() <= 1e-6 * HEIGHT
 

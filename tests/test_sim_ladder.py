@@ -121,7 +121,7 @@ def test_from_rest_what_lies_inside_out_is_the_loads_doing_and_counted() -> None
 def test_tetrahedra_inside_out_are_counted(element: str, precision: str) -> None:
     """None at rest, nor in a turned or crushed body; one whose corner is pushed through; all of a mirrored body."""
     space = discretise(MESH, element)
-    inversion = Inversion(space, find_device("cpu", precision))  # pyright: ignore[reportArgumentType]
+    device = find_device("cpu", precision)  # pyright: ignore[reportArgumentType]
     turn = MESH.nodes @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     through = MESH.nodes.copy()
     alone = np.flatnonzero(np.bincount(MESH.tets.ravel()) == np.bincount(MESH.tets.ravel()).min())[0]
@@ -129,7 +129,7 @@ def test_tetrahedra_inside_out_are_counted(element: str, precision: str) -> None
     through[alone] += 3.0 * (MESH.nodes.mean(axis=0) - MESH.nodes[alone])
     places = [MESH.nodes, turn, 1e-1 * MESH.nodes, MESH.nodes * [1.0, 1.0, -1.0], 0.0 * MESH.nodes, through]
     u = np.stack([space.interpolated(place - MESH.nodes).ravel() for place in places], axis=1)
-    count = inversion.count(u)
+    count = Inversion(space, device).count(device.array(u))
     every = len(MESH.tets)
     np.testing.assert_array_equal(count[:5], [0, 0, 0, every, every])
     assert 1 <= count[5] <= touching.sum()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from boxes import base_held, box, hold, top_forces
+from on_host import Found, equilibrium_of
 from oracle import EVERY_LAW, internal_forces, tissue
 from tiny_terms import Spring, Wall
 
@@ -22,7 +23,6 @@ from sim.fem import Fem
 from sim.linear import BlockJacobi
 from sim.loads import Loads, Nodal, Prescribed
 from sim.mesh import TetMesh
-from sim.newton import Equilibrium, find_equilibrium
 from sim.precondition import rest_solver
 from sim.problem import Problem
 from sim.term import Cases
@@ -61,11 +61,11 @@ def rows_of(cases: Cases, index: np.ndarray) -> Cases:
     return Cases(cases.loads.rows(index), cases.start_time[index], history)
 
 
-def solve(problem: Problem, cases: Cases, accuracy: Accuracy = TIGHT, start: np.ndarray | None = None) -> Equilibrium:
+def solve(problem: Problem, cases: Cases, accuracy: Accuracy = TIGHT, start: np.ndarray | None = None) -> Found:
     problem.begin(cases)
     direction = NewtonCG(rest_solver(problem), accuracy.inner)
     guess = np.zeros((ROWS, len(cases.loads))) if start is None else start
-    return find_equilibrium(problem, direction, guess, accuracy)
+    return equilibrium_of(problem, direction, guess, accuracy)
 
 
 @pytest.fixture(scope="module")
@@ -79,30 +79,30 @@ def problem(device: Device) -> Problem:
 
 
 @pytest.fixture(scope="module")
-def batch(problem: Problem) -> Equilibrium:
+def batch(problem: Problem) -> Found:
     return solve(problem, cases_of())
 
 
-def test_the_cases_leave_at_different_steps(batch: Equilibrium) -> None:
+def test_the_cases_leave_at_different_steps(batch: Found) -> None:
     """Otherwise the tests below prove nothing."""
     assert all(outcome is Outcome.CONVERGED for outcome in batch.outcome)
     assert len(set(batch.iterations)) >= 4
 
 
-def test_a_batch_is_its_rows_one_by_one(problem: Problem, batch: Equilibrium) -> None:
+def test_a_batch_is_its_rows_one_by_one(problem: Problem, batch: Found) -> None:
     for row in range(len(TOTAL)):
         alone = solve(problem, rows_of(cases_of(), np.array([row])))
         np.testing.assert_allclose(alone.u[:, 0], batch.u[:, row], atol=1e-8 * max(np.abs(batch.u[:, row]).max(), 1e-3))
         assert alone.iterations[0] == batch.iterations[row]
 
 
-def test_rows_do_not_depend_on_their_order(problem: Problem, batch: Equilibrium) -> None:
+def test_rows_do_not_depend_on_their_order(problem: Problem, batch: Found) -> None:
     order = np.array([5, 0, 6, 2, 1, 4, 3])
     shuffled = solve(problem, rows_of(cases_of(), order))
     np.testing.assert_allclose(shuffled.u, batch.u[:, order], atol=1e-10)
 
 
-def test_history_arrives_in_its_rows(problem: Problem, batch: Equilibrium, device: Device) -> None:
+def test_history_arrives_in_its_rows(problem: Problem, batch: Found, device: Device) -> None:
     cases = cases_of()
     problem.begin(cases)
     history = problem.end(device.array(batch.u))
@@ -138,7 +138,7 @@ def test_history_travels_through_the_deformer() -> None:
             np.testing.assert_allclose(alone[0], whole[row], atol=1e-10)
 
 
-def test_the_wall_is_never_crossed(problem: Problem, batch: Equilibrium, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_wall_is_never_crossed(problem: Problem, batch: Found, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not by the answers, and not on the way: every state that the gradient sees lies below it."""
     wall = next(term for term in problem.terms if isinstance(term, Wall))
     assert wall.distance(batch.u).min() > 0.0
@@ -245,7 +245,7 @@ def test_block_jacobi_reaches_the_same_answer(device: Device) -> None:
     problem = compile_problem(effects, ANATOMY, device)
     cases = cases_of()
     problem.begin(cases)
-    jacobi = find_equilibrium(
+    jacobi = equilibrium_of(
         problem, NewtonCG(BlockJacobi(device), 400), np.zeros((ROWS, len(TOTAL))), Accuracy(tolerance=1e-9)
     )
     assert all(outcome.good for outcome in jacobi.outcome)
@@ -275,12 +275,12 @@ class Contrary:
         return replace(found, d=problem.device.array(sign * found.d.numpy()))
 
 
-def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, batch: Equilibrium) -> None:
+def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, batch: Found) -> None:
     """Every other step is lost, the others take the curvature at rest: slower, but it arrives."""
     rows = np.array([1, 2, 4])
     problem.begin(rows_of(cases_of(), rows))
     patient = Accuracy(tolerance=1e-7, outer=300)
-    found = find_equilibrium(problem, Contrary(problem, False), np.zeros((ROWS, 3)), patient)
+    found = equilibrium_of(problem, Contrary(problem, False), np.zeros((ROWS, 3)), patient)
     assert all(outcome is Outcome.CONVERGED for outcome in found.outcome)
     assert found.iterations[2] > batch.iterations[4]
     np.testing.assert_allclose(found.u, batch.u[:, rows], atol=1e-6 * np.abs(batch.u).max())
@@ -288,7 +288,7 @@ def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, b
 
 def test_a_search_that_fails_twice_is_told(problem: Problem) -> None:
     problem.begin(cases_of())
-    found = find_equilibrium(problem, Contrary(problem, True), np.zeros((ROWS, len(TOTAL))), TIGHT)
+    found = equilibrium_of(problem, Contrary(problem, True), np.zeros((ROWS, len(TOTAL))), TIGHT)
     assert all(outcome is Outcome.STALLED for outcome in found.outcome)
     assert not found.u.any()
 

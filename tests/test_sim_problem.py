@@ -51,7 +51,7 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_sixty_four_loads_launch_as_many_kernels_as_one(launches: list[str], precision: Precision) -> None:
+def test_sixty_four_loads_launch_as_many_kernels_as_a_few(launches: list[str], precision: Precision) -> None:
     """Identical loads take the same iterations, so that the whole solves can be compared launch by launch."""
     accuracy = Accuracy(tolerance=1e-4, precision=precision)
     fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce(), NodalForce()], accuracy, "cpu", batch=64)
@@ -62,11 +62,11 @@ def test_sixty_four_loads_launch_as_many_kernels_as_one(launches: list[str], pre
         found = fem.deform(Loads((push, Nodal(top_forces(MESH, np.repeat([[0.1, 0.2, 0.0]], count, axis=0))))))
         return list(launches), found.iterations
 
-    one, iterations = solved(1)
+    few, iterations = solved(4)  # of still fewer, each is solved by itself
     many, together = solved(64)
     assert iterations[0] >= 3
     assert (together == iterations[0]).all()
-    assert many == one
+    assert many == few
 
 
 def test_only_what_is_asked_for_is_imported() -> None:

@@ -17,6 +17,8 @@ class Spring:
     E = k/2 |u - a|^2; over a step dt the anchor moves to a + (1 - exp(-dt / tau)) (u - a). History: a (B, N, 3) [m].
     """
 
+    constant = False
+
     def __init__(self, device: Device, rows: int, stiffness: float, tau: float = 1.0):
         self.name = "spring"
         self._device, self._rows, self._stiffness, self._tau = device, rows, stiffness, tau
@@ -66,6 +68,8 @@ class Wall:
     E = -k sum (h - d)^2 ln(h / d) over nodes whose distance h to the wall is below d; +inf where h <= 0.
     Li et al. 2020, "Incremental Potential Contact", eq. 6. No rest curvature: the wall is far away at rest.
     """
+
+    constant = False
 
     def __init__(self, device: Device, nodes: np.ndarray, height: float, reach: float, stiffness: float):
         self.name = "wall"

@@ -239,6 +239,8 @@ class Elasticity:
         Where its arrays live.
     """
 
+    constant = False
+
     def __init__(
         self, name: str, law: Law, elements: Elements, coefficients: np.ndarray, lame: np.ndarray, device: Device
     ):

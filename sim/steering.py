@@ -1,0 +1,356 @@
+"""The kernels of L-BFGS on many columns: what every load case does next is decided where its numbers are.
+
+Every pair (s, y) of a column, a step and the change of the gradient along it, is kept as s and w = M^-1 y, with M^-1
+the preconditioner. The two loops of Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4 then need inner
+products with s and w alone, and the direction is a sum of these: one pass over the pairs for each.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from .columns import CHUNK
+from .device import Device
+
+LIVE, DONE, LEFT, BROKEN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+"""What a column is: on its way, in equilibrium, not brought farther here, never finite."""
+# The slope ahead may rise to this share of the promised decrease: a step that overshoots more is cut.
+OVERSHOOT = 0.5
+# A cut keeps at least and at most this share of a step; one that left the numbers keeps the middle share.
+LEAST_KEPT, KEPT, MOST_KEPT = 0.1, 0.25, 0.7
+CUTS = 12
+# Rows that one thread moves: what it must know of their column is read once.
+SOME = 4
+# A pair along which the gradient hardly changes, or against the step, says nothing of a positive definite curvature.
+LEAST_CURVATURE = 1e-3
+# Rows of sums that one evaluation gives each column.
+OWN, WHOLE, FREE, SLOPE = 0, 1, 2, 3
+SUMS = 4
+# Rows of products after the 2 m with the pairs.
+GZ, GOLD, YW = 0, 1, 2
+PRODUCTS = 3
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Arithmetic of one scalar type and number of pairs."""
+
+    step: wp.Kernel
+    absorb: wp.Kernel
+    finish: wp.Kernel
+    multiply: wp.Kernel
+    judge: wp.Kernel
+    aim: wp.Kernel
+    move: wp.Kernel
+    clamp: wp.Kernel
+
+
+@cache
+def kernels_of(device: Device, pairs: int) -> Kernels:
+    """Kernels of a device's scalar type for columns that keep so many pairs."""
+    scalar, vec = device.scalar, device.vector
+    several = wp.types.vector(length=SOME, dtype=scalar)
+    m, chunk, some = pairs, CHUNK, SOME
+    overshoot, least_kept, kept, most_kept = OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT
+    cuts, least_curvature = CUTS, LEAST_CURVATURE
+    own_row, whole_row, free_row, slope_row = OWN, WHOLE, FREE, SLOPE
+    gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW
+
+    @wp.kernel(module="unique")
+    def step(
+        u: wp.array2d(dtype=scalar),
+        t: wp.array(dtype=wp.float64),
+        d: wp.array2d(dtype=scalar),
+        # outputs
+        v: wp.array2d(dtype=scalar),
+    ):
+        """v = u + t_c d."""
+        block, c = wp.tid()
+        length = scalar(t[c])
+        for k in range(some):
+            r = some * block + k
+            if r < u.shape[0]:
+                v[r, c] = u[r, c] + length * d[r, c]
+
+    @wp.kernel(module="unique")
+    def absorb(
+        # outputs
+        own: wp.array2d(dtype=scalar),
+        total: wp.array2d(dtype=scalar),
+        square: wp.array(dtype=wp.float64),
+    ):
+        """total += own, own = 0, and its square norm."""
+        block, c = wp.tid()
+        squares = wp.float64(0.0)
+        for r in range(block * chunk, wp.min((block + 1) * chunk, own.shape[0])):
+            x = own[r, c]
+            total[r, c] += x
+            own[r, c] = scalar(0.0)
+            squares += wp.float64(x) * wp.float64(x)
+        wp.atomic_add(square, c, squares)
+
+    @wp.kernel(module="unique")
+    def finish(
+        constant: wp.array2d(dtype=scalar),
+        held: wp.array2d(dtype=wp.int8),
+        normal: wp.array(dtype=vec),
+        d: wp.array2d(dtype=scalar),
+        # outputs
+        total: wp.array2d(dtype=scalar),
+        sums: wp.array2d(dtype=wp.float64),
+    ):
+        """Project the gradient; sums: |total - constant|^2, |total|^2, |free|^2, free . d."""
+        block, c = wp.tid()
+        own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+        for i in range(block * chunk, wp.min((block + 1) * chunk, held.shape[0])):
+            x = vec(total[3 * i, c], total[3 * i + 1, c], total[3 * i + 2, c])
+            y = x - vec(constant[3 * i, c], constant[3 * i + 1, c], constant[3 * i + 2, c])
+            own += wp.float64(wp.dot(y, y))
+            whole += wp.float64(wp.dot(x, x))
+            n = normal[i]
+            x -= wp.dot(n, x) * n
+            for k in range(3):
+                f = wp.where(held[i, k] == wp.int8(0), x[k], scalar(0.0))
+                total[3 * i + k, c] = f
+                free += wp.float64(f) * wp.float64(f)
+                slope += wp.float64(f) * wp.float64(d[3 * i + k, c])
+        wp.atomic_add(sums, own_row, c, own)
+        wp.atomic_add(sums, whole_row, c, whole)
+        wp.atomic_add(sums, free_row, c, free)
+        wp.atomic_add(sums, slope_row, c, slope)
+
+    @wp.kernel(module="unique")
+    def multiply(
+        known: wp.array(dtype=wp.int32),
+        s: wp.array3d(dtype=scalar),
+        w: wp.array3d(dtype=scalar),
+        g: wp.array2d(dtype=scalar),
+        z: wp.array2d(dtype=scalar),
+        new_g: wp.array2d(dtype=scalar),
+        new_z: wp.array2d(dtype=scalar),
+        # outputs
+        products: wp.array2d(dtype=wp.float64),
+    ):
+        """Products of the new gradient g' with every s, every w, z' and z; and y . w of the pair that opens now."""
+        block, c = wp.tid()
+        first, end = block * chunk, wp.min((block + 1) * chunk, g.shape[0])
+        gz, gold, yw = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+        for r in range(first, end):
+            a, x, y = new_g[r, c], new_z[r, c], z[r, c]
+            gz += wp.float64(a) * wp.float64(x)
+            gold += wp.float64(a) * wp.float64(y)
+            yw += wp.float64(a - g[r, c]) * wp.float64(x - y)
+        wp.atomic_add(products, gz_row, c, gz)
+        wp.atomic_add(products, gold_row, c, gold)
+        wp.atomic_add(products, yw_row, c, yw)
+        for i in range(known[c]):
+            sg, wg = wp.float64(0.0), wp.float64(0.0)
+            for r in range(first, end):
+                h = wp.float64(new_g[r, c])
+                sg += h * wp.float64(s[i, r, c])
+                wg += h * wp.float64(w[i, r, c])
+            wp.atomic_add(products, i, c, sg)
+            wp.atomic_add(products, m + i, c, wg)
+
+    @wp.kernel(module="unique")
+    def judge(
+        loudest: wp.array(dtype=wp.float64),
+        own: wp.array2d(dtype=wp.float64),
+        tolerance: wp.array(dtype=wp.float64),
+        sums: wp.array2d(dtype=wp.float64),
+        promised: wp.array(dtype=wp.float64),
+        # outputs
+        status: wp.array(dtype=wp.int32),
+        accepted: wp.array(dtype=wp.int32),
+        steps: wp.array(dtype=wp.int32),
+        cut: wp.array(dtype=wp.int32),
+        t: wp.array(dtype=wp.float64),
+        gone: wp.array(dtype=wp.float64),
+        residual: wp.array(dtype=wp.float64),
+    ):
+        """Accept the trial, or cut the step; the first trial is the start itself."""
+        c = wp.tid()
+        accepted[c] = 0
+        if status[c] != LIVE:
+            return
+        zero = wp.float64(0.0)
+        slope, free, whole = sums[slope_row, c], sums[free_row, c], sums[whole_row, c]
+        scale = wp.max(whole - free, zero)  # the projection is orthogonal
+        for k in range(own.shape[0]):
+            scale = wp.max(scale, own[k, c])
+        scale = wp.max(loudest[c], wp.sqrt(scale))
+        finite = wp.isfinite(free) and wp.isfinite(slope)
+        relative = wp.sqrt(free)
+        if scale > zero:
+            relative = relative / scale
+        first = promised[c] == wp.float64(wp.inf)
+        done = finite and relative <= tolerance[c]
+        if done or (finite and slope <= wp.float64(overshoot) * promised[c]):
+            accepted[c] = 1
+            gone[c] = t[c]
+            residual[c] = relative
+            cut[c] = 0
+            if not first:
+                steps[c] = steps[c] + 1
+        elif first:
+            status[c] = BROKEN
+        else:
+            share = wp.float64(kept)
+            if finite:
+                share = wp.clamp(promised[c] / (promised[c] + slope), wp.float64(least_kept), wp.float64(most_kept))
+            t[c] = share * t[c]
+            cut[c] = cut[c] + 1
+            if cut[c] > cuts:
+                status[c] = LEFT
+        if done:
+            status[c] = DONE
+        if status[c] != LIVE:
+            t[c] = zero
+
+    @wp.kernel(module="unique")
+    def aim(
+        accepted: wp.array(dtype=wp.int32),
+        gone: wp.array(dtype=wp.float64),
+        sums: wp.array2d(dtype=wp.float64),
+        products: wp.array2d(dtype=wp.float64),
+        # outputs
+        status: wp.array(dtype=wp.int32),
+        head: wp.array(dtype=wp.int32),
+        known: wp.array(dtype=wp.int32),
+        slot: wp.array(dtype=wp.int32),
+        t: wp.array(dtype=wp.float64),
+        promised: wp.array(dtype=wp.float64),
+        sg: wp.array2d(dtype=wp.float64),
+        wg: wp.array2d(dtype=wp.float64),
+        sy: wp.array3d(dtype=wp.float64),
+        yw: wp.array3d(dtype=wp.float64),
+        along_s: wp.array2d(dtype=wp.float64),
+        along_w: wp.array2d(dtype=wp.float64),
+    ):
+        """Take the pair of the accepted step in, and weigh the pairs: d = -M^-1 g + sum of (a_i s_i + b_i w_i).
+
+        The first `known` slots are filled; from slot m - 1 the head goes on to slot 0.
+        """
+        c = wp.tid()
+        slot[c] = -1
+        if accepted[c] == 0 or status[c] != LIVE:
+            return
+        zero = wp.float64(0.0)
+        slope, gz = sums[slope_row, c], products[gz_row, c]
+        rise = slope + promised[c]
+        n = int(-1)
+        # Also false of the first trial, whose promise is infinite.
+        if rise > wp.float64(least_curvature) * promised[c] and products[yw_row, c] > zero:
+            n = (head[c] + 1) % m
+            for i in range(m):
+                change = products[m + i, c] - wg[i, c]
+                sy[i, n, c] = products[i, c] - sg[i, c]
+                yw[i, n, c] = change
+                yw[n, i, c] = change
+            sy[n, n, c] = gone[c] * rise
+            yw[n, n, c] = products[yw_row, c]
+            head[c] = n
+            known[c] = wp.min(known[c] + 1, m)
+            slot[c] = n
+        size = known[c]
+        for i in range(m):
+            sg[i, c] = wp.where(i == n, gone[c] * slope, products[i, c])
+            wg[i, c] = wp.where(i == n, gz - products[gold_row, c], products[m + i, c])
+            along_s[i, c] = zero
+            along_w[i, c] = zero
+        for a in range(m):  # from the newest pair to the oldest
+            if a < size:
+                i = (head[c] - a + m) % m
+                value = sg[i, c]
+                for b in range(a):
+                    j = (head[c] - b + m) % m
+                    value -= along_w[j, c] * sy[i, j, c]
+                along_w[i, c] = value / sy[i, i, c]
+        for k in range(m):  # and back
+            a = m - 1 - k
+            if a < size:
+                i = (head[c] - a + m) % m
+                value = wg[i, c]
+                for b in range(m):
+                    if b < size:
+                        j = (head[c] - b + m) % m
+                        value -= along_w[j, c] * yw[i, j, c]
+                        if b > a:
+                            value -= along_s[j, c] * sy[j, i, c]
+                along_s[i, c] = value / sy[i, i, c] - along_w[i, c]
+        decrease = gz
+        for i in range(m):
+            decrease -= along_w[i, c] * wg[i, c] + along_s[i, c] * sg[i, c]
+        if not decrease > zero:  # round-off: begin anew
+            decrease = gz
+            known[c] = 0
+            head[c] = m - 1
+            for i in range(m):
+                along_s[i, c] = zero
+                along_w[i, c] = zero
+        promised[c] = decrease
+        t[c] = wp.float64(1.0)
+        if not (decrease > zero and wp.isfinite(decrease)):
+            status[c] = LEFT
+            t[c] = zero
+
+    @wp.kernel(module="unique")
+    def move(
+        status: wp.array(dtype=wp.int32),
+        accepted: wp.array(dtype=wp.int32),
+        known: wp.array(dtype=wp.int32),
+        slot: wp.array(dtype=wp.int32),
+        gone: wp.array(dtype=wp.float64),
+        along_s: wp.array2d(dtype=wp.float64),
+        along_w: wp.array2d(dtype=wp.float64),
+        new_g: wp.array2d(dtype=scalar),
+        new_z: wp.array2d(dtype=scalar),
+        # outputs
+        u: wp.array2d(dtype=scalar),
+        d: wp.array2d(dtype=scalar),
+        g: wp.array2d(dtype=scalar),
+        z: wp.array2d(dtype=scalar),
+        s: wp.array3d(dtype=scalar),
+        w: wp.array3d(dtype=scalar),
+    ):
+        """Where accepted: u += t d, the new pair takes its slot, g = g', z = z', and the next direction."""
+        block, c = wp.tid()
+        if accepted[c] == 0:
+            return
+        taken = scalar(gone[c])
+        n = slot[c]
+        direction = several()
+        for k in range(some):
+            r = wp.min(some * block + k, u.shape[0] - 1)
+            x = new_z[r, c]
+            direction[k] = -x
+            if n >= 0:
+                s[n, r, c] = taken * d[r, c]
+                w[n, r, c] = x - z[r, c]
+        for i in range(known[c]):
+            of_s, of_w = scalar(along_s[i, c]), scalar(along_w[i, c])
+            for k in range(some):
+                r = wp.min(some * block + k, u.shape[0] - 1)
+                direction[k] += of_w * w[i, r, c] + of_s * s[i, r, c]
+        for k in range(some):
+            r = some * block + k
+            if r < u.shape[0]:
+                u[r, c] += taken * d[r, c]
+                if status[c] == LIVE:
+                    g[r, c] = new_g[r, c]
+                    z[r, c] = new_z[r, c]
+                    d[r, c] = direction[k]
+
+    @wp.kernel(module="unique")
+    def clamp(
+        # outputs
+        bound: wp.array(dtype=scalar),
+        t: wp.array(dtype=wp.float64),
+    ):
+        """t = min(t, bound), and the bound is one again."""
+        c = wp.tid()
+        t[c] = wp.min(t[c], wp.float64(bound[c]))
+        bound[c] = scalar(1.0)
+
+    return Kernels(step, absorb, finish, multiply, judge, aim, move, clamp)

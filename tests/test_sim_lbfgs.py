@@ -1,0 +1,164 @@
+"""L-BFGS on many columns: the algorithm of the book, column by column, and what the host does between its turns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from boxes import base_held, box, top_forces
+from on_host import equilibrium_of
+from oracle import tissue
+from tiny_terms import Wall
+
+from sim.accuracy import Accuracy
+from sim.compile import compile_problem
+from sim.device import Device, find_device
+from sim.direction import NewtonCG
+from sim.effects import Effect, Elasticity, Held, NodalForce
+from sim.lbfgs import PAIRS, Descended, descend
+from sim.linear import BlockJacobi
+from sim.loads import Loads, Nodal
+from sim.precondition import rest_solver
+from sim.problem import Problem
+from sim.steering import BROKEN, DONE, LEFT, LIVE
+from sim.term import Cases
+
+MESH = box((2, 2, 3), 0.1, distortion=0.15)
+ANATOMY = base_held(MESH)
+ROWS = MESH.nodes.size
+FREE = ~ANATOMY.held.ravel()
+TOTAL = np.array([[0.0, 0.0, -0.1], [0.2, 0.1, -0.4], [0.0, 0.0, 2.0], [0.01, 0.0, 0.0], [0.6, 0.0, -0.9], [0, 0, 0]])
+FINE = 1e-9
+
+
+@pytest.fixture(scope="module")
+def device() -> Device:
+    return find_device("cpu", "float64")
+
+
+def problem_of(device: Device, law: str = "stable-neo-hookean", total: np.ndarray = TOTAL) -> Problem:
+    effects: list[Effect] = [Elasticity(tissue(law)), Held(), NodalForce()]
+    problem = compile_problem(effects, ANATOMY, device)
+    problem.begin(Cases(Loads((Nodal(top_forces(MESH, total)),)), np.zeros(len(total))))
+    return problem
+
+
+def descended(problem: Problem, start: np.ndarray | None = None, tolerance: float = FINE, most: int = 300) -> Descended:
+    count = len(TOTAL) if start is None else start.shape[1]
+    start = np.zeros((ROWS, count)) if start is None else start
+    solver = rest_solver(problem)
+    return descend(problem, solver, problem.device.array(start), np.full(count, tolerance), most)
+
+
+def book(problem: Problem, steps: int) -> np.ndarray:
+    """u (3N,) of one column after so many steps of Nocedal and Wright's two loops, each taken whole."""
+    device, solver = problem.device, rest_solver(problem)
+
+    def gradient(u: np.ndarray) -> np.ndarray:
+        g = problem.gradient(device.array(u[:, None]))
+        problem.constraint.project(g)
+        return g.numpy()[:, 0].copy()
+
+    def solved(r: np.ndarray) -> np.ndarray:
+        out = device.zeros(ROWS, 1)
+        solver.apply(device.array(r[:, None]), np.ones(1, bool), out)
+        return out.numpy()[:, 0].copy()
+
+    u, g, pairs = np.zeros(ROWS), gradient(np.zeros(ROWS)), []
+    for _ in range(steps):
+        q, weights = g.copy(), []
+        for s, y in reversed(pairs):
+            weights.append(s @ q / (s @ y))
+            q -= weights[-1] * y
+        x = solved(q)
+        for (s, y), weight in zip(pairs, reversed(weights), strict=True):
+            x += (weight - y @ x / (s @ y)) * s
+        assert gradient(u - x) @ -x <= 0.5 * g @ x  # the loads here let every whole step pass
+        pairs = [*pairs, (-x, gradient(u - x) - g)][-PAIRS:]
+        u, g = u - x, gradient(u - x)
+    return u
+
+
+def test_the_steps_are_those_of_the_book(device: Device) -> None:
+    """More steps than pairs: the oldest leave in turn."""
+    mild = TOTAL[1:2]
+    for steps in (1, 2, 5, PAIRS + 3):
+        found = descended(problem_of(device, total=mild), np.zeros((ROWS, 1)), 1e-300, steps + 1)
+        assert found.steps[0] == steps
+        expected = book(problem_of(device, total=mild), steps)
+        np.testing.assert_allclose(found.u.numpy()[:, 0], expected, atol=1e-7 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("law", ["linear", "corotational", "neo-hookean", "stable-neo-hookean", "ogden"])
+def test_it_ends_where_newton_does(device: Device, law: str) -> None:
+    problem = problem_of(device, law)
+    found = descended(problem)
+    assert (found.status == DONE).all()
+    assert (found.residual <= FINE).all()
+    problem = problem_of(device, law)
+    newton = NewtonCG(rest_solver(problem), 400)
+    exact = equilibrium_of(problem, newton, np.zeros((ROWS, len(TOTAL))), Accuracy(tolerance=FINE))
+    np.testing.assert_allclose(found.u.numpy(), exact.u, atol=1e-6 * np.abs(exact.u).max())
+    again = problem_of(device, law)
+    _, free, scale = again.residual(found.u)
+    np.testing.assert_allclose(found.residual[:-1], free[:-1] / scale[:-1], rtol=1e-4, atol=1e-15)
+
+
+def test_hookes_law_is_solved_by_the_first_step_and_no_load_by_none(device: Device) -> None:
+    found = descended(problem_of(device, "linear"))
+    np.testing.assert_array_equal(found.steps, [1, 1, 1, 1, 1, 0])
+    assert not found.u.numpy()[:, -1].any()
+
+
+def test_columns_are_steered_each_by_itself(device: Device) -> None:
+    """Others that end sooner or later change nothing."""
+    whole = descended(problem_of(device))
+    for row in range(len(TOTAL)):
+        alone = descended(problem_of(device, total=TOTAL[[row]]), np.zeros((ROWS, 1)))
+        assert alone.steps[0] == whole.steps[row]
+        np.testing.assert_allclose(alone.u.numpy()[:, 0], whole.u.numpy()[:, row], atol=1e-12)
+
+
+def test_what_the_budget_leaves_is_the_last_accepted_state(device: Device) -> None:
+    found = descended(problem_of(device), most=6)
+    np.testing.assert_array_equal(found.left, np.flatnonzero(found.status != DONE))
+    assert len(found.left) >= 2
+    _, free, scale = problem_of(device).residual(found.u)
+    np.testing.assert_allclose(free[:-1] / scale[:-1], found.residual[:-1], rtol=1e-5)
+    assert (found.residual[found.left] > FINE).all()
+
+
+def test_a_start_that_is_not_finite_is_given_up(device: Device) -> None:
+    start = np.zeros((ROWS, len(TOTAL)))
+    start[FREE, 1] = 1e200
+    found = descended(problem_of(device), start)
+    assert found.status[1] == BROKEN
+    assert (np.delete(found.status, 1) == DONE).all()
+
+
+def test_steps_stay_inside_the_domain(device: Device) -> None:
+    """Pulled towards a wall, none passes it on the way, nor at the end."""
+    problem = problem_of(device, "neo-hookean")
+    wall = Wall(device, MESH.nodes, 0.105, 4e-3, 1.0)
+    walled = Problem((*problem.terms, wall), problem.constraint, device)
+    walled.begin(Cases(Loads((Nodal(top_forces(MESH, TOTAL)),)), np.zeros(len(TOTAL))))
+    for most in (1, 2, 3, 5, 8, 200):
+        found = descend(walled, rest_solver(problem), device.zeros(ROWS, len(TOTAL)), np.full(len(TOTAL), 1e-7), most)
+        assert wall.distance(found.u.numpy()).min() > 0.0
+        walled.begin(Cases(Loads((Nodal(top_forces(MESH, TOTAL)),)), np.zeros(len(TOTAL))))
+    assert np.isin(found.status, [DONE, LEFT, LIVE]).all()
+    assert found.status[0] == DONE
+    assert wall.distance(found.u.numpy())[:, 2].min() < 5e-3
+
+
+def test_any_preconditioner_serves(device: Device) -> None:
+    problem = problem_of(device)
+    jacobi = descend(problem, BlockJacobi(device), device.zeros(ROWS, len(TOTAL)), np.full(len(TOTAL), 1e-6), 2000)
+    assert (jacobi.status == DONE).all()
+    exact = descended(problem_of(device)).u.numpy()
+    np.testing.assert_allclose(jacobi.u.numpy(), exact, atol=1e-3 * np.abs(exact).max())
+
+
+def test_single_precision_ends_at_its_floor() -> None:
+    single = find_device("cpu", "float32")
+    found = descended(problem_of(single), tolerance=2e-5)
+    assert (found.status == DONE).all()
