@@ -126,6 +126,8 @@ class Deformation:
         InputError
             A vertex that is not among `self.nodes`.
         """
+        if np.array_equal(nodes, self.nodes):
+            return self
         order = np.argsort(self.nodes)
         position = order[np.searchsorted(self.nodes, nodes, sorter=order).clip(max=len(order) - 1)]
         missing = self.nodes[position] != nodes

@@ -131,10 +131,10 @@ def _fill(
 
 def _write(file: h5py.File, name: str, first: int, answer: Deformation) -> None:
     """Put answers into the rows from `first` on, and then call them done."""
-    scale = 1.0 / UNIT_FORCE if name == "unit" else 1.0
+    response = answer.displacement / UNIT_FORCE if name == "unit" else answer.displacement
     columns = {
-        # One pass: 64 kB a load on a brain of 5,300 nodes, in the width of the file.
-        "displacement": np.multiply(answer.displacement, scale, dtype=np.float32, casting="same_kind"),
+        # In the width of the file, 64 kB a load on a brain of 5,300 nodes: HDF5 converts at a third of the speed.
+        "displacement": response.astype(np.float32, copy=False),
         "outcome": np.array([outcome.name for outcome in answer.outcome], NAME_TYPE),
         "iterations": answer.iterations,
         "residual": answer.residual,
