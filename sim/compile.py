@@ -26,9 +26,15 @@ CAUSES = {ToolForce: Pushed, ToolDisplacement: Displaced, NodalForce: Nodal, Hel
 
 
 def compile_problem(
-    effects: Iterable[Effect], anatomy: Anatomy, device: Device, space: Discretisation | None = None
+    effects: Iterable[Effect],
+    anatomy: Anatomy,
+    device: Device,
+    space: Discretisation | None = None,
+    skin: Skin | None = None,
 ) -> Problem:
     """Build the terms and constraints that `effects` ask for, and nothing else; on linear tetrahedra without `space`.
+
+    `skin` is the surface of `space`, for who presses it too.
 
     Raises
     ------
@@ -43,7 +49,7 @@ def compile_problem(
     if Elasticity not in kinds:
         raise InputError("no effect resists deformation: add Elasticity.")
     space = space or discretise(anatomy.mesh, "p1")
-    skin = Skin(space.nodes, space.surface, device)
+    skin = skin or Skin(space.nodes, space.surface, device)
     terms: list[Term] = []
     held = np.zeros_like(anatomy.held)
     normal = np.zeros_like(anatomy.slide_normal)

@@ -67,8 +67,8 @@ class Fem:
         self.accuracy = accuracy
         self.batch = batch
         self.space = discretise(anatomy.mesh, element)
-        self.problem = compile_problem(self.effects, anatomy, find_device(device, accuracy.precision), self.space)
-        self._skin = Skin(self.space.nodes, self.space.surface, self.problem.device)
+        self._skin = Skin(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
+        self.problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed)
         self.preconditioner = name_of(preconditioner)
         self._ladder = Ladder(preconditioner, Inversion(self.space, self.problem.device), accuracy)

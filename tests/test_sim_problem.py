@@ -166,3 +166,11 @@ def test_the_potential_is_the_sum_of_its_terms(device: Device) -> None:
         F = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2) @ np.linalg.inv(rest)
         psi = energy_density(BRAIN.law, F, *BRAIN.lame)
         assert parts[0][column] == pytest.approx((MESH.volumes * psi).sum(), rel=1e-10)
+
+
+def test_a_solve_integrates_its_tools_once(launches: list[str]) -> None:
+    """It begins, begins again for the reactions, and needs their moments."""
+    fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce()], TIGHT, "cpu")
+    launches.clear()
+    fem.deform(Loads((Pushed(np.array([[0.03, 0.03, 0.1]]), np.array([[0.0, 0.0, -0.1]]), np.array([0.02])),)))
+    assert launches.count("_press") == 1
