@@ -25,7 +25,7 @@ COMMANDS = {
 }
 
 # Commands with commands of their own; the first is meant where none is named.
-INNER = {"bench": ("stages", "elements", "robust", "live", "growth", "solver")}
+INNER = {"bench": ("stages", "elements", "robust", "live", "growth", "throughput", "solver")}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

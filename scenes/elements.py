@@ -10,12 +10,13 @@ import numpy as np
 
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
-from sim.effects import Effect, Elasticity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.footprint import nearest_on
 from sim.loads import Loads, push
 from sim.material import Material
+
+from .tissue import pushed_effects
 
 # Fine enough that what is left is the mesh's error, and within reach of float64 at any Poisson's ratio.
 ACCURACY = Accuracy(tolerance=1e-5)
@@ -95,9 +96,7 @@ def _loads(anatomy: Anatomy, press: Press) -> Loads:
 
 def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, device: str) -> Row:
     mesh = anatomy.mesh
-    slide = (Slide(),) if anatomy.slide_normal.any() else ()
-    law = Elasticity(Material(press.law, press.young, poisson))
-    effects: tuple[Effect, ...] = (law, Held(), *slide, ToolForce())
+    effects = pushed_effects(anatomy, Material(press.law, press.young, poisson))
     begun = clock.perf_counter()
     fem = Fem(anatomy, effects, ACCURACY, device, element=element)
     made = clock.perf_counter()

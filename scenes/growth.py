@@ -20,13 +20,15 @@ import warp as wp
 
 from ar.chart import Curve, Panel
 from sim.accuracy import TRAIN
-from sim.effects import Effect, Elasticity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.material import BRAIN
 from sim.meshfile import read_anatomy, write_anatomy
 from sim.subject import Plan, make_anatomy
 from sim.template import Tumour, template_subject
 from surrogate.sampling import draw
+
+from .tissue import pushed_effects
 
 # Batches are solved until so many loads, or so many seconds, are spent.
 LOADS, PATIENCE = 12, 60.0
@@ -74,10 +76,9 @@ class Trial:
 def measured(trial: Trial, size: int, batch: int) -> Row:
     """Solve palpation loads on one mesh, to 1e-4 in single precision, in this process."""
     anatomy = read_anatomy(trial.mesh(size))
-    slide: tuple[Effect, ...] = (Slide(),) if anatomy.slide_normal.any() else ()
     with _watched(trial.device) as card:
         begun = clock.perf_counter()
-        fem = Fem(anatomy, (Elasticity(), Held(), *slide, ToolForce()), TRAIN, trial.device, batch, trial.element)
+        fem = Fem(anatomy, pushed_effects(anatomy, BRAIN), TRAIN, trial.device, batch, trial.element)
         wp.synchronize()
         made = clock.perf_counter() - begun
         loads = draw("palpation", anatomy, max(LOADS, batch) + 1, SEED)

@@ -11,6 +11,7 @@ BENCHES = {
     "robust": "how many of thousands of random loads converge",
     "live": "what a frame of a moving tool takes, warm-started, and how far off it is",
     "growth": "what a load takes in seconds and memory, the finer the mesh the more, and what preconditions it",
+    "throughput": "how many loads a second the finite elements solve: one mesh, thousands of loads",
     "solver": "the first load on a mesh and a further one, beside other packages",
 }
 

@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from sim.discretisation import ELEMENTS
-from sim.effects import Effect, Elasticity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.files import check_output
 from sim.meshfile import read_anatomy
 
 from ..shipped import template_path
-from ..tissue import add_tissue_arguments, tissue_of
+from ..tissue import add_tissue_arguments, pushed_effects, tissue_of
 
 if TYPE_CHECKING:
     from ..robust import Tally
@@ -46,8 +45,7 @@ def run(args: argparse.Namespace) -> int:
     if args.count < 2 or args.batch < 1:
         raise InputError(f"--count {args.count} --batch {args.batch} tries nothing: give --count >= 2, --batch >= 1.")
     anatomy = read_anatomy(args.anatomy or template_path())
-    slide = (Slide(),) if anatomy.slide_normal.any() else ()
-    effects: tuple[Effect, ...] = (Elasticity(tissue_of(args)), Held(), *slide, ToolForce())
+    effects = pushed_effects(anatomy, tissue_of(args))
     trial = Trial(anatomy, effects, args.element, args.device, args.batch)
     stated = f"{anatomy.digest} {effects!r} {args.element} count {args.count} seed {args.seed}"
     if args.out:

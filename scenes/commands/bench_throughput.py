@@ -1,0 +1,122 @@
+"""`sulcus bench throughput`: how many loads a second the finite elements solve."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from sim.accuracy import TRAIN
+from sim.discretisation import ELEMENTS
+from sim.errors import InputError
+from sim.material import LAWS, Material
+from sim.meshfile import read_anatomy
+from surrogate.sampling import PRESETS
+
+from ..shipped import template_path
+
+if TYPE_CHECKING:
+    from ..throughput import Row, Together
+
+YOUNG = 3000.0
+# Loads together on the CPU, where more gain nothing; and loads a row there, and on CUDA.
+CPU_BATCH, CPU_COUNT, CUDA_COUNT = 64, 64, 4096
+NAMES = (
+    "law", "nu", "element", "nodes", "set", "loads", "converged", "steps: median", "p99", "solves/s", "us a load",
+    "draws/s", "float64 residual",
+)  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument(
+        "--presets", nargs="+", choices=PRESETS, default=list(PRESETS), metavar="SET", help="of loads (default: all)"
+    )
+    parser.add_argument(
+        "--laws", nargs="+", choices=LAWS, default=["stable-neo-hookean", "neo-hookean"], metavar="LAW",
+        help=f"with E = {YOUNG:g} Pa (default: stable-neo-hookean neo-hookean)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--poisson", nargs="+", type=float, default=[0.45, 0.49], metavar="NU", help="Poisson's ratios (0.45 0.49)"
+    )
+    parser.add_argument("--element", choices=ELEMENTS, default="p1", help="(default %(default)s)")
+    parser.add_argument("--count", type=int, help=f"loads a row (default {CUDA_COUNT} on CUDA, {CPU_COUNT} on the CPU)")
+    parser.add_argument("--batch", type=int, help=f"loads solved together (default all; {CPU_BATCH} on the CPU)")
+    parser.add_argument("--repeats", type=int, default=3, help="of each row; the median counts (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line on stdout, the table on stderr")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row; 1 if a load did not converge."""
+    from sim.device import find_device
+
+    from ..bench import machine
+    from ..robust import Trial
+    from ..throughput import drawn, rows, together
+
+    on_cuda = find_device(args.device, TRAIN.precision).on_cuda
+    count = args.count if args.count is not None else (CUDA_COUNT if on_cuda else CPU_COUNT)
+    batch = args.batch if args.batch is not None else (count if on_cuda else CPU_BATCH)
+    if min(count, batch, args.repeats) < 1:
+        raise InputError(
+            f"--count {count} --batch {batch} --repeats {args.repeats} measures nothing: give whole numbers from 1 up."
+        )
+    materials = [Material(law, YOUNG, poisson) for law in args.laws for poisson in args.poisson]
+    anatomy = read_anatomy(args.anatomy or template_path())
+    trial = Trial(anatomy, (), args.element, args.device, batch)
+    sets = drawn(anatomy, args.presets, count)
+    table = sys.stderr if args.json else sys.stdout
+    where = machine(args.device)
+    print(where, file=table)
+    found: list[Row] = []
+    with tqdm(total=len(materials) * len(sets) * (args.repeats + 2), unit="solve", file=sys.stderr) as bar:
+        for material in materials:
+            for row in rows(trial, material, sets, args.repeats, bar.update):
+                with tqdm.external_write_mode(table):
+                    if not found:
+                        print(_header(row, batch, args.repeats), file=table)
+                    print(_line(row), file=table, flush=True)
+                found.append(row)
+    tools = together(found)
+    print("", *map(_sentence, tools), sep="\n", file=table)
+    if args.json:
+        said = {"machine": where, "batch": batch, "rows": [{**asdict(row), "rate": row.rate} for row in found]}
+        print(json.dumps({**said, "tools": [{**asdict(item), "rate": item.rate} for item in tools]}))
+    return 0 if all(row.converged == row.loads for row in found) else 1
+
+
+def _header(row: Row, batch: int, repeats: int) -> str:
+    done = f"preconditioner: {row.preconditioner}; batches of {batch}, E {YOUNG:g} Pa, to {TRAIN.tolerance:g}"
+    return f"{done} in {TRAIN.precision}, median of {repeats}\n\n| {' | '.join(NAMES)} |\n|{'---|' * len(NAMES)}"
+
+
+def _line(row: Row) -> str:
+    cells = (
+        row.law, f"{row.poisson:g}", row.element, row.nodes, row.preset, row.loads, row.converged,
+        f"{row.steps_median:g}", f"{row.steps_p99:g}", _whole(row.rate), _whole(1e6 / row.rate),
+        _whole(row.loads / row.draw_seconds), f"<= {row.double:.1e} of {row.checked}",
+    )  # fmt: skip
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _sentence(item: Together) -> str:
+    tissue = f"{item.law}, nu {item.poisson:g}: set-up {item.set_up:.3g} s"
+    if item.rate is None:
+        return tissue
+    names = ", ".join(item.presets)
+    return (
+        f"{tissue}; the tools together ({names}): {item.loads} loads in {item.seconds:.3g} s, "
+        f"{_whole(item.rate)} solves/s"
+    )
+
+
+def _whole(value: float) -> str:
+    """Whole thousands apart; three digits where it is small."""
+    return f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"

@@ -1,0 +1,103 @@
+"""`sulcus bench throughput`: a row for each tissue and set of loads, every count and second accounted for."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from conftest import make_box
+
+from scenes import throughput
+from scenes.cli import main
+from scenes.robust import Trial
+from scenes.throughput import Row, drawn, rows, together
+from sim.accuracy import Accuracy
+from sim.material import BRAIN
+from sim.meshfile import write_anatomy
+
+ROW = Row("linear", 0.45, "p1", 99, "sparse factor", 1.0, "bipolar", 60, 60, 4.0, 7.0, (9.0, 2.0, 3.0), 0.1, 4, 9e-5)
+
+
+@pytest.fixture(scope="module")
+def box():
+    """Coarser than the shared one."""
+    return make_box(cells=(8, 8, 5), spacing=9e-3)
+
+
+@pytest.fixture(scope="module")
+def words(tmp_path_factory, box):
+    """The command on the box."""
+    path = tmp_path_factory.mktemp("throughput") / "box.vtu"
+    write_anatomy(path, box)
+    return ["bench", "throughput", "--anatomy", str(path), "--device", "cpu", "--laws", "stable-neo-hookean"]
+
+
+def test_a_row_for_each_tissue_and_set(words, capsys):
+    few = ["--presets", "bipolar", "mixed", "--count", "6", "--batch", "4", "--repeats", "2"]
+    assert main([*words, *few, "--poisson", "0.4", "0.45", "--json"]) == 0
+    captured = capsys.readouterr()
+    said = json.loads(captured.out)
+    sets = [(row["poisson"], row["preset"]) for row in said["rows"]]
+    assert sets == [(nu, preset) for nu in (0.4, 0.45) for preset in ("bipolar", "mixed")]
+    for row in said["rows"]:
+        assert (row["law"], row["element"], row["preconditioner"]) == ("stable-neo-hookean", "p1", "sparse factor")
+        assert row["nodes"] == 9 * 9 * 6 and row["loads"] == row["converged"] == 6
+        assert len(row["seconds"]) == 2 and min(*row["seconds"], row["draw_seconds"], row["set_up"]) > 0.0
+        assert row["rate"] == pytest.approx(12 / sum(row["seconds"]))
+        assert 1 <= row["steps_median"] <= row["steps_p99"]
+        # Solved again, and judged in double precision: not zero, and not over the tolerance but for round-off.
+        assert row["checked"] == 4 and 1e-9 < row["double"] < 1.1e-4
+    assert [(one["poisson"], one["presets"], one["loads"]) for one in said["tools"]] == [
+        (0.4, ["bipolar"], 6),
+        (0.45, ["bipolar"], 6),
+    ]
+    assert captured.err.count("| stable-neo-hookean |") == 4
+    assert "preconditioner: sparse factor; batches of 4" in captured.err
+    assert captured.err.count("the tools together (bipolar): 6 loads in") == 2
+
+
+def test_a_load_that_does_not_converge_is_counted_and_said(words, monkeypatch, capsys):
+    """One step is too few for a brutal load; where no tool is asked for there is no sum over the tools."""
+    monkeypatch.setattr(throughput, "TRAIN", Accuracy(tolerance=1e-4, outer=1, precision="float32", steps=0))
+    assert main([*words, "--presets", "brutal", "--poisson", "0.45", "--count", "2", "--repeats", "1"]) == 1
+    text = capsys.readouterr().out
+    assert "| brutal | 2 | 0 |" in text
+    assert "set-up" in text and "tools together" not in text
+
+
+def test_the_middle_repeat_counts():
+    assert (ROW.median, ROW.rate) == (3.0, 20.0)
+
+
+def test_the_tools_are_summed_and_no_other_set():
+    others = [replace(ROW, preset=preset, seconds=(1.0,)) for preset in ("mixed", "seed", "brutal")]
+    stiff = replace(ROW, poisson=0.49, set_up=2.0)
+    found = [ROW, replace(ROW, preset="spatula", loads=40, seconds=(17.0,)), *others, stiff]
+    soft, other = together(found)
+    assert (soft.presets, soft.loads, soft.seconds, soft.rate) == (("bipolar", "spatula"), 100, 20.0, 5.0)
+    assert (other.poisson, other.set_up, other.rate) == (0.49, 2.0, 20.0)
+    assert [one.rate for one in together(others)] == [None]
+
+
+def test_one_in_a_hundred_is_checked_and_every_solve_is_told(box, monkeypatch):
+    monkeypatch.setattr(throughput, "CHECKED", 2)
+    told = []
+    sets = drawn(box, ["bipolar"], 11)
+    (row,) = rows(Trial(box, (), "p1", "cpu", 11), BRAIN, sets, 1, lambda: told.append(1))
+    assert (row.loads, row.checked, len(told)) == (11, 6, 3)
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        (["--count", "0"], "--count 0"),
+        (["--batch", "0"], "--batch 0"),
+        (["--repeats", "0"], "--repeats 0"),
+        (["--poisson", "0.5"], "Poisson"),
+        (["--device", "abacus"], "abacus"),
+        (["--anatomy", "none.vtu"], "no such file"),
+    ],
+)
+def test_bad_input_is_a_sentence(words, more, reason, capsys):
+    assert main([*words, *more]) == 2
+    captured = capsys.readouterr()
+    assert reason in captured.err and not captured.out
