@@ -51,7 +51,7 @@ def test_a_row_for_each_tissue_and_set(words, capsys):
         (0.45, ["bipolar"], 6),
     ]
     assert captured.err.count("| stable-neo-hookean |") == 4
-    assert "preconditioner: sparse factor; batches of 4" in captured.err
+    assert "preconditioner: sparse factor; batches of at most 4" in captured.err
     assert captured.err.count("the tools together (bipolar): 6 loads in") == 2
 
 

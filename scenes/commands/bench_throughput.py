@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _header(row: Row, batch: int, repeats: int) -> str:
-    done = f"preconditioner: {row.preconditioner}; batches of {batch}, E {YOUNG:g} Pa, to {TRAIN.tolerance:g}"
+    done = f"preconditioner: {row.preconditioner}; batches of at most {batch}, E {YOUNG:g} Pa, to {TRAIN.tolerance:g}"
     return f"{done} in {TRAIN.precision}, median of {repeats}\n\n| {' | '.join(NAMES)} |\n|{'---|' * len(NAMES)}"
 
 
