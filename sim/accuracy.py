@@ -22,7 +22,7 @@ class Accuracy:
         Converged: free gradient <= tolerance x the largest 2-norm among the terms' own gradients and the
         reaction at constrained nodes.
     outer
-        Most outer steps for one load.
+        Most Newton steps for one load. L-BFGS, which goes first unless they are very few, has a budget of its own.
     inner
         Most conjugate-gradient iterations in one Newton step.
     precision
@@ -59,6 +59,6 @@ class Accuracy:
 
 
 DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32", steps=0)
-LIVE = Accuracy(tolerance=2e-3, outer=30, precision="float32", steps=8)
+LIVE = Accuracy(tolerance=5e-3, outer=30, precision="float32", steps=8)
 TRAIN = Accuracy(tolerance=1e-4, precision="float32")
 REFERENCE = Accuracy(tolerance=1e-8)

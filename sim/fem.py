@@ -145,7 +145,7 @@ class Fem:
         found = self._ladder.climb(self.problem, cases, guess)
         solved = time.perf_counter()
         self.problem.begin(cases)
-        history = dict(self.problem.end(found.u))
+        history = {**self.problem.end(found.u), **found.learnt}
         on_footprint = None
         if cases.loads.of(Displaced) is not None:
             on_footprint = self.problem.constraint.force_on_footprint(self.problem.gradient(found.u))
@@ -193,7 +193,8 @@ def _joined(parts: list[Deformation]) -> Deformation:
     def stacked(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    history = {key: np.concatenate([part.history[key] for part in parts]) for key in parts[0].history}
+    shared = set.intersection(*(set(part.history) for part in parts))
+    history = {key: np.concatenate([part.history[key] for part in parts]) for key in sorted(shared)}
     stages = parts[0].cost.seconds
     return Deformation(
         displacement=stacked("displacement"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 import warp as wp
@@ -13,15 +15,21 @@ from .deformation import Outcome
 from .device import Device
 from .direction import NewtonCG
 from .inversion import Inversion
-from .lbfgs import descend
+from .lbfgs import LEARNT, descend
 from .linear import Preconditioner
 from .newton import find_equilibrium
 from .problem import Problem
 from .steering import BROKEN, DONE
 from .term import Cases
 
-# L-BFGS has so many turns; what it does not bring to its end is left to Newton.
-QUICK, QUICK_ON_CUDA = 20, 100
+# L-BFGS has so many turns; what it does not bring to its end is left to Newton. On CUDA, where few columns cost hardly
+# less than one, Newton comes last.
+QUICK, QUICK_ON_CUDA = 60, 800
+# A budget of fewer outer steps is Newton's alone: its steps lead farther.
+FEWEST = 10
+# Begins the history's keys of what L-BFGS has learnt.
+LEARNT_KEY = "l-bfgs "
+NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
 # Load steps as shares of the load: the first, the least, and what is left of one that failed.
 FIRST_STEP, LEAST_STEP, CUT = 1.0 / 4.0, 1.0 / 64.0, 1.0 / 4.0
 # The next load step is as long as lets expect so many outer steps; one that takes more than the most is too long.
@@ -34,7 +42,7 @@ PATIENCE = 4
 class Answer:
     """u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, shares of the load reached, inverted tets.
 
-    And the linear iterations of the batch.
+    The linear iterations of the batch; what of the curvature the next frame may know, as history.
     """
 
     u: wp.array
@@ -44,6 +52,7 @@ class Answer:
     reached: np.ndarray
     inverted: np.ndarray
     linear_iterations: int
+    learnt: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def good(self) -> np.ndarray:
@@ -83,18 +92,19 @@ class Ladder:
         device, count = problem.device, len(cases.loads)
         problem.begin(cases)
         if guess is None:
-            answer, astray = self._whole(problem, cases, device.zeros(problem.rows, count), True), np.zeros(count, bool)
+            answer, astray = self._whole(problem, cases), np.zeros(count, bool)
         else:
             started = guess.any(axis=0)
             astray = started & (self.inversion.count(device.array(guess)) > 0)
-            answer = self._whole(problem, cases, device.array(np.where(astray, 0.0, guess)), False)
+            learnt = NOTHING if astray.any() else _learnt(cases, problem.rows)
+            answer = self._whole(problem, cases, device.array(np.where(astray, 0.0, guess)), learnt)
             lost = np.where(answer.good, answer.inverted > 0, self._lost(answer))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
                 some = cases.rows(again)
                 problem.begin(some)
-                answer.put(again, self._whole(problem, some, device.zeros(problem.rows, len(again)), True), device)
+                answer.put(again, self._whole(problem, some), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
         lost = np.flatnonzero(self._lost(answer))
         if len(lost):
@@ -105,27 +115,32 @@ class Ladder:
         """Which cases (B,) another rung may save: at round-off none is nearer to equilibrium."""
         return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
-    def _whole(self, problem: Problem, cases: Cases, start: wp.array, rest: bool) -> Answer:
+    def _whole(
+        self, problem: Problem, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] = NOTHING
+    ) -> Answer:
         """The whole load at once, of a batch that has begun: L-BFGS, and Newton from where that ended.
 
-        Motions that are imposed are left to Newton: it knows how the free nodes follow them. So is a small budget: its
-        steps lead farther.
+        From rest without a start; `learnt` on the way to it, if anything was.
+
+        Motions that are imposed are left to Newton: it knows how the free nodes follow them.
         """
-        device, count = problem.device, start.shape[1]
+        device, count = problem.device, len(cases.loads)
         most = QUICK_ON_CUDA if device.on_cuda else QUICK
         # Rest satisfies whatever the batch does not move.
-        imposed = problem.constraint.imposes or (not rest and problem.gap(start)[1].any())
-        if imposed or self.accuracy.outer <= most:
+        imposed = problem.constraint.imposes or (start is not None and problem.gap(start)[1].any())
+        start = device.zeros(problem.rows, count) if start is None else start
+        if imposed or self.accuracy.outer < FEWEST:
             return self._thorough(problem, start, self.accuracy.outer)
         tolerance = np.full(count, self.accuracy.tolerance)
-        found = descend(problem, self.preconditioner, start, tolerance, most)
+        found = descend(problem, self.preconditioner, start, tolerance, most, learnt)
         outcome = np.full(count, Outcome.BUDGET, object)
         outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
         answer = self._answer(found.u, outcome, found.steps, found.residual, 0)
+        answer = replace(answer, learnt={LEARNT_KEY + name: array for name, array in found.learnt.items()})
         if len(found.left):
             problem.begin(cases.rows(found.left))
             some = gathered(device, found.u, found.left)
-            answer.put(found.left, self._thorough(problem, some, self.accuracy.outer - most), device)
+            answer.put(found.left, self._thorough(problem, some, self.accuracy.outer), device)
         return answer
 
     def _thorough(self, problem: Problem, start: wp.array, outer: int) -> Answer:
@@ -169,6 +184,12 @@ class Ladder:
             problem.begin(cases.rows(short))
             residual[short] = shortfall(problem, gathered(device, u, short))
         return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent)
+
+
+def _learnt(cases: Cases, rows: int) -> dict[str, np.ndarray]:
+    """What an earlier descent on as many rows = 3N left in the history; nothing if there was none."""
+    found = {name: cases.history[LEARNT_KEY + name] for name in LEARNT if LEARNT_KEY + name in cases.history}
+    return found if found and found["s"].shape[-1] == rows else {}
 
 
 def shortfall(problem: Problem, u: wp.array) -> np.ndarray:

@@ -7,6 +7,7 @@ drops the columns that have ended.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,21 +16,29 @@ import warp as wp
 from .columns import CHUNK, combined, gathered, norms, scattered
 from .linear import Preconditioner
 from .problem import Problem
-from .steering import LEFT, LIVE, OWN, PRODUCTS, SOME, SUMS, Kernels, kernels_of
+from .steering import FEW, LEFT, LIVE, OWN, PRODUCTS, SOME, SUMS, Kernels, kernels_of
 
 PAIRS = 8
 # The host looks after so many turns, and drops what has ended once it is this share of the columns.
-TURNS, ENDED = 4, 0.125
+TURNS, ENDED = 2, 0.1
+
+
+# What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
+# the newest pair and how many there are (b,).
+LEARNT = ("s", "w", "sy", "yw", "head", "known")
+# Learnt curvature travels with the answers of so few load cases: a larger batch has no next frame.
+TAUGHT = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Descended:
-    """u (3N, b) [m] on the device; (b,) on the host: status, accepted steps, relative residuals."""
+    """u (3N, b) [m] on the device; (b,) on the host: status, accepted steps, relative residuals; what was `LEARNT`."""
 
     u: wp.array
     status: np.ndarray
     steps: np.ndarray
     residual: np.ndarray
+    learnt: Mapping[str, np.ndarray]
 
     @property
     def left(self) -> np.ndarray:
@@ -38,24 +47,30 @@ class Descended:
 
 
 def descend(
-    problem: Problem, preconditioner: Preconditioner, start: wp.array, tolerance: np.ndarray, most: int
+    problem: Problem,
+    preconditioner: Preconditioner,
+    start: wp.array,
+    tolerance: np.ndarray,
+    most: int,
+    learnt: Mapping[str, np.ndarray] | None = None,
 ) -> Descended:
     """Minimise the potential of a problem that has begun a batch, from start (3N, b) [m], in at most `most` turns.
 
     The start satisfies the constraints, and no footprint is moved. tolerance (b,), relative as `Problem.residual` has
-    it. Every u is the last accepted state of its column.
+    it. `learnt`, if any, is what an earlier descent of the same problem found out, near here it is hoped. Every u is
+    the last accepted state of its column.
     """
     device, count = problem.device, start.shape[1]
     u, place = wp.clone(start), np.arange(count)
     status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
     if count == 0:
-        return Descended(u, status, steps, residual)
-    work, turns = _begun(problem, preconditioner, start, tolerance), 0
+        return Descended(u, status, steps, residual, {})
+    work, turns = _begun(problem, preconditioner, start, tolerance, learnt or {}), 0
     while True:
         turns += work.turn(min(TURNS, most - turns))
         now = work.status.numpy()
         last = turns >= most or not (now == LIVE).any()
-        if last or (now != LIVE).mean() >= ENDED:
+        if last or ((now != LIVE).mean() >= ENDED and count > TAUGHT):
             leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
             there = place[leave]
             scattered(device, gathered(device, work.u, leave), there, u)
@@ -63,7 +78,8 @@ def descend(
                 array.numpy()[leave] for array in (work.status, work.steps, work.residual)
             )
             if last:
-                return Descended(u, status, steps, residual)
+                learnt = {name: _rows_first(work.columns[name]) for name in LEARNT} if count <= TAUGHT else {}
+                return Descended(u, status, steps, residual, learnt)
             stay = np.flatnonzero(now == LIVE)
             place, work = place[stay], work.kept(stay)
 
@@ -125,7 +141,7 @@ class _Work:
         a, b, k = self.columns, self.scratch, self.kernels
         problem, device = self.problem, self.problem.device
         rows, count = a["u"].shape
-        one, chunks, some = (count,), (-(-rows // CHUNK), count), (-(-rows // SOME), count)
+        one, some = (count,), (-(-rows // SOME), count)
         device.launch(k.step, some, [a["u"], a["t"], a["d"]], [b["v"]])
         own = self._evaluate()
         inputs = [a["loudest"], own, a["tolerance"], b["sums"], a["promised"]]
@@ -139,14 +155,14 @@ class _Work:
         problem.constraint.project_nodes(b["z"])
         b["products"].zero_()
         inputs = [a["known"], a["s"], a["w"], a["g"], a["z"], b["g"], b["z"]]
-        device.launch(k.multiply, chunks, inputs, [b["products"]])
+        device.launch(k.multiply, some, inputs, [b["products"]])
         inputs = [b["accepted"], b["gone"], b["sums"], b["products"]]
         outputs = [a["status"], a["head"], a["known"], b["slot"], a["t"], a["promised"]]
         outputs += [a["sg"], a["wg"], a["sy"], a["yw"], b["along_s"], b["along_w"]]
         device.launch(k.aim, one, inputs, outputs)
         inputs = [a["status"], b["accepted"], a["known"], b["slot"], b["gone"], b["along_s"], b["along_w"]]
         outputs = [a["u"], a["d"], a["g"], a["z"], a["s"], a["w"]]
-        device.launch(k.move, some, [*inputs, b["g"], b["z"]], outputs)
+        device.launch(k.move, (-(-rows // FEW), count), [*inputs, b["g"], b["z"]], outputs)
         for term in problem.terms:
             term.longest_step(a["u"], a["d"], b["bound"])
         device.launch(k.clamp, one, [], [b["bound"], a["t"]])
@@ -169,11 +185,17 @@ class _Work:
                 term.add_gradient(b["v"], b["part"])
                 device.launch(k.absorb, (-(-rows // CHUNK), count), [], [b["part"], b["g"], own[number]])
         inputs = [a["constant"], *problem.constraint.nodes, a["d"]]
-        device.launch(k.finish, (-(-rows // (3 * CHUNK)), count), inputs, [b["g"], b["sums"]])
+        device.launch(k.finish, (-(-rows // (3 * SOME)), count), inputs, [b["g"], b["sums"]])
         return own
 
 
-def _begun(problem: Problem, preconditioner: Preconditioner, start: wp.array, tolerance: np.ndarray) -> _Work:
+def _begun(
+    problem: Problem,
+    preconditioner: Preconditioner,
+    start: wp.array,
+    tolerance: np.ndarray,
+    learnt: Mapping[str, np.ndarray],
+) -> _Work:
     device, (rows, count) = problem.device, start.shape
     _prepare(problem, preconditioner, start)
     constant, loudest = device.zeros(rows, count), np.zeros(count)
@@ -206,7 +228,13 @@ def _begun(problem: Problem, preconditioner: Preconditioner, start: wp.array, to
         "status": whole(LIVE),
         "head": whole(PAIRS - 1),
     }
+    for name, rows_first in learnt.items():
+        columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
     return _Work(problem, preconditioner, kernels_of(device, PAIRS), columns, _scratch(problem, count))
+
+
+def _rows_first(array: wp.array) -> np.ndarray:
+    return np.moveaxis(array.numpy(), -1, 0)
 
 
 def _prepare(problem: Problem, preconditioner: Preconditioner, u: wp.array) -> None:

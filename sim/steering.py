@@ -20,8 +20,9 @@ OVERSHOOT = 0.5
 # A cut keeps at least and at most this share of a step; one that left the numbers keeps the middle share.
 LEAST_KEPT, KEPT, MOST_KEPT = 0.1, 0.25, 0.7
 CUTS = 12
-# Rows that one thread moves: what it must know of their column is read once.
-SOME = 4
+# Rows, or nodes, that one thread takes, so that what it must know of their column is read once; where it keeps more of
+# each row, fewer.
+SOME, FEW = 16, 4
 # A pair along which the gradient hardly changes, or against the step, says nothing of a positive definite curvature.
 LEAST_CURVATURE = 1e-3
 # Rows of sums that one evaluation gives each column.
@@ -50,8 +51,8 @@ class Kernels:
 def kernels_of(device: Device, pairs: int) -> Kernels:
     """Kernels of a device's scalar type for columns that keep so many pairs."""
     scalar, vec = device.scalar, device.vector
-    several = wp.types.vector(length=SOME, dtype=scalar)
-    m, chunk, some = pairs, CHUNK, SOME
+    several, few_scalars = (wp.types.vector(length=length, dtype=scalar) for length in (SOME, FEW))
+    m, chunk, some, few = pairs, CHUNK, SOME, FEW
     overshoot, least_kept, kept, most_kept = OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT
     cuts, least_curvature = CUTS, LEAST_CURVATURE
     own_row, whole_row, free_row, slope_row = OWN, WHOLE, FREE, SLOPE
@@ -103,7 +104,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         """Project the gradient; sums: |total - constant|^2, |total|^2, |free|^2, free . d."""
         block, c = wp.tid()
         own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-        for i in range(block * chunk, wp.min((block + 1) * chunk, held.shape[0])):
+        for i in range(block * some, wp.min((block + 1) * some, held.shape[0])):
             x = vec(total[3 * i, c], total[3 * i + 1, c], total[3 * i + 2, c])
             y = x - vec(constant[3 * i, c], constant[3 * i + 1, c], constant[3 * i + 2, c])
             own += wp.float64(wp.dot(y, y))
@@ -134,24 +135,27 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
     ):
         """Products of the new gradient g' with every s, every w, z' and z; and y . w of the pair that opens now."""
         block, c = wp.tid()
-        first, end = block * chunk, wp.min((block + 1) * chunk, g.shape[0])
-        gz, gold, yw = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-        for r in range(first, end):
-            a, x, y = new_g[r, c], new_z[r, c], z[r, c]
-            gz += wp.float64(a) * wp.float64(x)
-            gold += wp.float64(a) * wp.float64(y)
-            yw += wp.float64(a - g[r, c]) * wp.float64(x - y)
-        wp.atomic_add(products, gz_row, c, gz)
-        wp.atomic_add(products, gold_row, c, gold)
-        wp.atomic_add(products, yw_row, c, yw)
+        last = g.shape[0] - 1
+        own = several()
+        gz, gold, yw = scalar(0.0), scalar(0.0), scalar(0.0)
+        for k in range(some):
+            r = wp.min(some * block + k, last)
+            inside = wp.where(some * block + k <= last, scalar(1.0), scalar(0.0))
+            own[k] = inside * new_g[r, c]
+            gz += own[k] * new_z[r, c]
+            gold += own[k] * z[r, c]
+            yw += (own[k] - inside * g[r, c]) * (new_z[r, c] - z[r, c])
+        wp.atomic_add(products, gz_row, c, wp.float64(gz))
+        wp.atomic_add(products, gold_row, c, wp.float64(gold))
+        wp.atomic_add(products, yw_row, c, wp.float64(yw))
         for i in range(known[c]):
-            sg, wg = wp.float64(0.0), wp.float64(0.0)
-            for r in range(first, end):
-                h = wp.float64(new_g[r, c])
-                sg += h * wp.float64(s[i, r, c])
-                wg += h * wp.float64(w[i, r, c])
-            wp.atomic_add(products, i, c, sg)
-            wp.atomic_add(products, m + i, c, wg)
+            sg, wg = scalar(0.0), scalar(0.0)
+            for k in range(some):
+                r = wp.min(some * block + k, last)
+                sg += own[k] * s[i, r, c]
+                wg += own[k] * w[i, r, c]
+            wp.atomic_add(products, i, c, wp.float64(sg))
+            wp.atomic_add(products, m + i, c, wp.float64(wg))
 
     @wp.kernel(module="unique")
     def judge(
@@ -318,26 +322,26 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         block, c = wp.tid()
         if accepted[c] == 0:
             return
-        taken = scalar(gone[c])
-        n = slot[c]
-        direction = several()
-        for k in range(some):
-            r = wp.min(some * block + k, u.shape[0] - 1)
-            x = new_z[r, c]
-            direction[k] = -x
+        taken, last, n = scalar(gone[c]), u.shape[0] - 1, slot[c]
+        step, direction = few_scalars(), few_scalars()
+        for k in range(few):
+            r = wp.min(few * block + k, last)
+            step[k] = taken * d[r, c]
+            direction[k] = -new_z[r, c]
             if n >= 0:
-                s[n, r, c] = taken * d[r, c]
-                w[n, r, c] = x - z[r, c]
+                s[n, r, c] = step[k]
+                w[n, r, c] = new_z[r, c] - z[r, c]
         for i in range(known[c]):
             of_s, of_w = scalar(along_s[i, c]), scalar(along_w[i, c])
-            for k in range(some):
-                r = wp.min(some * block + k, u.shape[0] - 1)
+            for k in range(few):
+                r = wp.min(few * block + k, last)
                 direction[k] += of_w * w[i, r, c] + of_s * s[i, r, c]
-        for k in range(some):
-            r = some * block + k
-            if r < u.shape[0]:
-                u[r, c] += taken * d[r, c]
-                if status[c] == LIVE:
+        live = status[c] == LIVE
+        for k in range(few):
+            r = few * block + k
+            if r <= last:
+                u[r, c] += step[k]
+                if live:
                     g[r, c] = new_g[r, c]
                     z[r, c] = new_z[r, c]
                     d[r, c] = direction[k]

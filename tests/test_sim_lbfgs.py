@@ -162,3 +162,17 @@ def test_single_precision_ends_at_its_floor() -> None:
     single = find_device("cpu", "float32")
     found = descended(problem_of(single), tolerance=2e-5)
     assert (found.status == DONE).all()
+
+
+def test_what_was_learnt_shortens_the_next_descent(device: Device) -> None:
+    """The load grows by a tenth: the pairs of the last descent know the way."""
+    few, rest = TOTAL[:3], device.zeros(ROWS, 3)
+    problem = problem_of(device, total=few)
+    solver, tolerance = rest_solver(problem), np.full(3, 1e-6)
+    first = descend(problem, solver, rest, tolerance, 300)
+    plain = descend(problem_of(device, total=1.1 * few), solver, first.u, tolerance, 300)
+    taught = descend(problem_of(device, total=1.1 * few), solver, first.u, tolerance, 300, first.learnt)
+    assert (taught.status == DONE).all()
+    assert taught.steps.sum() < plain.steps.sum()
+    np.testing.assert_allclose(taught.u.numpy(), plain.u.numpy(), atol=1e-4 * np.abs(plain.u.numpy()).max())
+    assert not descended(problem_of(device)).learnt  # too many columns to have a next frame
