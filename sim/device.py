@@ -13,6 +13,8 @@ from .errors import InputError
 
 # No adjoints are taken anywhere in the house: half the code to compile.
 wp.config.enable_backward = False
+# Launches are as wide as the work: no thread takes a second turn, and registers are saved.
+wp.config.default_grid_stride = False
 # Start-up notes would stand among a command's own lines; that no driver is there is said all the same.
 wp.config.log_level = wp.LOG_ERROR
 

@@ -19,8 +19,8 @@ from .problem import Problem
 from .steering import FEW, LEFT, LIVE, OWN, PRODUCTS, SOME, SUMS, Kernels, kernels_of
 
 PAIRS = 8
-# The host looks after so many turns, and drops what has ended once it is this share of the columns.
-TURNS, ENDED = 2, 0.1
+# On CUDA the host looks after so many turns; it drops what has ended once that is such a share of the columns.
+TURNS_ON_CUDA, ENDED = 2, 0.15
 
 
 # What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
@@ -67,7 +67,7 @@ def descend(
         return Descended(u, status, steps, residual, {})
     work, turns = _begun(problem, preconditioner, start, tolerance, learnt or {}), 0
     while True:
-        turns += work.turn(min(TURNS, most - turns))
+        turns += work.turn(min(TURNS_ON_CUDA if device.on_cuda else 1, most - turns))
         now = work.status.numpy()
         last = turns >= most or not (now == LIVE).any()
         if last or ((now != LIVE).mean() >= ENDED and count > TAUGHT):
