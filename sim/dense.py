@@ -126,6 +126,8 @@ class Dense:
         kind = wp.dtype_to_torch(LOW[device.precision])
         self._inverse = torch.zeros((self._size, self._size), dtype=kind, device=where)
         self._inverse[:count, :count] = inverse
+        del free, inverse
+        torch.cuda.empty_cache()  # batches of loads want the room
         self._scale = device.array(scale.cpu().numpy())
         back = motions @ sp.diags_array(scale.cpu().numpy())
         self._into, self._back = (_compressed(sp.csr_array(matrix), device) for matrix in (motions.T, back))

@@ -21,7 +21,7 @@ from .footprint import Skin
 from .inversion import Inversion
 from .ladder import Ladder, shortfall
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
-from .memory import check_fits
+from .memory import check_fits, fitting_batch
 from .precondition import choose_preconditioner, name_of
 from .term import Cases
 
@@ -43,7 +43,7 @@ class Fem:
     device
         "auto", "cpu", "cuda" or "cuda:1".
     batch
-        Most load cases that are solved together.
+        Most load cases that are solved together; None: as many as are worth it on this device.
     element
         One of `discretisation.ELEMENTS`; None: p1, or p2 on a mesh that brings mid-edge nodes of its own.
 
@@ -59,16 +59,16 @@ class Fem:
         effects: Iterable[Effect],
         accuracy: Accuracy = TRAIN,
         device: str = "auto",
-        batch: int = 64,
+        batch: int | None = None,
         element: str | None = None,
     ):
         self._anatomy = anatomy
         self.effects = tuple(effects)
         self.accuracy = accuracy
-        self.batch = batch
         self.space = discretise(anatomy.mesh, element)
         self._skin = Skin(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
         self.problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
+        self.batch = fitting_batch(self.problem.rows, self.problem.device) if batch is None else batch
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed)
         self.preconditioner = name_of(preconditioner)
         self._ladder = Ladder(preconditioner, Inversion(self.space, self.problem.device), accuracy)

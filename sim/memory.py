@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import warp as wp
 
 from .device import Device
@@ -11,6 +12,8 @@ from .errors import InputError
 
 # Columns of the solver at its widest: pairs of L-BFGS, vectors of conjugate gradients, trials of the line search.
 WORK_COLUMNS = 40
+# Load cases that are worth solving together: more fill the processor no better.
+WIDEST, WIDEST_ON_CUDA = 64, 4096
 # Copies of the answer on the host while batches are joined, in double precision.
 ANSWER_COPIES = 3
 # Of what is free, this share may be used: other programs live too.
@@ -39,6 +42,13 @@ def host_bytes() -> int:
         cached = sum(int(line.split()[1]) for line in parts if line.startswith("inactive_file "))
         found.append(int(most[0]) - int(used[0]) + cached)
     return min(found)
+
+
+def fitting_batch(rows: int, device: Device) -> int:
+    """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it, or half of memory."""
+    column = WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
+    widest = WIDEST_ON_CUDA if device.on_cuda else WIDEST
+    return int(np.clip(free_bytes(device) / 2 / max(column, 1), 1, widest))
 
 
 def check_fits(rows: int, batch: int, count: int, device: Device) -> None:

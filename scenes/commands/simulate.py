@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_tissue_arguments(parser)
     add_element_argument(parser)
     parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
-    parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
+    parser.add_argument("--batch", type=int, help="loads solved together (default: 64, on CUDA up to 4096)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
             bar.update(done - bar.n)
 
         try:
-            solved = simulate(out, fem, loads, provenance, args.batch, progress)
+            solved = simulate(out, fem, loads, provenance, fem.batch, progress)
         except KeyboardInterrupt:
             print(f"stopped; the same command goes on from {args.out}.partial", file=sys.stderr)
             return INTERRUPTED
