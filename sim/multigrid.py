@@ -72,6 +72,8 @@ class TwoLevel:
         What a person calls it.
     """
 
+    on_device = False  # a cycle makes its arrays as it goes: no captured graph may replay it
+
     def __init__(self, coarse: Preconditioner, stiffness: sp.bsr_array, device: Device, name: str = "two levels"):
         self.name = name
         self._coarse, self._device = coarse, device
@@ -81,17 +83,12 @@ class TwoLevel:
         self._inverse = device.array(inverse, wp.types.matrix((self._size, self._size), device.scalar))
         self._largest = MARGIN * self._power()
 
-    @property
-    def on_device(self) -> bool:
-        """As the coarse solver."""
-        return self._coarse.on_device
-
     def prepare(self, problem: Problem, columns: int) -> None:
         """The rest stiffness serves every state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """One cycle, for the live columns if they are known to the host."""
-        if self.on_device or live.all():
+        """One cycle, for the live columns."""
+        if live.all():
             wp.copy(out, self._cycle(r))
             return
         columns = np.flatnonzero(live)
@@ -146,14 +143,11 @@ class TwoLevel:
 class Lifted:
     """L M L^T: a preconditioner M of fewer unknowns, for what motions L (m, n), in blocks, can do."""
 
+    on_device = False
+
     def __init__(self, motions: sp.bsr_array, coarse: Preconditioner, device: Device):
         self.coarse, self._device = coarse, device
         self._up, self._down = Sparse(motions, device), Sparse(sp.bsr_array(motions.T), device)
-
-    @property
-    def on_device(self) -> bool:
-        """As the coarse solver."""
-        return self.coarse.on_device
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """The rest stiffness serves every state."""
