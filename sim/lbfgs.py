@@ -21,8 +21,6 @@ from .steering import FEW, LEFT, LIVE, OWN, PRODUCTS, SOME, SUMS, Kernels, kerne
 PAIRS = 8
 # On CUDA the host looks after so many turns; it drops what has ended once that is such a share of the columns.
 TURNS_ON_CUDA, ENDED = 2, 0.15
-
-
 # What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
 # the newest pair and how many there are (b,).
 LEARNT = ("s", "w", "sy", "yw", "head", "known")
@@ -67,7 +65,9 @@ def descend(
         return Descended(u, status, steps, residual, {})
     work, turns = _begun(problem, preconditioner, start, tolerance, learnt or {}), 0
     while True:
-        turns += work.turn(min(TURNS_ON_CUDA if device.on_cuda else 1, most - turns))
+        more = min(TURNS_ON_CUDA if device.on_cuda else 1, most - turns)
+        work.turn(more)
+        turns += more
         now = work.status.numpy()
         last = turns >= most or not (now == LIVE).any()
         if last or ((now != LIVE).mean() >= ENDED and count > TAUGHT):
@@ -120,13 +120,13 @@ class _Work:
         _prepare(self.problem, self.preconditioner, columns["u"])
         return _Work(self.problem, self.preconditioner, self.kernels, columns, _scratch(self.problem, len(stay)))
 
-    def turn(self, times: int) -> int:
-        """Turn so many times, and return how many."""
+    def turn(self, times: int) -> None:
+        """Turn so many times."""
         device = self.problem.device
         if not (device.on_cuda and self.preconditioner.on_device):
             for _ in range(times):
                 self._turn()
-            return times
+            return
         if self.graph is None:
             self._turn()  # loads what a capture cannot
             with wp.ScopedCapture(device.name, force_module_load=False) as capture:
@@ -135,7 +135,6 @@ class _Work:
             times -= 1
         for _ in range(times):
             wp.capture_launch(self.graph)
-        return times
 
     def _turn(self) -> None:
         a, b, k = self.columns, self.scratch, self.kernels
