@@ -335,7 +335,7 @@ def test_round_off_is_told_and_ends_the_iteration() -> None:
     double = Fem(base_held(mesh), effects, Accuracy(tolerance=2e-5), "cpu").deform(loads)
     assert all(outcome is Outcome.ROUND_OFF for outcome in single.outcome)
     assert (single.residual > 2e-5).all()
-    assert (single.iterations < 45).all()  # of 60, and no load steps
+    assert (single.iterations < 80).all()  # of 260, and no load steps
     assert all(outcome is Outcome.CONVERGED for outcome in double.outcome)
     largest = np.abs(double.displacement).max(axis=(1, 2))
     assert (np.abs(single.displacement - double.displacement).max(axis=(1, 2)) < 2e-2 * largest).all()
