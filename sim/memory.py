@@ -46,7 +46,7 @@ def host_bytes() -> int:
 
 def fitting_batch(rows: int, device: Device) -> int:
     """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it, or half of memory."""
-    column = WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
+    column = _column(rows, device)
     widest = WIDEST_ON_CUDA if device.on_cuda else WIDEST
     return int(np.clip(free_bytes(device) / 2 / max(column, 1), 1, widest))
 
@@ -59,7 +59,7 @@ def check_fits(rows: int, batch: int, count: int, device: Device) -> None:
     InputError
         Naming what it takes, what is free, and what would fit.
     """
-    column = WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
+    column = _column(rows, device)
     each, host = ANSWER_COPIES * 8 * rows, SHARE * host_bytes()
     answers, alone = each * count, 0 if device.on_cuda else column
     if answers + alone > host:
@@ -77,6 +77,11 @@ def check_fits(rows: int, batch: int, count: int, device: Device) -> None:
             f"a batch of {columns} loads takes about {_gigabytes(column * columns)}, and {_gigabytes(max(room, 0.0))} "
             f"are free: {remedy}"
         )
+
+
+def _column(rows: int, device: Device) -> int:
+    """Bytes that one load case takes while it is solved."""
+    return WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
 
 
 def _gigabytes(amount: float) -> str:

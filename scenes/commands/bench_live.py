@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from sim.discretisation import ELEMENTS
-from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.meshfile import read_anatomy
 
 from ..shipped import template_path
-from ..tissue import add_tissue_arguments, tissue_of
+from ..tissue import add_tissue_arguments, pushed_effects, tissue_of
 
 if TYPE_CHECKING:
     from ..live import Tally
@@ -49,8 +48,7 @@ def run(args: argparse.Namespace) -> int:
             f"--frames {args.frames} --checked {args.checked} measures nothing: give 1 <= --checked <= --frames."
         )
     site = site_of(read_anatomy(args.anatomy or template_path()))
-    slide = (Slide(),) if site.anatomy.slide_normal.any() else ()
-    scene = replace(find_scene("press"), effects=(Elasticity(tissue_of(args)), Held(), *slide, ToolForce()))
+    scene = replace(find_scene("press"), effects=pushed_effects(site.anatomy, tissue_of(args)))
     fem = live_fem(scene, site, args.device, args.element)
     found = []
     for ride in RIDES:

@@ -12,12 +12,11 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.accuracy import Accuracy
-from sim.anatomy import Anatomy
 from sim.deformation import Outcome
-from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolForce
+from sim.effects import NodalForce
 from sim.fem import Fem
 from sim.files import check_output
-from sim.material import Tissue, tissue_to_json
+from sim.material import tissue_to_json
 from sim.meshfile import read_anatomy
 from sim.stages import stage
 from surrogate.dataset import read_outcomes
@@ -25,7 +24,7 @@ from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import Solved, simulate
 
 from ..shipped import template_path
-from ..tissue import add_element_argument, add_tissue_arguments, tissue_of
+from ..tissue import add_element_argument, add_tissue_arguments, pushed_effects, tissue_of
 
 INTERRUPTED = 130
 
@@ -55,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         loads = draw(args.preset, anatomy, args.count, args.seed)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
     tissue = tissue_of(args)
-    effects = _effects(anatomy, tissue)
+    effects = (*pushed_effects(anatomy, tissue), NodalForce())
     with stage("set-up"):
         fem = Fem(anatomy, effects, accuracy, args.device, args.batch, args.element)
     provenance = {
@@ -81,12 +80,6 @@ def run(args: argparse.Namespace) -> int:
             return INTERRUPTED
     _report(args, len(loads), solved)
     return 0
-
-
-def _effects(anatomy: Anatomy, tissue: Tissue) -> tuple[Effect, ...]:
-    """What pushing tools and unit forces call for on this body."""
-    slide = (Slide(),) if anatomy.slide_normal.any() else ()
-    return (Elasticity(tissue), Held(), *slide, ToolForce(), NodalForce())
 
 
 def _report(args: argparse.Namespace, asked: int, solved: Solved) -> None:
