@@ -1,0 +1,27 @@
+"""Products of block matrices against SciPy's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from sim.device import Precision, find_device
+from sim.sparse import Sparse
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-5), ("float64", 1e-13)])
+@pytest.mark.parametrize("size", [(3, 3), (3, 6), (6, 3), (6, 6)])
+@pytest.mark.parametrize("width", [1, 3, 8, 19])
+def test_adds_the_product(size: tuple[int, int], width: int, precision: Precision, tolerance: float) -> None:
+    """Of any number of columns; the third row of blocks is empty, the last one full to its end."""
+    random, device = np.random.default_rng(0), find_device("cpu", precision)
+    there = random.random((7, 5)) < 0.4
+    there[2], there[6] = False, True
+    dense = np.kron(there, np.ones(size)) * random.normal(size=(7 * size[0], 5 * size[1]))
+    matrix = Sparse(sp.bsr_array(dense, blocksize=size), device)
+    x, out = random.normal(size=(5 * size[1], width)), random.normal(size=(7 * size[0], width))
+    added = device.array(out)
+    matrix.add_to(added, -0.5, device.array(x))
+    np.testing.assert_allclose(added.numpy(), out - 0.5 * dense @ x, atol=tolerance * np.abs(dense @ x).max())
+    np.testing.assert_allclose(matrix.times(device.array(x)).numpy(), dense @ x, atol=tolerance * 20)
