@@ -1,7 +1,9 @@
 """Elastic energy of one region: the integral of psi(H) over the rest volume, for any law and element."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -10,11 +12,21 @@ import warp as wp
 from ..device import Device
 from ..element import Elements, hooke_stiffness
 from ..term import Cases
-from .invariants import cofactor, volume_change
+from ..together import cores, together
+from .invariants import cofactor
 from .law import Law
 
 # A step must leave every volume above this share of what it was: the logarithm and its curvature stay moderate.
 VOLUME_KEPT = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Some of the elements: how many; sizes, node numbers and shape gradients; weights and coefficients."""
+
+    count: int
+    shape: list[wp.array]
+    inside: list[wp.array]
 
 
 @dataclass(frozen=True)
@@ -39,17 +51,8 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
     stress, stress_change, density = law.stress, law.stress_change, law.energy
     kept = VOLUME_KEPT
 
-    # A constant bound lets the compiler unroll the loops over nodes; unrolled over points too, it takes thrice as long.
-    @wp.func
-    def constant(sizes: wp.array(dtype=wp.int32), e: int):
-        return size
-
-    @wp.func
-    def stored(sizes: wp.array(dtype=wp.int32), e: int):
-        return sizes[e]
-
-    nodes_of = constant if size else stored
-
+    # Loops over nodes are unrolled where `size` is a constant, a fifth less time on the CPU; over points too, they take
+    # thrice as long to compile. Shape gradients sum to zero: only how far nodes moved from node 0 counts.
     @wp.func
     def gradient_of(
         u: wp.array2d(dtype=scalar),
@@ -60,12 +63,37 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
         q: int,
         c: int,
     ):
-        """H = sum over nodes of u_a (x) grad N_a."""
+        """H = sum over nodes of (u_a - u_0) (x) grad N_a."""
         H = mat()
-        for a in range(nodes_of(sizes, e)):
+        i = 3 * table[e, 0]
+        origin = vec(u[i, c], u[i + 1, c], u[i + 2, c])
+        for a in range(1, size if size else sizes[e]):
             i = 3 * table[e, a]
-            H += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]), gradient[e, q, a])
+            H += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]) - origin, gradient[e, q, a])
         return H
+
+    @wp.func
+    def spread(
+        P: mat,
+        sizes: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        e: int,
+        q: int,
+        c: int,
+        out: wp.array2d(dtype=scalar),
+    ):
+        """f_a += P grad N_a; they sum to zero."""
+        total = vec()
+        for a in range(1, size if size else sizes[e]):
+            i = 3 * table[e, a]
+            f = P * gradient[e, q, a]
+            total += f
+            for k in range(3):
+                wp.atomic_add(out, i + k, c, f[k])
+        i = 3 * table[e, 0]
+        for k in range(3):
+            wp.atomic_sub(out, i + k, c, total[k])
 
     @wp.kernel(module="unique")
     def add_energy(
@@ -99,11 +127,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             P = weight[e, q] * stress(gradient_of(u, sizes, table, gradient, e, q, c), coefficients[e])
-            for a in range(nodes_of(sizes, e)):
-                i = 3 * table[e, a]
-                f = P * gradient[e, q, a]
-                for k in range(3):
-                    wp.atomic_add(out, i + k, c, f[k])
+            spread(P, sizes, table, gradient, e, q, c, out)
 
     @wp.kernel(module="unique")
     def add_curvature(
@@ -126,11 +150,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
                 H = gradient_of(at, sizes, table, gradient, e, q, c)
             D = gradient_of(p, sizes, table, gradient, e, q, c)
             P = weight[e, q] * stress_change(H, D, coefficients[e])
-            for a in range(nodes_of(sizes, e)):
-                i = 3 * table[e, a]
-                f = P * gradient[e, q, a]
-                for k in range(3):
-                    wp.atomic_add(out, i + k, c, f[k])
+            spread(P, sizes, table, gradient, e, q, c, out)
 
     @wp.func
     def along(H: mat, of: constants, k: int, m: int):
@@ -165,7 +185,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
                 X = along(H, coefficients[e], k, 0)
                 Y = along(H, coefficients[e], k, 1)
                 Z = along(H, coefficients[e], k, 2)
-                for a in range(nodes_of(sizes, e)):
+                for a in range(size if size else sizes[e]):
                     g = gradient[e, q, a]
                     f = weight[e, q] * ((g[0] * X + g[1] * Y + g[2] * Z) * g)
                     block = mat()
@@ -190,12 +210,17 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
             H = gradient_of(u, sizes, table, gradient, e, q, c)
             D = gradient_of(du, sizes, table, gradient, e, q, c)
             F = wp.identity(n=3, dtype=scalar) + H
-            a0 = one + volume_change(H)
-            a1 = wp.ddot(cofactor(F), D)
-            a2 = wp.ddot(F, cofactor(D))
-            a3 = wp.determinant(D)
+            normal, normal_change = cofactor(F), cofactor(D)
+            a0 = wp.dot(F[0], normal[0])
+            a1 = wp.ddot(normal, D)
+            a2 = wp.ddot(F, normal_change)
+            a3 = wp.dot(D[0], normal_change[0])
             floor = scalar(kept) * a0
             t = out[c]
+            zero = scalar(0.0)
+            # Most steps are so short that nothing has to be looked at closely.
+            if a0 + t * (wp.min(a1, zero) + t * (wp.min(a2, zero) + t * wp.min(a3, zero))) >= floor:
+                continue
             for _ in range(40):
                 low = a0 + t * (a1 + t * (a2 + t * a3))
                 # Stationary points of the cubic inside (0, t), by the root formula that does not cancel.
@@ -251,13 +276,20 @@ class Elasticity:
         sizes = np.zeros(0, np.int32) if elements.size is None else elements.size
         self._kernels = kernels_of(law, device, size, count)
         self._rest = (elements, *lame.T)
-        self._shape = [
+        shape = [
             device.array(sizes, wp.int32),
             device.array(elements.table, wp.int32),
             device.array(elements.gradient, device.vector),
         ]
-        self._weight = device.array(elements.weight)
-        self._coefficients = device.array(coefficients, wp.types.vector(length=count, dtype=device.scalar))
+        inside = [
+            device.array(elements.weight),
+            device.array(coefficients, wp.types.vector(length=count, dtype=device.scalar)),
+        ]
+        ends = np.linspace(0, len(elements.table), (1 if device.on_cuda else cores()) + 1).astype(int).tolist()
+        self._parts = [
+            _Part(stop - first, *([_rows(array, first, stop) for array in arrays] for arrays in (shape, inside)))
+            for first, stop in pairwise(ends)
+        ]
         self._at: wp.array | None = None
         self._definite: wp.array | None = None
 
@@ -269,11 +301,11 @@ class Elasticity:
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """E += sum of w psi(H)."""
-        self._launch(self._kernels.add_energy, [u, *self._shape, self._weight, self._coefficients], out, u)
+        self._launch(self._kernels.add_energy, [u], out, u.shape[1])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         """f += internal forces."""
-        self._launch(self._kernels.add_gradient, [u, *self._shape, self._weight, self._coefficients], out, u)
+        self._launch(self._kernels.add_gradient, [u], out, u.shape[1])
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
         """Curvature is recomputed from u; where `definite`, Hooke's at rest stands in: positive definite."""
@@ -281,13 +313,11 @@ class Elasticity:
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
         """f += K(u) p."""
-        inputs = [p, self._at, self._definite, *self._shape, self._weight, self._coefficients]
-        self._launch(self._kernels.add_curvature, inputs, out, p)
+        self._launch(self._kernels.add_curvature, [p, self._at, self._definite], out, p.shape[1])
 
     def add_diagonal(self, out: wp.array) -> None:
         """Blocks += diagonal of K(u)."""
-        inputs = [self._at, self._definite, *self._shape, self._weight, self._coefficients]
-        self._launch(self._kernels.add_diagonal, inputs, out, out)
+        self._launch(self._kernels.add_diagonal, [self._at, self._definite], out, out.shape[1])
 
     def rest_curvature(self) -> sp.csc_array:
         """Hooke's stiffness, which every law meets at rest."""
@@ -295,11 +325,35 @@ class Elasticity:
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
         """Bound the step where the law needs J > 0."""
-        if self._kernels.bound_step is not None:
-            self._launch(self._kernels.bound_step, [u, du, *self._shape], out, u)
+        kernel = self._kernels.bound_step
+        if kernel is not None:
+            bounds = [out, *(wp.clone(out) for _ in self._parts[1:])]
+            self._each(kernel, lambda part: [u, du, *part.shape], bounds, u.shape[1])
+            for bound in bounds[1:]:
+                np.minimum(out.numpy(), bound.numpy(), out=out.numpy())
 
     def end(self, u: wp.array) -> None:
         """Elasticity remembers nothing."""
 
-    def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, batch: wp.array) -> None:
-        self._device.launch(kernel, (len(self._rest[0].table), batch.shape[1]), inputs, [out])
+    def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:
+        """Add to `out` whatever a kernel adds."""
+        sums = [out, *(wp.zeros_like(out) for _ in self._parts[1:])]
+        self._each(kernel, lambda part: [*inputs, *part.shape, *part.inside], sums, columns)
+        for total in sums[1:]:
+            np.add(out.numpy(), total.numpy(), out=out.numpy())
+
+    def _each(
+        self, kernel: wp.Kernel, inputs: Callable[[_Part], list], outputs: Sequence[wp.array], columns: int
+    ) -> None:
+        """All parts at the same time, each into an output of its own."""
+        together(
+            [
+                partial(self._device.launch, kernel, (part.count, columns), inputs(part), [out])
+                for part, out in zip(self._parts, outputs, strict=True)
+            ]
+        )
+
+
+def _rows(array: wp.array, first: int, stop: int) -> wp.array:
+    """A view of some rows; of nothing, nothing."""
+    return array[first:stop] if len(array) else array

@@ -10,10 +10,16 @@ import warp as wp
 
 
 @wp.func
+def cofactor(A: Any):
+    """cof A, the derivative of det A: its rows are cross products of A's rows."""
+    return wp.matrix_from_rows(wp.cross(A[1], A[2]), wp.cross(A[2], A[0]), wp.cross(A[0], A[1]))
+
+
+@wp.func
 def second_order_volume(H: Any):
-    """J - 1 - tr H = (tr^2 H - tr H^2) / 2 + det H."""
-    t = wp.trace(H)
-    return (t * t - wp.trace(H * H)) / type(t)(2.0) + wp.determinant(H)
+    """J - 1 - tr H = tr cof H + det H."""
+    C = cofactor(H)
+    return wp.trace(C) + wp.dot(H[0], C[0])
 
 
 @wp.func
@@ -30,12 +36,6 @@ def log_one_plus(j: Any):
     if change == type(j)(0.0):
         return j
     return wp.log(J) * (j / change)
-
-
-@wp.func
-def cofactor(A: Any):
-    """cof A, the derivative of det A: its rows are cross products of A's rows."""
-    return wp.matrix_from_rows(wp.cross(A[1], A[2]), wp.cross(A[2], A[0]), wp.cross(A[0], A[1]))
 
 
 @wp.func

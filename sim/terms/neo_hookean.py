@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from .invariants import cofactor_change, cofactor_excess, log_one_plus, second_order_volume, volume_change
+from .invariants import cofactor, cofactor_change, cofactor_excess, log_one_plus, second_order_volume, volume_change
 from .law import Law
 
 
@@ -39,13 +39,14 @@ def energy(H: Any, c: Any):
 
 @wp.func
 def stress(H: Any, c: Any):
-    """First Piola-Kirchhoff stress P [Pa] = (mu (H - (cof F - I) + j F) + lambda ln J cof F) / J."""
+    """First Piola-Kirchhoff stress P [Pa] = mu F + (lambda ln J - mu) F^-T, sorted by powers of H."""
     mu, lam = c[0], c[1]
     identity = wp.identity(n=3, dtype=type(mu))
     j = volume_change(H)
-    excess = cofactor_excess(H)
-    shape = H - excess + j * (identity + H)
-    return (mu * shape + lam * log_one_plus(j) * (identity + excess)) / (type(mu)(1.0) + j)
+    shrunk = mu / (type(mu)(1.0) + j)
+    pressure = lam * log_one_plus(j) / (type(mu)(1.0) + j)
+    normal = pressure - shrunk
+    return mu * H + normal * (cofactor(H) - wp.transpose(H)) + (normal * wp.trace(H) + shrunk * j + pressure) * identity
 
 
 @wp.func

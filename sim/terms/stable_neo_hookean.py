@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from .invariants import cofactor_change, cofactor_excess, second_order_volume, volume_change
+from .invariants import cofactor, cofactor_change, cofactor_excess, second_order_volume, volume_change
 from .law import Law
 
 
@@ -25,11 +25,12 @@ def energy(H: Any, c: Any):
 
 @wp.func
 def stress(H: Any, c: Any):
-    """First Piola-Kirchhoff stress P [Pa] = mu (H - (cof F - I)) + (lambda + mu) j cof F."""
+    """First Piola-Kirchhoff stress P [Pa] = mu (F - cof F) + (lambda + mu) j cof F, sorted by powers of H."""
     mu, lam = c[0], c[1]
-    excess = cofactor_excess(H)
     pressure = (lam + mu) * volume_change(H)
-    return mu * (H - excess) + pressure * (wp.identity(n=3, dtype=type(mu)) + excess)
+    normal = pressure - mu
+    identity = wp.identity(n=3, dtype=type(mu))
+    return mu * H + normal * (cofactor(H) - wp.transpose(H)) + (normal * wp.trace(H) + pressure) * identity
 
 
 @wp.func
