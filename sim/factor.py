@@ -7,10 +7,15 @@ twenty times for 64.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from threadpoolctl import ThreadpoolController
 
 from .accuracy import Precision
@@ -18,11 +23,15 @@ from .device import Device
 from .fronts import Front, fronts_of
 from .problem import Problem
 from .sweep import Sweep
+from .together import cores, together
 
-potrf, potri = get_lapack_funcs(("potrf", "potri"), dtype=np.float64)
+potrf, trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
+syrk, trsm = get_blas_funcs(("syrk", "trsm"), dtype=np.float64)
 
 # Up to so many right-hand sides, sweeps one by one are faster than products of matrices.
 FEW = 3
+# Border unknowns and their lower half of a matrix (m, m), for each front that these wait for.
+Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 # A pivot that has lost so many digits is zero: the last ones are round-off.
 SINGULAR = 1e-13
 
@@ -37,7 +46,10 @@ class Factor:
     motions
         L (3N, n): independent motions as columns. Their own unknowns, three to a node, are numbered by `node` (n,).
     device
-        Where the right-hand sides live; the factor is kept in its precision.
+        Where the right-hand sides live.
+    precision
+        In which the factor is kept; what it does is symmetric and positive definite in both. Single precision has half
+        the bytes to read.
 
     Raises
     ------
@@ -47,16 +59,22 @@ class Factor:
 
     on_device = False
 
-    def __init__(self, stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device):
+    def __init__(
+        self,
+        stiffness: sp.csc_array,
+        motions: sp.csc_array,
+        node: np.ndarray,
+        device: Device,
+        precision: Precision = "float32",
+    ):
         free = sp.csc_array(motions.T @ stiffness @ motions)
-        order, fronts = fronts_of(free, node)
+        order, fronts = fronts_of(free, node, cores())
         motions = sp.csc_array(motions[:, order].astype(device.precision))
         self._motions, self._transposed = sp.csr_array(motions), sp.csr_array(motions.T)
-        self._blas = ThreadpoolController()
-        self._fronts = fronts
+        self._precision, self._blas = precision, ThreadpoolController()
         with self._blas.limit(limits=1, user_api="blas"):
-            whole, self._panels = panels_of(sp.csc_array(free[order][:, order]), fronts, device.precision)
-        self._sweep = Sweep(fronts, whole, device.precision)
+            values, self._panels = panels_of(sp.csc_array(free[order][:, order]), fronts, precision)
+        self._sweep = Sweep(fronts, values, precision)
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """The rest stiffness serves every state."""
@@ -65,7 +83,11 @@ class Factor:
         """One sweep up and one down for the live columns: the others would cost as much."""
         values = r.numpy()
         solved = np.zeros_like(values)
-        solved[:, live] = self._motions @ self._solved(self._transposed @ values[:, live])
+        x = self._transposed @ values[:, live]
+        # Single precision holds no forces of 1e-40 N beside columns of 1 N.
+        size = np.abs(x).max(axis=0, initial=0.0)
+        size[size == 0.0] = 1.0
+        solved[:, live] = self._motions @ (self._solved((x / size).astype(self._precision)) * size)
         out.assign(solved)
 
     def _solved(self, x: np.ndarray) -> np.ndarray:
@@ -73,14 +95,10 @@ class Factor:
             return self._sweep.solved(x)
         # Threads of BLAS wait for one another at every front, ages where something else runs on their cores.
         with self._blas.limit(limits=1, user_api="blas"):
-            for front, panel in zip(self._fronts, self._panels, strict=True):
-                size = front.stop - front.first
-                product = panel.T @ x[front.first : front.stop]
-                x[front.first : front.stop] = product[:size]
-                x[front.border] -= product[size:]
-            for front, panel in zip(reversed(self._fronts), reversed(self._panels), strict=True):
-                size = front.stop - front.first
-                x[front.first : front.stop] -= panel[:, size:] @ x[front.border]
+            for panel in self._panels:
+                panel.up(x)
+            for panel in reversed(self._panels):
+                panel.down(x)
         return x
 
 
@@ -89,12 +107,34 @@ def node_of(basis: sp.csc_array) -> np.ndarray:
     return np.asarray(basis.indices[basis.indptr[:-1]] // 3)
 
 
-def panels_of(matrix: sp.csc_array, fronts: list[Front], precision: Precision) -> tuple[np.ndarray, list[np.ndarray]]:
-    """All panels in one array, and its parts: of a front of k own and m border unknowns (k, k + m) [S^-1, S^-1 C^T].
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """What is kept of a front of k own and m border unknowns: `values` (k, k + m) = R^-T [1, -R^-1 C^T].
 
-    S (k, k) and C (m, k) are the rows of the matrix at the front's own and border unknowns, what was eliminated before
-    them subtracted. Solving is then, upwards, x_border -= (S^-1 C^T)^T x_own and x_own = S^-1 x_own, and downwards
-    x_own -= S^-1 C^T x_border.
+    S = R R^T (k, k) and C (m, k) are the rows of the matrix at the front's own and border unknowns, less what was
+    eliminated before them. Down is the transpose of up, whatever was rounded: the whole stays symmetric and positive
+    definite.
+    """
+
+    front: Front
+    values: np.ndarray
+
+    def up(self, x: np.ndarray) -> None:
+        """x_own = R^-1 x_own, x_border -= C S^-1 x_own, in x (n, b)."""
+        own = slice(self.front.first, self.front.stop)
+        product = self.values.T @ x[own]
+        x[own] = product[: len(self.values)]
+        x[self.front.border] += product[len(self.values) :]
+
+    def down(self, x: np.ndarray) -> None:
+        """x_own = R^-T x_own - S^-1 C^T x_border, in x (n, b)."""
+        x[self.front.first : self.front.stop] = self.values @ x[self.front.rows]
+
+
+def panels_of(
+    matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision
+) -> tuple[np.ndarray, list[Panel]]:
+    """The values of all panels, one after the other in one array; and the panels.
 
     Raises
     ------
@@ -102,39 +142,61 @@ def panels_of(matrix: sp.csc_array, fronts: list[Front], precision: Precision) -
         The matrix is not positive definite.
     """
     matrix.sort_indices()
-    diagonal = matrix.diagonal()
-    owner = np.repeat(np.arange(len(fronts)), [front.stop - front.first for front in fronts])
-    waiting: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    shapes = [(front.stop - front.first, len(front.rows)) for front in fronts]
-    ends = np.cumsum([0, *(k * n for k, n in shapes)])
-    together = np.zeros(ends[-1], precision)
-    panels = [part.reshape(shape) for part, shape in zip(np.split(together, ends[1:-1]), shapes, strict=False)]
-    for number, (front, panel) in enumerate(zip(fronts, panels, strict=True)):
-        rows, size = front.rows, front.stop - front.first
-        whole = np.zeros((len(rows), len(rows)))
-        entries = slice(matrix.indptr[front.first], matrix.indptr[front.stop])
-        row, value = matrix.indices[entries], matrix.data[entries]
-        column = np.repeat(np.arange(size), np.diff(matrix.indptr[front.first : front.stop + 1]))
-        later = row >= front.first
+    every = [front for part in fronts for front in part]
+    shapes = [(front.stop - front.first, len(front.rows)) for front in every]
+    cuts = np.cumsum([0, *(k * n for k, n in shapes)])
+    values = np.zeros(cuts[-1], precision)
+    panels = [
+        Panel(front, values[first:stop].reshape(shape))
+        for front, shape, (first, stop) in zip(every, shapes, pairwise(cuts), strict=True)
+    ]
+    ends = np.cumsum([0, *(len(part) for part in fronts)]).tolist()
+    work = _Elimination(matrix, panels)
+    lower = [partial(work.eliminate, range(first, stop)) for first, stop in pairwise(ends[:-1])]
+    left: list[Updates] = [{} for _ in lower]
+    together([partial(task, updates) for task, updates in zip(lower, left, strict=True)])
+    meeting: Updates = {}
+    for updates in left:
+        for number, waiting in updates.items():
+            meeting.setdefault(number, []).extend(waiting)
+    work.eliminate(range(ends[-2], ends[-1]), meeting)
+    return values, panels
+
+
+class _Elimination:
+    """Fronts of a sparse matrix, one after the other; those of different parts may be eliminated at the same time."""
+
+    def __init__(self, matrix: sp.csc_array, panels: Sequence[Panel]):
+        self._matrix, self._diagonal, self._panels = matrix, matrix.diagonal(), panels
+        sizes = [len(panel.values) for panel in panels]
+        self._owner = np.repeat(np.arange(len(panels)), sizes)
+
+    def eliminate(self, numbers: range, updates: Updates) -> None:
+        """Fill the panels of these fronts; `updates` brings what waits for them, and leaves with what waits later."""
+        for number in numbers:
+            panel = self._panels[number]
+            front, size = panel.front, len(panel.values)
+            whole = self._rows(front)
+            for border, update in updates.pop(number, ()):
+                place = np.searchsorted(front.rows, border)
+                whole[np.ix_(place, place)] += update
+            root, info = potrf(whole[:size, :size], lower=1)
+            if info or (np.diagonal(root) ** 2 <= SINGULAR * self._diagonal[front.first : front.stop]).any():
+                raise RuntimeError("it is not positive definite")
+            panel.values[:, :size] = trtri(root, lower=1)[0].T
+            if len(front.border):
+                across = trsm(1.0, root, whole[size:, :size], side=1, lower=1, trans_a=1)
+                update = syrk(-1.0, across, beta=1.0, c=whole[size:, size:], lower=1)
+                updates.setdefault(int(self._owner[front.border[0]]), []).append((front.border, update))
+                panel.values[:, size:] = -trsm(1.0, root, across, side=1, lower=1).T
+
+    def _rows(self, front: Front) -> np.ndarray:
+        """The matrix (k + m, k + m) at a front's unknowns, as far as its own columns hold; the lower half."""
+        start, rows, size = self._matrix.indptr, front.rows, front.stop - front.first
+        whole = np.zeros((len(rows), len(rows)), order="F")
+        entries = slice(start[front.first], start[front.stop])
+        row, value = self._matrix.indices[entries], self._matrix.data[entries]
+        column = np.repeat(np.arange(size), np.diff(start[front.first : front.stop + 1]))
+        later = row >= front.first + column
         whole[np.searchsorted(rows, row[later]), column[later]] = value[later]
-        for border, update in waiting.pop(number, ()):
-            place = np.searchsorted(rows, border)
-            whole[np.ix_(place, place)] += update
-        inverse = _inverse(whole[:size, :size], diagonal[front.first : front.stop])
-        coupling = whole[size:, :size]
-        across = coupling @ inverse
-        if len(front.border):
-            above = int(owner[front.border[0]])
-            waiting.setdefault(above, []).append((front.border, whole[size:, size:] - across @ coupling.T))
-        panel[:, :size], panel[:, size:] = inverse, across.T
-    return together, panels
-
-
-def _inverse(block: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
-    """Of a positive definite block (k, k), of which only the lower half is read; diagonal (k,) of the whole matrix."""
-    lower, info = potrf(block, lower=1)
-    if info or (np.diagonal(lower) ** 2 <= SINGULAR * diagonal).any():
-        raise RuntimeError("it is not positive definite")
-    inverse, _ = potri(lower, lower=1)
-    half = np.tril(inverse, -1)
-    return half + half.T + np.diag(np.diagonal(inverse))
+        return whole

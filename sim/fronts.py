@@ -16,6 +16,8 @@ from scipy.sparse import csgraph
 LEAF = 64
 # Two fronts are joined while that stores at most so many zeros: another dense product costs as much.
 ZEROS = 1000
+# Parts are not divided further once so many fronts are above them.
+MOST_ABOVE = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +34,11 @@ class Front:
         return np.concatenate([np.arange(self.first, self.stop), self.border])
 
 
-def fronts_of(matrix: sp.csc_array, node: np.ndarray) -> tuple[np.ndarray, list[Front]]:
+def fronts_of(matrix: sp.csc_array, node: np.ndarray, parts: int = 1) -> tuple[np.ndarray, list[list[Front]]]:
     """An order (n,) of a matrix's unknowns with little fill, and its fronts; every front comes before those it touches.
 
-    `node` (n,): unknowns of one node stay together.
+    `node` (n,): unknowns of one node stay together. The fronts come in so many parts that do not touch one another, of
+    about the same work, and in a last one, which all of them touch.
     """
     number, member, weight = np.unique(node, return_inverse=True, return_counts=True)
     entry = sp.coo_array(matrix)
@@ -45,15 +48,21 @@ def fronts_of(matrix: sp.csc_array, node: np.ndarray) -> tuple[np.ndarray, list[
     graph = sp.csr_array(sp.coo_array(links, shape=(len(number),) * 2))
     order = dissection(graph)
     groups = _groups(sp.csr_array(graph[order][:, order]), weight[order])
-    inner = np.concatenate([np.zeros(0, int), *(own for own, _ in groups)])
+    divided = _divided(groups, weight[order], parts)
+    inner = np.concatenate([np.zeros(0, int), *(groups[number][0] for part in divided for number in part)])
     order, place = order[inner], np.argsort(inner)
     weight = weight[order]
     start = np.cumsum(weight) - weight
-    fronts, stop = [], 0
-    for own, border in groups:
+    stop = 0
+
+    def front(number: int) -> Front:
+        nonlocal stop
+        own, border = groups[number]
         first, stop = stop, stop + int(weight[place[own]].sum())
         later = np.sort(place[border])
-        fronts.append(Front(first, stop, _spread(start[later], weight[later])))
+        return Front(first, stop, _spread(start[later], weight[later]))
+
+    fronts = [[front(number) for number in part] for part in divided]
     return np.argsort(np.argsort(order)[member], kind="stable"), fronts
 
 
@@ -154,6 +163,48 @@ def _groups(graph: sp.csr_array, weight: np.ndarray) -> list[tuple[np.ndarray, n
         if border:
             children[(border & -border).bit_length() - 1].append(last)
     return [(np.array(own), _nodes(border, count)) for own, border, _, _ in groups.values()]
+
+
+def _divided(groups: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, parts: int) -> list[list[int]]:
+    """Whole subtrees of groups in so many parts, and in a last one what is above them; each in its order.
+
+    The heaviest subtree is opened, its top left to the last part, as long as that shortens the whole: the last part and
+    the longest of the others, one after the other.
+    """
+    owner = np.zeros(len(weight), int)
+    for number, (own, _) in enumerate(groups):
+        owner[own] = number
+    entries = [float(weight[own].sum() * (0.5 * weight[own].sum() + weight[border].sum())) for own, border in groups]
+    below: list[list[int]] = [[] for _ in groups]
+    trees, whole = [], list(entries)
+    for number, (_, border) in enumerate(groups):
+        if len(border):
+            above = int(owner[border.min()])
+            below[above].append(number)
+            whole[above] += whole[number]
+        else:
+            trees.append(number)
+    shortest, best, top = np.inf, [], []
+    while trees and len(top) <= MOST_ABOVE:
+        trees.sort(key=lambda number: whole[number], reverse=True)
+        shares: list[list[int]] = [[] for _ in range(parts)]
+        loads = [0.0] * parts
+        for number in trees:
+            least = loads.index(min(loads))
+            shares[least].append(number)
+            loads[least] += whole[number]
+        length = max(loads) + sum(entries[number] for number in top)
+        if length < shortest:
+            shortest, best = length, [*shares, list(top)]
+        top.append(trees.pop(0))
+        trees += below[top[-1]]
+    if not best:
+        return [[] for _ in range(parts + 1)]
+
+    def subtree(number: int) -> list[int]:
+        return [number, *(lower for child in below[number] for lower in subtree(child))]
+
+    return [*(sorted(lower for number in share for lower in subtree(number)) for share in best[:-1]), sorted(best[-1])]
 
 
 def _bits(nodes: np.ndarray, count: int) -> int:

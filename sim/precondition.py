@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import scipy.sparse as sp
 
+from .accuracy import Precision
 from .constraint import Constraint
 from .device import Device
 from .discretisation import Discretisation
@@ -70,7 +71,7 @@ def name_of(preconditioner: Preconditioner) -> str:
 
 
 def rest_solver(problem: Problem) -> Preconditioner:
-    """The whole free rest stiffness, inverted or factorised.
+    """The whole free rest stiffness, inverted or factorised, in the problem's own precision.
 
     Raises
     ------
@@ -78,7 +79,8 @@ def rest_solver(problem: Problem) -> Preconditioner:
         It is singular.
     """
     basis = problem.constraint.basis()
-    return _direct(problem.rest_curvature(), basis, node_of(basis), problem.device)
+    device = problem.device
+    return _direct(problem.rest_curvature(), basis, node_of(basis), device, device.precision)
 
 
 def _on_corners(stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device) -> Lifted:
@@ -109,9 +111,11 @@ def _direct_pays(count: int, device: Device) -> bool:
     return fits(count, device)
 
 
-def _direct(stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device) -> Preconditioner:
+def _direct(
+    stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device, precision: Precision = "float32"
+) -> Preconditioner:
     if device.on_cuda and _direct_pays(len(node), device):
         from .dense import Dense
 
         return Dense(stiffness, motions, device)
-    return Factor(stiffness, motions, node, device)
+    return Factor(stiffness, motions, node, device, precision)

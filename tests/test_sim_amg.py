@@ -32,7 +32,7 @@ def too_large(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_symmetric_positive_and_close(kind: str, poisson: float) -> None:
     problem, preconditioner = built(kind, poisson, (3, 3, 4))
     K, M = matrices(problem, preconditioner)
-    assert np.abs(M - M.T).max() < 1e-11 * np.abs(M).max()
+    assert np.abs(M - M.T).max() < 1e-6 * np.abs(M).max()  # the coarsest factor is kept in single precision
     assert np.linalg.eigvalsh((M + M.T) / 2.0).min() > 0.0
     assert spread(K, M) < (12.0 if poisson == 0.3 else 150.0)
 

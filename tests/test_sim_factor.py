@@ -53,7 +53,7 @@ def applied(factor: Factor, r: np.ndarray, precision: Precision, live: np.ndarra
 @pytest.mark.usefixtures("order")
 def test_it_is_the_inverse_over_the_free_motions(precision: Precision) -> None:
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", precision))
+    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", precision), precision)
     L, r = motions.toarray(), np.random.default_rng(0).normal(size=(stiffness.shape[0], FEW + 2))
     expected = L @ np.linalg.solve(L.T @ stiffness @ L, L.T @ r)
     for columns in (1, FEW, FEW + 2):  # sweeps, and products of matrices
@@ -75,7 +75,7 @@ def test_it_is_symmetric_in_single_precision(columns: int) -> None:
 @pytest.mark.parametrize("count", [2, FEW + 3])
 def test_only_live_columns_are_solved(count: int) -> None:
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", "float64"))
+    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", "float64"), "float64")
     r = np.random.default_rng(2).normal(size=(stiffness.shape[0], count))
     live = np.arange(count) != 1
     found, whole = applied(factor, r, "float64", live), applied(factor, r, "float64")
@@ -83,12 +83,47 @@ def test_only_live_columns_are_solved(count: int) -> None:
     assert np.isfinite(found).all()
 
 
+@pytest.mark.parametrize("columns", [1, FEW + 1])
+def test_in_single_precision_it_solves_for_forces_of_any_size(columns: int) -> None:
+    """Under a solver in double precision; a column without forces stays so."""
+    stiffness, motions = system(sliding())
+    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", "float64"))
+    r = np.random.default_rng(4).normal(size=(stiffness.shape[0], columns)) * 10.0 ** (-60 * np.arange(1, columns + 1))
+    r[:, 1:2] = 0.0
+    found = motions.T @ stiffness @ applied(factor, r, "float64")
+    expected = motions.T @ r
+    assert (np.linalg.norm(found - expected, axis=0) <= 1e-5 * np.linalg.norm(expected, axis=0)).all()
+
+
+def test_in_single_precision_it_stays_positive_definite() -> None:
+    """Where single precision holds no inverse: springs between neighbours, ten thousand million times as stiff here."""
+    stiff = np.where(np.arange(299) % 3 == 0, 1e10, 1.0)
+    diagonal = np.append(stiff, 0.0) + np.append(1.0, stiff)
+    matrix = sp.csc_array(sp.diags_array([-stiff, diagonal, -stiff], offsets=[-1, 0, 1]))
+    factor = Factor(matrix, sp.csc_array(sp.eye_array(300)), np.arange(300), find_device("cpu", "float64"))
+    gram = applied(factor, np.eye(300), "float64")
+    assert np.linalg.eigvalsh(gram / np.abs(gram).max())[0] > -1e-7
+
+
+@pytest.mark.usefixtures("order")
+def test_parts_do_not_touch_one_another_and_share_the_work() -> None:
+    stiffness, motions = system(sliding())
+    free = sp.csc_array(motions.T @ stiffness @ motions)
+    _, (first, second, last) = fronts_of(free, node_of(motions), 2)
+    for front in first:
+        assert not ((front.border >= first[-1].stop) & (front.border < second[-1].stop)).any()
+    loads = [sum((front.stop - front.first) * len(front.rows) for front in part) for part in (first, second, last)]
+    assert min(loads[:2]) > 0.5 * max(loads[:2])
+    assert sum(loads) > 1.1 * (max(loads[:2]) + loads[2])
+
+
 @pytest.mark.usefixtures("order")
 def test_a_front_touches_later_unknowns_alone() -> None:
     """And every entry of the matrix lies within the front of its earlier unknown."""
     stiffness, motions = system(sliding())
     free = sp.csc_array(motions.T @ stiffness @ motions)
-    order, fronts = fronts_of(free, node_of(motions))
+    order, parts = fronts_of(free, node_of(motions), 2)
+    fronts = [front for part in parts for front in part]
     assert sorted(order) == list(range(free.shape[0]))
     assert len(fronts) > 4
     assert [front.first for front in fronts[1:]] == [front.stop for front in fronts[:-1]]
@@ -107,14 +142,14 @@ def test_dissection_leaves_little_fill() -> None:
     chain = sp.csr_array(sp.diags_array([np.ones(999), np.ones(999)], offsets=[-1, 1]).astype(np.int8))
     assert sorted(dissection(chain)) == list(range(1000))
     matrix = sp.csc_array(sp.diags_array([-np.ones(999), np.full(1000, 3.0), -np.ones(999)], offsets=[-1, 0, 1]))
-    _, fronts = fronts_of(matrix, np.arange(1000))
-    assert max(len(front.border) for front in fronts) <= 4
+    _, parts = fronts_of(matrix, np.arange(1000))
+    assert max(len(front.border) for part in parts for front in part) <= 4
 
 
 @pytest.mark.usefixtures("order")
 def test_pieces_that_do_not_touch_are_solved_together() -> None:
     matrix = sp.csc_array(sp.block_diag([np.array([[2.0, -1.0], [-1.0, 2.0]])] * 200))
-    factor = Factor(matrix, sp.csc_array(sp.eye_array(400)), np.arange(400), find_device("cpu", "float64"))
+    factor = Factor(matrix, sp.csc_array(sp.eye_array(400)), np.arange(400), find_device("cpu", "float64"), "float64")
     r = np.random.default_rng(3).normal(size=(400, 1))
     np.testing.assert_allclose(matrix @ applied(factor, r, "float64"), r, rtol=1e-12)
 

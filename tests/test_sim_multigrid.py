@@ -74,7 +74,7 @@ def test_symmetric_positive_and_close(kind: str, poisson: float) -> None:
     problem, preconditioner = built(kind, poisson, (2, 2, 3))
     assert isinstance(preconditioner, TwoLevel)
     K, M = matrices(problem, preconditioner)
-    assert np.abs(M - M.T).max() < 1e-12 * np.abs(M).max()
+    assert np.abs(M - M.T).max() < 1e-6 * np.abs(M).max()  # the coarse factor is kept in single precision
     assert np.linalg.eigvalsh((M + M.T) / 2.0).min() > 0.0
     _, jacobi = matrices(problem, BlockJacobi(problem.device))
     assert spread(K, M) < spread(K, jacobi) / 10.0
