@@ -18,9 +18,9 @@ from .linear import BlockJacobi, Preconditioner
 from .multigrid import Lifted, TwoLevel, over_free
 from .problem import Problem
 
-# On the CPU, above this many unknowns levels cost less than a factor. Of 17,000 nodes, levels against factor: 7.5 and
-# 11 s to set up, 30 and 18 ms to apply; of 49,000 nodes 22 and 57 s, 62 and 73 ms. CUDA inverts what fits.
-LARGEST_FACTOR = 75_000
+# On the CPU, above this many unknowns levels cost less than a factor. Of 17,000 nodes, levels against factor: 6.8 and
+# 7.1 s to set up, 16 and 11 ms to apply to one column, 51 and 83 ms to eight. CUDA inverts what fits.
+LARGEST_FACTOR = 50_000
 # Smoothed strains link the neighbours of neighbours: their own factor pays up to this many unknowns.
 LARGEST_SMOOTHED_FACTOR = 40_000
 
