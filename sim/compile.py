@@ -127,9 +127,9 @@ def _elasticity(effect: Elasticity, space: Discretisation, device: Device) -> li
         obeying = {label: material for label, material in materials.items() if material.law == name}
         chosen = np.isin(mesh.region, list(obeying))
         for part in space.parts(chosen):
-            tissues = [obeying[int(label)] for label in mesh.region[part.elements.owner]]
-            lame = np.array([portion(tissue, part.carries) for tissue in tissues])
-            coefficients = coefficients_of(tissues, part.carries)
+            tissues, which = list(obeying.values()), np.searchsorted(list(obeying), mesh.region[part.elements.owner])
+            lame = np.array([portion(tissue, part.carries) for tissue in tissues])[which]
+            coefficients = coefficients_of(tissues, part.carries)[which]
             term = f"elasticity {name}" if part.carries == "whole" else f"elasticity {name} of {part.carries}"
             terms.append(ElasticityTerm(term, law, part.elements, coefficients, lame, device))
     return terms

@@ -105,14 +105,18 @@ def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray) -> sp.c
 
 def _assembled(elements: Elements, part: np.ndarray, size: int, mu: np.ndarray, lam: np.ndarray) -> sp.csc_array:
     g, w = elements.gradient[part, :, :size], elements.weight[part]
-    dots = np.einsum("tq,tqai,tqbi->tab", w, g, g)
-    outer = np.einsum("tq,tqai,tqbj->taibj", w, g, g)
-    blocks = lam[:, None, None, None, None] * outer
-    blocks += mu[:, None, None, None, None] * (
-        np.einsum("tab,ij->taibj", dots, np.eye(3)) + outer.transpose(0, 1, 4, 3, 2)
-    )
-    table = elements.table[part, :size].astype(np.int32)
-    dof = (3 * table[:, :, None] + np.arange(3, dtype=np.int32)).reshape(len(part), 3 * size)
-    row = np.repeat(dof, 3 * size, axis=1).ravel()
-    column = np.tile(dof, (1, 3 * size)).ravel()
-    return sp.csc_array(sp.coo_array((blocks.ravel(), (row, column)), shape=(3 * elements.nodes,) * 2))
+    slopes = g.reshape(len(part), -1, 3 * size)
+    outer = (np.swapaxes(slopes * w[:, :, None], 1, 2) @ slopes).reshape(len(part), size, 3, size, 3)
+    outer = outer.transpose(0, 1, 3, 2, 4)  # g_a (x) g_b as blocks (T, a, b, 3, 3)
+    blocks = lam[:, None, None, None, None] * outer + mu[:, None, None, None, None] * np.swapaxes(outer, 3, 4)
+    dots = mu[:, None, None] * np.trace(outer, axis1=3, axis2=4)
+    for i in range(3):
+        blocks[..., i, i] += dots
+    table = elements.table[part, :size].astype(np.int64)
+    pair = (table[:, :, None] * elements.nodes + table[:, None, :]).ravel()
+    order = np.argsort(pair, kind="stable")
+    first = np.flatnonzero(np.diff(pair[order], prepend=-1))
+    row, column = np.divmod(pair[order[first]], elements.nodes)
+    summed = np.add.reduceat(blocks.reshape(-1, 9)[order], first, axis=0).reshape(-1, 3, 3)
+    start = np.searchsorted(row, np.arange(elements.nodes + 1))
+    return sp.csc_array(sp.bsr_array((summed, column, start), shape=(3 * elements.nodes,) * 2).tocsr().T)  # symmetric

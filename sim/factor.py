@@ -22,7 +22,7 @@ from .accuracy import Precision
 from .device import Device
 from .fronts import Front, fronts_of
 from .problem import Problem
-from .sweep import Sweep
+from .sweep import Sweep, add_lower
 from .together import cores, together
 
 potrf, trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
@@ -178,8 +178,7 @@ class _Elimination:
             front, size = panel.front, len(panel.values)
             whole = self._rows(front)
             for border, update in updates.pop(number, ()):
-                place = np.searchsorted(front.rows, border)
-                whole[np.ix_(place, place)] += update
+                add_lower(update, np.searchsorted(front.rows, border), whole)
             root, info = potrf(whole[:size, :size], lower=1)
             if info or (np.diagonal(root) ** 2 <= SINGULAR * self._diagonal[front.first : front.stop]).any():
                 raise RuntimeError("it is not positive definite")

@@ -117,6 +117,39 @@ def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
     return up, down
 
 
+ADD = """
+    for (int j = 0; j < place.shape[0]; ++j) {
+        double* to = whole.data + (size_t)place.data[j] * whole.shape[1];
+        const double* from = part.data + (size_t)j * part.shape[1];
+        for (int i = j; i < place.shape[0]; ++i) to[place.data[i]] += from[i];
+    }
+"""
+
+
+@wp.func_native(ADD)
+def _add(part: wp.array2d(dtype=wp.float64), place: wp.array(dtype=wp.int64), whole: wp.array2d(dtype=wp.float64)): ...
+
+
+@wp.kernel(module="unique")
+def _add_part(
+    part: wp.array2d(dtype=wp.float64),
+    place: wp.array(dtype=wp.int64),
+    # outputs
+    whole: wp.array2d(dtype=wp.float64),
+):
+    """Both are transposed: columns lie in one piece."""
+    _add(part, place, whole)
+
+
+def add_lower(part: np.ndarray, place: np.ndarray, whole: np.ndarray) -> None:
+    """Add the lower half of `part` (m, m) to rows and columns `place` (m,), ascending, of `whole`; both by columns.
+
+    NumPy takes ten times as long for it.
+    """
+    views = [wp.array(array, device="cpu", copy=False) for array in (part.T, place, whole.T)]
+    Device("cpu", "float64").launch(_add_part, (1,), views[:2], views[2:])
+
+
 class Sweep:
     """The fronts of a factor, part by part, and the values of its panels, one after the other.
 
