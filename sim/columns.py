@@ -19,6 +19,7 @@ class Kernels:
 
     dot: wp.Kernel
     combine: wp.Kernel
+    add_multiple: wp.Kernel
     unstack: wp.Kernel
 
 
@@ -55,6 +56,18 @@ def kernels_of(device: Device) -> Kernels:
         out[r, c] = x[r, c] + factor[c] * y[r, c]
 
     @wp.kernel(module="unique")
+    def add_multiple(
+        x: wp.array2d(dtype=scalar),
+        factor: scalar,
+        y: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out = x + factor y."""
+        r, c = wp.tid()
+        out[r, c] = x[r, c] + factor * y[r, c]
+
+    @wp.kernel(module="unique")
     def unstack(
         x: wp.array2d(dtype=scalar),
         nodes: wp.array(dtype=wp.int32),
@@ -66,7 +79,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             out[c, n, k] = wp.float64(x[3 * nodes[n] + k, c])
 
-    return Kernels(dot, combine, unstack)
+    return Kernels(dot, combine, add_multiple, unstack)
 
 
 @cache
@@ -115,16 +128,21 @@ def norms(device: Device, x: wp.array) -> np.ndarray:
     return np.sqrt(dots(device, x, x))
 
 
-def combined(device: Device, x: wp.array, factor: np.ndarray, y: wp.array, out: wp.array) -> wp.array:
-    """out = x + factor y column by column; factor (b,) from the host; out may be x."""
-    device.launch(kernels_of(device).combine, x.shape, [x, device.array(factor), y], [out])
+def combined(device: Device, x: wp.array, factor: np.ndarray | float, y: wp.array, out: wp.array) -> wp.array:
+    """out = x + factor y; factor (b,) from the host, or one for all columns; out may be x."""
+    kernels = kernels_of(device)
+    if isinstance(factor, (int, float)):
+        device.launch(kernels.add_multiple, x.shape, [x, factor, y], [out])
+    else:
+        device.launch(kernels.combine, x.shape, [x, device.array(factor), y], [out])
     return out
 
 
-def gathered(device: Device, x: wp.array, columns: np.ndarray | wp.array) -> wp.array:
-    """A copy (..., k) of some columns (k,) of x (..., b)."""
+def gathered(device: Device, x: wp.array, columns: np.ndarray | wp.array, out: wp.array | None = None) -> wp.array:
+    """A copy (..., k) of some columns (k,) of x (..., b); in `out`, if it is given."""
     index = _index(device, columns)
-    out = wp.empty((*x.shape[:-1], len(index)), dtype=x.dtype, device=device.name)
+    if out is None:
+        out = wp.empty((*x.shape[:-1], len(index)), dtype=x.dtype, device=device.name)
     gather, _ = moving_kernels_of(x.dtype)
     device.launch(gather, _flat(out).shape, [_flat(x), index], [_flat(out)])
     return out

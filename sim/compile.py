@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import warp as wp
 
 from .anatomy import Anatomy
 from .constraint import Constraint
@@ -106,8 +108,45 @@ def _impose(space: Discretisation, skin: Skin, loads: Loads) -> Imposed:
     return Imposed(value, weight.toarray().T, displaced.displacement.T)
 
 
-def _elasticity(effect: Elasticity, space: Discretisation, device: Device) -> list[Term]:
-    """One term for each law and kind of element, over the elements of all regions that obey it."""
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A problem on some of a body's nodes, and what puts a force (3n, b) [N] on it, or none."""
+
+    problem: Problem
+    put: Callable[[wp.array | None], None]
+
+
+def compile_part(
+    effects: Iterable[Effect], space: Discretisation, whole: Problem, chosen: np.ndarray, nodes: np.ndarray
+) -> Problem:
+    """What resists deformation in the `chosen` (T,) bool tetrahedra alone, posed on their `nodes` (n,), ascending."""
+    effect = next(effect for effect in effects if isinstance(effect, Elasticity))
+    constraint = Constraint(whole.constraint.held[nodes], whole.constraint.normal[nodes], whole.device)
+    return Problem(tuple(_elasticity(effect, space, whole.device, chosen, nodes)), constraint, whole.device)
+
+
+def surrounded(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> Part:
+    """A part and a stiffness (m, m) [N/m] around it, which its rows (m,) of 3n touch."""
+    from .terms.dead_force import DeadForce, Forces
+    from .terms.exterior import Exterior
+
+    device = part.device
+    load, nodes = DeadForce("load", lambda _: None, device), device.array(np.arange(part.rows // 3), wp.int32)
+    problem = replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, device), load))
+    return Part(problem, lambda force: load.take(None if force is None else Forces(nodes, force)))
+
+
+def _elasticity(
+    effect: Elasticity,
+    space: Discretisation,
+    device: Device,
+    within: np.ndarray | None = None,
+    nodes: np.ndarray | None = None,
+) -> list[Term]:
+    """One term for each law and kind of element, over the elements of all regions that obey it.
+
+    `within` (T,) bool: of these tetrahedra alone, posed on their own nodes (n,).
+    """
     from .terms.elasticity import Elasticity as ElasticityTerm
 
     mesh = space.mesh
@@ -126,10 +165,15 @@ def _elasticity(effect: Elasticity, space: Discretisation, device: Device) -> li
         law = importlib.import_module(f".terms.{name.replace('-', '_')}", __package__).LAW
         obeying = {label: material for label, material in materials.items() if material.law == name}
         chosen = np.isin(mesh.region, list(obeying))
+        if within is not None:
+            chosen &= within
+        if not chosen.any():
+            continue
         for part in space.parts(chosen):
             tissues, which = list(obeying.values()), np.searchsorted(list(obeying), mesh.region[part.elements.owner])
             lame = np.array([portion(tissue, part.carries) for tissue in tissues])[which]
             coefficients = coefficients_of(tissues, part.carries)[which]
             term = f"elasticity {name}" if part.carries == "whole" else f"elasticity {name} of {part.carries}"
-            terms.append(ElasticityTerm(term, law, part.elements, coefficients, lame, device))
+            elements = part.elements if nodes is None else part.elements.on(nodes)
+            terms.append(ElasticityTerm(term, law, elements, coefficients, lame, device))
     return terms

@@ -188,11 +188,11 @@ class Constraint:
         inputs = [self._held, self._normal, self._drag, value, u]
         self.device.launch(kernels_of(self.device).close, (len(self.held), u.shape[1]), inputs, [gap])
         if self._weight is not None:
-            one, rest = np.ones(u.shape[1]), self.device.zeros(*u.shape)
+            rest = self.device.zeros(*u.shape)
             reached = self._average(u) + self._average(gap)
             self._spread(self._target - reached, rest)
             self.project_nodes(rest)
-            combined(self.device, gap, one, rest, gap)
+            combined(self.device, gap, 1.0, rest, gap)
         return gap, np.abs(gap.numpy()).max(axis=0, initial=0.0)
 
     def force_on_footprint(self, gradient: wp.array) -> np.ndarray | None:

@@ -152,12 +152,12 @@ class Dense:
         device.launch(raise_, (-(-r.shape[0] // SOME), count), inputs, [out])
 
     def _room(self, count: int) -> Buffers:
-        """For batches of one width; that of the last one is kept, as captured graphs know it."""
+        """For batches of one width; kept, as captured graphs know them."""
         if count not in self._rooms:
             low, name = LOW[self._device.precision], self._device.name
             shape = (self._size, -(-count // TILE) * TILE if count > 1 else 1)
             right, solved = (wp.zeros(shape, dtype=low, device=name) for _ in range(2))
-            self._rooms = {count: Buffers(right, solved, wp.zeros(count, dtype=wp.float64, device=name))}
+            self._rooms[count] = Buffers(right, solved, wp.zeros(count, dtype=wp.float64, device=name))
         return self._rooms[count]
 
 

@@ -98,16 +98,15 @@ class NewtonCG:
 def right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None) -> tuple[wp.array, np.ndarray]:
     """-P (g + K gap) (3N, b) [N] at the last linearisation, and which columns (b,) have a gap to close."""
     device, columns = problem.device, g.shape[1]
-    minus = np.full(columns, -1.0)
-    rhs = combined(device, device.zeros(*g.shape), minus, g, wp.empty_like(g))
+    rhs = combined(device, device.zeros(*g.shape), -1.0, g, wp.empty_like(g))
     if gap is None:
         return rhs, np.zeros(columns, bool)
     pull = device.zeros(*g.shape)
     problem.add_curvature(gap, pull)
     problem.constraint.project(pull)
-    return combined(device, rhs, minus, pull, rhs), norms(device, gap) > 0.0
+    return combined(device, rhs, -1.0, pull, rhs), norms(device, gap) > 0.0
 
 
 def closing(device: Device, x: wp.array, gap: wp.array | None) -> wp.array:
     """x (3N, b) and, if any, the motion that closes the constraints, in place."""
-    return x if gap is None else combined(device, x, np.ones(x.shape[1]), gap, x)
+    return x if gap is None else combined(device, x, 1.0, gap, x)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -34,6 +34,10 @@ class Elements:
     nodes: int
     owner: np.ndarray
     size: np.ndarray | None = None
+
+    def on(self, nodes: np.ndarray) -> Elements:
+        """The same elements, of a body that has these nodes (n,) alone, ascending: theirs among them."""
+        return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), nodes=len(nodes))
 
 
 def linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:

@@ -16,6 +16,7 @@ from .deformation import Cost, Deformation
 from .device import find_device
 from .discretisation import discretise
 from .effects import Effect
+from .elimination import eliminating
 from .errors import InputError
 from .footprint import Skin
 from .inversion import Inversion
@@ -23,6 +24,7 @@ from .ladder import Ladder, shortfall
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
 from .memory import check_fits, fitting_batch
 from .precondition import choose_preconditioner, name_of
+from .problem import Problem
 from .term import Cases
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
@@ -67,11 +69,19 @@ class Fem:
         self.accuracy = accuracy
         self.space = discretise(anatomy.mesh, element)
         self._skin = Skin(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
-        self.problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
-        self.batch = fitting_batch(self.problem.rows, self.problem.device) if batch is None else batch
-        preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed)
+        problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
+        self.batch = fitting_batch(problem.rows, problem.device) if batch is None else batch
+        preconditioner = choose_preconditioner(problem, self.space, self._unsmoothed)
         self.preconditioner = name_of(preconditioner)
-        self._ladder = Ladder(preconditioner, Inversion(self.space, self.problem.device), accuracy)
+        near = None
+        if problem.device.on_cuda and self.preconditioner == "dense inverse":
+            near = eliminating(problem, preconditioner, self.effects, self.space)
+        self._ladder = Ladder(problem, preconditioner, Inversion(self.space, problem.device), accuracy, near)
+
+    @property
+    def problem(self) -> Problem:
+        """What is minimised."""
+        return self._ladder.problem
 
     @property
     def anatomy(self) -> Anatomy:
@@ -110,7 +120,7 @@ class Fem:
     def _unsmoothed(self) -> sp.csc_array:
         """Rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh."""
         linear = discretise(self._anatomy.mesh, "p1")
-        return compile_problem(self.effects, self._anatomy, self.problem.device, linear).rest_curvature()
+        return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature()
 
     def residual(self, loads: Loads, answer: Deformation) -> np.ndarray:
         """The relative residual (B,), in this solver's precision, of somebody's answers at every vertex.
@@ -142,7 +152,7 @@ class Fem:
 
     def _solve(self, cases: Cases, guess: np.ndarray | None, at: np.ndarray | None) -> Deformation:
         clock = time.perf_counter()
-        found = self._ladder.climb(self.problem, cases, guess)
+        found = self._ladder.climb(cases, guess)
         solved = time.perf_counter()
         self.problem.begin(cases)
         history = {**self.problem.end(found.u), **found.learnt}

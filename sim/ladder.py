@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
@@ -14,8 +15,9 @@ from .columns import gathered, scattered
 from .deformation import Outcome
 from .device import Device
 from .direction import NewtonCG
+from .elimination import Elimination
 from .inversion import Inversion
-from .lbfgs import LEARNT, descend
+from .lbfgs import LEARNT, TAUGHT, Lbfgs
 from .linear import Preconditioner
 from .newton import find_equilibrium
 from .problem import Problem
@@ -71,82 +73,99 @@ class Answer:
 class Ladder:
     """The rungs: each takes what the one before it did not bring to equilibrium.
 
+    problem
+        What the cases are posed on.
     preconditioner
         Of the problem: L-BFGS starts from it, Newton's linear systems are solved with it.
     inversion
         Of the discretisation that the problem is posed on.
     accuracy
         Tolerance and budgets.
+    near
+        Of the same problem; None: nothing is eliminated.
     """
 
+    problem: Problem
     preconditioner: Preconditioner
     inversion: Inversion
     accuracy: Accuracy
+    near: Elimination | None = None
 
-    def climb(self, problem: Problem, cases: Cases, guess: np.ndarray | None) -> Answer:
+    @cached_property
+    def _lbfgs(self) -> Lbfgs:
+        return Lbfgs(self.problem, self.preconditioner)
+
+    def climb(self, cases: Cases, guess: np.ndarray | None) -> Answer:
         """The equilibria of B cases, from guess (3N, B) [m]; from rest without one.
 
         A start that lies inside out is left alone, and so is a state that does to which a start led: a body turned
         over or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing.
         """
-        device, count = problem.device, len(cases.loads)
+        problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
         if guess is None:
-            answer, astray = self._whole(problem, cases), np.zeros(count, bool)
+            answer, astray = self._whole(cases), np.zeros(count, bool)
         else:
             started = guess.any(axis=0)
             astray = started & (self.inversion.count(device.array(guess)) > 0)
             learnt = NOTHING if astray.any() else _learnt(cases, problem.rows)
-            answer = self._whole(problem, cases, device.array(np.where(astray, 0.0, guess)), learnt)
+            answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
             lost = np.where(answer.good, answer.inverted > 0, self._lost(answer))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
                 some = cases.rows(again)
                 problem.begin(some)
-                answer.put(again, self._whole(problem, some), device)
+                answer.put(again, self._whole(some), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
         lost = np.flatnonzero(self._lost(answer))
         if len(lost):
-            answer.put(lost, self._in_steps(problem, cases.rows(lost), answer, lost), device)
+            answer.put(lost, self._in_steps(cases.rows(lost), answer, lost), device)
         return answer
 
     def _lost(self, answer: Answer) -> np.ndarray:
         """Which cases (B,) another rung may save: at round-off none is nearer to equilibrium."""
         return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
-    def _whole(
-        self, problem: Problem, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] = NOTHING
-    ) -> Answer:
+    def _whole(self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] = NOTHING) -> Answer:
         """The whole load at once, of a batch that has begun: L-BFGS, and Newton from where that ended.
 
         From rest without a start; `learnt` on the way to it, if anything was.
 
         Motions that are imposed are left to Newton: it knows how the free nodes follow them.
         """
-        device, count = problem.device, len(cases.loads)
+        problem, device, count = self.problem, self.problem.device, len(cases.loads)
         most = QUICK_ON_CUDA if device.on_cuda else QUICK
         # Rest satisfies whatever the batch does not move.
         imposed = problem.constraint.imposes or (start is not None and problem.gap(start)[1].any())
         start = device.zeros(problem.rows, count) if start is None else start
         if imposed or self.accuracy.outer < FEWEST:
-            return self._thorough(problem, start, self.accuracy.outer)
-        tolerance = np.full(count, self.accuracy.tolerance)
-        found = descend(problem, self.preconditioner, start, tolerance, most, learnt)
-        outcome = np.full(count, Outcome.BUDGET, object)
-        outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
-        answer = self._answer(found.u, outcome, found.steps, found.residual, 0)
-        answer = replace(answer, learnt={LEARNT_KEY + name: array for name, array in found.learnt.items()})
-        if len(found.left):
-            problem.begin(cases.rows(found.left))
-            some = gathered(device, found.u, found.left)
-            answer.put(found.left, self._thorough(problem, some, self.accuracy.outer), device)
-        return answer
+            return self._thorough(start, self.accuracy.outer)
+        descents: list[Elimination | Lbfgs] = [self._lbfgs]
+        if self.near is not None and count > TAUGHT:
+            descents.insert(0, self.near)
+        index, never = np.arange(count), np.full(count, np.inf)
+        answer = self._answer(wp.clone(start), np.full(count, Outcome.BUDGET, object), np.zeros(count, int), never, 0)
+        taught: Mapping[str, np.ndarray] = {}
+        for descent in descents:
+            found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), most, learnt)
+            outcome = np.full(len(index), Outcome.BUDGET, object)
+            outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
+            answer.put(index, self._answer(found.u, outcome, found.steps, found.residual, 0), device)
+            taught = {LEARNT_KEY + name: array for name, array in found.learnt.items()}
+            index = index[found.left]
+            if len(index) == 0:
+                break
+            problem.begin(cases.rows(index))
+            start, learnt = gathered(device, found.u, found.left), {}
+        else:
+            answer.put(index, self._thorough(start, self.accuracy.outer), device)
+        return replace(answer, learnt=taught)
 
-    def _thorough(self, problem: Problem, start: wp.array, outer: int) -> Answer:
+    def _thorough(self, start: wp.array, outer: int) -> Answer:
         """Newton, in at most so many outer steps, of a batch that has begun."""
         newton = NewtonCG(self.preconditioner, self.accuracy.inner)
-        found = find_equilibrium(problem, newton, start, replace(self.accuracy, outer=outer))
+        found = find_equilibrium(self.problem, newton, start, replace(self.accuracy, outer=outer))
         return self._answer(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
 
     def _answer(
@@ -155,12 +174,12 @@ class Ladder:
         reached = np.array([ended.good for ended in outcome], float)
         return Answer(u, outcome, steps, residual, reached, self.inversion.count(u), linear_iterations)
 
-    def _in_steps(self, problem: Problem, cases: Cases, failed: Answer, index: np.ndarray) -> Answer:
+    def _in_steps(self, cases: Cases, failed: Answer, index: np.ndarray) -> Answer:
         """From rest, the load raised in steps that grow and shrink; the equilibrium under the largest share found.
 
         Of cases that are the rows `index` (k,) of what failed; where no share is found that stands.
         """
-        device, count = problem.device, len(index)
+        problem, device, count = self.problem, self.problem.device, len(index)
         u, step, spent = device.zeros(problem.rows, count), np.full(count, FIRST_STEP), 0
         reached, iterations, residual = np.zeros(count), np.zeros(count, int), failed.residual[index]
         for _ in range(self.accuracy.steps):
@@ -170,7 +189,7 @@ class Ladder:
             aim = np.minimum(reached[live] + step[live], 1.0)
             part = cases.rows(live)
             problem.begin(replace(part, loads=part.loads.scaled(aim)))
-            found = self._thorough(problem, gathered(device, u, live), min(MOST_STEP_OUTER, self.accuracy.outer))
+            found = self._thorough(gathered(device, u, live), min(MOST_STEP_OUTER, self.accuracy.outer))
             good, spent = found.good, spent + found.linear_iterations
             iterations[live] += found.iterations
             step[live] *= np.where(good, np.clip(STEP_OUTER / np.maximum(found.iterations, 1), 0.5, 2.0), CUT)

@@ -22,7 +22,10 @@ class Preconditioner(Protocol):
 
     @property
     def on_device(self) -> bool:
-        """Whether `apply` only launches work on the device, whatever is `live`: a graphics card replays it."""
+        """Whether `apply` only launches work on the device, for batches of one width always in the same arrays.
+
+        A graphics card replays it, whatever is `live`.
+        """
         ...
 
     def prepare(self, problem: Problem, columns: int) -> None:
@@ -74,7 +77,7 @@ def block_kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
 class BlockJacobi:
     """The 3 x 3 diagonal blocks of the current curvature, inverted: for meshes too large to factorise."""
 
-    on_device = True
+    on_device = False
 
     def __init__(self, device: Device):
         self._device = device

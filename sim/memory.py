@@ -10,10 +10,10 @@ import warp as wp
 from .device import Device
 from .errors import InputError
 
-# Columns of the solver at its widest: pairs of L-BFGS, vectors of conjugate gradients, trials of the line search.
-WORK_COLUMNS = 40
+# Columns of the solver at its widest: pairs of L-BFGS, those that move elsewhere, vectors of the elimination around it.
+WORK_COLUMNS = 60
 # Load cases that are worth solving together: more fill the processor no better.
-WIDEST, WIDEST_ON_CUDA = 64, 4096
+WIDEST, WIDEST_ON_CUDA = 64, 16384
 # Copies of the answer on the host while batches are joined, in double precision.
 ANSWER_COPIES = 3
 # Of what is free, this share may be used: other programs live too.

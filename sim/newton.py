@@ -106,4 +106,4 @@ def round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
     sign = np.random.default_rng(0).choice([-1.0, 1.0], (len(values), 1))
     near = problem.gradient(device.array(values * (1.0 + sign * np.finfo(device.precision).eps)))
     problem.constraint.project(near)
-    return norms(device, combined(device, near, np.full(g.shape[1], -1.0), g, near))
+    return norms(device, combined(device, near, -1.0, g, near))

@@ -80,7 +80,7 @@ def rest_solver(problem: Problem) -> Preconditioner:
     """
     basis = problem.constraint.basis()
     device = problem.device
-    return _direct(problem.rest_curvature(), basis, node_of(basis), device, device.precision)
+    return direct(problem.rest_curvature(), basis, node_of(basis), device, device.precision)
 
 
 def _on_corners(stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device) -> Lifted:
@@ -96,11 +96,11 @@ def _solver(stiffness: sp.csc_array, constraint: Constraint, points: np.ndarray,
     """K (3N, 3N) over what is free of nodes at points (N, 3): inverted or factorised where that pays."""
     basis = constraint.basis()
     if _direct_pays(len(basis.indptr) - 1, device):
-        return _direct(stiffness, basis, node_of(basis), device)
+        return direct(stiffness, basis, node_of(basis), device)
     from .amg import algebraic, rigid_motions
 
     motions = basis @ (basis.T @ rigid_motions(points))
-    return algebraic(over_free(stiffness, constraint), motions, partial(_direct, device=device), device)
+    return algebraic(over_free(stiffness, constraint), motions, partial(direct, device=device), device)
 
 
 def _direct_pays(count: int, device: Device) -> bool:
@@ -111,9 +111,18 @@ def _direct_pays(count: int, device: Device) -> bool:
     return fits(count, device)
 
 
-def _direct(
+def direct(
     stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device, precision: Precision = "float32"
 ) -> Preconditioner:
+    """K (3N, 3N) over some motions (3N, n), each of one `node` (n,): inverted where that fits, else factorised.
+
+    A factor is kept in `precision`.
+
+    Raises
+    ------
+    RuntimeError
+        It is singular.
+    """
     if device.on_cuda and _direct_pays(len(node), device):
         from .dense import Dense
 

@@ -94,7 +94,7 @@ class Problem:
             own = self.device.zeros(*u.shape)
             term.add_gradient(u, own)
             scale = np.maximum(scale, norms(self.device, own))
-            combined(self.device, total, np.ones(u.shape[1]), own, total)
+            combined(self.device, total, 1.0, own, total)
         whole = norms(self.device, total)
         self.constraint.project(total)
         free = norms(self.device, total)

@@ -15,14 +15,15 @@ from .device import Device
 
 LIVE, DONE, LEFT, BROKEN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 """What a column is: on its way, in equilibrium, not brought farther here, never finite."""
+# Pairs that each column keeps.
+PAIRS = 8
 # The slope ahead may rise to this share of the promised decrease: a step that overshoots more is cut.
 OVERSHOOT = 0.5
 # A cut keeps at least and at most this share of a step; one that left the numbers keeps the middle share.
 LEAST_KEPT, KEPT, MOST_KEPT = 0.1, 0.25, 0.7
 CUTS = 12
-# Rows, or nodes, that one thread takes, so that what it must know of their column is read once; where it keeps more of
-# each row, fewer.
-SOME, FEW = 16, 4
+# Rows, or nodes, that one thread takes, so that what it must know of their column is read once.
+SOME = 16
 # A pair along which the gradient hardly changes, or against the step, says nothing of a positive definite curvature.
 LEAST_CURVATURE = 1e-3
 # Rows of sums that one evaluation gives each column.
@@ -47,12 +48,18 @@ class Kernels:
     clamp: wp.Kernel
 
 
+def few_of(device: Device) -> int:
+    """Rows that one thread takes where it keeps much of each."""
+    return 1 if device.on_cuda else 4
+
+
 @cache
 def kernels_of(device: Device, pairs: int) -> Kernels:
     """Kernels of a device's scalar type for columns that keep so many pairs."""
     scalar, vec = device.scalar, device.vector
-    several, few_scalars = (wp.types.vector(length=length, dtype=scalar) for length in (SOME, FEW))
-    m, chunk, some, few = pairs, CHUNK, SOME, FEW
+    several, few_scalars = (wp.types.vector(length=length, dtype=scalar) for length in (SOME, few_of(device)))
+    weights = wp.types.vector(length=pairs, dtype=wp.float64)
+    m, chunk, some, few = pairs, CHUNK, SOME, few_of(device)
     overshoot, least_kept, kept, most_kept = OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT
     cuts, least_curvature = CUTS, LEAST_CURVATURE
     own_row, whole_row, free_row, slope_row = OWN, WHOLE, FREE, SLOPE
@@ -159,9 +166,10 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
 
     @wp.kernel(module="unique")
     def judge(
-        loudest: wp.array(dtype=wp.float64),
+        loud: wp.array2d(dtype=wp.float64),
         own: wp.array2d(dtype=wp.float64),
         tolerance: wp.array(dtype=wp.float64),
+        force: wp.array(dtype=wp.float64),
         sums: wp.array2d(dtype=wp.float64),
         promised: wp.array(dtype=wp.float64),
         # outputs
@@ -183,13 +191,15 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         scale = wp.max(whole - free, zero)  # the projection is orthogonal
         for k in range(own.shape[0]):
             scale = wp.max(scale, own[k, c])
-        scale = wp.max(loudest[c], wp.sqrt(scale))
+        for k in range(loud.shape[0]):
+            scale = wp.max(scale, loud[k, c])
         finite = wp.isfinite(free) and wp.isfinite(slope)
         relative = wp.sqrt(free)
+        small = relative <= force[c]
         if scale > zero:
-            relative = relative / scale
+            relative = relative / wp.sqrt(scale)
         first = promised[c] == wp.float64(wp.inf)
-        done = finite and relative <= tolerance[c]
+        done = finite and (small or relative <= tolerance[c])
         if done or (finite and slope <= wp.float64(overshoot) * promised[c]):
             accepted[c] = 1
             gone[c] = t[c]
@@ -229,8 +239,8 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         wg: wp.array2d(dtype=wp.float64),
         sy: wp.array3d(dtype=wp.float64),
         yw: wp.array3d(dtype=wp.float64),
-        along_s: wp.array2d(dtype=wp.float64),
-        along_w: wp.array2d(dtype=wp.float64),
+        along_s: wp.array2d(dtype=scalar),
+        along_w: wp.array2d(dtype=scalar),
     ):
         """Take the pair of the accepted step in, and weigh the pairs: d = -M^-1 g + sum of (a_i s_i + b_i w_i).
 
@@ -258,19 +268,19 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             known[c] = wp.min(known[c] + 1, m)
             slot[c] = n
         size = known[c]
+        # In registers: every number here waits for the one before it.
+        by_s, by_w = weights(), weights()
         for i in range(m):
             sg[i, c] = wp.where(i == n, gone[c] * slope, products[i, c])
             wg[i, c] = wp.where(i == n, gz - products[gold_row, c], products[m + i, c])
-            along_s[i, c] = zero
-            along_w[i, c] = zero
         for a in range(m):  # from the newest pair to the oldest
             if a < size:
                 i = (head[c] - a + m) % m
                 value = sg[i, c]
                 for b in range(a):
                     j = (head[c] - b + m) % m
-                    value -= along_w[j, c] * sy[i, j, c]
-                along_w[i, c] = value / sy[i, i, c]
+                    value -= by_w[j] * sy[i, j, c]
+                by_w[i] = value / sy[i, i, c]
         for k in range(m):  # and back
             a = m - 1 - k
             if a < size:
@@ -279,20 +289,21 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
                 for b in range(m):
                     if b < size:
                         j = (head[c] - b + m) % m
-                        value -= along_w[j, c] * yw[i, j, c]
+                        value -= by_w[j] * yw[i, j, c]
                         if b > a:
-                            value -= along_s[j, c] * sy[j, i, c]
-                along_s[i, c] = value / sy[i, i, c] - along_w[i, c]
+                            value -= by_s[j] * sy[j, i, c]
+                by_s[i] = value / sy[i, i, c] - by_w[i]
         decrease = gz
         for i in range(m):
-            decrease -= along_w[i, c] * wg[i, c] + along_s[i, c] * sg[i, c]
+            decrease -= by_w[i] * wg[i, c] + by_s[i] * sg[i, c]
         if not decrease > zero:  # round-off: begin anew
             decrease = gz
             known[c] = 0
             head[c] = m - 1
-            for i in range(m):
-                along_s[i, c] = zero
-                along_w[i, c] = zero
+            by_s, by_w = weights(), weights()
+        for i in range(m):
+            along_s[i, c] = scalar(by_s[i])
+            along_w[i, c] = scalar(by_w[i])
         promised[c] = decrease
         t[c] = wp.float64(1.0)
         if not (decrease > zero and wp.isfinite(decrease)):
@@ -306,8 +317,8 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         known: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
         gone: wp.array(dtype=wp.float64),
-        along_s: wp.array2d(dtype=wp.float64),
-        along_w: wp.array2d(dtype=wp.float64),
+        along_s: wp.array2d(dtype=scalar),
+        along_w: wp.array2d(dtype=scalar),
         new_g: wp.array2d(dtype=scalar),
         new_z: wp.array2d(dtype=scalar),
         # outputs
@@ -331,11 +342,12 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             if n >= 0:
                 s[n, r, c] = step[k]
                 w[n, r, c] = new_z[r, c] - z[r, c]
-        for i in range(known[c]):
-            of_s, of_w = scalar(along_s[i, c]), scalar(along_w[i, c])
-            for k in range(few):
-                r = wp.min(few * block + k, last)
-                direction[k] += of_w * w[i, r, c] + of_s * s[i, r, c]
+        size = known[c]
+        for i in range(m):  # unrolled: addresses cost more than numbers
+            if i < size:
+                for k in range(few):
+                    r = wp.min(few * block + k, last)
+                    direction[k] += along_w[i, c] * w[i, r, c] + along_s[i, c] * s[i, r, c]
         live = status[c] == LIVE
         for k in range(few):
             r = few * block + k

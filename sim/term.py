@@ -62,7 +62,8 @@ class Term(Protocol):
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         """Add the energy's gradient [N] at u (3N, b) to out (3N, b); not finite outside the domain.
 
-        On the device alone, if it is not `constant`: a graphics card replays it.
+        If it is not `constant`: on the device alone, for batches of one width always in the same arrays, as a graphics
+        card replays it.
         """
         ...
 

@@ -16,16 +16,16 @@ HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
 """Each room and the rooms that it may import."""
 TIERS = (
-    {"device", "columns", "sparse", "sweep", "term", "constraint", "footprint"},
+    {"device", "columns", "rows", "product", "sparse", "sweep", "term", "constraint", "footprint"},
     {"terms", "problem"},
     {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering"},
-    {"newton", "lbfgs", "multigrid", "amg", "inversion"},
-    {"precondition", "ladder"},
+    {"newton", "balance", "room", "lbfgs", "multigrid", "amg", "inversion"},
+    {"precondition", "condensation", "elimination", "ladder"},
     {"fem"},
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""
 OWNERS = {
-    "torch": {"sim/dense.py", "surrogate/ann.py"},
+    "torch": {"sim/dense.py", "sim/product.py", "surrogate/ann.py"},
     "sklearn": {"surrogate/svr.py"},
     "trimesh": {"scenes/play.py", "scenes/site.py", "scenes/tool.py"},
     "meshio": {"sim/meshfile.py"},

@@ -7,12 +7,15 @@ import pytest
 import warp as wp
 from oracle import EVERY_LAW, tissue
 
+from scenes.shipped import template_path
 from sim.accuracy import TRAIN, Accuracy
 from sim.discretisation import ELEMENTS
 from sim.effects import Elasticity, Held, Slide, ToolDisplacement, ToolForce
 from sim.fem import Fem
 from sim.linear import BlockJacobi
 from sim.loads import Displaced, Loads, push
+from sim.meshfile import read_anatomy
+from surrogate.sampling import draw
 
 pytestmark = [
     pytest.mark.gpu,
@@ -56,5 +59,20 @@ def test_block_jacobi_reaches_what_the_inverse_reaches(box):
     fem = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8), "cuda")
     reference = fem.deform(pushes()).displacement
     plain = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8, inner=4000), "cuda")
-    plain._ladder = replace(plain._ladder, preconditioner=BlockJacobi(plain.problem.device))
+    plain._ladder = replace(plain._ladder, preconditioner=BlockJacobi(plain.problem.device), near=None)
     np.testing.assert_allclose(plain.deform(pushes()).displacement, reference, atol=1e-6 * np.abs(reference).max())
+
+
+def test_a_near_part_is_solved_by_itself_and_the_batch_ends_where_the_whole_does():
+    """More columns than one room has, so that rooms change."""
+    anatomy = read_anatomy(template_path())
+    effects, loads = (Elasticity(), Held(), Slide(), ToolForce()), draw("mixed", anatomy, 150, 3)
+    fem = Fem(anatomy, effects, TRAIN, "cuda")
+    found = fem.deform(loads)
+    assert fem._ladder.near is not None and all(outcome.good for outcome in found.outcome)
+    assert (fem.residual(loads, found) <= 1.5 * TRAIN.tolerance).all()
+    fem._ladder = replace(fem._ladder, near=None)
+    plain = fem.deform(loads)
+    assert np.median(found.iterations) < 0.7 * np.median(plain.iterations)
+    largest = np.abs(plain.displacement).max(axis=(1, 2), keepdims=True)
+    assert (np.abs(found.displacement - plain.displacement) <= BOUND["float32"] * largest).all()

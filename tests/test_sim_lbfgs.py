@@ -14,12 +14,12 @@ from sim.compile import compile_problem
 from sim.device import Device, find_device
 from sim.direction import NewtonCG
 from sim.effects import Effect, Elasticity, Held, NodalForce
-from sim.lbfgs import PAIRS, Descended, descend
+from sim.lbfgs import Descended, Lbfgs
 from sim.linear import BlockJacobi
 from sim.loads import Loads, Nodal
 from sim.precondition import rest_solver
 from sim.problem import Problem
-from sim.steering import BROKEN, DONE, LEFT, LIVE
+from sim.steering import BROKEN, DONE, LEFT, LIVE, PAIRS
 from sim.term import Cases
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
@@ -46,7 +46,7 @@ def descended(problem: Problem, start: np.ndarray | None = None, tolerance: floa
     count = len(TOTAL) if start is None else start.shape[1]
     start = np.zeros((ROWS, count)) if start is None else start
     solver = rest_solver(problem)
-    return descend(problem, solver, problem.device.array(start), np.full(count, tolerance), most)
+    return Lbfgs(problem, solver).descend(problem.device.array(start), np.full(count, tolerance), most)
 
 
 def book(problem: Problem, steps: int) -> np.ndarray:
@@ -142,7 +142,9 @@ def test_steps_stay_inside_the_domain(device: Device) -> None:
     walled = Problem((*problem.terms, wall), problem.constraint, device)
     walled.begin(Cases(Loads((Nodal(top_forces(MESH, TOTAL)),)), np.zeros(len(TOTAL))))
     for most in (1, 2, 3, 5, 8, 200):
-        found = descend(walled, rest_solver(problem), device.zeros(ROWS, len(TOTAL)), np.full(len(TOTAL), 1e-7), most)
+        found = Lbfgs(walled, rest_solver(problem)).descend(
+            device.zeros(ROWS, len(TOTAL)), np.full(len(TOTAL), 1e-7), most
+        )
         assert wall.distance(found.u.numpy()).min() > 0.0
         walled.begin(Cases(Loads((Nodal(top_forces(MESH, TOTAL)),)), np.zeros(len(TOTAL))))
     assert np.isin(found.status, [DONE, LEFT, LIVE]).all()
@@ -152,7 +154,9 @@ def test_steps_stay_inside_the_domain(device: Device) -> None:
 
 def test_any_preconditioner_serves(device: Device) -> None:
     problem = problem_of(device)
-    jacobi = descend(problem, BlockJacobi(device), device.zeros(ROWS, len(TOTAL)), np.full(len(TOTAL), 1e-6), 2000)
+    jacobi = Lbfgs(problem, BlockJacobi(device)).descend(
+        device.zeros(ROWS, len(TOTAL)), np.full(len(TOTAL), 1e-6), 2000
+    )
     assert (jacobi.status == DONE).all()
     exact = descended(problem_of(device)).u.numpy()
     np.testing.assert_allclose(jacobi.u.numpy(), exact, atol=1e-3 * np.abs(exact).max())
@@ -169,10 +173,49 @@ def test_what_was_learnt_shortens_the_next_descent(device: Device) -> None:
     few, rest = TOTAL[:3], device.zeros(ROWS, 3)
     problem = problem_of(device, total=few)
     solver, tolerance = rest_solver(problem), np.full(3, 1e-6)
-    first = descend(problem, solver, rest, tolerance, 300)
-    plain = descend(problem_of(device, total=1.1 * few), solver, first.u, tolerance, 300)
-    taught = descend(problem_of(device, total=1.1 * few), solver, first.u, tolerance, 300, first.learnt)
+    first = Lbfgs(problem, solver).descend(rest, tolerance, 300, {})
+    plain = Lbfgs(problem_of(device, total=1.1 * few), solver).descend(first.u, tolerance, 300)
+    taught = Lbfgs(problem_of(device, total=1.1 * few), solver).descend(first.u, tolerance, 300, first.learnt)
     assert (taught.status == DONE).all()
     assert taught.steps.sum() < plain.steps.sum()
     np.testing.assert_allclose(taught.u.numpy(), plain.u.numpy(), atol=1e-4 * np.abs(plain.u.numpy()).max())
     assert not descended(problem_of(device)).learnt  # too many columns to have a next frame
+
+
+def test_a_column_ends_at_a_force_too(device: Device) -> None:
+    problem = problem_of(device)
+    force = np.array([0.0, 1e-3, 0.0, 1e-4, 0.0, 0.0])
+    start, count = device.zeros(ROWS, len(TOTAL)), len(TOTAL)
+    found = Lbfgs(problem, rest_solver(problem)).descend(start, np.full(count, FINE), 300, force=force)
+    _, free, _ = problem_of(device).residual(found.u)
+    assert (found.status == DONE).all() and (found.residual[[1, 3]] > 100.0 * FINE).all()
+    assert (free[[1, 3]] <= force[[1, 3]]).all()
+
+
+def test_stragglers_are_left_where_they_are(device: Device) -> None:
+    problem = problem_of(device)
+    start, count = device.zeros(ROWS, len(TOTAL)), len(TOTAL)
+    found = Lbfgs(problem, rest_solver(problem)).descend(start, np.full(count, FINE), 300, stragglers=0.4)
+    assert 1 <= (found.status == LIVE).sum() <= 2
+    assert (found.residual[found.status == LIVE] < 1.0).all()
+
+
+@pytest.mark.parametrize("law", ["stable-neo-hookean", "neo-hookean"])
+def test_a_known_gradient_saves_the_first_look(device: Device, law: str) -> None:
+    """And no more: the same steps follow, the first of them within the domain."""
+    problem = problem_of(device, law)
+    solver, start = rest_solver(problem), device.zeros(ROWS, len(TOTAL))
+    tolerance = np.full(len(TOTAL), FINE)
+    plain = Lbfgs(problem, solver).descend(start, tolerance, 300)
+    problem = problem_of(device, law)
+    g, _, _ = problem.residual(start)
+    z = device.zeros(ROWS, len(TOTAL))
+    solver.apply(g, np.ones(len(TOTAL), bool), z)
+    looks = []
+    term = next(term for term in problem.terms if not term.constant)
+    whole = term.add_gradient
+    term.add_gradient = lambda u, out: (looks.append(1), whole(u, out))
+    found = Lbfgs(problem, solver).descend(start, tolerance, 300, ahead=(g, z))
+    assert (found.steps[:-1] == plain.steps[:-1]).all()
+    np.testing.assert_allclose(found.u.numpy(), plain.u.numpy(), atol=1e-9)
+    assert len(looks) >= found.steps.max()

@@ -114,9 +114,8 @@ def test_history_arrives_in_its_rows(problem: Problem, batch: Found, device: Dev
 def test_history_travels_through_the_deformer() -> None:
     """Spring that creeps: with each call the body sinks further, as the same steps one by one in a batch of its own."""
     fem = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TIGHT, "cpu", batch=2)
-    fem.problem = Problem(
-        (*fem.problem.terms, Spring(fem.problem.device, ROWS, 40.0)), fem.problem.constraint, fem.problem.device
-    )
+    terms = (*fem.problem.terms, Spring(fem.problem.device, ROWS, 40.0))
+    fem._ladder = replace(fem._ladder, problem=Problem(terms, fem.problem.constraint, fem.problem.device))
     total = np.array([[0.0, 0.0, -0.1], [0.05, 0.0, 0.02], [0.0, 0.0, -0.3]])
 
     def walk(rows: np.ndarray) -> list[np.ndarray]:

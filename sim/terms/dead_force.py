@@ -139,7 +139,11 @@ class DeadForce:
 
     def begin(self, cases: Cases) -> None:
         """Assemble the nodal forces of every column."""
-        self._forces = self._assemble(cases.loads)
+        self.take(self._assemble(cases.loads))
+
+    def take(self, forces: Forces | None) -> None:
+        """These forces act on the batch."""
+        self._forces = forces
 
     def keep(self, columns: np.ndarray) -> None:
         """Drop the forces of the others."""

@@ -1,0 +1,70 @@
+"""What is out of balance in a state: the free gradient of the potential, and what it is measured against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from .columns import CHUNK, add_dots, combined
+from .problem import Problem
+from .steering import OWN, PAIRS, SOME, SUMS, kernels_of
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """What is out of balance: the free gradient g (3N, b) [N] on the device, and its `sums` (SUMS, b) of steering.
+
+    Square norms own (terms, b) of the gradients of the terms that are not constant. `part` (3N, b) is zero between.
+    """
+
+    g: wp.array
+    part: wp.array
+    sums: wp.array
+    own: wp.array
+
+
+def _balance_room(problem: Problem, count: int) -> Balance:
+    device = problem.device
+    sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
+    return Balance(device.zeros(problem.rows, count), device.zeros(problem.rows, count), sums, own)
+
+
+def balance(
+    problem: Problem, v: wp.array, constant: wp.array, d: wp.array | None = None, room: Balance | None = None
+) -> Balance:
+    """The balance at v (3N, b) [m] of a batch with `constant` gradients (3N, b) [N], and its slope along d (3N, b).
+
+    In the arrays of `room`, if it is given.
+    """
+    device, (rows, count) = problem.device, v.shape
+    room, k = room or _balance_room(problem, count), kernels_of(problem.device, PAIRS)
+    varying = [term for term in problem.terms if not term.constant]
+    room.sums.zero_()
+    wp.copy(room.g, constant)
+    if len(varying) == 1:
+        varying[0].add_gradient(v, room.g)
+    else:
+        room.own.zero_()
+        for number, term in enumerate(varying):
+            term.add_gradient(v, room.part)
+            device.launch(k.absorb, (-(-rows // CHUNK), count), [], [room.part, room.g, room.own[number]])
+    inputs = [constant, *problem.constraint.nodes, v if d is None else d]
+    device.launch(k.finish, (-(-rows // (3 * SOME)), count), inputs, [room.g, room.sums])
+    if len(varying) == 1:
+        wp.copy(room.own[0], room.sums[OWN])
+    return room
+
+
+def constants_of(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
+    """The summed gradient (3N, b) [N] of the terms that are constant, and the square norm (terms, b) of each one's."""
+    device = problem.device
+    total = device.zeros(*u.shape)
+    square = wp.zeros((len(problem.terms), u.shape[1]), dtype=wp.float64, device=device.name)
+    for number, term in enumerate(problem.terms):
+        if term.constant:
+            own = device.zeros(*u.shape)
+            term.add_gradient(u, own)
+            add_dots(device, own, own, square[number])
+            combined(device, total, 1.0, own, total)
+    return total, square

@@ -1,0 +1,210 @@
+"""Everything that the columns of a batch carry from turn to turn of L-BFGS, and the turn itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import prod
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .balance import Balance, balance, constants_of
+from .columns import add_dots, combined, gathered
+from .linear import Preconditioner
+from .problem import Problem
+from .steering import DONE, LIVE, PAIRS, PRODUCTS, SOME, SUMS, few_of, kernels_of
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+
+def layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
+    """By kind of number: its type, the arrays that move with their columns, and those that a turn writes anew."""
+    vector, pairs, terms = (problem.rows,), (PAIRS, problem.rows), (len(problem.terms),)
+    return {
+        "scalar": (
+            problem.device.scalar,
+            {**dict.fromkeys(("u", "d", "g", "z", "constant"), vector), "s": pairs, "w": pairs},
+            {
+                **dict.fromkeys(("v", "new_z", "new_g", "part"), vector),
+                **dict.fromkeys(("along_s", "along_w"), (PAIRS,)),
+                "bound": (),
+            },
+        ),
+        "double": (
+            wp.float64,
+            {
+                **dict.fromkeys(("t", "promised", "residual", "tolerance", "force"), ()),
+                **dict.fromkeys(("sg", "wg"), (PAIRS,)),
+                **dict.fromkeys(("sy", "yw"), (PAIRS, PAIRS)),
+                "loud": terms,
+            },
+            {"products": (2 * PAIRS + PRODUCTS,), "gone": (), "sums": (SUMS,), "own": terms},
+        ),
+        "whole": (
+            wp.int32,
+            dict.fromkeys(("steps", "cut", "known", "status", "head"), ()),
+            dict.fromkeys(("accepted", "slot"), ()),
+        ),
+    }
+
+
+def ground_of(problem: Problem, width: int) -> dict[str, wp.array]:
+    """Memory, by kind of number, for rooms of at most this width: they stand in the same place, one at a time."""
+    return {
+        kind: wp.zeros((_rows(moved) + _rows(written), width), dtype=dtype, device=problem.device.name)
+        for kind, (dtype, moved, written) in layout(problem).items()
+    }
+
+
+class Room:
+    """Columns last, on the ground that rooms share. On a graphics card the turn is captured once.
+
+    Parameters
+    ----------
+    problem, preconditioner
+        Whose turns these are.
+    width
+        How many columns there is room for.
+    ground
+        As `ground_of` makes it, for at least this width.
+    """
+
+    def __init__(self, problem: Problem, preconditioner: Preconditioner, width: int, ground: Mapping[str, wp.array]):
+        self.width = width
+        self._problem = problem
+        self._preconditioner = preconditioner
+        self._kernels = kernels_of(problem.device, PAIRS)
+        self._graph: wp.Graph | None = None
+        self._moved: dict[str, wp.array] = {}
+        arrays: dict[str, wp.array] = {}
+        for kind, (_, moved, written) in layout(problem).items():
+            first = 0
+            for name, shape in {**moved, **written}.items():
+                arrays[name] = _standing(ground[kind], first, (*shape, width))
+                first += width * prod(shape)
+            self._moved[kind] = _standing(ground[kind], 0, (_rows(moved), width))
+        self._ground = ground  # arrays that stand on it do not keep it
+        self.columns = arrays
+        self._trial = Balance(arrays["new_g"], arrays["part"], arrays["sums"], arrays["own"])
+
+    def begin(
+        self, start: wp.array, tolerance: np.ndarray, force: np.ndarray, learnt: Mapping[str, np.ndarray]
+    ) -> None:
+        """Take a batch of at most as many columns, about to judge its start (3N, b)."""
+        a, device, spare = self.columns, self._problem.device, self.width - start.shape[1]
+        for array in (a["d"], a["g"], a["z"], self._moved["double"], self._moved["whole"]):
+            array.zero_()
+        if spare:
+            index = self._padded(np.arange(start.shape[1]))
+            self._problem.keep(index)
+            gathered(device, start, index, a["u"])
+        else:
+            wp.copy(a["u"], start)
+        for name, value in (("promised", np.inf), ("residual", np.inf), ("head", PAIRS - 1)):
+            a[name].fill_(value)
+        # What is there to fill the room ends at once.
+        a["tolerance"].assign(np.append(tolerance, np.full(spare, np.inf)))
+        a["force"].assign(np.append(force, np.full(spare, np.inf)))
+        constant, loud = constants_of(self._problem, a["u"])
+        wp.copy(a["constant"], constant)
+        wp.copy(a["loud"], loud)
+        for name, rows_first in learnt.items():
+            a[name].assign(np.moveaxis(rows_first, 0, -1).reshape(a[name].shape))
+        self._prepare()
+
+    def aim(self, g: wp.array, z: wp.array) -> None:
+        """The first trial goes along -z (3N, b) from a start that has the free gradient g (3N, b)."""
+        a, device, count = self.columns, self._problem.device, g.shape[1]
+        index = device.array(self._padded(np.arange(count)), wp.int32)
+        gathered(device, g, index, a["g"])
+        gathered(device, z, index, a["z"])
+        combined(device, a["d"], -1.0, a["z"], a["d"])
+        a["promised"].zero_()
+        add_dots(device, a["g"], a["z"], a["promised"])
+        a["t"].fill_(1.0)
+        self._clamp()
+
+    def take(self, other: Room, stay: np.ndarray) -> None:
+        """Go on with these columns (k,) of another room's batch."""
+        index = self._padded(stay)
+        self._problem.keep(index)
+        there = self._problem.device.array(index, wp.int32)
+        for kind, own in self._moved.items():
+            wp.copy(own, gathered(self._problem.device, other._moved[kind], there))
+        if len(stay) < self.width:
+            self.columns["status"][len(stay) :].fill_(DONE)
+        self._prepare()
+
+    def _padded(self, stay: np.ndarray) -> np.ndarray:
+        """The last of them again, until the room is full."""
+        return np.append(stay, np.full(self.width - len(stay), stay[-1]))
+
+    def _prepare(self) -> None:
+        self.columns["part"].zero_()
+        self.columns["bound"].fill_(1.0)
+        if self._preconditioner.on_device:
+            return
+        u = self.columns["u"]
+        self._problem.linearise(u, np.zeros(u.shape[1], bool))
+        self._preconditioner.prepare(self._problem, u.shape[1])
+
+    def turn(self, times: int) -> None:
+        """Turn so many times."""
+        device = self._problem.device
+        if not (device.on_cuda and self._preconditioner.on_device):
+            for _ in range(times):
+                self._turn()
+            return
+        if self._graph is None:
+            self._turn()  # loads what a capture cannot
+            with wp.ScopedCapture(device.name, force_module_load=False) as capture:
+                self._turn()
+            self._graph = capture.graph
+            times -= 1
+        for _ in range(times):
+            wp.capture_launch(self._graph)
+
+    def _turn(self) -> None:
+        a, k = self.columns, self._kernels
+        problem, device = self._problem, self._problem.device
+        rows, count = a["u"].shape
+        one, some = (count,), (-(-rows // SOME), count)
+        device.launch(k.step, some, [a["u"], a["t"], a["d"]], [a["v"]])
+        balance(problem, a["v"], a["constant"], a["d"], self._trial)
+        inputs = [a["loud"], self._trial.own, a["tolerance"], a["force"], self._trial.sums, a["promised"]]
+        outputs = [a["status"], a["accepted"], a["steps"], a["cut"], a["t"], a["gone"], a["residual"]]
+        device.launch(k.judge, one, inputs, outputs)
+        live = np.ones(count, bool)
+        if not self._preconditioner.on_device:  # the host's time is better not spent on trials that failed
+            live = (a["accepted"].numpy() != 0) & (a["status"].numpy() == LIVE)
+        if live.any():
+            self._preconditioner.apply(self._trial.g, live, a["new_z"])
+        problem.constraint.project_nodes(a["new_z"])
+        a["products"].zero_()
+        inputs = [a["known"], a["s"], a["w"], a["g"], a["z"], self._trial.g, a["new_z"]]
+        device.launch(k.multiply, some, inputs, [a["products"]])
+        inputs = [a["accepted"], a["gone"], self._trial.sums, a["products"]]
+        outputs = [a["status"], a["head"], a["known"], a["slot"], a["t"], a["promised"]]
+        outputs += [a["sg"], a["wg"], a["sy"], a["yw"], a["along_s"], a["along_w"]]
+        device.launch(k.aim, one, inputs, outputs)
+        inputs = [a["status"], a["accepted"], a["known"], a["slot"], a["gone"], a["along_s"], a["along_w"]]
+        outputs = [a["u"], a["d"], a["g"], a["z"], a["s"], a["w"]]
+        device.launch(k.move, (-(-rows // few_of(device)), count), [*inputs, self._trial.g, a["new_z"]], outputs)
+        self._clamp()
+
+    def _clamp(self) -> None:
+        a, bound = self.columns, self.columns["bound"]
+        for term in self._problem.terms:
+            term.longest_step(a["u"], a["d"], bound)
+        self._problem.device.launch(self._kernels.clamp, (self.width,), [], [bound, a["t"]])
+
+
+def _standing(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
+    """The numbers from the first on, as an array of any shape: views of Warp cannot skip 2^31 numbers."""
+    address = ground.ptr + first * wp.types.type_size_in_bytes(ground.dtype)
+    return wp.array(ptr=address, dtype=ground.dtype, shape=shape, device=ground.device)
+
+
+def _rows(shapes: Shapes) -> int:
+    return sum(prod(shape) for shape in shapes.values())

@@ -1,0 +1,86 @@
+"""What lies around a part of a body, as stiff as at rest: a dense stiffness between the nodes that both share."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..columns import add_dots, combined
+from ..device import Device
+from ..product import product_with
+from ..rows import add_rows, rows_taken
+from ..term import Cases
+
+
+class Exterior:
+    """A Term: u . F u / 2 over some rows of u.
+
+    Parameters
+    ----------
+    rows
+        (m,) of the part's 3N, each once.
+    stiffness
+        F (m, m) [N/m], symmetric.
+    count
+        3N.
+    device
+        Where its arrays live.
+    """
+
+    name = "exterior"
+    constant = False
+
+    def __init__(self, rows: np.ndarray, stiffness: np.ndarray, count: int, device: Device):
+        self._device = device
+        self._rest = rows, stiffness, count
+        self._rows = device.array(rows, wp.int32)
+        self._product = product_with(stiffness, device)
+        self._rooms: dict[int, tuple[wp.array, wp.array]] = {}
+
+    def begin(self, cases: Cases) -> None:
+        """The exterior remembers nothing."""
+
+    def keep(self, columns: np.ndarray) -> None:
+        """Columns are all alike to the exterior."""
+
+    def energy(self, u: wp.array, out: wp.array) -> None:
+        """E += u . F u / 2."""
+        x, force = self._multiplied(u)
+        add_dots(self._device, combined(self._device, x, -0.5, x, x), force, out)
+
+    def add_gradient(self, u: wp.array, out: wp.array) -> None:
+        """f += F u."""
+        _, force = self._multiplied(u)
+        add_rows(self._device, force, self._rows, out)
+
+    def linearise(self, u: wp.array, definite: wp.array) -> None:
+        """It is linear."""
+
+    def add_curvature(self, p: wp.array, out: wp.array) -> None:
+        """f += F p."""
+        self.add_gradient(p, out)
+
+    def add_diagonal(self, out: wp.array) -> None:
+        """Left out: whoever solves for a part has its rest stiffness whole."""
+
+    def rest_curvature(self) -> sp.csc_array:
+        """F."""
+        rows, stiffness, count = self._rest
+        place = np.repeat(rows, len(rows)), np.tile(rows, len(rows))
+        return sp.csc_array(sp.coo_array((stiffness.ravel(), place), shape=(count, count)))
+
+    def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
+        """It allows every step."""
+
+    def end(self, u: wp.array) -> None:
+        """It remembers nothing."""
+
+    def _multiplied(self, u: wp.array) -> tuple[wp.array, wp.array]:
+        """The rows (m, b) of u, and F times them; batches of one width find both where the last one did."""
+        shape = (len(self._rows), u.shape[1])
+        if u.shape[1] not in self._rooms:
+            self._rooms[u.shape[1]] = self._device.zeros(*shape), self._device.zeros(*shape)
+        x, force = self._rooms[u.shape[1]]
+        self._product(rows_taken(self._device, u, self._rows, x), force)
+        return x, force

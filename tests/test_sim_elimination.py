@@ -1,0 +1,200 @@
+"""Nonlinear elimination: its equilibria are those of the whole body, found in fewer looks at all of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from boxes import base_held, box, hold, surface_nodes
+from oracle import tissue
+
+from scenes.shipped import template_path
+from sim.accuracy import TRAIN, Accuracy
+from sim.anatomy import Anatomy
+from sim.compile import compile_part, compile_problem
+from sim.condensation import condensed
+from sim.device import find_device
+from sim.discretisation import Discretisation, discretise
+from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolForce
+from sim.elimination import PATIENCE, Elimination, eliminating, near_tetrahedra
+from sim.fem import Fem
+from sim.lbfgs import Lbfgs
+from sim.loads import Loads, Nodal
+from sim.meshfile import read_anatomy
+from sim.precondition import rest_solver
+from sim.problem import Problem
+from sim.steering import BROKEN, DONE, LIVE
+from sim.term import Cases
+from sim.terms.exterior import Exterior
+from surrogate.sampling import draw
+
+MESH = box((8, 8, 5), 0.08, distortion=0.1)
+TOP = MESH.nodes[:, 2] > MESH.nodes[:, 2].max() - 1e-9
+OPENING = TOP & (np.abs(MESH.nodes[:, :2] - 0.04).max(axis=1) < 0.021)
+TOTAL = np.array([[0.0, 0.0, -0.05], [0.1, 0.05, -0.3], [0.0, 0.0, 0.3], [-0.2, 0.1, -0.8], [0.0, 0.0, 0.0]])
+EFFECTS: tuple[Effect, ...] = (Held(), Slide(), NodalForce())
+FINE = 1e-8
+
+
+def body(element: str = "p1") -> tuple[Anatomy, Discretisation]:
+    """Held below, sliding on the sides and round an opening on top."""
+    normal = np.where(TOP[:, None] & ~OPENING[:, None], [0.0, 0.0, 1.0], 0.0)
+    for axis, side in ((0, 0.0), (0, 0.08), (1, 0.0), (1, 0.08)):
+        wall = (np.abs(MESH.nodes[:, axis] - side) < 1e-9) & ~TOP
+        normal[wall] = np.eye(3)[axis]
+    anatomy = hold(MESH, surface_nodes(MESH) & (MESH.nodes[:, 2] < 1e-9), normal)
+    return anatomy, discretise(MESH, element)
+
+
+def loads_of(total: np.ndarray) -> Loads:
+    force = np.zeros((len(total), len(MESH.nodes), 3))
+    force[:, OPENING] = total[:, None] / OPENING.sum()
+    return Loads((Nodal(force),))
+
+
+def begun(law: str, element: str = "p1", total: np.ndarray = TOTAL) -> tuple[Problem, Discretisation]:
+    anatomy, space = body(element)
+    problem = compile_problem((Elasticity(tissue(law)), *EFFECTS), anatomy, find_device("cpu", "float64"), space)
+    problem.begin(Cases(loads_of(total), np.zeros(len(total))))
+    return problem, space
+
+
+def elimination_of(problem: Problem, space: Discretisation, law: str) -> Elimination:
+    found = eliminating(problem, rest_solver(problem), (Elasticity(tissue(law)), *EFFECTS), space)
+    assert found is not None
+    return found
+
+
+def equilibria(problem: Problem, total: np.ndarray = TOTAL) -> np.ndarray:
+    """By L-BFGS on the whole."""
+    problem.begin(Cases(loads_of(total), np.zeros(len(total))))
+    start = problem.device.zeros(problem.rows, len(total))
+    found = Lbfgs(problem, rest_solver(problem)).descend(start, np.full(len(total), FINE), 2000)
+    assert (found.status == DONE).all()
+    return found.u.numpy().copy()
+
+
+@pytest.mark.parametrize(
+    ("law", "element"),
+    [("linear", "p1"), ("neo-hookean", "p1"), ("stable-neo-hookean", "p1"), ("ogden", "p1"),
+     ("stable-neo-hookean", "smoothed"), ("stable-neo-hookean", "p2")],
+)  # fmt: skip
+def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
+    problem, space = begun(law, element)
+    start = problem.device.zeros(problem.rows, len(TOTAL))
+    found = elimination_of(problem, space, law).descend(start, np.full(len(TOTAL), FINE), 100)
+    assert (found.status == DONE).all() and (found.residual <= FINE).all()
+    expected = equilibria(problem)
+    np.testing.assert_allclose(found.u.numpy(), expected, atol=1e-5 * np.abs(expected).max())
+    assert found.steps[-1] == 0 and not found.u.numpy()[:, -1].any()
+
+
+def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
+    anatomy = read_anatomy(template_path())
+    effects = (Elasticity(), Held(), Slide(), ToolForce())
+    fem, loads = Fem(anatomy, effects, TRAIN, "cpu"), draw("spatula", anatomy, 3, 1)
+    near = eliminating(fem.problem, rest_solver(fem.problem), effects, fem.space)
+    assert near is not None and 0.1 < len(near.rows) / fem.problem.rows < 0.3
+    fem.problem.begin(Cases(loads, np.zeros(3)))
+    rest, tolerance = fem.problem.device.zeros(fem.problem.rows, 3), np.full(3, TRAIN.tolerance)
+    found = near.descend(rest, tolerance, 100)
+    plain = fem.deform(loads)
+    assert (found.status == DONE).all() and all(outcome.good for outcome in plain.outcome)
+    assert np.median(found.steps) <= 0.4 * np.median(plain.iterations)
+    expected = plain.displacement.reshape(3, -1).T
+    np.testing.assert_allclose(found.u.numpy(), expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_columns_go_each_by_itself() -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law)
+    elimination = elimination_of(problem, space, law)
+    together = elimination.descend(problem.device.zeros(problem.rows, len(TOTAL)), np.full(len(TOTAL), 1e-5), 100)
+    for row in range(len(TOTAL)):
+        problem.begin(Cases(loads_of(TOTAL[[row]]), np.zeros(1)))
+        alone = elimination.descend(problem.device.zeros(problem.rows, 1), np.full(1, 1e-5), 100)
+        assert alone.steps[0] == together.steps[row]
+        np.testing.assert_allclose(alone.u.numpy()[:, 0], together.u.numpy()[:, row], atol=1e-10)
+
+
+def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law)
+    elimination = elimination_of(problem, space, law)
+    start = problem.device.zeros(problem.rows, len(TOTAL)).numpy()
+    start[:, 1] = np.nan
+    found = elimination.descend(problem.device.array(start), np.full(len(TOTAL), 1e-12), 1)
+    np.testing.assert_array_equal(found.status, [LIVE, BROKEN, LIVE, LIVE, DONE])
+    good = [0, 2, 3]
+    problem.begin(Cases(loads_of(TOTAL[good]), np.zeros(3)))
+    _, free, scale = problem.residual(problem.device.array(found.u.numpy()[:, good]))
+    np.testing.assert_allclose(found.residual[good], free / scale, rtol=1e-6)
+    np.testing.assert_array_equal(found.left, good)
+
+
+def test_what_gets_no_nearer_is_left_to_others() -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law, total=TOTAL[:1])
+    elimination = elimination_of(problem, space, law)
+    found = elimination.descend(problem.device.zeros(problem.rows, 1), np.zeros(1), 100)
+    assert found.status[0] == LIVE and found.residual[0] < 1e-12
+    assert found.steps[0] < 20 + PATIENCE
+
+
+def test_the_condensed_surroundings_are_the_schur_complement() -> None:
+    law = "linear"
+    problem, space = begun(law, "smoothed")
+    chosen = near_tetrahedra(space, problem.constraint)
+    assert chosen is not None and 0.15 < chosen.mean() < 0.25
+    nodes = np.unique(space.table[chosen])
+    own = compile_part((Elasticity(tissue(law)), *EFFECTS), space, problem, chosen, nodes)
+    around = condensed(problem, nodes, own.rest_curvature())
+    basis, whole = problem.constraint.basis(), problem.rest_curvature().toarray()
+    part = (3 * nodes[:, None] + np.arange(3)).ravel()
+    stays = np.ones(problem.rows, bool)
+    stays[part] = False
+    far = basis.toarray()[:, np.abs(basis.toarray()[stays]).max(axis=0) > 0.0]
+    moved = -far @ np.linalg.solve(far.T @ whole @ far, far.T @ whole[:, part])
+    schur = whole[np.ix_(part, part)] + whole[part] @ moved - own.rest_curvature().toarray()
+    expected = np.zeros_like(schur)
+    expected[np.ix_(around.rows, around.rows)] = around.stiffness
+    np.testing.assert_allclose(expected, schur, atol=1e-6 * np.abs(whole).max())
+    np.testing.assert_allclose(around.follow, moved[:, around.rows], atol=1e-5)
+
+
+def test_a_body_without_a_small_opening_has_no_near_part() -> None:
+    anatomy = base_held(MESH)
+    problem = compile_problem((Elasticity(tissue("linear")), *EFFECTS), anatomy, find_device("cpu", "float64"))
+    assert eliminating(problem, rest_solver(problem), (Elasticity(tissue("linear")),), discretise(MESH)) is None
+
+
+def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    anatomy, space = body()
+    effects = (Elasticity(tissue("stable-neo-hookean")), *EFFECTS)
+    fem = Fem(anatomy, effects, Accuracy(tolerance=FINE), "cpu")
+    plain = fem.deform(loads_of(TOTAL))
+    near = eliminating(fem.problem, rest_solver(fem.problem), effects, space)
+    fem._ladder = replace(fem._ladder, near=near)
+    for cycles in (12, 3):
+        monkeypatch.setattr("sim.elimination.CYCLES", cycles)
+        found = fem.deform(loads_of(TOTAL))
+        assert all(outcome.good for outcome in found.outcome)
+        assert (found.iterations != plain.iterations).any()
+        largest = np.abs(plain.displacement).max()
+        np.testing.assert_allclose(found.displacement, plain.displacement, atol=1e-5 * largest)
+
+
+def test_the_surroundings_are_a_potential() -> None:
+    device, random = find_device("cpu", "float64"), np.random.default_rng(0)
+    root, rows = random.normal(size=(4, 4)), np.array([1, 2, 5, 7])
+    exterior = Exterior(rows, root @ root.T, 9, device)
+    u, d = random.normal(size=(2, 9, 3))
+    out, energy = device.zeros(9, 3), [wp.zeros(3, dtype=wp.float64, device=device.name) for _ in range(2)]
+    exterior.add_gradient(device.array(u), out)
+    np.testing.assert_allclose(out.numpy(), exterior.rest_curvature() @ u, atol=1e-12)
+    for value, at in zip(energy, (u + d, u - d), strict=True):
+        exterior.energy(device.array(at), value)
+    rise = energy[0].numpy() - energy[1].numpy()
+    np.testing.assert_allclose(rise, 2.0 * (out.numpy() * d).sum(axis=0), rtol=1e-12)
