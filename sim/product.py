@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import warp as wp
+from threadpoolctl import ThreadpoolController
 
 from .device import Device
 
@@ -16,10 +17,12 @@ def product_with(matrix: np.ndarray, device: Device, rough: bool = False) -> Cal
 
 
 def _on_cpu(matrix: np.ndarray, device: Device) -> Callable[[wp.array, wp.array], None]:
-    kept = matrix.astype(device.precision)
+    kept, blas = matrix.astype(device.precision), ThreadpoolController()
 
     def multiply(x: wp.array, out: wp.array) -> None:
-        np.matmul(kept, x.numpy(), out=out.numpy())
+        # Its threads wait for one another, ages where something else runs on their cores.
+        with blas.limit(limits=1, user_api="blas"):
+            np.matmul(kept, x.numpy(), out=out.numpy())
 
     return multiply
 
