@@ -43,7 +43,7 @@ CYCLES = 12
 # The near part is solved to a share of the whole residual, or of the tolerance, in so many turns or until few columns
 # are left.
 FORCING, ENOUGH, TURNS, STRAGGLERS = 0.03, 0.3, 100, 0.05
-# A column whose residual was not halved in so many cycles goes elsewhere.
+# A column whose free force was not halved in so many cycles goes elsewhere.
 PATIENCE = 3
 
 
@@ -72,11 +72,14 @@ class Elimination:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
-        """As `Lbfgs.descend`, in at most `most` cycles. Nothing is learnt; every u is a column's last finite state."""
+        """As `Lbfgs.descend`, in at most `most` cycles; nothing is learnt.
+
+        No cycle raises the free force above what it was at the start: a column in which one did ends where it was.
+        """
         problem, device, count = self.problem, self.problem.device, start.shape[1]
         result, u, live = wp.clone(start), wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
-        best, idle = np.full(count, np.inf), np.zeros(count, int)
+        first, mark, idle = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count, int)
         constant, loud = constants_of(problem, u)
         square = loud.numpy().max(axis=0, initial=0.0)
         before = u
@@ -85,23 +88,24 @@ class Elimination:
             sums, own = found.sums.numpy(), found.own.numpy()
             largest = np.maximum(square[live], own.max(axis=0))
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-                largest = np.maximum(largest, sums[WHOLE] - sums[FREE])
-                relative = np.sqrt(np.where(sums[FREE] == 0.0, 0.0, sums[FREE] / largest))
-            finite = np.isfinite(relative)
+                free, largest = np.sqrt(sums[FREE]), np.sqrt(np.maximum(largest, sums[WHOLE] - sums[FREE]))
+                relative = np.where(free == 0.0, 0.0, free / largest)
+            # Forces that explode lower the relative residual.
+            sane = np.isfinite(relative) & np.isfinite(largest) & (free <= first[live])
             if cycle == 0:
-                status[~finite] = BROKEN
-            residual[live[finite]], steps[live[finite]] = relative[finite], cycle
-            done = finite & (relative <= tolerance[live])
+                first, status[~sane] = free, BROKEN
+            residual[live[sane]], steps[live[sane]] = relative[sane], cycle
+            done = sane & (relative <= tolerance[live])
             status[live[done]] = DONE
-            halved = relative <= 0.5 * best[live]
-            best[live[halved]] = relative[halved]
+            halved = free <= 0.5 * mark[live]
+            mark[live[halved]] = free[halved]
             idle[live] = np.where(halved, 0, idle[live] + 1)
-            leave = done | ~finite | (idle[live] >= PATIENCE) | (cycle == min(CYCLES, most))
-            for state, columns in ((u, leave & finite), (before, ~finite)):
+            leave = done | ~sane | (idle[live] >= PATIENCE) | (cycle == min(CYCLES, most))
+            for state, columns in ((u, leave & sane), (before, ~sane)):
                 scattered(device, gathered(device, state, np.flatnonzero(columns)), live[columns], result)
             if leave.all():
                 break
-            g, force = found.g, np.fmax(FORCING * relative, ENOUGH * tolerance[live]) * np.sqrt(largest)
+            g, force = found.g, np.fmax(FORCING * free, ENOUGH * tolerance[live] * largest)
             if leave.any():
                 stay = np.flatnonzero(~leave)
                 problem.keep(stay)

@@ -100,7 +100,9 @@ class Problem:
         free = norms(self.device, total)
         with np.errstate(invalid="ignore", over="ignore"):  # forces that overflowed: the caller sees it in `free`
             reaction = np.sqrt(np.maximum(whole**2 - free**2, 0.0))  # the projection is orthogonal
-        return total, free, np.maximum(scale, reaction)
+            scale = np.maximum(scale, reaction)
+        # Where forces overflowed that are not free, nothing else would look out of balance.
+        return total, np.where(np.isfinite(scale), free, np.inf), scale
 
     def gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
         """The least motion (3N, b) [m] from u (3N, b) to the constraints, and which columns (b,) are off them at all.

@@ -193,7 +193,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             scale = wp.max(scale, own[k, c])
         for k in range(loud.shape[0]):
             scale = wp.max(scale, loud[k, c])
-        finite = wp.isfinite(free) and wp.isfinite(slope)
+        finite = wp.isfinite(free) and wp.isfinite(slope) and wp.isfinite(scale)
         relative = wp.sqrt(free)
         small = relative <= force[c]
         if scale > zero:

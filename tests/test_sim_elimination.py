@@ -134,6 +134,24 @@ def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
     np.testing.assert_array_equal(found.left, good)
 
 
+@pytest.mark.parametrize("factor", [1e3, 1e12, 1e30])
+def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    """Forces so large that they overflow, or that what is free of them looks small beside the rest."""
+    law = "stable-neo-hookean"
+    anatomy, space = body()
+    device = find_device("cpu", "float32")
+    problem = compile_problem((Elasticity(tissue(law)), *EFFECTS), anatomy, device, space)
+    problem.begin(Cases(loads_of(TOTAL[:4]), np.zeros(4)))
+    elimination = elimination_of(problem, space, law)
+    inside = Elimination._corrected
+    monkeypatch.setattr(
+        Elimination, "_corrected", lambda *args: device.array(factor * inside(*args).numpy().astype(np.float64))
+    )
+    found = elimination.descend(device.zeros(problem.rows, 4), np.full(4, 1e-4), 100)
+    assert (found.status == LIVE).all() and not found.u.numpy().any()
+    np.testing.assert_allclose(found.residual, 1.0)
+
+
 def test_what_gets_no_nearer_is_left_to_others() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[:1])

@@ -135,6 +135,19 @@ def test_a_start_that_is_not_finite_is_given_up(device: Device) -> None:
     assert (np.delete(found.status, 1) == DONE).all()
 
 
+def test_forces_that_overflow_are_no_equilibrium() -> None:
+    """In single precision, at held nodes first: what is free then looks like nothing beside them."""
+    single, power = find_device("cpu", "float32"), np.arange(2, 34, 0.5)
+    problem = problem_of(single, total=np.tile(TOTAL[1], (len(power), 1)))
+    start = np.random.default_rng(0).normal(size=(ROWS, 1)) * FREE[:, None] * 10.0**power
+    _, free, scale = problem.residual(single.array(start))
+    with np.errstate(invalid="ignore"):
+        assert not (free / scale <= 1e-4).any() and not np.isfinite(scale).all()
+    tolerance = np.full(len(power), 1e-4)
+    found = Lbfgs(problem, rest_solver(problem)).descend(single.array(start), tolerance, 1)
+    assert not (found.status == DONE).any() and (found.status == BROKEN).any()
+
+
 def test_steps_stay_inside_the_domain(device: Device) -> None:
     """Pulled towards a wall, none passes it on the way, nor at the end."""
     problem = problem_of(device, "neo-hookean")
