@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from functools import cache, partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -73,9 +74,9 @@ class Fem:
         self.batch = fitting_batch(problem.rows, problem.device) if batch is None else batch
         preconditioner = choose_preconditioner(problem, self.space, self._unsmoothed)
         self.preconditioner = name_of(preconditioner)
-        near = None
-        if problem.device.on_cuda and self.preconditioner == "dense inverse":
-            near = eliminating(problem, preconditioner, self.effects, self.space)
+        near = cache(partial(eliminating, problem, preconditioner, self.effects, self.space))
+        if problem.device.on_cuda:
+            near()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
         self._ladder = Ladder(problem, preconditioner, Inversion(self.space, problem.device), accuracy, near)
 
     @property

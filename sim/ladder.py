@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -17,7 +17,7 @@ from .device import Device
 from .direction import NewtonCG
 from .elimination import Elimination
 from .inversion import Inversion
-from .lbfgs import LEARNT, TAUGHT, Lbfgs
+from .lbfgs import LEARNT, Lbfgs
 from .linear import Preconditioner
 from .newton import find_equilibrium
 from .problem import Problem
@@ -29,6 +29,8 @@ from .term import Cases
 QUICK, QUICK_ON_CUDA = 60, 800
 # A budget of fewer outer steps is Newton's alone: its steps lead farther.
 FEWEST = 10
+# So many load cases are worth the set-up of a near part, and teach nothing.
+WORTH = 16
 # Begins the history's keys of what L-BFGS has learnt.
 LEARNT_KEY = "l-bfgs "
 NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
@@ -82,14 +84,14 @@ class Ladder:
     accuracy
         Tolerance and budgets.
     near
-        Of the same problem; None: nothing is eliminated.
+        Makes, or has made, the elimination of the same problem's near part; None: nothing is eliminated.
     """
 
     problem: Problem
     preconditioner: Preconditioner
     inversion: Inversion
     accuracy: Accuracy
-    near: Elimination | None = None
+    near: Callable[[], Elimination | None] = lambda: None
 
     @cached_property
     def _lbfgs(self) -> Lbfgs:
@@ -142,8 +144,9 @@ class Ladder:
         if imposed or self.accuracy.outer < FEWEST:
             return self._thorough(start, self.accuracy.outer)
         descents: list[Elimination | Lbfgs] = [self._lbfgs]
-        if self.near is not None and count > TAUGHT:
-            descents.insert(0, self.near)
+        near = self.near() if count >= WORTH else None
+        if near is not None:
+            descents.insert(0, near)
         index, never = np.arange(count), np.full(count, np.inf)
         answer = self._answer(wp.clone(start), np.full(count, Outcome.BUDGET, object), np.zeros(count, int), never, 0)
         taught: Mapping[str, np.ndarray] = {}

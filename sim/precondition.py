@@ -70,6 +70,11 @@ def name_of(preconditioner: Preconditioner) -> str:
             return "dense inverse"
 
 
+def is_exact(preconditioner: Preconditioner) -> bool:
+    """Whether it is the inverse of the whole rest stiffness, up to rounding."""
+    return name_of(preconditioner) in ("sparse factor", "dense inverse")
+
+
 def rest_solver(problem: Problem) -> Preconditioner:
     """The whole free rest stiffness, inverted or factorised, in the problem's own precision.
 
