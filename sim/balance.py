@@ -41,11 +41,11 @@ def balance(
     room, k = room or _balance_room(problem, count), kernels_of(problem.device, PAIRS)
     varying = [term for term in problem.terms if not term.constant]
     room.sums.zero_()
+    room.own.zero_()
     wp.copy(room.g, constant)
     if len(varying) == 1:
         varying[0].add_gradient(v, room.g)
     else:
-        room.own.zero_()
         for number, term in enumerate(varying):
             term.add_gradient(v, room.part)
             device.launch(k.absorb, (-(-rows // CHUNK), count), [], [room.part, room.g, room.own[number]])

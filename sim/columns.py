@@ -9,6 +9,8 @@ import warp as wp
 
 from .device import Device
 
+# On CUDA rooms of L-BFGS are so wide, or multiples of the widest. Arrays of these widths are kept: graphs know them.
+WIDTHS = (1, 2, 3, 4, *(share * 2**k for k in range(5, 13) for share in (2, 3)), 16384)
 # Rows that one thread sums before it adds to the column's total.
 CHUNK = 64
 
@@ -109,6 +111,11 @@ def moving_kernels_of(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
         out[r, columns[c]] = x[r, c]
 
     return gather, scatter
+
+
+def is_kept(width: int) -> bool:
+    """Whether a room may be so wide."""
+    return width in WIDTHS or width % WIDTHS[-1] == 0
 
 
 def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:

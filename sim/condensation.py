@@ -49,7 +49,7 @@ def condensed(problem: Problem, nodes: np.ndarray, own: sp.csc_array) -> Condens
     stiffness = beyond[rows][:, rows].toarray()
     far = sp.csc_array(basis[:, ~np.isin(node_of(basis), nodes)])
     fine = Device(problem.device.name, "float64")
-    solver = direct(sp.csc_array(whole), far, node_of(far), fine)
+    solver = direct(sp.csc_array(whole), far, node_of(far), fine, "float64")
     coupling = sp.csc_array(whole[part[rows]].T)
     follow = np.zeros((problem.rows, len(rows)), problem.device.precision)
     for first in range(0, len(rows), STRIP):

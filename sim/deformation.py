@@ -66,8 +66,8 @@ class Deformation:
     outcome
         B outcomes.
     iterations, residual, time
-        (B,): Newton steps, relative residual as in `Accuracy`, time [s]. A surrogate has zero iterations, and
-        NaN for the residual that it did not compute.
+        (B,): outer steps of all descents, relative residual as in `Accuracy`, time [s]. A surrogate has zero
+        iterations, and NaN for the residual that it did not compute.
     reaction
         (B, tools, 6): force [N] and moment about the tool's point [N m] that each tool exerts.
     history

@@ -15,7 +15,7 @@ import scipy.sparse as sp
 import torch
 import warp as wp
 
-from .columns import add_dots
+from .columns import add_dots, is_kept
 from .device import Device
 from .problem import Problem
 
@@ -152,8 +152,9 @@ class Dense:
         device.launch(raise_, (-(-r.shape[0] // SOME), count), inputs, [out])
 
     def _room(self, count: int) -> Buffers:
-        """For batches of one width; kept, as captured graphs know them."""
+        """For batches of one width; those of rooms are kept, and the last other."""
         if count not in self._rooms:
+            self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
             low, name = LOW[self._device.precision], self._device.name
             shape = (self._size, -(-count // TILE) * TILE if count > 1 else 1)
             right, solved = (wp.zeros(shape, dtype=low, device=name) for _ in range(2))

@@ -135,6 +135,7 @@ class Elimination:
         missed = combined(device, found.u, -1.0, aim, aim)
         followed = wp.empty_like(out)
         self.follow(rows_taken(device, missed, self.shared), followed)
+        self.problem.constraint.project_nodes(followed)  # what is rounded row by row leaves the planes it slides on
         combined(device, out, 1.0, followed, out)
         put_rows(device, found.u, self.rows, out)
         return out
@@ -157,11 +158,6 @@ def eliminating(
     """Of the tissue near the opening; None on a body without a small one, and where the preconditioner is no inverse.
 
     Levels, which solve nearly, would leave a share of every correction to the next cycle.
-
-    Raises
-    ------
-    RuntimeError
-        The body is not held.
     """
     device = problem.device
     chosen = near_tetrahedra(space, problem.constraint) if is_exact(preconditioner) else None
@@ -169,14 +165,18 @@ def eliminating(
         return None
     nodes = np.unique(space.table[chosen])
     own = compile_part(effects, space, problem, chosen, nodes)
-    around = condensed(problem, nodes, own.rest_curvature())
-    part = surrounded(own, around.rows, around.stiffness)
+    try:
+        around = condensed(problem, nodes, own.rest_curvature())
+        part = surrounded(own, around.rows, around.stiffness)
+        solver = rest_solver(part.problem)
+    except RuntimeError:  # too nearly singular to be taken apart
+        return None
     return Elimination(
         problem=problem,
         preconditioner=preconditioner,
         rows=device.array((3 * nodes[:, None] + np.arange(3)).ravel(), wp.int32),
         part=part,
-        lbfgs=Lbfgs(part.problem, rest_solver(part.problem)),
+        lbfgs=Lbfgs(part.problem, solver),
         shared=device.array(around.rows, wp.int32),
         follow=product_with(around.follow, device, rough=True),
     )

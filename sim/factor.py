@@ -68,7 +68,7 @@ class Factor:
         precision: Precision = "float32",
     ):
         free = sp.csc_array(motions.T @ stiffness @ motions)
-        order, fronts = fronts_of(free, node, cores())
+        order, fronts = fronts_of(free, node, cores(len(node)))
         motions = sp.csc_array(motions[:, order].astype(device.precision))
         self._motions, self._transposed = sp.csr_array(motions), sp.csr_array(motions.T)
         self._precision, self._blas = precision, ThreadpoolController()
@@ -151,7 +151,7 @@ def panels_of(
         for front, shape, (first, stop) in zip(every, shapes, pairwise(cuts), strict=True)
     ]
     ends = np.cumsum([0, *(len(part) for part in fronts)]).tolist()
-    work = _Elimination(matrix, panels)
+    work = _Fronts(matrix, panels)
     lower = [partial(work.eliminate, range(first, stop)) for first, stop in pairwise(ends[:-1])]
     left: list[Updates] = [{} for _ in lower]
     together([partial(task, updates) for task, updates in zip(lower, left, strict=True)])
@@ -163,7 +163,7 @@ def panels_of(
     return values, panels
 
 
-class _Elimination:
+class _Fronts:
     """Fronts of a sparse matrix, one after the other; those of different parts may be eliminated at the same time."""
 
     def __init__(self, matrix: sp.csc_array, panels: Sequence[Panel]):

@@ -103,7 +103,7 @@ class Fem:
         """
         check_causes(self.effects, loads)
         self._check_vertices(at)
-        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device)
+        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
         guess = None if start is None else self._guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads))) if start is None else Cases(loads, start.time, start.history)
         parts = []

@@ -97,6 +97,11 @@ class Ladder:
     def _lbfgs(self) -> Lbfgs:
         return Lbfgs(self.problem, self.preconditioner)
 
+    @property
+    def held(self) -> int:
+        """Bytes that L-BFGS keeps from batch to batch."""
+        return self._lbfgs.held
+
     def climb(self, cases: Cases, guess: np.ndarray | None) -> Answer:
         """The equilibria of B cases, from guess (3N, B) [m]; from rest without one.
 
@@ -129,8 +134,10 @@ class Ladder:
         """Which cases (B,) another rung may save: at round-off none is nearer to equilibrium."""
         return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
-    def _whole(self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] = NOTHING) -> Answer:
-        """The whole load at once, of a batch that has begun: L-BFGS, and Newton from where that ended.
+    def _whole(
+        self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] | None = NOTHING
+    ) -> Answer:
+        """The whole load at once, of a batch that has begun: elimination, L-BFGS, Newton, each from where one ended.
 
         From rest without a start; `learnt` on the way to it, if anything was.
 
@@ -160,7 +167,7 @@ class Ladder:
             if len(index) == 0:
                 break
             problem.begin(cases.rows(index))
-            start, learnt = gathered(device, found.u, found.left), {}
+            start, learnt = gathered(device, found.u, found.left), None
         else:
             answer.put(index, self._thorough(start, self.accuracy.outer), device)
         return replace(answer, learnt=taught)
@@ -219,5 +226,7 @@ def shortfall(problem: Problem, u: wp.array) -> np.ndarray:
     _, free, scale = problem.residual(u)
     gap, size = problem.constraint.close_gap(u)
     largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)
-    share = [np.divide(a, b, out=np.zeros(len(b)), where=b > 0.0) for a, b in ((free, scale), (size, largest))]
-    return np.maximum(*share)
+    with np.errstate(invalid="ignore"):  # forces that overflowed
+        share = [np.divide(a, b, out=np.zeros(len(b)), where=b > 0.0) for a, b in ((free, scale), (size, largest))]
+    worse = np.maximum(*share)
+    return np.where(np.isnan(worse), np.inf, worse)

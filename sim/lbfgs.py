@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .columns import gathered, scattered
+from .columns import WIDTHS, gathered, scattered
 from .linear import Preconditioner
 from .problem import Problem
 from .room import Room, ground_of
@@ -26,9 +26,6 @@ TURNS_ON_CUDA, SMALLER_ON_CUDA, SMALLER = 2, 0.75, 0.85
 LEARNT = ("s", "w", "sy", "yw", "head", "known")
 # Learnt curvature travels with the answers of so few load cases: a larger batch has no next frame.
 TAUGHT = 4
-# On CUDA rooms are so wide, for batches of as many columns or fewer: one graph is captured for each. Those that teach
-# fit exactly; the widest are multiples of the last.
-WIDTHS = (*range(1, TAUGHT + 1), *(share * 2**k for k in range(5, 13) for share in (2, 3)), 16384)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +45,7 @@ class Descended:
 
 
 class Lbfgs:
-    """L-BFGS on one problem, whose batches work in the same arrays if they are as wide.
+    """L-BFGS on one problem. What the widest batch worked in is kept for the next ones.
 
     Parameters
     ----------
@@ -63,6 +60,11 @@ class Lbfgs:
         self._preconditioner = preconditioner
         self._rooms: dict[int, Room] = {}
         self._ground: dict[str, wp.array] = {}
+
+    @property
+    def held(self) -> int:
+        """Bytes that are kept."""
+        return sum(array.capacity for array in self._ground.values())
 
     def descend(
         self,
@@ -91,7 +93,9 @@ class Lbfgs:
             return Descended(u, status, steps, residual, {})
         smaller = SMALLER_ON_CUDA if device.on_cuda else SMALLER
         room, turns = self._room(count), 0
-        room.begin(start, tolerance, np.zeros(count) if force is None else force, learnt or {})
+        room.begin(
+            start, tolerance, np.zeros(count) if force is None else force, (learnt or {}) if count <= TAUGHT else {}
+        )
         if ahead is not None:
             room.aim(*ahead)
         while True:

@@ -51,8 +51,10 @@ def fitting_batch(rows: int, device: Device) -> int:
     return int(np.clip(free_bytes(device) / 2 / max(column, 1), 1, widest))
 
 
-def check_fits(rows: int, batch: int, count: int, device: Device) -> None:
+def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0) -> None:
     """Refuse `count` load cases of `rows` = 3N unknowns, `batch` together, that would not fit.
+
+    `held` bytes are the solver's own already.
 
     Raises
     ------
@@ -68,7 +70,7 @@ def check_fits(rows: int, batch: int, count: int, device: Device) -> None:
             f"the answers to {count} loads take about {_gigabytes(answers)}, and {_gigabytes(host)} are free: "
             + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
         )
-    room = SHARE * free_bytes(device) - (0 if device.on_cuda else answers)
+    room = SHARE * free_bytes(device) + held - (0 if device.on_cuda else answers)
     columns = min(batch, count)
     if column * columns > room:
         fitting = int(room / column)

@@ -232,3 +232,16 @@ def test_a_known_gradient_saves_the_first_look(device: Device, law: str) -> None
     assert (found.steps[:-1] == plain.steps[:-1]).all()
     np.testing.assert_allclose(found.u.numpy(), plain.u.numpy(), atol=1e-9)
     assert len(looks) >= found.steps.max()
+
+
+def test_a_batch_forgets_the_one_before(device: Device) -> None:
+    """A narrower room stands where a wider one worked: what that left there is no scale of a residual."""
+    problem = problem_of(device, total=np.tile(50.0 * TOTAL[1], (8, 1)))
+    solver, few = rest_solver(problem), TOTAL[[0, 1, 3]]
+    lbfgs = Lbfgs(problem, solver)
+    lbfgs.descend(device.zeros(ROWS, 8), np.full(8, FINE), 300)
+    problem.begin(Cases(Loads((Nodal(top_forces(MESH, few)),)), np.zeros(3)))
+    again = lbfgs.descend(device.zeros(ROWS, 3), np.full(3, 1e-4), 300)
+    fresh = Lbfgs(problem_of(device, total=few), solver).descend(device.zeros(ROWS, 3), np.full(3, 1e-4), 300)
+    np.testing.assert_array_equal(again.u.numpy(), fresh.u.numpy())
+    np.testing.assert_array_equal(again.residual, fresh.residual)

@@ -2,9 +2,16 @@
 
 import threading
 
+import numpy as np
 import pytest
+from boxes import base_held, box
+from oracle import tissue
 
-from sim.together import cores, together
+from sim.compile import compile_problem
+from sim.device import find_device
+from sim.effects import Elasticity, Held
+from sim.precondition import rest_solver
+from sim.together import LEAST, cores, together
 
 
 def test_every_task_is_done_when_it_returns():
@@ -34,5 +41,22 @@ def test_errors_come_out_and_the_threads_stay(bad: int):
     assert done == [1, 2, 2]
 
 
-def test_one_core_at_least():
-    assert cores() >= 1
+def test_one_core_at_least_and_one_for_little() -> None:
+    assert cores(10**6) >= 1
+    assert cores(LEAST - 1) == 1
+
+
+def test_two_cores_find_what_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    device, mesh = find_device("cpu", "float64"), box((4, 4, 4), 0.1, distortion=0.1)
+    u = device.array(np.random.default_rng(0).normal(size=(mesh.nodes.size, 3)) * 1e-3)
+    found = []
+    for number in (1, 2):
+        for place in ("sim.terms.elasticity.cores", "sim.factor.cores"):
+            monkeypatch.setattr(place, lambda work, number=number: number)
+        problem = compile_problem((Elasticity(tissue("neo-hookean")), Held()), base_held(mesh), device)
+        g, _, _ = problem.residual(u)
+        z = device.zeros(*u.shape)
+        rest_solver(problem).apply(g, np.ones(3, bool), z)
+        found.append((g.numpy().copy(), problem.longest_step(u, g), z.numpy().copy()))
+    for one, two in zip(*found, strict=True):
+        np.testing.assert_allclose(two, one, atol=1e-11 * np.abs(one).max())

@@ -285,7 +285,8 @@ class Elasticity:
             device.array(elements.weight),
             device.array(coefficients, wp.types.vector(length=count, dtype=device.scalar)),
         ]
-        ends = np.linspace(0, len(elements.table), (1 if device.on_cuda else cores()) + 1).astype(int).tolist()
+        every = len(elements.table)
+        ends = np.linspace(0, every, (1 if device.on_cuda else cores(every)) + 1).astype(int).tolist()
         self._parts = [
             _Part(stop - first, *([_rows(array, first, stop) for array in arrays] for arrays in (shape, inside)))
             for first, stop in pairwise(ends)

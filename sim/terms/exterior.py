@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..columns import add_dots, combined
+from ..columns import add_dots, combined, is_kept
 from ..device import Device
 from ..product import product_with
 from ..rows import add_rows, rows_taken
@@ -62,7 +62,13 @@ class Exterior:
         self.add_gradient(p, out)
 
     def add_diagonal(self, out: wp.array) -> None:
-        """Left out: whoever solves for a part has its rest stiffness whole."""
+        """Blocks += those of F."""
+        rows, stiffness, count = self._rest
+        blocks = np.zeros((count // 3, 3, 3))
+        same = rows[:, None] // 3 == rows // 3
+        first, second = np.nonzero(same)
+        blocks[rows[first] // 3, rows[first] % 3, rows[second] % 3] = stiffness[same]
+        out.assign(out.numpy() + blocks[:, None])
 
     def rest_curvature(self) -> sp.csc_array:
         """F."""
@@ -77,9 +83,10 @@ class Exterior:
         """It remembers nothing."""
 
     def _multiplied(self, u: wp.array) -> tuple[wp.array, wp.array]:
-        """The rows (m, b) of u, and F times them; batches of one width find both where the last one did."""
+        """The rows (m, b) of u, and F times them; batches as wide as a room find both where the last one did."""
         shape = (len(self._rows), u.shape[1])
         if u.shape[1] not in self._rooms:
+            self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
             self._rooms[u.shape[1]] = self._device.zeros(*shape), self._device.zeros(*shape)
         x, force = self._rooms[u.shape[1]]
         self._product(rows_taken(self._device, u, self._rows, x), force)
