@@ -152,6 +152,21 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
     np.testing.assert_allclose(found.residual, 1.0)
 
 
+def test_rounding_of_what_follows_leaves_no_plane() -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law)
+    elimination, random = elimination_of(problem, space, law), np.random.default_rng(0)
+
+    def rounded(x: wp.array, out: wp.array) -> None:
+        elimination.follow(x, out)
+        out.assign(out.numpy() + 1e-6 * random.normal(size=out.shape))
+
+    rough = replace(elimination, follow=rounded)
+    found = rough.descend(problem.device.zeros(problem.rows, len(TOTAL)), np.full(len(TOTAL), 1e-5), 1)
+    assert found.u.numpy()[:, :4].any(axis=0).all()
+    assert not problem.gap(found.u)[1].any()
+
+
 def test_what_gets_no_nearer_is_left_to_others() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[:1])
