@@ -9,8 +9,10 @@ import warp as wp
 
 from .device import Device
 
-# On CUDA rooms of L-BFGS are so wide, or multiples of the widest. Arrays of these widths are kept: graphs know them.
-WIDTHS = (1, 2, 3, 4, *(share * 2**k for k in range(5, 13) for share in (2, 3)), 16384)
+# Rooms of L-BFGS fit batches of so few columns exactly: what these learn goes from one to the next.
+EXACT = 4
+# On CUDA rooms are so wide, or multiples of the widest. Arrays of these widths are kept: graphs know them.
+WIDTHS = (*range(1, EXACT + 1), *(share * 2**k for k in range(5, 13) for share in (2, 3)), 16384)
 # Rows that one thread sums before it adds to the column's total.
 CHUNK = 64
 

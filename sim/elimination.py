@@ -83,7 +83,8 @@ class Elimination:
         constant, loud = constants_of(problem, u)
         square = loud.numpy().max(axis=0, initial=0.0)
         before = u
-        for cycle in range(min(CYCLES, most) + 1):
+        last = min(CYCLES, most)
+        for cycle in range(last + 1):
             found = balance(problem, u, constant)
             sums, own = found.sums.numpy(), found.own.numpy()
             largest = np.maximum(square[live], own.max(axis=0))
@@ -100,7 +101,7 @@ class Elimination:
             halved = free <= 0.5 * mark[live]
             mark[live[halved]] = free[halved]
             idle[live] = np.where(halved, 0, idle[live] + 1)
-            leave = done | ~sane | (idle[live] >= PATIENCE) | (cycle == min(CYCLES, most))
+            leave = done | ~sane | (idle[live] >= PATIENCE) | (cycle == last)
             for state, columns in ((u, leave & sane), (before, ~sane)):
                 scattered(device, gathered(device, state, np.flatnonzero(columns)), live[columns], result)
             if leave.all():

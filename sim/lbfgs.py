@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .columns import WIDTHS, gathered, scattered
+from .columns import EXACT, WIDTHS, gathered, scattered
 from .linear import Preconditioner
 from .problem import Problem
 from .room import Room, ground_of
@@ -25,7 +25,7 @@ TURNS_ON_CUDA, SMALLER_ON_CUDA, SMALLER = 2, 0.75, 0.85
 # the newest pair and how many there are (b,).
 LEARNT = ("s", "w", "sy", "yw", "head", "known")
 # Learnt curvature travels with the answers of so few load cases: a larger batch has no next frame.
-TAUGHT = 4
+TAUGHT = EXACT
 
 
 @dataclass(frozen=True, eq=False)

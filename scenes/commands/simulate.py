@@ -17,6 +17,7 @@ from sim.effects import NodalForce
 from sim.fem import Fem
 from sim.files import check_output
 from sim.material import tissue_to_json
+from sim.memory import WIDEST, WIDEST_ON_CUDA
 from sim.meshfile import read_anatomy
 from sim.stages import stage
 from surrogate.dataset import read_outcomes
@@ -41,7 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_tissue_arguments(parser)
     add_element_argument(parser)
     parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
-    parser.add_argument("--batch", type=int, help="loads solved together (default: 64, on CUDA up to 4096)")
+    parser.add_argument(
+        "--batch", type=int, help=f"loads solved together (default: as fit, up to {WIDEST}, on CUDA {WIDEST_ON_CUDA})"
+    )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
 
