@@ -39,12 +39,14 @@ from .steering import BROKEN, DONE, FREE, LIVE, WHOLE
 
 # The near part: such a share of the tetrahedra, where the free surface is at most such a share of all of it.
 NEAR, LARGEST_OPENING = 0.2, 0.25
-CYCLES = 12
+CYCLES = 20
 # The near part is solved to a share of the whole residual, or of the tolerance, in so many turns or until few columns
 # are left.
 FORCING, ENOUGH, TURNS, STRAGGLERS = 0.03, 0.3, 100, 0.05
 # A column whose free force was not halved in so many cycles goes elsewhere.
-PATIENCE = 3
+PATIENCE = 5
+# Hard loads pass through states whose free force is so many times the start's; beyond that they have exploded.
+RISE = 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +76,7 @@ class Elimination:
     ) -> Descended:
         """As `Lbfgs.descend`, in at most `most` cycles; nothing is learnt.
 
-        No cycle raises the free force above what it was at the start: a column in which one did ends where it was.
+        A column that has not got below the free force of its start ends there: it has not become better.
         """
         problem, device, count = self.problem, self.problem.device, start.shape[1]
         result, u, live = wp.clone(start), wp.clone(start), np.arange(count)
@@ -82,7 +84,6 @@ class Elimination:
         first, mark, idle = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count, int)
         constant, loud = constants_of(problem, u)
         square = loud.numpy().max(axis=0, initial=0.0)
-        before = u
         last = min(CYCLES, most)
         for cycle in range(last + 1):
             found = balance(problem, u, constant)
@@ -91,19 +92,19 @@ class Elimination:
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
                 free, largest = np.sqrt(sums[FREE]), np.sqrt(np.maximum(largest, sums[WHOLE] - sums[FREE]))
                 relative = np.where(free == 0.0, 0.0, free / largest)
-            # Forces that explode lower the relative residual.
-            sane = np.isfinite(relative) & np.isfinite(largest) & (free <= first[live])
+            finite = np.isfinite(relative) & np.isfinite(largest)
             if cycle == 0:
-                first, status[~sane] = free, BROKEN
-            residual[live[sane]], steps[live[sane]] = relative[sane], cycle
-            done = sane & (relative <= tolerance[live])
+                first, status[~finite] = free, BROKEN
+            sane, better = finite & (free <= RISE * first[live]), finite & (free <= first[live])
+            residual[live[better]], steps[live[sane]] = relative[better], cycle
+            done = better & (relative <= tolerance[live])  # forces that explode lower the relative residual
             status[live[done]] = DONE
             halved = free <= 0.5 * mark[live]
             mark[live[halved]] = free[halved]
             idle[live] = np.where(halved, 0, idle[live] + 1)
             leave = done | ~sane | (idle[live] >= PATIENCE) | (cycle == last)
-            for state, columns in ((u, leave & sane), (before, ~sane)):
-                scattered(device, gathered(device, state, np.flatnonzero(columns)), live[columns], result)
+            better &= leave
+            scattered(device, gathered(device, u, np.flatnonzero(better)), live[better], result)
             if leave.all():
                 break
             g, force = found.g, np.fmax(FORCING * free, ENOUGH * tolerance[live] * largest)
@@ -112,7 +113,7 @@ class Elimination:
                 problem.keep(stay)
                 u, g, constant = (gathered(device, array, stay) for array in (u, g, constant))
                 live, force = live[stay], force[stay]
-            before, u = u, self._corrected(u, g, force)
+            u = self._corrected(u, g, force)
         return Descended(result, status, steps, residual, {})
 
     def _corrected(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
