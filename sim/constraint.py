@@ -208,19 +208,19 @@ class Constraint:
     def basis(self) -> sp.csc_array:
         """Orthonormal basis (3N, n) of the motions that held and sliding nodes leave free, sparse."""
         sliding = (self.normal != 0.0).any(axis=1)
-        plain = ~self.held & ~sliding[:, None]
-        rows = [np.flatnonzero(plain)]
+        rows = [np.flatnonzero(~self.held & ~sliding[:, None])]
         columns, values = [np.arange(len(rows[0]))], [np.ones(len(rows[0]))]
         count = len(rows[0])
-        for node in np.flatnonzero(sliding):
+        for fixed in range(2):  # with two components held a sliding node has no direction left
+            node = np.flatnonzero(sliding & (self.held.sum(axis=1) == fixed))
             # Free directions: the orthogonal complement of the held axes and the normal.
-            blocked = np.vstack([np.eye(3)[self.held[node]], self.normal[node]])
-            _, _, right = np.linalg.svd(blocked)
-            free = right[len(blocked) :]
-            rows.append(np.tile(3 * node + np.arange(3), len(free)))
-            columns.append(np.repeat(count + np.arange(len(free)), 3))
+            axes = np.eye(3)[np.nonzero(self.held[node])[1]].reshape(len(node), fixed, 3)
+            free = np.linalg.svd(np.concatenate([axes, self.normal[node, None]], axis=1))[2][:, fixed + 1 :]
+            number = count + np.arange(len(node) * (2 - fixed))
+            rows.append(np.repeat(3 * node[:, None] + np.arange(3), 2 - fixed, axis=0).ravel())
+            columns.append(np.repeat(number, 3))
             values.append(free.ravel())
-            count += len(free)
+            count += len(number)
         data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
         return sp.csc_array(sp.coo_array(data, shape=(self.held.size, count)))
 
