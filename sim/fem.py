@@ -20,8 +20,10 @@ from .effects import Effect
 from .elimination import eliminating
 from .errors import InputError
 from .footprint import Skin
+from .heading import moved_on, way_of
 from .inversion import Inversion
 from .ladder import Ladder, shortfall
+from .lbfgs import TAUGHT
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
 from .memory import check_fits, fitting_batch
 from .precondition import choose_preconditioner, name_of
@@ -104,12 +106,12 @@ class Fem:
         check_causes(self.effects, loads)
         self._check_vertices(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
-        guess = None if start is None else self._guess(loads, start)
+        last = None if start is None else self._guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads))) if start is None else Cases(loads, start.time, start.history)
         parts = []
         for first in range(0, max(len(loads), 1), self.batch):
             rows = slice(first, first + self.batch)
-            parts.append(self._solve(cases.rows(rows), None if guess is None else guess[:, rows], at))
+            parts.append(self._solve(cases.rows(rows), None if last is None else last[:, rows], at))
         return _joined(parts)
 
     def _check_vertices(self, at: np.ndarray | None) -> None:
@@ -151,12 +153,14 @@ class Fem:
             full[:, vertices:] += start.history[MIDDLES]
         return np.where(loaded, full.reshape(len(loads), self.problem.rows).T, 0.0)
 
-    def _solve(self, cases: Cases, guess: np.ndarray | None, at: np.ndarray | None) -> Deformation:
+    def _solve(self, cases: Cases, last: np.ndarray | None, at: np.ndarray | None) -> Deformation:
         clock = time.perf_counter()
-        found = self._ladder.climb(cases, guess)
+        found = self._ladder.climb(cases, None if last is None else self._moved_on(cases, last))
         solved = time.perf_counter()
         self.problem.begin(cases)
         history = {**self.problem.end(found.u), **found.learnt}
+        if len(cases.loads) <= TAUGHT:
+            history |= way_of(cases.loads, last, cases.history)
         on_footprint = None
         if cases.loads.of(Displaced) is not None:
             on_footprint = self.problem.constraint.force_on_footprint(self.problem.gradient(found.u))
@@ -182,6 +186,13 @@ class Fem:
             reached=found.reached,
             inverted=found.inverted,
         )
+
+    def _moved_on(self, cases: Cases, last: np.ndarray) -> np.ndarray:
+        """Starts (3N, B) moved on from the last answers (3N, B), where that turns nothing inside out."""
+        start = moved_on(cases.loads, last, cases.history)
+        if start is last:
+            return last
+        return np.where(self._ladder.inversion.count(self.problem.device.array(start)) > 0, last, start)
 
     def _reaction(self, loads: Loads, on_footprint: np.ndarray | None) -> np.ndarray:
         """(B, tools, 6): force and moment about its point that each tool exerts [N, N m]."""

@@ -1,0 +1,62 @@
+"""Where pushes go on to: a frame starts from its last answer, moved on along the way from the one before that.
+
+Between neighbouring loads the answer is nearly linear in them. Loads q, p with the answers v, u are followed by p' from
+u + a (u - v), a = (p' - p) . (p - q) / |p - q|^2: as far as the load goes on the way that it came; nothing where it
+stands still or turns aside, and back on that way where it returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from .loads import Loads, Pushed
+
+# The history's keys: the answer's own loads (B, 2, 7), last those before them; displacements (B, 3N) [m] before it.
+PUSHES, BEFORE = "pushes", "before"
+# A way is followed back to where it began, and on for at most as long again twice.
+BACK, ON = -1.0, 2.0
+
+
+def pushes_of(loads: Loads) -> np.ndarray | None:
+    """Point [m], force [N] and footprint [m] (B, 7) of each load; None where anything but a push acts."""
+    if len(loads.causes) != 1 or not isinstance(loads.causes[0], Pushed):
+        return None
+    push = loads.causes[0]
+    return np.column_stack([push.point, push.force, push.footprint])
+
+
+def shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """a (B,) for three pushes (B, 7) in turn; zero where one of them has no force, or the last two are the same.
+
+    Lengths are measured against the last footprint, forces against the last force.
+    """
+    size = np.linalg.norm([push[:, 3:6] for push in (now, last, before)], axis=2)
+    unit = np.where(np.arange(7) // 3 == 1, size[1][:, None], last[:, 6:])
+    unit[unit == 0.0] = 1.0
+    way, further = (last - before) / unit, (now - last) / unit
+    square = (way**2).sum(axis=1)
+    known = size.all(axis=0) & (square > 0.0)
+    share = np.divide((further * way).sum(axis=1), square, out=np.zeros(len(now)), where=known)
+    return share.clip(BACK, ON)
+
+
+def moved_on(loads: Loads, last: np.ndarray, history: Mapping[str, Any]) -> np.ndarray:
+    """Starts (3N, B) [m] for loads whose last answers (3N, B) have this history; those answers if it tells no way."""
+    now = pushes_of(loads)
+    if now is None or BEFORE not in history or history[BEFORE].shape != last.T.shape:
+        return last
+    came, before = history[PUSHES][:, 0], history[PUSHES][:, 1]
+    return last + shares(now, came, before) * (last - history[BEFORE].T)
+
+
+def way_of(loads: Loads, last: np.ndarray | None, history: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """What the answers to loads hand on, whose last answers (3N, B) had this history, if there were any."""
+    now = pushes_of(loads)
+    if now is None:
+        return {}
+    if last is None or PUSHES not in history:
+        return {PUSHES: np.stack([now, now], axis=1)}
+    return {PUSHES: np.stack([now, history[PUSHES][:, 0]], axis=1), BEFORE: last.T}

@@ -1,0 +1,107 @@
+"""A frame starts where the last two lead: exact on a straight way, and no farther than the load goes on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import make_box
+
+from sim.accuracy import LIVE
+from sim.deformation import guess
+from sim.effects import Elasticity, Held, ToolForce
+from sim.fem import Fem
+from sim.heading import BEFORE, PUSHES, moved_on, pushes_of, shares
+from sim.loads import Loads, push
+
+EFFECTS = (Elasticity(), Held(), ToolForce())
+POINT, DOWN = np.array([2e-3, -1e-3, 0.0]), np.array([0.0, 0.0, -0.2])
+
+
+@pytest.fixture(scope="module")
+def body():
+    return make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3)
+
+
+def pushed(x: float, force: float = 1.0, y: float = 0.0) -> Loads:
+    return push(POINT + [x, y, 0.0], force * DOWN, 8e-3)
+
+
+def forgetting(history: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in history.items() if name != BEFORE}
+
+
+def row_of(load: Loads) -> np.ndarray:
+    row = pushes_of(load)
+    assert row is not None
+    return row
+
+
+def share_of(now: Loads, last: Loads, before: Loads) -> float:
+    return shares(row_of(now), row_of(last), row_of(before))[0]
+
+
+def test_as_far_as_the_load_goes_on_its_way():
+    before, last = pushed(0.0), pushed(1e-3)
+    assert share_of(pushed(2e-3), last, before) == pytest.approx(1.0)
+    assert share_of(pushed(1.5e-3), last, before) == pytest.approx(0.5)
+    assert share_of(last, last, before) == 0.0
+    assert share_of(pushed(1e-3, y=2e-3), last, before) == pytest.approx(0.0)
+    assert share_of(before, last, before) == pytest.approx(-1.0)
+    assert share_of(pushed(-9e-3), last, before) == -1.0
+    assert share_of(pushed(9e-3), last, before) == 2.0
+    assert share_of(pushed(0.0, 1.2), pushed(0.0, 1.1), pushed(0.0)) == pytest.approx(1.0)
+
+
+def test_a_tool_that_stood_still_or_was_lifted_tells_no_way():
+    assert share_of(pushed(1e-3), pushed(0.0), pushed(0.0)) == 0.0
+    for lifted in range(3):
+        loads = [pushed(2e-3), pushed(1e-3), pushed(0.0)]
+        loads[lifted] = pushed(1e-3 * (2 - lifted), 0.0)
+        assert share_of(*loads) == 0.0
+
+
+def test_the_start_lies_on_the_line_through_two_answers_for_each_load_by_itself():
+    last, before = np.random.default_rng(0).normal(size=(2, 12, 2))
+    pushes = np.stack([np.concatenate([row_of(pushed(x)) for x in (1e-3, 0.0)]).reshape(2, 7)] * 2)
+    history = {PUSHES: pushes, BEFORE: before.T}
+    loads = push(np.array([POINT + [2e-3, 0.0, 0.0], POINT + [1e-3, 0.0, 0.0]]), np.array([DOWN, DOWN]), 8e-3)
+    start = moved_on(loads, last, history)
+    np.testing.assert_allclose(start, np.column_stack([2.0 * last[:, 0] - before[:, 0], last[:, 1]]), atol=1e-12)
+    assert moved_on(loads, last, {}) is last
+    assert moved_on(loads, last, history | {BEFORE: before.T[:, :9]}) is last  # another element's
+
+
+def test_frames_of_a_moving_tool_take_fewer_steps_to_the_same_answers(body):
+    fem = Fem(body, EFFECTS, LIVE, "cpu")
+    exact = Fem(body, EFFECTS, replace(LIVE, tolerance=1e-4), "cpu")
+    steps, last, plain = np.zeros(2, int), None, None
+    for x in np.linspace(0.0, 10e-3, 12):
+        load = pushed(x, 2.0)
+        last = fem.deform(load, last)
+        plain = fem.deform(load, plain and replace(plain, history=forgetting(plain.history)))
+        steps += last.iterations[0], plain.iterations[0]
+        truth = exact.deform(load).displacement
+        assert np.abs(last.displacement - truth).max() <= 0.03 * np.abs(truth).max()
+    assert steps[0] < 0.9 * steps[1]
+
+
+def test_a_start_that_would_turn_inside_out_is_not_moved_on(body):
+    fem = Fem(body, EFFECTS, LIVE, "cpu")
+    first = fem.deform(pushed(0.0))
+    last = fem.deform(pushed(1e-3), first)
+    torn = last.history[BEFORE] + np.random.default_rng(1).normal(0.0, 0.1, last.history[BEFORE].shape)
+    answer = fem.deform(pushed(2e-3), replace(last, history={**last.history, BEFORE: torn}))
+    assert answer.outcome[0].name == "CONVERGED" and answer.inverted[0] == 0
+
+
+def test_a_foreign_start_tells_no_way(body):
+    fem = Fem(body, EFFECTS, LIVE, "cpu")
+    first = fem.deform(pushed(0.0))
+    assert BEFORE not in first.history
+    second = fem.deform(pushed(1e-3), guess(first.displacement))
+    assert BEFORE not in second.history
+    np.testing.assert_allclose(fem.deform(pushed(2e-3), second).history[BEFORE][0], second.displacement.ravel())
