@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+import warp as wp
 
 from .device import Device
 from .factor import node_of
@@ -48,15 +49,34 @@ def condensed(problem: Problem, nodes: np.ndarray, own: sp.csc_array) -> Condens
     rows = np.flatnonzero(abs(beyond).max(axis=1).toarray().ravel() > ROUND_OFF * abs(whole).max())
     stiffness = beyond[rows][:, rows].toarray()
     far = sp.csc_array(basis[:, ~np.isin(node_of(basis), nodes)])
-    fine = Device(problem.device.name, "float64")
+    follow, taken = _followed(whole, far, sp.csc_array(whole[part[rows]].T), problem.device)
+    stiffness -= taken
+    return Condensation(rows, (stiffness + stiffness.T) / 2, follow)
+
+
+def _followed(
+    whole: sp.csr_array, far: sp.csc_array, coupling: sp.csc_array, device: Device
+) -> tuple[np.ndarray, np.ndarray]:
+    """-L (L^T K L)^-1 L^T B (3N, m) and what it takes from the stiffness (m, m), of motions L and a coupling B (3N, m).
+
+    CUDA takes them apart in blocks where these fit.
+    """
+    if device.on_cuda:
+        from . import pivots
+
+        where = wp.device_to_torch(device.name)
+        if pivots.fits(len(far.indptr) + len(coupling.indptr), where):
+            across, taken = pivots.eliminated(far.T @ whole @ far, far.T @ coupling, where)
+            return -(far.astype(np.float32) @ across), taken
+    fine = Device(device.name, "float64")
     solver = direct(sp.csc_array(whole), far, node_of(far), fine, "float64")
-    coupling = sp.csc_array(whole[part[rows]].T)
-    follow = np.zeros((problem.rows, len(rows)), problem.device.precision)
-    for first in range(0, len(rows), STRIP):
+    count = len(coupling.indptr) - 1
+    follow, taken = np.zeros((len(whole.indptr) - 1, count), device.precision), np.zeros((count, count))
+    for first in range(0, count, STRIP):
         some = coupling[:, first : first + STRIP].toarray()
         out = fine.zeros(*some.shape)
         solver.apply(fine.array(some), np.ones(some.shape[1], bool), out)
         moved = out.numpy()
         follow[:, first : first + STRIP] = -moved
-        stiffness[:, first : first + STRIP] -= coupling.T @ moved
-    return Condensation(rows, (stiffness + stiffness.T) / 2, follow)
+        taken[:, first : first + STRIP] = coupling.T @ moved
+    return follow, taken

@@ -15,12 +15,11 @@ import scipy.sparse as sp
 import torch
 import warp as wp
 
+from . import pivots
 from .columns import add_dots, is_kept
 from .device import Device
 from .problem import Problem
 
-# Stiffness, factor, inverse and what the factorisation works in stand in memory together, in double precision.
-COPIES = 5
 # Tensor cores want rows and columns in multiples of this.
 TILE = 64
 # Rows that one thread takes.
@@ -30,11 +29,9 @@ LOW = {"float32": wp.float16, "float64": wp.float64}
 
 
 def fits(rows: int, device: Device) -> bool:
-    """Whether torch sees the card, and the dense matrices of `rows` unknowns fit into its free memory."""
-    if not torch.cuda.is_available():
-        return False
-    free, _ = torch.cuda.mem_get_info(wp.device_to_torch(device.name))
-    return COPIES * 8 * rows**2 < free
+    """Whether the card can invert `rows` unknowns, in time, and keep the inverse."""
+    kept = wp.types.type_size_in_bytes(LOW[device.precision]) * rows**2
+    return pivots.fits(rows, wp.device_to_torch(device.name), kept)
 
 
 @cache
@@ -114,20 +111,13 @@ class Dense:
     def __init__(self, stiffness: sp.csc_array, motions: sp.csc_array, device: Device):
         self._device = device
         where = wp.device_to_torch(device.name)
-        entry = sp.coo_array(motions.T @ stiffness @ motions)
-        place = tuple(torch.as_tensor(index, dtype=torch.int64, device=where) for index in (entry.row, entry.col))
         count = len(motions.indptr) - 1
-        free = torch.zeros((count, count), dtype=torch.float64, device=where)
-        free.index_put_(place, torch.as_tensor(entry.data, device=where))
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(free))
-        scale = inverse.diagonal().sqrt()
-        inverse /= scale * scale[:, None]
+        rows = pivots.halved(sp.csc_array(motions.T @ stiffness @ motions), pivots.cuts_of(count), where)
+        pivots.invert(rows)
+        scale = torch.cat([-row[:, -len(row) :].diagonal() for row in rows]).sqrt()
         self._size = -(-count // TILE) * TILE
-        kind = wp.dtype_to_torch(LOW[device.precision])
-        self._inverse = torch.zeros((self._size, self._size), dtype=kind, device=where)
-        self._inverse[:count, :count] = inverse
-        del free, inverse
-        torch.cuda.empty_cache()  # batches of loads want the room
+        self._inverse = _scaled(rows, scale, self._size, wp.dtype_to_torch(LOW[device.precision]))
+        pivots.release(where)
         self._scale = device.array(scale.cpu().numpy())
         back = motions @ sp.diags_array(scale.cpu().numpy())
         self._into, self._back = (_compressed(sp.csr_array(matrix), device) for matrix in (motions.T, back))
@@ -160,6 +150,20 @@ class Dense:
             right, solved = (wp.zeros(shape, dtype=low, device=name) for _ in range(2))
             self._rooms[count] = Buffers(right, solved, wp.zeros(count, dtype=wp.float64, device=name))
         return self._rooms[count]
+
+
+def _scaled(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torch.dtype) -> torch.Tensor:
+    """The matrix (size, size) whose negative lower half is in `rows` of blocks, over scales; rows are given back."""
+    out = torch.zeros((size, size), dtype=kind, device=scale.device)
+    while rows:
+        row = rows.pop()
+        stop = row.shape[1]
+        first = stop - len(row)
+        row /= -scale[first:stop, None]
+        row /= scale[:stop]
+        out[first:stop, :stop] = row
+        out[:first, first:stop] = row[:, :first].T
+    return out
 
 
 def _compressed(matrix: sp.csr_array, device: Device) -> list[wp.array]:

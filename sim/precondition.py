@@ -44,6 +44,8 @@ def choose_preconditioner(
     try:
         if space.element == "p2":
             stiffness = problem.rest_curvature()
+            if device.on_cuda and _direct_pays(len(constraint.basis().indptr) - 1, device):
+                return _solver(stiffness, constraint, space.nodes, device)
             lifted = _on_corners(stiffness, space, constraint, device)
             name = f"p-multigrid on {name_of(lifted.coarse)}"
             return TwoLevel(lifted, over_free(stiffness, constraint), device, name)

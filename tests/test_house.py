@@ -25,7 +25,7 @@ TIERS = (
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""
 OWNERS = {
-    "torch": {"sim/dense.py", "sim/product.py", "surrogate/ann.py"},
+    "torch": {"sim/dense.py", "sim/pivots.py", "sim/product.py", "surrogate/ann.py"},
     "sklearn": {"surrogate/svr.py"},
     "trimesh": {"scenes/play.py", "scenes/site.py", "scenes/tool.py"},
     "meshio": {"sim/meshfile.py"},

@@ -1,0 +1,132 @@
+"""Symmetric positive definite matrices inverted and eliminated on CUDA: in place, half of them, in blocks.
+
+An exchange of the first unknowns of a symmetric matrix with their right-hand sides makes [[-A^-1, A^-1 B^T],
+[B A^-1, C - B A^-1 B^T]] of [[A, B^T], [B, C]]: Goodnight 1979, "A tutorial on the SWEEP operator", Am. Stat.
+33:149-158. Of all unknowns it leaves the inverse, in n^3 operations and 4 n^2 bytes of double precision, where a
+library's factor and inverse stand beside each other. Uses torch, as `dense` does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+
+# Unknowns of a block: rows of blocks stand beside the matrix while it is exchanged.
+BLOCK, BESIDE = 4096, 3
+# Side of the product that says how fast a device multiplies, after one that wakes it.
+TRIAL = 4096
+# An exchange may take this share of the free memory, and so many seconds.
+SHARE, LONGEST = 0.9, 40.0
+
+
+@cache
+def rate(where: str) -> float:
+    """Multiplications and additions a second in double precision, measured."""
+    one = torch.ones((TRIAL, TRIAL), dtype=torch.float64, device=where)
+    spent = 0.0
+    for _ in range(2):
+        begun = time.perf_counter()
+        float((one @ one)[0, 0])  # waits for it
+        spent = time.perf_counter() - begun
+    return TRIAL**3 / spent
+
+
+def fits(count: int, where: str, besides: int = 0) -> bool:
+    """Whether a card can exchange so many unknowns, beside so many bytes, in its free memory and in time."""
+    if not torch.cuda.is_available():
+        return False
+    free, _ = torch.cuda.mem_get_info(where)
+    taken = 8 * (count * (count + BLOCK) // 2 + BESIDE * min(count, BLOCK) * count)
+    return taken + besides < SHARE * free and count**3 / 2 < LONGEST * rate(where)
+
+
+def halved(matrix: sp.csc_array, cuts: Sequence[int], where: str) -> list[torch.Tensor]:
+    """A symmetric matrix (n, n) in rows of blocks between the cuts, each as far as its own block on the diagonal."""
+    rows, out = sp.csr_array(matrix), []
+    for first, stop in pairwise(cuts):
+        part = sp.coo_array(rows[first:stop])
+        own = part.col < stop
+        place = tuple(torch.as_tensor(index[own], dtype=torch.int64, device=where) for index in (part.row, part.col))
+        block = torch.zeros((stop - first, stop), dtype=torch.float64, device=where)
+        out.append(block.index_put_(place, torch.as_tensor(part.data[own].astype(np.float64), device=where)))
+    return out
+
+
+def invert(rows: Sequence[torch.Tensor]) -> None:
+    """-A^-1 in place of A, as `halved` has them.
+
+    Raises
+    ------
+    RuntimeError
+        A is not positive definite.
+    """
+    for k in range(len(rows)):
+        stop = rows[k].shape[1]
+        own = slice(stop - len(rows[k]), stop)
+        inverse = _inverse(rows[k][:, own])
+        across = torch.cat([rows[k], *(row[:, own].T for row in rows[k + 1 :])], dim=1)
+        across[:, own] = 0.0
+        solved = inverse @ across
+        for row in rows:
+            if row is not rows[k]:
+                mine = slice(row.shape[1] - len(row), row.shape[1])
+                row.addmm_(across[:, mine].T, solved[:, : mine.stop], alpha=-1.0)
+                if mine.start >= stop:
+                    row[:, own] = solved[:, mine].T
+        rows[k][:] = solved[:, :stop]
+        rows[k][:, own] = -inverse
+
+
+def cuts_of(count: int) -> list[int]:
+    """Where the blocks of so many unknowns begin and end."""
+    return [*range(0, count, BLOCK), count]
+
+
+def eliminated(matrix: sp.csc_array, border: sp.csc_array, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """X = A^-1 B (n, m) in single precision and B^T X (m, m), of sparse A (n, n) and B (n, m).
+
+    Raises
+    ------
+    RuntimeError
+        A is not positive definite.
+    """
+    cuts = cuts_of(len(matrix.indptr) - 1)
+    stop = cuts[-1] + len(border.indptr) - 1
+    whole = sp.csc_array(sp.block_array([[matrix, border], [border.T, None]]))
+    *rows, last = halved(whole, [*cuts, stop], where)
+    for k in range(len(rows)):
+        _eliminate(rows[k], [*rows[k + 1 :], last])
+    while rows:  # and back
+        row = rows.pop()
+        own = slice(row.shape[1] - len(row), row.shape[1])
+        for first, stop in pairwise(cuts[: len(rows) + 1]):
+            last[:, first:stop].addmm_(last[:, own], row[:, first:stop], alpha=-1.0)
+    return last[:, : cuts[-1]].T.to(torch.float32).cpu().numpy(), -last[:, cuts[-1] :].cpu().numpy()
+
+
+def _eliminate(row: torch.Tensor, below: Sequence[torch.Tensor]) -> None:
+    """Take a block's unknowns out of the rows below, which keep what solves for it in their place."""
+    stop = row.shape[1]
+    own = slice(stop - len(row), stop)
+    across = torch.cat([later[:, own].T for later in below], dim=1)
+    solved = _inverse(row[:, own]) @ across
+    for later in below:
+        mine = slice(later.shape[1] - len(later) - stop, later.shape[1] - stop)
+        later[:, stop:].addmm_(across[:, mine].T, solved[:, : mine.stop], alpha=-1.0)
+        later[:, own] = solved[:, mine].T
+
+
+def _inverse(block: torch.Tensor) -> torch.Tensor:
+    return torch.cholesky_inverse(torch.linalg.cholesky(block))
+
+
+def release(where: str) -> None:
+    """Give back what nobody holds: batches of loads want the room."""
+    if where != "cpu":
+        torch.cuda.empty_cache()

@@ -1,0 +1,52 @@
+"""Matrices taken apart in blocks against dense algebra, on the host: torch multiplies there as it does on a card."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from sim import pivots
+
+COUNT, BORDER = 23, 7
+RANDOM = np.random.default_rng(0)
+ROOT = RANDOM.normal(size=(COUNT, COUNT)) * (RANDOM.random((COUNT, COUNT)) < 0.3)
+MATRIX = ROOT @ ROOT.T + np.eye(COUNT)
+ACROSS = RANDOM.normal(size=(COUNT, BORDER))
+
+
+@pytest.mark.parametrize("block", [1, 5, 23, 100])
+def test_what_is_inverted_in_place_is_the_inverse(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pivots, "BLOCK", block)
+    rows = pivots.halved(sp.csc_array(MATRIX), pivots.cuts_of(COUNT), "cpu")
+    assert len(rows) == -(-COUNT // block)
+    pivots.invert(rows)
+    expected, first = -np.linalg.inv(MATRIX), 0
+    for row in rows:
+        stop = first + len(row)
+        np.testing.assert_allclose(row.numpy(), expected[first:stop, :stop], atol=1e-12)
+        first = stop
+    assert first == COUNT
+
+
+@pytest.mark.parametrize("block", [1, 5, 23, 100])
+def test_what_is_eliminated_is_the_solution_and_what_it_takes(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pivots, "BLOCK", block)
+    solution, taken = pivots.eliminated(sp.csc_array(MATRIX), sp.csc_array(ACROSS), "cpu")
+    expected = np.linalg.solve(MATRIX, ACROSS)
+    assert solution.dtype == np.float32
+    np.testing.assert_allclose(solution, expected, atol=1e-6)
+    np.testing.assert_allclose(taken, ACROSS.T @ expected, atol=1e-12)
+
+
+def test_what_is_not_positive_definite_is_refused() -> None:
+    matrix = sp.csc_array(MATRIX - 1e3 * np.eye(COUNT))
+    with pytest.raises(RuntimeError, match="positive"):
+        pivots.eliminated(matrix, sp.csc_array(ACROSS), "cpu")
+
+
+def test_a_device_is_asked_how_fast_it_multiplies(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pivots, "TRIAL", 8)
+    pivots.rate.cache_clear()
+    assert pivots.rate("cpu") > 0.0
+    pivots.rate.cache_clear()
