@@ -48,6 +48,20 @@ class Footprints:
         return sums[:, 1:] / sums[:, :1]
 
 
+@dataclass(frozen=True, eq=False)
+class Imprint:
+    """Arrays on the device in which B tools press: (B,) of point and radius [m], and of where each touches first.
+
+    `found` on the way there; weight (M, B) and sums (B,) as `Footprints`.
+    """
+
+    tools: wp.array
+    touched: wp.array
+    found: wp.array
+    weight: wp.array
+    sums: wp.array
+
+
 class Skin:
     """A surface that tools touch, on a device.
 
@@ -76,7 +90,9 @@ class Skin:
 
     def nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The nearest points (B, 3) [m] to `points` (B, 3) and how far they are; inf if not `within` (B,) [m]."""
-        touched = self._touched(self._tools(points, within)).numpy().reshape(-1, 4)
+        imprint = self.imprint(self._tools(points, within))
+        self._touch(imprint)
+        touched = imprint.touched.numpy().reshape(-1, 4)
         return touched[:, :3], touched[:, 3]
 
     def press(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
@@ -95,32 +111,43 @@ class Skin:
             self._last = key, self._pressed(points, radii)
         return self._last[1]
 
+    def imprint(self, tools: wp.array) -> Imprint:
+        """Where tools (B,) are about to press."""
+        chunks, count, device = -(-len(self._ball) // CHUNK), len(tools), self.device.name
+        found, touched, sums = (
+            wp.empty(shape, dtype=wp.vec4d, device=device) for shape in ((chunks, count), count, count)
+        )
+        weight = wp.empty((len(self.nodes), count), dtype=wp.float64, device=device)
+        return Imprint(tools, touched, found, weight, sums)
+
+    def put(self, imprint: Imprint) -> None:
+        """Let the tools press, on the device alone; infinitely far away, and no weight, where one does not touch."""
+        self._touch(imprint)
+        imprint.weight.zero_()
+        imprint.sums.zero_()
+        inputs = [self._corners, self._ball, self._table, self._position, imprint.tools, imprint.touched]
+        self.device.launch(_press, (len(self._ball), len(imprint.tools)), inputs, [imprint.weight, imprint.sums])
+
     def _pressed(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
-        tools, count = self._tools(points, radii), len(points)
-        touched = self._touched(tools)
-        missed = np.flatnonzero(np.isinf(touched.numpy().reshape(-1, 4)[:, 3]))
+        imprint = self.imprint(self._tools(points, radii))
+        self.put(imprint)
+        missed = np.flatnonzero(np.isinf(imprint.touched.numpy().reshape(-1, 4)[:, 3]))
         if len(missed):
             number = missed[0]
             raise InputError(
                 f"load {number} presses at {np.round(1e3 * points[number], 1)} mm with a footprint of "
                 f"{1e3 * radii[number]:.3g} mm, which does not touch the surface: choose a point on it."
             )
-        weight = wp.zeros((len(self.nodes), count), dtype=wp.float64, device=self.device.name)
-        sums = wp.zeros(count, dtype=wp.vec4d, device=self.device.name)
-        inputs = [self._corners, self._ball, self._table, self._position, tools, touched]
-        self.device.launch(_press, (len(self._ball), count), inputs, [weight, sums])
-        return Footprints(self.nodes, weight, sums)
+        return Footprints(self.nodes, imprint.weight, imprint.sums)
 
     def _tools(self, points: np.ndarray, radii: np.ndarray) -> wp.array:
         return self.device.array(np.column_stack([points, radii]), wp.vec4d)
 
-    def _touched(self, tools: wp.array) -> wp.array:
-        """Where (B,) each tool touches first, and how far that is from its point; inf if beyond its radius."""
-        found = wp.empty((-(-len(self._ball) // CHUNK), len(tools)), dtype=wp.vec4d, device=self.device.name)
-        touched = wp.empty(len(tools), dtype=wp.vec4d, device=self.device.name)
-        self.device.launch(_search, found.shape, [self._corners, self._ball, tools], [found])
-        self.device.launch(_settle, touched.shape, [found], [touched])
-        return touched
+    def _touch(self, imprint: Imprint) -> None:
+        """Where each tool touches first, and how far that is from its point; inf if beyond its radius."""
+        inputs = [self._corners, self._ball, imprint.tools]
+        self.device.launch(_search, imprint.found.shape, inputs, [imprint.found])
+        self.device.launch(_settle, imprint.touched.shape, [imprint.found], [imprint.touched])
 
 
 def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:

@@ -62,8 +62,12 @@ class Inversion:
 
     def count(self, u: wp.array) -> np.ndarray:
         """How many (B,) in u (3N, B) [m], on the device."""
-        _, points, size = self._gradient.shape
         out = wp.zeros(u.shape[1], dtype=wp.int32, device=self._device.name)
+        self.add_count(u, out)
+        return out.numpy()
+
+    def add_count(self, u: wp.array, out: wp.array) -> None:
+        """Add how many in u (3N, B) [m] to out (B,) int32, on the device alone."""
+        _, points, size = self._gradient.shape
         inputs = [u, self._table, self._gradient]
         self._device.launch(kernel_of(self._device, size, points), (len(self._table), u.shape[1]), inputs, [out])
-        return out.numpy()

@@ -115,7 +115,7 @@ class Ladder:
         else:
             started = guess.any(axis=0)
             astray = started & (self.inversion.count(device.array(guess)) > 0)
-            learnt = NOTHING if astray.any() else _learnt(cases, problem.rows)
+            learnt = NOTHING if astray.any() else learnt_from(cases, problem.rows)
             answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
             lost = np.where(answer.good, answer.inverted > 0, self._lost(answer))
             again = np.flatnonzero(started & ~astray & lost)
@@ -215,7 +215,7 @@ class Ladder:
         return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent)
 
 
-def _learnt(cases: Cases, rows: int) -> dict[str, np.ndarray]:
+def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
     """What an earlier descent on as many rows = 3N left in the history; nothing if there was none."""
     found = {name: cases.history[LEARNT_KEY + name] for name in LEARNT if LEARNT_KEY + name in cases.history}
     return found if found and found["s"].shape[-1] == rows else {}

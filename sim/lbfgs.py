@@ -113,7 +113,7 @@ class Lbfgs:
                     room.columns[name].numpy()[leave] for name in ("status", "steps", "residual")
                 )
                 if last:
-                    learnt = {name: _rows_first(room.columns[name]) for name in LEARNT} if teach else {}
+                    learnt = {name: rows_first(room.columns[name]) for name in LEARNT} if teach else {}
                     return Descended(u, status, steps, residual, learnt)
                 stay = np.flatnonzero(now == LIVE)
                 place, before, room = place[stay], room, self._room(len(stay))
@@ -135,5 +135,6 @@ class Lbfgs:
         return count
 
 
-def _rows_first(array: wp.array) -> np.ndarray:
+def rows_first(array: wp.array) -> np.ndarray:
+    """A copy (b, ...) on the host of an array (..., b) in a room."""
     return np.moveaxis(array.numpy(), -1, 0).copy()  # what stands in a room is written over

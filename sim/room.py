@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import prod
 from typing import Any
 
@@ -57,6 +58,28 @@ def ground_of(problem: Problem, width: int) -> dict[str, wp.array]:
     }
 
 
+@dataclass(frozen=True, eq=False)
+class State:
+    """Arrays of `width` columns by name, and by kind of number all those that move with them, where both stand."""
+
+    columns: Mapping[str, wp.array]
+    moved: Mapping[str, wp.array]
+    ground: Mapping[str, wp.array]  # arrays that stand on it do not keep it
+
+
+def standing(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> State:
+    """The state of so many columns on a ground that `ground_of` made for at least this width."""
+    columns: dict[str, wp.array] = {}
+    together: dict[str, wp.array] = {}
+    for kind, (_, moved, written) in layout(problem).items():
+        first = 0
+        for name, shape in {**moved, **written}.items():
+            columns[name] = _placed(ground[kind], first, (*shape, width))
+            first += width * prod(shape)
+        together[kind] = _placed(ground[kind], 0, (_rows(moved), width))
+    return State(columns, together, ground)
+
+
 class Room:
     """Columns last, on the ground that rooms share. On a graphics card the turn is captured once.
 
@@ -76,24 +99,16 @@ class Room:
         self._preconditioner = preconditioner
         self._kernels = kernels_of(problem.device, PAIRS)
         self._graph: wp.Graph | None = None
-        self._moved: dict[str, wp.array] = {}
-        arrays: dict[str, wp.array] = {}
-        for kind, (_, moved, written) in layout(problem).items():
-            first = 0
-            for name, shape in {**moved, **written}.items():
-                arrays[name] = _standing(ground[kind], first, (*shape, width))
-                first += width * prod(shape)
-            self._moved[kind] = _standing(ground[kind], 0, (_rows(moved), width))
-        self._ground = ground  # arrays that stand on it do not keep it
-        self.columns = arrays
-        self._trial = Balance(arrays["new_g"], arrays["part"], arrays["sums"], arrays["own"])
+        self.state = standing(problem, width, ground)
+        self.columns = a = self.state.columns
+        self._trial = Balance(a["new_g"], a["part"], a["sums"], a["own"])
 
     def begin(
         self, start: wp.array, tolerance: np.ndarray, force: np.ndarray, learnt: Mapping[str, np.ndarray]
     ) -> None:
         """Take a batch of at most as many columns, about to judge its start (3N, b)."""
         a, device, spare = self.columns, self._problem.device, self.width - start.shape[1]
-        for array in (a["d"], a["g"], a["z"], self._moved["double"], self._moved["whole"]):
+        for array in (a["d"], a["g"], a["z"], self.state.moved["double"], self.state.moved["whole"]):
             array.zero_()
         if spare:
             index = self._padded(np.arange(start.shape[1]))
@@ -111,7 +126,7 @@ class Room:
         wp.copy(a["loud"], loud)
         for name, rows_first in learnt.items():
             a[name].assign(np.moveaxis(rows_first, 0, -1).reshape(a[name].shape))
-        self._prepare()
+        self.prepare()
 
     def aim(self, g: wp.array, z: wp.array) -> None:
         """The first trial goes along -z (3N, b) from a start that has the free gradient g (3N, b)."""
@@ -130,17 +145,18 @@ class Room:
         index = self._padded(stay)
         self._problem.keep(index)
         there = self._problem.device.array(index, wp.int32)
-        for kind, own in self._moved.items():
-            wp.copy(own, gathered(self._problem.device, other._moved[kind], there))
+        for kind, own in self.state.moved.items():
+            wp.copy(own, gathered(self._problem.device, other.state.moved[kind], there))
         if len(stay) < self.width:
             self.columns["status"][len(stay) :].fill_(DONE)
-        self._prepare()
+        self.prepare()
 
     def _padded(self, stay: np.ndarray) -> np.ndarray:
         """The last of them again, until the room is full."""
         return np.append(stay, np.full(self.width - len(stay), stay[-1]))
 
-    def _prepare(self) -> None:
+    def prepare(self) -> None:
+        """Be ready to turn with what stands here."""
         self.columns["part"].zero_()
         self.columns["bound"].fill_(1.0)
         if self._preconditioner.on_device:
@@ -154,18 +170,19 @@ class Room:
         device = self._problem.device
         if not (device.on_cuda and self._preconditioner.on_device):
             for _ in range(times):
-                self._turn()
+                self.once()
             return
         if self._graph is None:
-            self._turn()  # loads what a capture cannot
+            self.once()  # loads what a capture cannot
             with wp.ScopedCapture(device.name, force_module_load=False) as capture:
-                self._turn()
+                self.once()
             self._graph = capture.graph
             times -= 1
         for _ in range(times):
             wp.capture_launch(self._graph)
 
-    def _turn(self) -> None:
+    def once(self) -> None:
+        """Turn; as a graphics card captures it, unless the preconditioner is the host's."""
         a, k = self.columns, self._kernels
         problem, device = self._problem, self._problem.device
         rows, count = a["u"].shape
@@ -200,7 +217,7 @@ class Room:
         self._problem.device.launch(self._kernels.clamp, (self.width,), [], [bound, a["t"]])
 
 
-def _standing(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
+def _placed(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
     """The numbers from the first on, as an array of any shape: views of Warp cannot skip 2^31 numbers."""
     address = ground.ptr + first * wp.types.type_size_in_bytes(ground.dtype)
     return wp.array(ptr=address, dtype=ground.dtype, shape=shape, device=ground.device)

@@ -20,7 +20,7 @@ TIERS = (
     {"terms", "problem"},
     {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering"},
     {"newton", "balance", "room", "lbfgs", "multigrid", "amg", "inversion"},
-    {"precondition", "condensation", "elimination", "ladder"},
+    {"precondition", "condensation", "elimination", "ladder", "frame", "following"},
     {"fem"},
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""

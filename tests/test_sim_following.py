@@ -1,0 +1,138 @@
+"""Frames that stay on the device: the same answers wherever a start stands, and nothing lost that somebody may read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+
+from sim import following
+from sim.accuracy import LIVE, Accuracy
+from sim.deformation import Deformation, Outcome, guess
+from sim.effects import Elasticity, Held, ToolForce
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.following import Kept
+from sim.frame import MOST
+from sim.lbfgs import LEARNT
+from sim.loads import Loads, push, stacked
+
+BODY = make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3)
+EFFECTS = (Elasticity(), Held(), ToolForce())
+
+
+def follower(accuracy: Accuracy = LIVE) -> Fem:
+    """On the CPU, which by itself would not follow."""
+    fem = Fem(BODY, EFFECTS, accuracy, "cpu")
+    assert fem._following is None
+    fem._following = fem._follower()
+    return fem
+
+
+@pytest.fixture(scope="module")
+def fem() -> Fem:
+    return follower()
+
+
+def pushed(x: float, force: float = 0.4) -> Loads:
+    return push(np.array([x, -1e-3, 0.0]), np.array([0.0, 0.05, -force]), 8e-3)
+
+
+def ride(fem: Fem, count: int = 6) -> list[Deformation]:
+    answers = [fem.deform(pushed(0.0))]
+    for number in range(1, count):
+        answers.append(fem.deform(pushed(7e-4 * number), answers[-1]))
+    return answers
+
+
+def same(one: Deformation, other: Deformation) -> bool:
+    assert set(one.history) == set(other.history)
+    names = ("displacement", "iterations", "residual", "reaction", "reached", "inverted", "time", "nodes")
+    pairs = [(getattr(one, name), getattr(other, name)) for name in names]
+    pairs += [(one.history[name], other.history[name]) for name in one.history]
+    return one.outcome == other.outcome and all(np.array_equal(*pair) for pair in pairs)
+
+
+def test_frames_are_those_of_the_ladder(fem):
+    plain = Fem(BODY, EFFECTS, LIVE, "cpu")
+    for own, other in zip(ride(fem)[1:], ride(plain)[1:], strict=True):
+        assert isinstance(own.history, Kept) and own.outcome == other.outcome == (Outcome.CONVERGED,)
+        assert own.iterations[0] == other.iterations[0]
+        np.testing.assert_allclose(own.displacement, other.displacement, atol=1e-4 * np.abs(other.displacement).max())
+        np.testing.assert_allclose(own.reaction, other.reaction, rtol=1e-9, atol=1e-12)
+        assert own.residual[0] == pytest.approx(other.residual[0], rel=0.02) and own.residual[0] <= LIVE.tolerance
+        assert set(own.history) == set(other.history)
+        assert own.history["l-bfgs known"].shape == (1,)
+
+
+def test_a_start_is_the_same_on_the_device_and_on_the_host(fem):
+    last = ride(fem)[-1]
+    here = fem.deform(pushed(5e-3), last)
+    brought = fem.deform(pushed(5e-3), replace(last, history={**last.history}))
+    assert same(here, brought)
+
+
+def test_an_older_frame_leads_where_it_led_before(fem):
+    answers = ride(fem)
+    again = fem.deform(pushed(7e-4 * 3), answers[2])
+    assert same(again, answers[3])
+    assert same(fem.deform(pushed(7e-4 * 5), answers[4]), answers[5])
+    assert same(fem.deform(pushed(7e-4 * 4), again), answers[4])
+
+
+def test_only_what_is_kept_leaves_the_device(fem, monkeypatch):
+    read = []
+    monkeypatch.setattr(following, "rows_first", lambda array: read.append(array) or array.numpy().copy())
+    last = ride(fem, 3)[-1]
+    read.clear()
+    for number in range(5):
+        last = fem.deform(pushed(2e-3 + 5e-4 * number), last)
+    assert not read
+    kept = last
+    for number in range(3):
+        last = fem.deform(pushed(5e-3 + 5e-4 * number), last)
+    assert len(read) == len(LEARNT) and kept.history["l-bfgs s"].any()
+    assert len(read) == len(LEARNT)
+
+
+def test_a_batch_between_frames_changes_nothing(fem):
+    answers = ride(fem)
+    other = ride(fem, 5)[-1]
+    fem.deform(stacked([pushed(x) for x in (0.0, 4e-3, 8e-3)]))
+    assert same(fem.deform(pushed(7e-4 * 5), other), answers[-1])
+
+
+def test_what_does_not_go_well_is_the_ladders(fem):
+    last = ride(fem)[-1]
+    with pytest.raises(InputError, match="does not touch the surface"):
+        fem.deform(pushed(0.5), last)
+    lifted = fem.deform(pushed(4e-3, 0.0).scaled(np.zeros(1)), last)
+    assert not lifted.displacement.any() and not isinstance(lifted.history, Kept)
+    assert isinstance(fem.deform(pushed(4e-3), lifted).history, Kept)
+    vast = fem.deform(pushed(4e-3, 60.0), last)
+    assert not isinstance(vast.history, Kept)
+    assert same(fem.deform(pushed(4e-3), last), fem.deform(pushed(4e-3), replace(last)))
+
+
+def test_a_start_that_is_not_fit_is_the_ladders(fem):
+    rng, good = np.random.default_rng(0), ride(fem, 2)[-1]
+    torn = fem.deform(pushed(1e-3), guess(good.displacement + rng.normal(0.0, 0.1, good.displacement.shape)))
+    assert torn.outcome == (Outcome.CONVERGED_ANEW,)
+    loose = good.displacement.copy()
+    loose[0, BODY.held.any(axis=1)] += 1e-4
+    assert not isinstance(fem.deform(pushed(1e-3), guess(loose)).history, Kept)
+    assert isinstance(fem.deform(pushed(1e-3), guess(good.displacement)).history, Kept)
+
+
+def test_vertices_are_picked_from_the_same_answer(fem):
+    last, some = ride(fem)[-1], np.array([40, 3, 7])
+    picked = fem.deform(pushed(5e-3), last, at=some)
+    np.testing.assert_array_equal(picked.displacement, fem.deform(pushed(5e-3), last).displacement[:, some])
+
+
+def test_a_body_of_another_element_or_a_small_budget_is_not_followed():
+    assert Fem(BODY, EFFECTS, replace(LIVE, outer=5), "cpu")._follower() is None
+    assert Fem(BODY, EFFECTS, LIVE, "cpu", element="p2")._follower() is None
+    assert MOST > 20
