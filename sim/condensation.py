@@ -66,7 +66,7 @@ def _followed(
 
         where = wp.device_to_torch(device.name)
         if pivots.fits(len(far.indptr) + len(coupling.indptr), where):
-            across, taken = pivots.eliminated(far.T @ whole @ far, far.T @ coupling, where)
+            across, taken = pivots.eliminated(sp.csc_array(far.T @ whole @ far), sp.csc_array(far.T @ coupling), where)
             return -(far.astype(np.float32) @ across), taken
     fine = Device(device.name, "float64")
     solver = direct(sp.csc_array(whole), far, node_of(far), fine, "float64")
