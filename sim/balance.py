@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import warp as wp
 
+from . import narrow
 from .columns import CHUNK, add_dots, combined
 from .problem import Problem
 from .steering import OWN, PAIRS, SOME, SUMS, kernels_of
@@ -15,7 +16,7 @@ from .steering import OWN, PAIRS, SOME, SUMS, kernels_of
 class Balance:
     """What is out of balance: the free gradient g (3N, b) [N] on the device, and its `sums` (SUMS, b) of steering.
 
-    Square norms own (terms, b) of the gradients of the terms that are not constant. `part` (3N, b) is zero between.
+    Square norms own (b last) of the gradients of the terms that are not constant. `part` (3N, b) is zero between.
     """
 
     g: wp.array
@@ -41,18 +42,21 @@ def balance(
     room, k = room or _balance_room(problem, count), kernels_of(problem.device, PAIRS)
     varying = [term for term in problem.terms if not term.constant]
     room.sums.zero_()
-    room.own.zero_()
     wp.copy(room.g, constant)
     if len(varying) == 1:
         varying[0].add_gradient(v, room.g)
+        room = replace(room, own=room.sums[OWN : OWN + 1])
     else:
+        room.own.zero_()
         for number, term in enumerate(varying):
             term.add_gradient(v, room.part)
             device.launch(k.absorb, (-(-rows // CHUNK), count), [], [room.part, room.g, room.own[number]])
     inputs = [constant, *problem.constraint.nodes, v if d is None else d]
-    device.launch(k.finish, (-(-rows // (3 * SOME)), count), inputs, [room.g, room.sums])
-    if len(varying) == 1:
-        wp.copy(room.own[0], room.sums[OWN])
+    if count == 1:
+        one = narrow.kernels_of(device, PAIRS)
+        device.launch(one.finish, (narrow.threads(device, rows // 3),), inputs, [room.g, room.sums])
+    else:
+        device.launch(k.finish, (-(-rows // (3 * SOME)), count), inputs, [room.g, room.sums])
     return room
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from .device import Device
+from .lanes import lanes_of, summed
 
 # Rooms of L-BFGS fit batches of so few columns exactly: what these learn goes from one to the next.
 EXACT = 4
@@ -22,6 +23,7 @@ class Kernels:
     """Column arithmetic of one scalar type."""
 
     dot: wp.Kernel
+    dot_alone: wp.Kernel
     combine: wp.Kernel
     add_multiple: wp.Kernel
     unstack: wp.Kernel
@@ -31,7 +33,7 @@ class Kernels:
 def kernels_of(device: Device) -> Kernels:
     """Kernels of a device's scalar type."""
     scalar = device.scalar
-    chunk = CHUNK
+    chunk, lanes = CHUNK, lanes_of(device)
 
     @wp.kernel(module="unique")
     def dot(
@@ -46,6 +48,22 @@ def kernels_of(device: Device) -> Kernels:
         for r in range(block * chunk, wp.min((block + 1) * chunk, x.shape[0])):
             total += wp.float64(x[r, c]) * wp.float64(y[r, c])
         wp.atomic_add(out, c, total)
+
+    @wp.kernel(module="unique")
+    def dot_alone(
+        x: wp.array2d(dtype=scalar),
+        y: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array(dtype=wp.float64),
+    ):
+        """The same for one column, one row a thread."""
+        r = wp.tid()
+        total = wp.float64(0.0)
+        if r < x.shape[0]:
+            total = wp.float64(x[r, 0]) * wp.float64(y[r, 0])
+        total = summed(total)
+        if r % lanes == 0:
+            wp.atomic_add(out, 0, total)
 
     @wp.kernel(module="unique")
     def combine(
@@ -83,7 +101,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             out[c, n, k] = wp.float64(x[3 * nodes[n] + k, c])
 
-    return Kernels(dot, combine, add_multiple, unstack)
+    return Kernels(dot, dot_alone, combine, add_multiple, unstack)
 
 
 @cache
@@ -122,7 +140,12 @@ def is_kept(width: int) -> bool:
 
 def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:
     """Add the columns' inner products of x and y (rows, b) to out (b,) float64, on the device."""
-    device.launch(kernels_of(device).dot, (-(-x.shape[0] // CHUNK), x.shape[1]), [x, y], [out])
+    k, (rows, count) = kernels_of(device), x.shape
+    if device.on_cuda and count == 1:
+        lanes = lanes_of(device)
+        device.launch(k.dot_alone, (-(-rows // lanes) * lanes,), [x, y], [out])
+    else:
+        device.launch(k.dot, (-(-rows // CHUNK), count), [x, y], [out])
 
 
 def dots(device: Device, x: wp.array, y: wp.array) -> np.ndarray:

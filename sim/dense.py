@@ -9,6 +9,7 @@ is imported by its arm in `precondition` alone.
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,6 +20,7 @@ from . import pivots
 from .columns import add_dots, is_kept
 from .device import Device
 from .problem import Problem
+from .symmetric import add_product, tiles_of
 
 # Tensor cores want rows and columns in multiples of this.
 TILE = 64
@@ -35,9 +37,9 @@ def fits(rows: int, device: Device) -> bool:
 
 
 @cache
-def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
-    """Kernels into the matrix's unknowns and precision, and back."""
-    scalar, low, some = device.scalar, LOW[device.precision], SOME
+def kernels_of(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """Kernels into the matrix's unknowns, as numbers of type `low`, and back; each thread takes `some` rows."""
+    scalar = device.scalar
 
     @wp.kernel(module="unique")
     def lower(
@@ -121,6 +123,7 @@ class Dense:
         self._scale = device.array(scale.cpu().numpy())
         back = motions @ sp.diags_array(scale.cpu().numpy())
         self._into, self._back = (_compressed(sp.csr_array(matrix), device) for matrix in (motions.T, back))
+        self._tiles = tiles_of(self._size, device.name)
         self._rooms: dict[int, Buffers] = {}
         torch.cuda.synchronize(where)
 
@@ -130,22 +133,32 @@ class Dense:
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
         """One dense matrix product, in Warp's stream."""
         device, count = self._device, r.shape[1]
-        lower, raise_ = kernels_of(device)
-        room = self._room(count)
+        room, some = self._room(count), SOME if count > 1 else 1
+        lower, raise_ = kernels_of(device, room.right.dtype, some)
         room.square.zero_()
         add_dots(device, r, r, room.square)
         inputs = [*self._into, self._scale, room.square, r]
-        device.launch(lower, (-(-self._scale.shape[0] // SOME), count), inputs, [room.right])
-        with torch.cuda.stream(wp.stream_to_torch(device.name)):
-            torch.matmul(self._inverse, wp.to_torch(room.right), out=wp.to_torch(room.solved))
+        device.launch(lower, (-(-self._scale.shape[0] // some), count), inputs, [room.right])
+        if self._halves(count):
+            room.solved.zero_()
+            add_product(self._tiles, wp.from_torch(self._inverse), room.right.flatten(), room.solved.flatten())
+        else:
+            with torch.cuda.stream(wp.stream_to_torch(device.name)):
+                torch.matmul(self._inverse, wp.to_torch(room.right), out=wp.to_torch(room.solved))
         inputs = [*self._back, room.square, room.solved]
-        device.launch(raise_, (-(-r.shape[0] // SOME), count), inputs, [out])
+        device.launch(raise_, (-(-r.shape[0] // some), count), inputs, [out])
+
+    def _halves(self, count: int) -> bool:
+        """Whether so many columns are multiplied by half of the matrix: then all they cost is reading it."""
+        return count == 1 and self._inverse.dtype == torch.float16
 
     def _room(self, count: int) -> Buffers:
         """For batches of one width; those of rooms are kept, and the last other."""
         if count not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
             low, name = LOW[self._device.precision], self._device.name
+            if self._halves(count):
+                low = wp.float32
             shape = (self._size, -(-count // TILE) * TILE if count > 1 else 1)
             right, solved = (wp.zeros(shape, dtype=low, device=name) for _ in range(2))
             self._rooms[count] = Buffers(right, solved, wp.zeros(count, dtype=wp.float64, device=name))

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from . import narrow
 from .balance import Balance, balance, constants_of
 from .columns import add_dots, combined, gathered
 from .linear import Preconditioner
 from .problem import Problem
-from .steering import DONE, LIVE, PAIRS, PRODUCTS, SOME, SUMS, few_of, kernels_of
+from .steering import DONE, PAIRS, PRODUCTS, SOME, SUMS, few_of, kernels_of
 
 Shapes = Mapping[str, tuple[int, ...]]
 
@@ -45,7 +46,7 @@ def layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
         "whole": (
             wp.int32,
             dict.fromkeys(("steps", "cut", "known", "status", "head"), ()),
-            dict.fromkeys(("accepted", "slot"), ()),
+            dict.fromkeys(("accepted", "slot", "aiming"), ()),
         ),
     }
 
@@ -186,29 +187,44 @@ class Room:
         a, k = self.columns, self._kernels
         problem, device = self._problem, self._problem.device
         rows, count = a["u"].shape
-        one, some = (count,), (-(-rows // SOME), count)
-        device.launch(k.step, some, [a["u"], a["t"], a["d"]], [a["v"]])
-        balance(problem, a["v"], a["constant"], a["d"], self._trial)
-        inputs = [a["loud"], self._trial.own, a["tolerance"], a["force"], self._trial.sums, a["promised"]]
-        outputs = [a["status"], a["accepted"], a["steps"], a["cut"], a["t"], a["gone"], a["residual"]]
-        device.launch(k.judge, one, inputs, outputs)
-        live = np.ones(count, bool)
-        if not self._preconditioner.on_device:  # the host's time is better not spent on trials that failed
-            live = (a["accepted"].numpy() != 0) & (a["status"].numpy() == LIVE)
-        if live.any():
-            self._preconditioner.apply(self._trial.g, live, a["new_z"])
-        problem.constraint.project_nodes(a["new_z"])
-        a["products"].zero_()
-        inputs = [a["known"], a["s"], a["w"], a["g"], a["z"], self._trial.g, a["new_z"]]
-        device.launch(k.multiply, some, inputs, [a["products"]])
-        inputs = [a["accepted"], a["gone"], self._trial.sums, a["products"]]
-        outputs = [a["status"], a["head"], a["known"], a["slot"], a["t"], a["promised"]]
-        outputs += [a["sg"], a["wg"], a["sy"], a["yw"], a["along_s"], a["along_w"]]
-        device.launch(k.aim, one, inputs, outputs)
+        alone, one, some = narrow.kernels_of(device, PAIRS), (count,), (-(-rows // SOME), count)
+        step, dim = (alone.step, (narrow.threads(device, rows),)) if count == 1 else (k.step, some)
+        device.launch(step, dim, [a["u"], a["t"], a["d"]], [a["v"]])
+        found = balance(problem, a["v"], a["constant"], a["d"], self._trial)
+        inputs = [a["loud"], found.own, a["tolerance"], a["force"], found.sums, a["promised"]]
+        names = ("status", "accepted", "steps", "cut", "t", "gone", "residual", "slot", "aiming")
+        device.launch(k.judge, one, inputs, [a[name] for name in names])
+        if count == 1 and (not device.on_cuda or wp.is_conditional_graph_supported()):
+            wp.capture_if(a["aiming"], self._aim)
+        else:
+            self._aim()
         inputs = [a["status"], a["accepted"], a["known"], a["slot"], a["gone"], a["along_s"], a["along_w"]]
         outputs = [a["u"], a["d"], a["g"], a["z"], a["s"], a["w"]]
-        device.launch(k.move, (-(-rows // few_of(device)), count), [*inputs, self._trial.g, a["new_z"]], outputs)
+        device.launch(k.move, (-(-rows // few_of(device)), count), [*inputs, found.g, a["new_z"]], outputs)
         self._clamp()
+
+    def _aim(self) -> None:
+        """The next direction of the columns that go on, from their new gradients."""
+        a, k = self.columns, self._kernels
+        problem, device, g = self._problem, self._problem.device, self._trial.g
+        rows, count = a["u"].shape
+        live = np.ones(count, bool)
+        if not self._preconditioner.on_device:  # the host's time is better not spent on trials that failed
+            live = a["aiming"].numpy() != 0
+        if live.any():
+            self._preconditioner.apply(g, live, a["new_z"])
+        problem.constraint.project_nodes(a["new_z"])
+        a["products"].zero_()
+        inputs, outputs = [a["known"], a["s"], a["w"], a["g"], a["z"], g, a["new_z"]], [a["products"]]
+        if count == 1 and device.on_cuda:
+            dim = (len(a["products"]), narrow.threads(device, rows))
+            device.launch(narrow.kernels_of(device, PAIRS).multiply, dim, inputs, outputs)
+        else:
+            device.launch(k.multiply, (-(-rows // SOME), count), inputs, outputs)
+        inputs = [a["aiming"], a["gone"], self._trial.sums, a["products"]]
+        outputs = [a["status"], a["head"], a["known"], a["slot"], a["t"], a["promised"]]
+        outputs += [a["sg"], a["wg"], a["sy"], a["yw"], a["along_s"], a["along_w"]]
+        device.launch(k.aim, (count,), inputs, outputs)
 
     def _clamp(self) -> None:
         a, bound = self.columns, self.columns["bound"]

@@ -59,6 +59,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
     scalar, vec = device.scalar, device.vector
     several, few_scalars = (wp.types.vector(length=length, dtype=scalar) for length in (SOME, few_of(device)))
     weights = wp.types.vector(length=pairs, dtype=wp.float64)
+    products_of_pairs = wp.types.matrix(shape=(pairs, pairs), dtype=wp.float64)
     m, chunk, some, few = pairs, CHUNK, SOME, few_of(device)
     overshoot, least_kept, kept, most_kept = OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT
     cuts, least_curvature = CUTS, LEAST_CURVATURE
@@ -180,10 +181,14 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         t: wp.array(dtype=wp.float64),
         gone: wp.array(dtype=wp.float64),
         residual: wp.array(dtype=wp.float64),
+        slot: wp.array(dtype=wp.int32),
+        aiming: wp.array(dtype=wp.int32),
     ):
-        """Accept the trial, or cut the step; the first trial is the start itself."""
+        """Accept the trial, or cut the step; the first trial is the start itself. Aiming are those that go on."""
         c = wp.tid()
         accepted[c] = 0
+        slot[c] = -1
+        aiming[c] = 0
         if status[c] != LIVE:
             return
         zero = wp.float64(0.0)
@@ -221,10 +226,12 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             status[c] = DONE
         if status[c] != LIVE:
             t[c] = zero
+        elif accepted[c] != 0:
+            aiming[c] = 1
 
     @wp.kernel(module="unique")
     def aim(
-        accepted: wp.array(dtype=wp.int32),
+        aiming: wp.array(dtype=wp.int32),
         gone: wp.array(dtype=wp.float64),
         sums: wp.array2d(dtype=wp.float64),
         products: wp.array2d(dtype=wp.float64),
@@ -247,8 +254,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         The first `known` slots are filled; from slot m - 1 the head goes on to slot 0.
         """
         c = wp.tid()
-        slot[c] = -1
-        if accepted[c] == 0 or status[c] != LIVE:
+        if aiming[c] == 0:
             return
         zero = wp.float64(0.0)
         slope, gz = sums[slope_row, c], products[gz_row, c]
@@ -268,42 +274,51 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             known[c] = wp.min(known[c] + 1, m)
             slot[c] = n
         size = known[c]
-        # In registers: every number here waits for the one before it.
-        by_s, by_w = weights(), weights()
         for i in range(m):
             sg[i, c] = wp.where(i == n, gone[c] * slope, products[i, c])
             wg[i, c] = wp.where(i == n, gz - products[gold_row, c], products[m + i, c])
+        # By age, in registers: from here on every number waits for the one before it.
+        by_s, by_w, along, across = weights(), weights(), weights(), weights()
+        curved, crossed = products_of_pairs(), products_of_pairs()
+        for a in range(m):
+            i = (head[c] - a + m) % m
+            along[a] = sg[i, c]
+            across[a] = wg[i, c]
+            for b in range(m):
+                if b <= a:
+                    j = (head[c] - b + m) % m
+                    curved[a, b] = sy[i, j, c]
+                    crossed[a, b] = yw[i, j, c]
         for a in range(m):  # from the newest pair to the oldest
             if a < size:
-                i = (head[c] - a + m) % m
-                value = sg[i, c]
-                for b in range(a):
-                    j = (head[c] - b + m) % m
-                    value -= by_w[j] * sy[i, j, c]
-                by_w[i] = value / sy[i, i, c]
+                value = along[a]
+                for b in range(m):
+                    if b < a:
+                        value -= by_w[b] * curved[a, b]
+                by_w[a] = value / curved[a, a]
         for k in range(m):  # and back
             a = m - 1 - k
             if a < size:
-                i = (head[c] - a + m) % m
-                value = wg[i, c]
+                value = across[a]
                 for b in range(m):
                     if b < size:
-                        j = (head[c] - b + m) % m
-                        value -= by_w[j] * yw[i, j, c]
                         if b > a:
-                            value -= by_s[j] * sy[j, i, c]
-                by_s[i] = value / sy[i, i, c] - by_w[i]
+                            value -= by_w[b] * crossed[b, a] + by_s[b] * curved[b, a]
+                        else:
+                            value -= by_w[b] * crossed[a, b]
+                by_s[a] = value / curved[a, a] - by_w[a]
         decrease = gz
-        for i in range(m):
-            decrease -= by_w[i] * wg[i, c] + by_s[i] * sg[i, c]
+        for a in range(m):
+            if a < size:
+                decrease -= by_w[a] * across[a] + by_s[a] * along[a]
         if not decrease > zero:  # round-off: begin anew
             decrease = gz
             known[c] = 0
             head[c] = m - 1
-            by_s, by_w = weights(), weights()
-        for i in range(m):
-            along_s[i, c] = scalar(by_s[i])
-            along_w[i, c] = scalar(by_w[i])
+        for a in range(m):
+            i = (head[c] - a + m) % m
+            along_s[i, c] = scalar(by_s[a])
+            along_w[i, c] = scalar(by_w[a])
         promised[c] = decrease
         t[c] = wp.float64(1.0)
         if not (decrease > zero and wp.isfinite(decrease)):

@@ -16,9 +16,9 @@ HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
 """Each room and the rooms that it may import."""
 TIERS = (
-    {"device", "columns", "rows", "product", "sparse", "sweep", "term", "constraint", "footprint"},
+    {"device", "lanes", "columns", "rows", "product", "sparse", "sweep", "term", "constraint", "footprint"},
     {"terms", "problem"},
-    {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering"},
+    {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering", "narrow"},
     {"newton", "balance", "room", "lbfgs", "multigrid", "amg", "inversion"},
     {"precondition", "condensation", "elimination", "ladder", "frame", "following"},
     {"fem"},

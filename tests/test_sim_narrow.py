@@ -1,0 +1,66 @@
+"""The kernels for one column do what those for many do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from sim import narrow, steering
+from sim.columns import add_dots
+from sim.device import find_device
+from sim.steering import PAIRS, PRODUCTS, SOME, SUMS
+
+NODES = 1500
+"""More than one thread takes."""
+ROWS = 3 * NODES
+DEVICE = find_device("cpu", "float64")
+RNG = np.random.default_rng(0)
+
+
+def column(*shape: int) -> wp.array:
+    return DEVICE.array(RNG.normal(size=(*shape, 1)))
+
+
+def double(*shape: int) -> wp.array:
+    return wp.zeros(shape, dtype=wp.float64, device="cpu")
+
+
+def test_a_step():
+    u, d, t, one, many = column(ROWS), column(ROWS), double(1), column(ROWS), column(ROWS)
+    t.fill_(0.3)
+    DEVICE.launch(narrow.kernels_of(DEVICE, PAIRS).step, (narrow.threads(DEVICE, ROWS),), [u, t, d], [one])
+    DEVICE.launch(steering.kernels_of(DEVICE, PAIRS).step, (-(-ROWS // SOME), 1), [u, t, d], [many])
+    np.testing.assert_array_equal(one.numpy(), many.numpy())
+
+
+def test_a_gradient_is_finished():
+    held = DEVICE.array(RNG.integers(0, 2, (NODES, 3)), wp.int8)
+    normals = RNG.normal(size=(NODES, 3)) * RNG.integers(0, 2, (NODES, 1))
+    normal = DEVICE.array(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9), DEVICE.vector)
+    constant, d, total = column(ROWS), column(ROWS), column(ROWS)
+    one, many, sums, other = wp.clone(total), wp.clone(total), double(SUMS, 1), double(SUMS, 1)
+    inputs = [constant, held, normal, d]
+    DEVICE.launch(narrow.kernels_of(DEVICE, PAIRS).finish, (narrow.threads(DEVICE, NODES),), inputs, [one, sums])
+    DEVICE.launch(steering.kernels_of(DEVICE, PAIRS).finish, (-(-NODES // SOME), 1), inputs, [many, other])
+    np.testing.assert_array_equal(one.numpy(), many.numpy())
+    np.testing.assert_allclose(sums.numpy(), other.numpy(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [0, 3, PAIRS])
+def test_products_with_the_pairs_that_are_known(count):
+    s, w, vectors = column(PAIRS, ROWS), column(PAIRS, ROWS), [column(ROWS) for _ in range(4)]
+    known = wp.array([count], dtype=wp.int32, device="cpu")
+    one, many = double(2 * PAIRS + PRODUCTS, 1), double(2 * PAIRS + PRODUCTS, 1)
+    inputs, dim = [known, s, w, *vectors], (len(one), narrow.threads(DEVICE, ROWS))
+    DEVICE.launch(narrow.kernels_of(DEVICE, PAIRS).multiply, dim, inputs, [one])
+    DEVICE.launch(steering.kernels_of(DEVICE, PAIRS).multiply, (-(-ROWS // SOME), 1), inputs, [many])
+    np.testing.assert_allclose(one.numpy(), many.numpy(), rtol=1e-9, atol=1e-9)
+    assert np.count_nonzero(one.numpy()) == 2 * count + PRODUCTS
+
+
+def test_a_dot_adds_to_what_is_there():
+    x, y, out = column(ROWS), column(ROWS), double(1)
+    out.fill_(2.0)
+    add_dots(DEVICE, x, y, out)
+    np.testing.assert_allclose(out.numpy(), 2.0 + (x.numpy() * y.numpy()).sum())
