@@ -175,6 +175,8 @@ class Room:
             return
         if self._graph is None:
             self.once()  # loads what a capture cannot
+            if not self.columns["aiming"].numpy().any():
+                self._aim()  # nor can it load what no column wanted
             with wp.ScopedCapture(device.name, force_module_load=False) as capture:
                 self.once()
             self._graph = capture.graph
