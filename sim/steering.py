@@ -251,7 +251,8 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
     ):
         """Take the pair of the accepted step in, and weigh the pairs: d = -M^-1 g + sum of (a_i s_i + b_i w_i).
 
-        The first `known` slots are filled; from slot m - 1 the head goes on to slot 0.
+        The first `known` slots are filled; from slot m - 1 the head goes on to slot 0. The next trial is as long as the
+        last step should have been by the slopes at its ends: where tissue stiffens, whole steps would all be cut.
         """
         c = wp.tid()
         if aiming[c] == 0:
@@ -259,6 +260,9 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         zero = wp.float64(0.0)
         slope, gz = sums[slope_row, c], products[gz_row, c]
         rise = slope + promised[c]
+        length = wp.float64(1.0)
+        if rise > zero and wp.isfinite(promised[c]):
+            length = wp.clamp(gone[c] * promised[c] / rise, wp.float64(least_kept), wp.float64(1.0))
         n = int(-1)
         # Also false of the first trial, whose promise is infinite.
         if rise > wp.float64(least_curvature) * promised[c] and products[yw_row, c] > zero:
@@ -320,7 +324,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             along_s[i, c] = scalar(by_s[a])
             along_w[i, c] = scalar(by_w[a])
         promised[c] = decrease
-        t[c] = wp.float64(1.0)
+        t[c] = length
         if not (decrease > zero and wp.isfinite(decrease)):
             status[c] = LEFT
             t[c] = zero

@@ -50,7 +50,10 @@ def descended(problem: Problem, start: np.ndarray | None = None, tolerance: floa
 
 
 def book(problem: Problem, steps: int) -> np.ndarray:
-    """u (3N,) of one column after so many steps of Nocedal and Wright's two loops, each taken whole."""
+    """u (3N,) of one column after so many steps of Nocedal and Wright's two loops.
+
+    Each is as long as the one before it should have been by the secant of its slopes, at most whole.
+    """
     device, solver = problem.device, rest_solver(problem)
 
     def gradient(u: np.ndarray) -> np.ndarray:
@@ -63,7 +66,7 @@ def book(problem: Problem, steps: int) -> np.ndarray:
         solver.apply(device.array(r[:, None]), np.ones(1, bool), out)
         return out.numpy()[:, 0].copy()
 
-    u, g, pairs = np.zeros(ROWS), gradient(np.zeros(ROWS)), []
+    u, g, pairs, t = np.zeros(ROWS), gradient(np.zeros(ROWS)), [], 1.0
     for _ in range(steps):
         q, weights = g.copy(), []
         for s, y in reversed(pairs):
@@ -72,9 +75,10 @@ def book(problem: Problem, steps: int) -> np.ndarray:
         x = solved(q)
         for (s, y), weight in zip(pairs, reversed(weights), strict=True):
             x += (weight - y @ x / (s @ y)) * s
-        assert gradient(u - x) @ -x <= 0.5 * g @ x  # the loads here let every whole step pass
-        pairs = [*pairs, (-x, gradient(u - x) - g)][-PAIRS:]
-        u, g = u - x, gradient(u - x)
+        slope = gradient(u - t * x) @ -x
+        assert slope <= 0.5 * g @ x  # the loads here let every such step pass
+        pairs = [*pairs, (-t * x, gradient(u - t * x) - g)][-PAIRS:]
+        u, t, g = u - t * x, min(1.0, t * (g @ x) / (slope + g @ x)), gradient(u - t * x)
     return u
 
 
