@@ -96,7 +96,8 @@ class Deformation:
 
     def __post_init__(self) -> None:
         for name in ("reached", "inverted"):
-            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), len(self)))
+            if getattr(self, name).shape != (len(self),):
+                object.__setattr__(self, name, np.broadcast_to(getattr(self, name), len(self)))
         if not np.isfinite(self.displacement).all():
             raise AssertionError("a deformer let a displacement pass that is not finite: a defect of the deformer")
 

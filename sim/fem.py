@@ -23,7 +23,7 @@ from .errors import InputError
 from .following import Following
 from .footprint import Skin
 from .frame import Frame
-from .heading import moved_on, way_of
+from .heading import moved_on, pushes_of, way_of
 from .inversion import Inversion
 from .ladder import FEWEST, Ladder, shortfall
 from .lbfgs import TAUGHT
@@ -181,7 +181,7 @@ class Fem:
         self.problem.begin(cases)
         history = {**self.problem.end(found.u), **found.learnt}
         if len(cases.loads) <= TAUGHT:
-            history |= way_of(cases.loads, last, cases.history)
+            history |= way_of(pushes_of(cases.loads), last, cases.history)
         on_footprint = None
         if cases.loads.of(Displaced) is not None:
             on_footprint = self.problem.constraint.force_on_footprint(self.problem.gradient(found.u))

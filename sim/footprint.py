@@ -5,6 +5,7 @@ over triangles subdivided until they are small against the footprint: force and 
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,8 +18,8 @@ from .errors import InputError
 FINENESS = 0.12
 # Each edge in so many pieces at least, and then in twice as many until that is fine enough.
 PIECES = 8
-# Triangles that one thread searches.
-CHUNK = 64
+# Triangles that one thread searches, and findings of which it takes the nearest.
+CHUNK = wp.constant(16)
 
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
 
@@ -52,12 +53,12 @@ class Footprints:
 class Imprint:
     """Arrays on the device in which B tools press: (B,) of point and radius [m], and of where each touches first.
 
-    `found` on the way there; weight (M, B) and sums (B,) as `Footprints`.
+    `found` (n, B) on the way there, fewer each time; weight (M, B) and sums (B,) as `Footprints`.
     """
 
     tools: wp.array
     touched: wp.array
-    found: wp.array
+    found: tuple[wp.array, ...]
     weight: wp.array
     sums: wp.array
 
@@ -113,12 +114,14 @@ class Skin:
 
     def imprint(self, tools: wp.array) -> Imprint:
         """Where tools (B,) are about to press."""
-        chunks, count, device = -(-len(self._ball) // CHUNK), len(tools), self.device.name
-        found, touched, sums = (
-            wp.empty(shape, dtype=wp.vec4d, device=device) for shape in ((chunks, count), count, count)
-        )
+        count, device = len(tools), self.device.name
+        found, left = [], len(self._ball)
+        while left > 1 or not found:
+            left = -(-left // CHUNK)
+            found.append(wp.empty((left, count), dtype=wp.vec4d, device=device))
+        sums = wp.empty(count, dtype=wp.vec4d, device=device)
         weight = wp.empty((len(self.nodes), count), dtype=wp.float64, device=device)
-        return Imprint(tools, touched, found, weight, sums)
+        return Imprint(tools, found[-1].flatten(), tuple(found), weight, sums)
 
     def put(self, imprint: Imprint) -> None:
         """Let the tools press, on the device alone; infinitely far away, and no weight, where one does not touch."""
@@ -146,8 +149,9 @@ class Skin:
     def _touch(self, imprint: Imprint) -> None:
         """Where each tool touches first, and how far that is from its point; inf if beyond its radius."""
         inputs = [self._corners, self._ball, imprint.tools]
-        self.device.launch(_search, imprint.found.shape, inputs, [imprint.found])
-        self.device.launch(_settle, imprint.touched.shape, [imprint.found], [imprint.touched])
+        self.device.launch(_search, imprint.found[0].shape, inputs, [imprint.found[0]])
+        for some, fewer in pairwise(imprint.found):
+            self.device.launch(_settle, fewer.shape, [some], [fewer])
 
 
 def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:
@@ -236,14 +240,16 @@ def _search(
 def _settle(
     found: wp.array2d(dtype=wp.vec4d),
     # outputs
-    touched: wp.array(dtype=wp.vec4d),
+    nearest: wp.array2d(dtype=wp.vec4d),
 ):
-    """The nearest of all chunks."""
-    c = wp.tid()
-    touched[c] = found[0, c]
-    for chunk in range(1, found.shape[0]):
-        if found[chunk, c][3] < touched[c][3]:
-            touched[c] = found[chunk, c]
+    """The nearest of some."""
+    group, c = wp.tid()
+    best = found[group * CHUNK, c]
+    for k in range(1, CHUNK):
+        other = found[wp.min(group * CHUNK + k, found.shape[0] - 1), c]
+        if other[3] < best[3]:
+            best = other
+    nearest[group, c] = best
 
 
 @wp.kernel

@@ -14,6 +14,7 @@ import warp as wp
 from .device import Device
 from .footprint import Skin
 from .inversion import Inversion
+from .lanes import lanes_of, summed
 from .linear import Preconditioner
 from .problem import Problem
 from .room import Room, State, ground_of, standing
@@ -21,8 +22,6 @@ from .steering import LIVE, PAIRS
 
 # A frame that takes more turns is not one of a tool that moves smoothly.
 MOST = 60
-# Nodes that one thread takes, where all add to one number.
-SOME = 8
 # What goes up: point and radius, force, and how far to move on.
 GIVEN = 8
 # What comes down before the displacements; the sums are those of the footprint.
@@ -44,7 +43,7 @@ class Kernels:
 @cache
 def kernels_of(device: Device) -> Kernels:
     """Kernels of a device's scalar type, for one column."""
-    scalar, most, m, head, some = device.scalar, MOST, PAIRS, HEAD, SOME
+    scalar, most, m, head, lanes = device.scalar, MOST, PAIRS, HEAD, lanes_of(device)
 
     @wp.kernel(module="unique")
     def pull(
@@ -57,15 +56,17 @@ def kernels_of(device: Device) -> Kernels:
         loud: wp.array2d(dtype=wp.float64),
     ):
         """Gradient -w_i / (sum of w) F of the push, and its square norm."""
-        block = wp.tid()
+        i = wp.tid()
         square = wp.float64(0.0)
-        for i in range(block * some, wp.min((block + 1) * some, nodes.shape[0])):
+        if i < nodes.shape[0]:
             share = weight[i, 0] / sums[0][0]
             for k in range(3):
                 f = scalar(share * given[4 + k])
                 constant[3 * nodes[i] + k, 0] = -f
                 square += wp.float64(f) * wp.float64(f)
-        wp.atomic_add(loud, 0, 0, square)
+        square = summed(square)
+        if i % lanes == 0:
+            wp.atomic_add(loud, 0, 0, square)
 
     @wp.kernel(module="unique")
     def move_on(
@@ -211,16 +212,18 @@ class Frame:
         written over by the next frame.
         """
         self._up.numpy()[:] = (*point, radius, *force, share)
+        device = self._device
         if self._graph is not None:
             wp.capture_launch(self._graph)
         else:
-            self._once()  # loads what a capture cannot
-            if self._device.on_cuda:
-                with wp.ScopedCapture(self._device.name, force_module_load=False) as capture:
+            self._once()
+        if device.on_cuda:
+            wp.synchronize_stream(wp.get_stream(device.name))
+            # What a capture cannot load has been loaded, once there was a step.
+            if self._graph is None and self._down.numpy()[STEPS] > 0:
+                with wp.ScopedCapture(device.name, force_module_load=False) as capture:
                     self._once()
                 self._graph = capture.graph
-        if self._device.on_cuda:
-            wp.synchronize_stream(wp.get_stream(self._device.name))
         return self._down.numpy()
 
     def _once(self) -> None:
@@ -235,7 +238,8 @@ class Frame:
         vectors = [self._past, *(a[name] for name in ("u", "d", "g", "z"))]
         device.launch(k.move_on, (len(self._past),), [self._given], vectors)
         inputs = [self._given, self._skin.numbers, imprint.weight, imprint.sums]
-        device.launch(k.pull, (-(-len(self._skin.numbers) // SOME),), inputs, [a["constant"], a["loud"]])
+        lanes = lanes_of(device)
+        device.launch(k.pull, (-(-len(self._skin.numbers) // lanes) * lanes,), inputs, [a["constant"], a["loud"]])
         wp.capture_while(self._going, self._turn)
         self._inversion.add_count(a["u"], self._inverted)
         inputs = [a["status"], a["steps"], a["residual"], self._inverted, imprint.sums, a["u"]]

@@ -33,14 +33,16 @@ def shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
 
     Lengths are measured against the last footprint, forces against the last force.
     """
-    size = np.linalg.norm([push[:, 3:6] for push in (now, last, before)], axis=2)
-    unit = np.where(np.arange(7) // 3 == 1, size[1][:, None], last[:, 6:])
+    forces = np.stack([now, last, before])[:, :, 3:6]
+    size = np.sqrt((forces * forces).sum(axis=2))
+    unit = np.repeat(last[:, 6:], 7, axis=1)
+    unit[:, 3:6] = size[1][:, None]
     unit[unit == 0.0] = 1.0
     way, further = (last - before) / unit, (now - last) / unit
-    square = (way**2).sum(axis=1)
+    square = (way * way).sum(axis=1)
     known = size.all(axis=0) & (square > 0.0)
-    share = np.divide((further * way).sum(axis=1), square, out=np.zeros(len(now)), where=known)
-    return share.clip(BACK, ON)
+    share = (further * way).sum(axis=1) / np.where(known, square, 1.0)
+    return np.where(known, share.clip(BACK, ON), 0.0)
 
 
 def moved_on(loads: Loads, last: np.ndarray, history: Mapping[str, Any]) -> np.ndarray:
@@ -52,9 +54,8 @@ def moved_on(loads: Loads, last: np.ndarray, history: Mapping[str, Any]) -> np.n
     return last + shares(now, came, before) * (last - history[BEFORE].T)
 
 
-def way_of(loads: Loads, last: np.ndarray | None, history: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """What the answers to loads hand on, whose last answers (3N, B) had this history, if there were any."""
-    now = pushes_of(loads)
+def way_of(now: np.ndarray | None, last: np.ndarray | None, history: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """What the answers to pushes (B, 7) hand on, whose last answers (3N, B) had this history, if there were any."""
     if now is None:
         return {}
     if last is None or PUSHES not in history:

@@ -14,7 +14,7 @@ from .lanes import lanes_of, summed
 from .steering import FREE, GOLD, GZ, OWN, SLOPE, WHOLE, YW
 
 # Rows, or nodes, that one thread takes: on CUDA, on the CPU.
-EACH, EACH_ON_CPU = 4, 1024
+EACH, EACH_ON_CPU = 2, 1024
 
 
 @dataclass(frozen=True)
