@@ -69,6 +69,7 @@ class Following:
 
     def __init__(self, problem: Problem, inversion: Inversion, frame: Frame):
         self._problem, self._inversion, self._frame = problem, inversion, frame
+        self._nodes = np.arange(problem.rows // 3)
         self._last: Callable[[], Deformation | None] = _gone
         # Histories whose pairs stand where the frame ended, and where it began.
         self._here: Callable[[], Kept | None] = _gone
@@ -102,9 +103,11 @@ class Following:
             return None
         history = Kept(way, self._frame.state)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
+        displacement = found[HEAD:].reshape(1, -1, 3).copy()
+        displacement.setflags(write=False)  # as a start, the device's own stands in for it
         answer = Deformation(
-            displacement=found[HEAD:].reshape(1, -1, 3).copy(),
-            nodes=start.nodes,
+            displacement=displacement,
+            nodes=self._nodes,
             outcome=(Outcome.CONVERGED,),
             iterations=found[STEPS : STEPS + 1].astype(int),
             residual=found[RESIDUAL : RESIDUAL + 1].copy(),

@@ -8,13 +8,15 @@ import warp as wp
 from oracle import EVERY_LAW, tissue
 
 from scenes.shipped import template_path
-from sim.accuracy import TRAIN, Accuracy
+from sim.accuracy import LIVE, TRAIN, Accuracy
 from sim.discretisation import ELEMENTS
 from sim.effects import Elasticity, Held, Slide, ToolDisplacement, ToolForce
 from sim.fem import Fem
+from sim.following import Kept
 from sim.linear import BlockJacobi
 from sim.loads import Displaced, Loads, push
 from sim.meshfile import read_anatomy
+from sim.symmetric import add_product, tiles_of
 from surrogate.sampling import draw
 
 pytestmark = [
@@ -76,3 +78,34 @@ def test_a_near_part_is_solved_by_itself_and_the_batch_ends_where_the_whole_does
     assert np.median(found.iterations) < 0.7 * np.median(plain.iterations)
     largest = np.abs(plain.displacement).max(axis=(1, 2), keepdims=True)
     assert (np.abs(found.displacement - plain.displacement) <= BOUND["float32"] * largest).all()
+
+
+def test_frames_stay_on_the_card(box):
+    """As on the CPU, and an older frame leads where it led before: what it knew has been brought away in time."""
+    effects = (Elasticity(), Held(), ToolForce())
+    loads = [push(np.array([x, 0.0, 0.0]), np.array([0.0, 0.05, -0.4]), 7e-3) for x in np.linspace(-4e-3, 4e-3, 8)]
+    fem, host = Fem(box, effects, LIVE, "cuda"), Fem(box, effects, LIVE, "cpu")
+    answers, other = [fem.deform(loads[0])], host.deform(loads[0])
+    for load in loads[1:]:
+        answers.append(fem.deform(load, answers[-1]))
+        other = host.deform(load, other)
+        assert isinstance(answers[-1].history, Kept) and answers[-1].outcome == other.outcome
+        off = np.abs(answers[-1].displacement - other.displacement).max()
+        assert off <= 0.02 * np.abs(other.displacement).max()  # both stop at LIVE's residual
+    np.testing.assert_allclose(fem.residual(loads[-1], answers[-1]), answers[-1].residual, rtol=0.05)
+    for number in (3, 7):
+        again = fem.deform(loads[number], answers[number - 1])
+        largest = np.abs(again.displacement).max()
+        np.testing.assert_allclose(again.displacement, answers[number].displacement, atol=1e-3 * largest)
+        np.testing.assert_array_equal(again.iterations, answers[number].iterations)
+
+
+def test_half_of_a_symmetric_matrix_is_enough_to_multiply():
+    size = 64 * 13  # no multiple of a tile
+    random = np.random.default_rng(0)
+    matrix, x = random.normal(size=(size, size)).astype(np.float16), random.normal(size=size).astype(np.float32)
+    whole = np.triu(matrix) + np.triu(matrix, 1).T
+    matrix, x = wp.array(whole, dtype=wp.float16, device="cuda"), wp.array(x, device="cuda")
+    y = wp.full(size, 1.0, dtype=wp.float32, device="cuda")
+    add_product(tiles_of(size, "cuda"), matrix, x, y)
+    np.testing.assert_allclose(y.numpy(), 1.0 + whole.astype(float) @ x.numpy(), atol=1e-3)

@@ -126,6 +126,17 @@ def test_a_start_that_is_not_fit_is_the_ladders(fem):
     assert isinstance(fem.deform(pushed(1e-3), guess(good.displacement)).history, Kept)
 
 
+def test_a_start_may_name_its_vertices_in_any_order(fem):
+    last = ride(fem)[-1]
+    turned = last.at(last.nodes[::-1].copy())
+    assert same(fem.deform(pushed(5e-3), last), fem.deform(pushed(5e-3), turned))
+
+
+def test_an_answer_cannot_be_changed_behind_the_device(fem):
+    with pytest.raises(ValueError, match="read-only"):
+        ride(fem)[-1].displacement[0, 0] = 1.0
+
+
 def test_vertices_are_picked_from_the_same_answer(fem):
     last, some = ride(fem)[-1], np.array([40, 3, 7])
     picked = fem.deform(pushed(5e-3), last, at=some)
