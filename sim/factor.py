@@ -30,6 +30,8 @@ syrk, trsm = get_blas_funcs(("syrk", "trsm"), dtype=np.float64)
 
 # Up to so many right-hand sides, sweeps one by one are faster than products of matrices.
 FEW = 3
+# Right-hand sides that stay in a core's cache while they are swept.
+STRIP = 128
 # Border unknowns and their lower half of a matrix (m, m), for each front that these wait for.
 Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 # A pivot that has lost so many digits is zero: the last ones are round-off.
@@ -90,16 +92,39 @@ class Factor:
         solved[:, live] = self._motions @ (self._solved((x / size).astype(self._precision)) * size)
         out.assign(solved)
 
+    def compliance(self, rows: np.ndarray) -> np.ndarray:
+        """What it does (m, m) [m/N] at some of the 3N rows (m,) alone, in the factor's precision.
+
+        Only fronts that these rows or what depends on them belong to are swept.
+        """
+        chosen = self._motions[rows]
+        unit = sp.csc_array(chosen.T)
+        reached = np.zeros(len(self._transposed.indptr) - 1, bool)
+        reached[chosen.indices] = True
+        panels = []
+        for panel in self._panels:
+            if reached[panel.front.first : panel.front.stop].any():
+                reached[panel.front.border] = True
+                panels.append(panel)
+        out = np.empty((len(rows), len(rows)), self._precision)
+
+        def fill(firsts: range) -> None:
+            for first in firsts:
+                strip = slice(first, first + STRIP)
+                x = unit[:, strip].toarray(order="C").astype(self._precision)
+                out[:, strip] = chosen @ _swept(panels, x)
+
+        share = cores(len(rows))
+        with self._blas.limit(limits=1, user_api="blas"):
+            together([partial(fill, range(STRIP * k, len(rows), STRIP * share)) for k in range(share)])
+        return out
+
     def _solved(self, x: np.ndarray) -> np.ndarray:
         if x.shape[1] <= FEW:
             return self._sweep.solved(x)
         # Threads of BLAS wait for one another at every front, ages where something else runs on their cores.
         with self._blas.limit(limits=1, user_api="blas"):
-            for panel in self._panels:
-                panel.up(x)
-            for panel in reversed(self._panels):
-                panel.down(x)
-        return x
+            return _swept(self._panels, x)
 
 
 def node_of(basis: sp.csc_array) -> np.ndarray:
@@ -129,6 +154,15 @@ class Panel:
     def down(self, x: np.ndarray) -> None:
         """x_own = R^-T x_own - S^-1 C^T x_border, in x (n, b)."""
         x[self.front.first : self.front.stop] = self.values @ x[self.front.rows]
+
+
+def _swept(panels: Sequence[Panel], x: np.ndarray) -> np.ndarray:
+    """x (n, b) after both sweeps through these panels, in place."""
+    for panel in panels:
+        panel.up(x)
+    for panel in reversed(panels):
+        panel.down(x)
+    return x
 
 
 def panels_of(

@@ -29,6 +29,7 @@ from .ladder import FEWEST, Ladder, shortfall
 from .lbfgs import TAUGHT
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
 from .memory import check_fits, fitting_batch
+from .patching import patching
 from .precondition import choose_preconditioner, is_exact, name_of
 from .problem import Problem
 from .term import Cases
@@ -82,7 +83,8 @@ class Fem:
         near = cache(partial(eliminating, problem, preconditioner, self.effects, self.space))
         if problem.device.on_cuda:
             near()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
-        self._ladder = Ladder(problem, preconditioner, Inversion(self.space, problem.device), accuracy, near)
+        alone = patching(problem, preconditioner, self.effects, self.space)
+        self._ladder = Ladder(problem, preconditioner, Inversion(self.space, problem.device), accuracy, near, alone)
 
     @property
     def problem(self) -> Problem:

@@ -20,6 +20,7 @@ from .inversion import Inversion
 from .lbfgs import LEARNT, Lbfgs
 from .linear import Preconditioner
 from .newton import find_equilibrium
+from .patching import NODES, Patching
 from .problem import Problem
 from .steering import BROKEN, DONE
 from .term import Cases
@@ -85,6 +86,8 @@ class Ladder:
         Tolerance and budgets.
     near
         Makes, or has made, the elimination of the same problem's near part; None: nothing is eliminated.
+    alone
+        What a single load goes through first, if anything; it is asked at every one.
     """
 
     problem: Problem
@@ -92,6 +95,7 @@ class Ladder:
     inversion: Inversion
     accuracy: Accuracy
     near: Callable[[], Elimination | None] = lambda: None
+    alone: Callable[[], Patching | None] = lambda: None
 
     @cached_property
     def _lbfgs(self) -> Lbfgs:
@@ -150,15 +154,16 @@ class Ladder:
         start = device.zeros(problem.rows, count) if start is None else start
         if imposed or self.accuracy.outer < FEWEST:
             return self._thorough(start, self.accuracy.outer)
-        descents: list[Elimination | Lbfgs] = [self._lbfgs]
-        near = self.near() if count >= WORTH else None
+        descents: list[tuple[Elimination | Patching | Lbfgs, Mapping[str, np.ndarray] | None]] = [(self._lbfgs, learnt)]
+        near = self.near() if count >= WORTH else self.alone() if count == 1 else None
         if near is not None:
-            descents.insert(0, near)
+            patch = {NODES: cases.history[LEARNT_KEY + NODES]} if LEARNT_KEY + NODES in cases.history else {}
+            descents = [(near, patch), (self._lbfgs, None)]
         index, never = np.arange(count), np.full(count, np.inf)
         answer = self._answer(wp.clone(start), np.full(count, Outcome.BUDGET, object), np.zeros(count, int), never, 0)
         taught: Mapping[str, np.ndarray] = {}
-        for descent in descents:
-            found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), most, learnt)
+        for descent, known in descents:
+            found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), most, known)
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
             answer.put(index, self._answer(found.u, outcome, found.steps, found.residual, 0), device)
@@ -167,7 +172,7 @@ class Ladder:
             if len(index) == 0:
                 break
             problem.begin(cases.rows(index))
-            start, learnt = gathered(device, found.u, found.left), None
+            start = gathered(device, found.u, found.left)
         else:
             answer.put(index, self._thorough(start, self.accuracy.outer), device)
         return replace(answer, learnt=taught)

@@ -7,21 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from boxes import base_held, box, hold, surface_nodes
+from boxes import base_held
+from openings import EFFECTS, FINE, MESH, TOTAL, begun, body, equilibria, loads_of
 from oracle import tissue
 
 from scenes.shipped import template_path
 from sim.accuracy import TRAIN, Accuracy
-from sim.anatomy import Anatomy
 from sim.compile import compile_part, compile_problem
 from sim.condensation import condensed
 from sim.device import find_device
 from sim.discretisation import Discretisation, discretise
-from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolForce
+from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.elimination import PATIENCE, Elimination, eliminating, near_tetrahedra
 from sim.fem import Fem
-from sim.lbfgs import Lbfgs
-from sim.loads import Loads, Nodal
 from sim.meshfile import read_anatomy
 from sim.precondition import rest_solver
 from sim.problem import Problem
@@ -30,50 +28,11 @@ from sim.term import Cases
 from sim.terms.exterior import Exterior
 from surrogate.sampling import draw
 
-MESH = box((8, 8, 5), 0.08, distortion=0.1)
-TOP = MESH.nodes[:, 2] > MESH.nodes[:, 2].max() - 1e-9
-OPENING = TOP & (np.abs(MESH.nodes[:, :2] - 0.04).max(axis=1) < 0.021)
-TOTAL = np.array([[0.0, 0.0, -0.05], [0.1, 0.05, -0.3], [0.0, 0.0, 0.3], [-0.2, 0.1, -0.8], [0.0, 0.0, 0.0]])
-EFFECTS: tuple[Effect, ...] = (Held(), Slide(), NodalForce())
-FINE = 1e-8
-
-
-def body(element: str = "p1") -> tuple[Anatomy, Discretisation]:
-    """Held below, sliding on the sides and round an opening on top."""
-    normal = np.where(TOP[:, None] & ~OPENING[:, None], [0.0, 0.0, 1.0], 0.0)
-    for axis, side in ((0, 0.0), (0, 0.08), (1, 0.0), (1, 0.08)):
-        wall = (np.abs(MESH.nodes[:, axis] - side) < 1e-9) & ~TOP
-        normal[wall] = np.eye(3)[axis]
-    anatomy = hold(MESH, surface_nodes(MESH) & (MESH.nodes[:, 2] < 1e-9), normal)
-    return anatomy, discretise(MESH, element)
-
-
-def loads_of(total: np.ndarray) -> Loads:
-    force = np.zeros((len(total), len(MESH.nodes), 3))
-    force[:, OPENING] = total[:, None] / OPENING.sum()
-    return Loads((Nodal(force),))
-
-
-def begun(law: str, element: str = "p1", total: np.ndarray = TOTAL) -> tuple[Problem, Discretisation]:
-    anatomy, space = body(element)
-    problem = compile_problem((Elasticity(tissue(law)), *EFFECTS), anatomy, find_device("cpu", "float64"), space)
-    problem.begin(Cases(loads_of(total), np.zeros(len(total))))
-    return problem, space
-
 
 def elimination_of(problem: Problem, space: Discretisation, law: str) -> Elimination:
     found = eliminating(problem, rest_solver(problem), (Elasticity(tissue(law)), *EFFECTS), space)
     assert found is not None
     return found
-
-
-def equilibria(problem: Problem, total: np.ndarray = TOTAL) -> np.ndarray:
-    """By L-BFGS on the whole."""
-    problem.begin(Cases(loads_of(total), np.zeros(len(total))))
-    start = problem.device.zeros(problem.rows, len(total))
-    found = Lbfgs(problem, rest_solver(problem)).descend(start, np.full(len(total), FINE), 2000)
-    assert (found.status == DONE).all()
-    return found.u.numpy().copy()
 
 
 @pytest.mark.parametrize(

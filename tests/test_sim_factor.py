@@ -13,7 +13,7 @@ from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.device import Precision, find_device
 from sim.effects import Elasticity, Held, Slide
-from sim.factor import FEW, Factor, node_of
+from sim.factor import FEW, STRIP, Factor, node_of
 from sim.fronts import dissection, fronts_of
 
 CELLS = (6, 6, 6)
@@ -60,6 +60,18 @@ def test_it_is_the_inverse_over_the_free_motions(precision: Precision) -> None:
         found = applied(factor, r[:, :columns], precision)
         error = np.linalg.norm(found - expected[:, :columns], axis=0) / np.linalg.norm(expected[:, :columns], axis=0)
         assert (error < EXACT[precision]).all()
+
+
+@pytest.mark.parametrize("precision", EXACT)
+def test_its_compliance_at_some_rows_is_what_unit_forces_do_there(precision: Precision) -> None:
+    stiffness, motions = system(sliding())
+    factor = Factor(stiffness, motions, node_of(motions), find_device("cpu", precision), precision)
+    rows = np.random.default_rng(1).choice(stiffness.shape[0], 2 * STRIP + 7, replace=False)
+    unit = np.zeros((stiffness.shape[0], len(rows)))
+    unit[rows, np.arange(len(rows))] = 1.0
+    expected = applied(factor, unit, precision)[rows]
+    np.testing.assert_allclose(factor.compliance(rows), expected, atol=EXACT[precision] * np.abs(expected).max())
+    assert factor.compliance(rows[:0]).shape == (0, 0)
 
 
 @pytest.mark.parametrize("columns", [FEW, FEW + 2])

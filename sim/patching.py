@@ -1,0 +1,216 @@
+"""Nonlinear elimination of the few hundred nodes that one load strains most: its patch is settled, the body follows.
+
+Far from rest are only the nodes close to a tool. Each cycle corrects the body with its rest stiffness, brings the patch
+to equilibrium beside it (`patch.py`), and lets the body follow the forces that this takes: two to five looks at all of
+it instead of five to twenty. `elimination.py` does so for batches, with one part for all loads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from itertools import count
+
+import numpy as np
+import warp as wp
+from threadpoolctl import ThreadpoolController
+
+from .balance import balance, constants_of
+from .columns import combined
+from .discretisation import Discretisation
+from .effects import Effect
+from .elimination import near_tetrahedra
+from .factor import Factor
+from .lbfgs import Descended
+from .linear import Preconditioner
+from .patch import Patch, patch_of
+from .problem import Problem
+from .steering import BROKEN, DONE, FREE, LIVE, WHOLE
+
+# A patch has at most so many nodes, and less where what lies beyond has such a share of the forces.
+LARGEST, NEGLIGIBLE = 550, 0.01
+# Where the rest stiffness alone leaves at most such a share of the free force, there is none.
+LINEAR = 0.15
+CYCLES = 20
+# A patch is settled to a share of the whole residual, or of the tolerance.
+FORCING, ENOUGH = 0.03, 0.3
+# A patch stays while each cycle leaves at most such a share of the free force.
+LEFT = 0.3
+# A load whose free force was not halved in so many cycles goes elsewhere, and so does one that it rises so far with.
+PATIENCE, RISE = 5, 30.0
+# To know the compliance of the near part costs as much as this many loads gain.
+WORTH = 4
+# What a descent has learnt: the nodes (1, n) of its patch.
+NODES = "patch"
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """u (3N, 1) [m], its free gradient g (3N, 1) [N] and that one's 2-norm, and the norm it is measured against."""
+
+    u: wp.array
+    g: wp.array
+    free: float
+    scale: float
+
+    @property
+    def relative(self) -> float:
+        """The relative residual."""
+        return self.free / self.scale if self.free else 0.0
+
+    @property
+    def finite(self) -> bool:
+        """Whether it is a state at all: forces that overflow have no scale."""
+        return bool(np.isfinite(self.free) and np.isfinite(self.scale))
+
+
+class Patching:
+    """A descent for single loads on one problem, on the CPU.
+
+    Parameters
+    ----------
+    problem, factor
+        The whole body, and its rest stiffness.
+    effects, space
+        What the problem was compiled from.
+    near
+        (T,) bool: the tetrahedra that a patch may be made of.
+    """
+
+    def __init__(
+        self, problem: Problem, factor: Factor, effects: Iterable[Effect], space: Discretisation, near: np.ndarray
+    ):
+        self._problem, self._factor, self._effects, self._space = problem, factor, tuple(effects), space
+        self._near, self._table = np.flatnonzero(near), space.table[near]
+        self._nodes = np.unique(self._table)
+        self._rows = (3 * self._nodes[:, None] + np.arange(3)).ravel()
+        self._blas = ThreadpoolController()
+        self._last: tuple[np.ndarray, Patch, np.ndarray] | None = None
+
+    def descend(
+        self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
+    ) -> Descended:
+        """As `Lbfgs.descend`, of one column, in at most `most` cycles.
+
+        What is learnt is the patch. A load that has not got below the free force of its start ends there.
+        """
+        u = wp.clone(start)
+        constant, loud = constants_of(self._problem, u)
+        judged = partial(self._judged, constant, float(loud.numpy().max(initial=0.0)))
+        first = best = now = judged(u)
+        nodes, forces = self._known(learnt), np.zeros(len(start) // 3)
+        status, mark, idle, cycle = LIVE if first.finite else BROKEN, np.inf, 0, 0
+        while status == LIVE:
+            # Forces that explode lower the relative residual.
+            if now.free <= first.free and now.relative <= tolerance[0]:
+                status = DONE
+            best = now if status == DONE or now.free <= best.free else best
+            mark, idle = (now.free, 0) if now.free <= 0.5 * mark else (mark, idle + 1)
+            if status == DONE or idle >= PATIENCE or cycle >= min(CYCLES, most):
+                break
+            force = max(FORCING * now.free, ENOUGH * float(tolerance[0]) * now.scale)
+            new, nodes, here = self._cycle(judged, now, nodes, force)
+            cycle += 1
+            if not (new.finite and new.free <= RISE * first.free):
+                break
+            forces = np.maximum(forces, here / np.linalg.norm(here))
+            if nodes is not None and new.free > LEFT * now.free:
+                nodes = self._strained(forces)
+            now = new
+        taught = {NODES: nodes[None]} if learnt is not None and nodes is not None else {}
+        return Descended(best.u, np.array([status]), np.array([cycle]), np.array([best.relative]), taught)
+
+    def _cycle(
+        self, judged: Callable[[wp.array], State], now: State, nodes: np.ndarray | None, force: float
+    ) -> tuple[State, np.ndarray | None, np.ndarray]:
+        """The next state, the nodes of the patch, and forces (N,) [N]: what is out of balance then, or the patch took.
+
+        Where the rest stiffness by itself is good enough, there is still no patch. `force` [N] may be left in one.
+        """
+        device = self._problem.device
+        if nodes is None:
+            ahead = judged(self._moved(now.u, combined(device, now.g, -2.0, now.g, wp.empty_like(now.g))))
+            if ahead.free <= LINEAR * now.free:
+                return ahead, None, _norms(ahead.g)
+            nodes = self._strained(_norms(ahead.g))
+        patch, reach = self._patch(nodes)
+        g = now.g.numpy()[:, 0]
+        with self._blas.limit(limits=1, user_api="blas"):
+            share, own = patch.settled(now.u.numpy()[patch.rows, 0], -(reach @ g[self._rows]), force)
+        pull = device.array(-share * g[:, None])
+        pull.numpy()[patch.rows, 0] += own
+        new = judged(self._moved(now.u, pull))
+        forces = _norms(new.g)
+        forces[patch.nodes] = np.linalg.norm(own.reshape(-1, 3), axis=1)
+        return new, nodes, forces
+
+    def _judged(self, constant: wp.array, square: float, u: wp.array) -> State:
+        """The state u (3N, 1) under loads of this `constant` gradient (3N, 1), `square` of the loudest one's norm."""
+        found = balance(self._problem, u, constant)
+        sums, own = found.sums.numpy()[:, 0], float(found.own.numpy().max())
+        free, largest = sums[FREE], max(square, own, float(sums[WHOLE] - sums[FREE]))
+        return State(u, found.g, float(np.sqrt(free)), float(np.sqrt(largest)))
+
+    def _moved(self, u: wp.array, force: wp.array) -> wp.array:
+        """u (3N, 1) [m] and how the body moves from there under a force (3N, 1) [N], at rest, as far as terms allow."""
+        problem, step = self._problem, self._problem.device.zeros(*u.shape)
+        self._factor.apply(force, np.ones(1, bool), step)
+        problem.constraint.project_nodes(step)  # what is rounded row by row leaves the planes it slides on
+        return combined(problem.device, u, float(problem.longest_step(u, step)[0]), step, step)
+
+    def _strained(self, forces: np.ndarray) -> np.ndarray:
+        """The nodes (k,), ascending, of those tetrahedra that have the largest `forces` (N,) at their nodes."""
+        size = forces[self._table].sum(axis=1)
+        size[~np.isfinite(size)] = np.inf
+        order = np.argsort(-size, kind="stable")
+        with np.errstate(over="ignore"):
+            rest = np.cumsum(size[order][::-1] ** 2)[::-1]
+        some = order[: max(1, int((rest > NEGLIGIBLE**2 * rest[0]).sum()))] if np.isfinite(rest[0]) else order
+        nodes, first = np.unique(self._table[some], return_index=True)
+        return np.sort(nodes[np.argsort(first)[:LARGEST]])
+
+    def _known(self, learnt: Mapping[str, np.ndarray] | None) -> np.ndarray | None:
+        """The nodes of a patch that served before, if that was here."""
+        nodes = (learnt or {}).get(NODES)
+        return nodes[0] if nodes is not None and np.isin(nodes, self._nodes).all() else None
+
+    def _patch(self, nodes: np.ndarray) -> tuple[Patch, np.ndarray]:
+        """All tetrahedra of the near part on these nodes; and how they move (m, M) [m/N] with forces on all of it."""
+        if self._last is None or not np.array_equal(self._last[0], nodes):
+            chosen = np.zeros(len(self._space.table), bool)
+            chosen[self._near] = np.isin(self._table, nodes).all(axis=1)
+            place = np.searchsorted(self._nodes, np.unique(self._space.table[chosen]))
+            rows = (3 * place[:, None] + np.arange(3)).ravel()
+            reach = self._compliance[rows]
+            patch = patch_of(self._effects, self._space, self._problem, chosen, reach.take(rows, axis=1))
+            self._last = nodes, patch, reach
+        return self._last[1:]
+
+    @cached_property
+    def _compliance(self) -> np.ndarray:
+        return self._factor.compliance(self._rows)
+
+
+def patching(
+    problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
+) -> Callable[[], Patching | None]:
+    """Asked at each single load: what solves it, if anything.
+
+    Nothing at first, nor on CUDA, nor on a body without a small opening.
+    """
+    asked = count()
+
+    @cache
+    def made() -> Patching | None:
+        if problem.device.on_cuda or not isinstance(preconditioner, Factor):
+            return None
+        near = near_tetrahedra(space, problem.constraint)
+        return None if near is None else Patching(problem, preconditioner, effects, space, near)
+
+    return lambda: made() if next(asked) >= WORTH - 1 else None
+
+
+def _norms(force: wp.array) -> np.ndarray:
+    """The size (N,) [N] of a force (3N, 1) at each node."""
+    return np.linalg.norm(force.numpy().reshape(-1, 3), axis=1)

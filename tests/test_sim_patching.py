@@ -1,0 +1,142 @@
+"""Single loads whose most strained tissue is settled by itself: their equilibria are those of the whole body."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from boxes import base_held, box
+from openings import EFFECTS, FINE, TOTAL, begun, equilibria, loads_of
+from oracle import tissue
+
+from scenes.shipped import template_path
+from sim.accuracy import TRAIN, Accuracy
+from sim.deformation import Outcome
+from sim.discretisation import Discretisation
+from sim.effects import Elasticity, Held, Slide, ToolForce
+from sim.fem import Fem
+from sim.linear import BlockJacobi
+from sim.meshfile import read_anatomy
+from sim.patch import Patch
+from sim.patching import CYCLES, NODES, PATIENCE, WORTH, Patching, patching
+from sim.precondition import rest_solver
+from sim.problem import Problem
+from sim.steering import BROKEN, DONE, LIVE
+from sim.term import Cases
+from surrogate.sampling import draw
+
+
+def patching_of(problem: Problem, space: Discretisation, law: str) -> Patching:
+    ask = patching(problem, rest_solver(problem), (Elasticity(tissue(law)), *EFFECTS), space)
+    assert [ask() for _ in range(WORTH - 1)] == [None] * (WORTH - 1)
+    found = ask()
+    assert found is not None and ask() is found
+    return found
+
+
+@pytest.mark.parametrize(
+    ("law", "element"),
+    [("linear", "p1"), ("neo-hookean", "p1"), ("stable-neo-hookean", "p1"), ("ogden", "p1"),
+     ("stable-neo-hookean", "smoothed"), ("stable-neo-hookean", "p2")],
+)  # fmt: skip
+def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
+    problem, space = begun(law, element)
+    descent, expected = patching_of(problem, space, law), equilibria(problem)
+    for row in range(len(TOTAL)):
+        problem.begin(Cases(loads_of(TOTAL[[row]]), np.zeros(1)))
+        found = descent.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)
+        assert found.status[0] == DONE and found.residual[0] <= FINE
+        np.testing.assert_allclose(found.u.numpy()[:, 0], expected[:, row], atol=1e-5 * np.abs(expected).max())
+    assert found.steps[0] == 0 and not found.u.numpy().any()
+
+
+def test_on_a_brain_hard_pushes_take_few_looks_at_the_whole() -> None:
+    anatomy = read_anatomy(template_path())
+    fem = Fem(anatomy, (Elasticity(), Held(), Slide(), ToolForce()), TRAIN, "cpu")
+    loads, rows = draw("spatula", anatomy, 2, 1), [0, 1, 1, 0, 1]
+    assert WORTH == 4
+    answers = [fem.deform(loads.rows(np.array([row]))) for row in rows]
+    assert all(answer.outcome[0] is Outcome.CONVERGED for answer in answers)
+    for before, after in zip(answers, answers[3:], strict=False):
+        assert after.iterations[0] <= 0.5 * before.iterations[0]
+        moved = np.abs(before.displacement).max()
+        np.testing.assert_allclose(after.displacement, before.displacement, atol=1e-3 * moved)
+
+
+def test_the_next_frame_begins_with_the_patch_of_the_last() -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law, total=TOTAL[3:4])
+    descent, rest, tolerance = patching_of(problem, space, law), problem.device.zeros(problem.rows, 1), np.full(1, FINE)
+    first = descent.descend(rest, tolerance, 100, {})
+    again = descent.descend(rest, tolerance, 100, first.learnt)
+    np.testing.assert_array_equal(first.learnt[NODES], np.unique(first.learnt[NODES])[None])
+    assert again.status[0] == DONE and again.steps[0] <= first.steps[0]
+    np.testing.assert_allclose(again.u.numpy(), first.u.numpy(), atol=1e-6 * np.abs(first.u.numpy()).max())
+    elsewhere = descent.descend(rest, tolerance, 100, {NODES: first.learnt[NODES] + len(space.nodes)})
+    np.testing.assert_array_equal(elsewhere.u.numpy(), first.u.numpy())
+    assert descent.descend(rest, tolerance, 100).learnt == {}
+
+
+def test_the_budget_leaves_the_best_state_and_says_so() -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law, total=TOTAL[3:4])
+    descent, rest = patching_of(problem, space, law), problem.device.zeros(problem.rows, 1)
+    found = descent.descend(rest, np.full(1, 1e-12), 2)
+    assert found.status[0] == LIVE and found.steps[0] == 2
+    _, free, scale = problem.residual(found.u)
+    np.testing.assert_allclose(found.residual, free / scale, rtol=1e-6)
+    assert found.residual[0] < 0.1
+    broken = descent.descend(problem.device.array(np.full((problem.rows, 1), np.nan)), np.full(1, 1e-12), 2)
+    assert broken.status[0] == BROKEN
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e12, 1e30])
+def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law, total=TOTAL[3:4])
+    descent = patching_of(problem, space, law)
+    inside = Patch.settled
+
+    def exploded(*args) -> tuple[float, np.ndarray]:
+        share, force = inside(*args)
+        return share, factor * force
+
+    monkeypatch.setattr(Patch, "settled", exploded)
+    monkeypatch.setattr("sim.patching.LINEAR", 0.0)
+    found = descent.descend(problem.device.zeros(problem.rows, 1), np.full(1, 1e-4), 100)
+    assert found.status[0] == LIVE and not found.u.numpy().any()
+
+
+def test_what_gets_no_nearer_is_left_to_others() -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law, total=TOTAL[:1])
+    found = patching_of(problem, space, law).descend(problem.device.zeros(problem.rows, 1), np.zeros(1), 100)
+    assert found.status[0] == LIVE and found.residual[0] < 1e-12
+    assert found.steps[0] <= CYCLES and found.steps[0] < 12 + PATIENCE
+
+
+def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law, total=TOTAL[3:4])
+    descent = patching_of(problem, space, law)
+    patch, reach = descent._patch(np.unique(descent._table[:80]))
+    inner = reach[:, np.isin(descent._nodes, patch.nodes).repeat(3)]
+    pull = problem.device.zeros(problem.rows, 1)
+    pull.numpy()[patch.rows[-3:], 0] = [0.01, 0.0, -0.03]
+    e = reach @ pull.numpy()[descent._rows, 0]
+    share, force = patch.settled(np.zeros_like(e), e, 1e-10)
+    assert share == 1.0 and np.abs(force).max() > 1e-4
+    x = e + inner @ force
+    taken = -patch._excess(np.zeros_like(e), x)  # nothing is strained yet
+    np.testing.assert_allclose(patch._free(force), patch._free(taken), atol=1e-6 * np.abs(force).max())
+
+
+@pytest.mark.parametrize("kind", ["wide", "levels"])
+def test_where_it_would_not_serve_there_is_none(kind: str) -> None:
+    law = "stable-neo-hookean"
+    if kind == "wide":
+        fem = Fem(base_held(box((3, 3, 3), 0.1)), (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(), "cpu")
+        ask = patching(fem.problem, rest_solver(fem.problem), fem.effects, fem.space)
+    else:
+        problem, space = begun(law)
+        ask = patching(problem, BlockJacobi(problem.device), (Elasticity(tissue(law)), *EFFECTS), space)
+    assert [ask() for _ in range(WORTH + 1)] == [None] * (WORTH + 1)
