@@ -5,9 +5,11 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
+from operator import add
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
 
 from .anatomy import Anatomy
@@ -21,7 +23,7 @@ from .holding import check_held
 from .loads import Displaced, Loads, Nodal, Prescribed, Pushed, check_field
 from .material import Tissue, coefficients_of, portion
 from .problem import Imposed, Problem
-from .term import Term
+from .term import Curved, Term
 
 CAUSES = {ToolForce: Pushed, ToolDisplacement: Displaced, NodalForce: Nodal, Held: Prescribed}
 """The cause that each effect answers; other effects act by themselves."""
@@ -127,12 +129,32 @@ def compile_part(
 
 def surrounded(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> Part:
     """A part and a stiffness (m, m) [N/m] around it, which its rows (m,) of 3n touch."""
-    from .terms.dead_force import DeadForce, Forces
     from .terms.exterior import Exterior
 
-    device = part.device
-    load, nodes = DeadForce("load", lambda _: None, device), device.array(np.arange(part.rows // 3), wp.int32)
-    problem = replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, device), load))
+    return _loaded(replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, part.device))))
+
+
+def rimmed(
+    effects: Iterable[Effect], space: Discretisation, whole: Problem, chosen: np.ndarray, nodes: np.ndarray
+) -> tuple[Part, Callable[[], sp.csc_array]]:
+    """As `compile_part`, whose nodes that other tetrahedra touch are held.
+
+    And its curvature (3n, 3n) [N/m], assembled, where the problem of one column was last linearised.
+    """
+    effect, device = next(effect for effect in effects if isinstance(effect, Elasticity)), whole.device
+    terms = _elasticity(effect, space, device, chosen, nodes)
+    rim = np.isin(nodes, space.table[~chosen])[:, None]
+    held, normal = whole.constraint.held[nodes] | rim, np.where(rim, 0.0, whole.constraint.normal[nodes])
+    part = _loaded(Problem(tuple(terms), Constraint(held, normal, device), device))
+    return part, lambda: reduce(add, [term.curvature() for term in terms])
+
+
+def _loaded(problem: Problem) -> Part:
+    from .terms.dead_force import DeadForce, Forces
+
+    device = problem.device
+    load, nodes = DeadForce("load", lambda _: None, device), device.array(np.arange(problem.rows // 3), wp.int32)
+    problem = replace(problem, terms=(*problem.terms, load))
     return Part(problem, lambda force: load.take(None if force is None else Forces(nodes, force)))
 
 
@@ -142,7 +164,7 @@ def _elasticity(
     device: Device,
     within: np.ndarray | None = None,
     nodes: np.ndarray | None = None,
-) -> list[Term]:
+) -> list[Curved]:
     """One term for each law and kind of element, over the elements of all regions that obey it.
 
     `within` (T,) bool: of these tetrahedra alone, posed on their own nodes (n,).
@@ -160,7 +182,7 @@ def _elasticity(
         if material is None:
             raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
         materials[label] = material
-    terms: list[Term] = []
+    terms: list[Curved] = []
     for name in sorted({material.law for material in materials.values()}):
         law = importlib.import_module(f".terms.{name.replace('-', '_')}", __package__).LAW
         obeying = {label: material for label, material in materials.items() if material.law == name}

@@ -33,6 +33,7 @@ from .patching import patching
 from .precondition import choose_preconditioner, is_exact, name_of
 from .problem import Problem
 from .term import Cases
+from .vicinity import vicinity_of
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"
@@ -83,7 +84,8 @@ class Fem:
         near = cache(partial(eliminating, problem, preconditioner, self.effects, self.space))
         if problem.device.on_cuda:
             near()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
-        alone = patching(problem, preconditioner, self.effects, self.space)
+        vicinity = vicinity_of(problem, preconditioner, self.effects, self.space)
+        alone = patching(problem, preconditioner, self.effects, self.space) if vicinity is None else lambda: vicinity
         self._ladder = Ladder(problem, preconditioner, Inversion(self.space, problem.device), accuracy, near, alone)
 
     @property

@@ -24,6 +24,7 @@ from .patching import NODES, Patching
 from .problem import Problem
 from .steering import BROKEN, DONE
 from .term import Cases
+from .vicinity import Vicinity
 
 # L-BFGS has so many turns; what it does not bring to its end is left to Newton. On CUDA, where few columns cost hardly
 # less than one, Newton comes last.
@@ -95,7 +96,7 @@ class Ladder:
     inversion: Inversion
     accuracy: Accuracy
     near: Callable[[], Elimination | None] = lambda: None
-    alone: Callable[[], Patching | None] = lambda: None
+    alone: Callable[[], Patching | Vicinity | None] = lambda: None
 
     @cached_property
     def _lbfgs(self) -> Lbfgs:
@@ -154,13 +155,18 @@ class Ladder:
         start = device.zeros(problem.rows, count) if start is None else start
         if imposed or self.accuracy.outer < FEWEST:
             return self._thorough(start, self.accuracy.outer)
-        descents: list[tuple[Elimination | Patching | Lbfgs, Mapping[str, np.ndarray] | None]] = [(self._lbfgs, learnt)]
+        descents: list[tuple[Elimination | Patching | Vicinity | Lbfgs, Mapping[str, np.ndarray] | None]] = [
+            (self._lbfgs, learnt)
+        ]
         near = self.near() if count >= WORTH else self.alone() if count == 1 else None
         if near is not None:
             patch = {NODES: cases.history[LEARNT_KEY + NODES]} if LEARNT_KEY + NODES in cases.history else {}
             descents = [(near, patch), (self._lbfgs, None)]
         index, never = np.arange(count), np.full(count, np.inf)
-        answer = self._answer(wp.clone(start), np.full(count, Outcome.BUDGET, object), np.zeros(count, int), never, 0)
+        none = np.zeros(count, int)
+        answer = Answer(
+            wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
+        )
         taught: Mapping[str, np.ndarray] = {}
         for descent, known in descents:
             found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), most, known)

@@ -90,3 +90,11 @@ class Term(Protocol):
     def end(self, u: wp.array) -> Any:
         """What must travel to the next call, rows first (B, ...), or None."""
         ...
+
+
+class Curved(Term, Protocol):
+    """A Term whose curvature can be had as a matrix."""
+
+    def curvature(self) -> sp.csc_array:
+        """Assembled K(u) (3N, 3N) [N/m] at the last linearisation, of one column."""
+        ...

@@ -19,8 +19,8 @@ TIERS = (
     {"device", "lanes", "columns", "rows", "product", "sparse", "sweep", "term", "constraint", "footprint"},
     {"terms", "problem"},
     {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering", "narrow"},
-    {"newton", "balance", "room", "lbfgs", "multigrid", "amg", "inversion", "patch"},
-    {"precondition", "condensation", "elimination", "patching", "ladder", "frame", "following"},
+    {"newton", "balance", "room", "lbfgs", "multigrid", "amg", "inversion", "patch", "rim"},
+    {"precondition", "condensation", "elimination", "patching", "vicinity", "ladder", "frame", "following"},
     {"fem"},
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""

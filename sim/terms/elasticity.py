@@ -1,8 +1,8 @@
 """Elastic energy of one region: the integral of psi(H) over the rest volume, for any law and element."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
 from itertools import pairwise
 
 import numpy as np
@@ -275,7 +275,7 @@ class Elasticity:
         size = elements.table.shape[1] if elements.size is None else 0
         sizes = np.zeros(0, np.int32) if elements.size is None else elements.size
         self._kernels = kernels_of(law, device, size, count)
-        self._rest = (elements, *lame.T)
+        self._rest, self._tissue = (elements, *lame.T), (law, coefficients)
         shape = [
             device.array(sizes, wp.int32),
             device.array(elements.table, wp.int32),
@@ -323,6 +323,28 @@ class Elasticity:
     def rest_curvature(self) -> sp.csc_array:
         """Hooke's stiffness, which every law meets at rest."""
         return hooke_stiffness(*self._rest)
+
+    def curvature(self) -> sp.csc_array:
+        """K(u) (3N, 3N) [N/m] of one column, assembled: each element by itself, along every motion of its nodes."""
+        assert self._at is not None
+        elements = self._rest[0]
+        count, size = len(elements.table), 3 * elements.table.shape[1]
+        dof = (3 * elements.table[:, :, None] + np.arange(3)).reshape(count, size)
+        u = self._device.array(np.repeat(self._at.numpy()[dof.ravel()], size, axis=1))
+        self._apart.linearise(u, self._device.array(np.zeros(size), wp.int32))
+        out = self._device.zeros(count * size, size)
+        self._apart.add_curvature(self._device.array(np.tile(np.eye(size), (count, 1))), out)
+        place = np.repeat(dof, size, axis=1).ravel(), np.tile(dof, size).ravel()
+        entries = out.numpy().ravel().astype(np.float64)
+        return sp.csc_array(sp.coo_array((entries, place), shape=(3 * elements.nodes,) * 2))
+
+    @cached_property
+    def _apart(self) -> "Elasticity":
+        """The same elements, each with nodes of its own."""
+        elements, law, coefficients = self._rest[0], *self._tissue
+        table = np.arange(elements.table.size, dtype=np.int32).reshape(elements.table.shape)
+        apart = replace(elements, table=table, nodes=table.size)
+        return Elasticity(self.name, law, apart, coefficients, np.column_stack(self._rest[1:]), self._device)
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
         """Bound the step where the law needs J > 0."""

@@ -1,0 +1,103 @@
+"""The vicinity of a load against L-BFGS and Newton on the whole body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boxes import base_held, box
+from oracle import EVERY_LAW, tissue
+
+from sim.accuracy import Accuracy
+from sim.balance import constants_of
+from sim.effects import Elasticity, Held, ToolForce
+from sim.fem import Fem
+from sim.loads import Loads, push
+from sim.rim import Rimmed
+from sim.steering import DONE, LIVE
+from sim.term import Cases
+from sim.terms.elasticity import Elasticity as ElasticityTerm
+from sim.vicinity import Vicinity, vicinity_of
+
+BODY = base_held(box((4, 4, 4), 0.1))
+EFFECTS = (Elasticity(tissue("stable-neo-hookean")), Held(), ToolForce())
+
+
+def pressed(down: float) -> Loads:
+    return push(np.array([0.05, 0.05, 0.1]), np.array([0.3 * down, 0.0, -down]), 0.02)
+
+
+def fem_and_vicinity() -> tuple[Fem, Vicinity]:
+    fem = Fem(BODY, EFFECTS, Accuracy(1e-8), "cpu", element="p2")
+    vicinity = vicinity_of(fem.problem, fem._ladder.preconditioner, EFFECTS, fem.space)
+    assert vicinity is not None
+    return fem, vicinity
+
+
+def test_it_is_for_levels_alone() -> None:
+    fem = Fem(BODY, EFFECTS, Accuracy(1e-8), "cpu", element="p1")
+    assert vicinity_of(fem.problem, fem._ladder.preconditioner, EFFECTS, fem.space) is None
+
+
+def test_finds_the_equilibrium() -> None:
+    """Under a force that presses a box in by a twentieth of its height."""
+    fem, vicinity = fem_and_vicinity()
+    load = pressed(0.6)
+    answer = fem.deform(load)
+    fem._ladder = replace(fem._ladder, alone=lambda: None)
+    expected = fem.deform(load)
+    moved = np.abs(expected.displacement).max()
+    assert answer.outcome[0].good and moved > 5e-3
+    np.testing.assert_allclose(answer.displacement, expected.displacement, atol=1e-5 * moved)
+    fem.problem.begin(Cases(load, np.zeros(1)))
+    found = vicinity.descend(fem.problem.device.zeros(fem.problem.rows, 1), np.array([1e-8]), 60)
+    assert found.status[0] == DONE and found.steps[0] > 0
+    assert fem.problem.residual(found.u)[1][0] <= 1.01e-8 * fem.problem.residual(found.u)[2][0]
+
+
+def test_what_it_does_not_bring_home_is_left_nearer_to_it() -> None:
+    fem, vicinity = fem_and_vicinity()
+    fem.problem.begin(Cases(pressed(0.6), np.zeros(1)))
+    start = fem.problem.device.zeros(fem.problem.rows, 1)
+    found = vicinity.descend(start, np.array([1e-8]), 3)
+    assert found.status[0] == LIVE and found.steps[0] == 3
+    before, after = (fem.problem.residual(u)[1][0] for u in (start, found.u))
+    assert after < 0.5 * before
+
+
+def test_what_is_hardly_strained_is_left_to_others() -> None:
+    fem, vicinity = fem_and_vicinity()
+    fem.problem.begin(Cases(pressed(1e-3), np.zeros(1)))
+    found = vicinity.descend(fem.problem.device.zeros(fem.problem.rows, 1), np.array([1e-8]), 60)
+    assert found.status[0] == LIVE and found.steps[0] == 0 and not found.u.numpy().any()
+    assert fem.deform(pressed(1e-3)).outcome[0].good
+
+
+def test_a_part_is_settled_between_what_holds_its_rim() -> None:
+    fem, _ = fem_and_vicinity()
+    problem, device = fem.problem, fem.problem.device
+    problem.begin(Cases(pressed(0.6), np.zeros(1)))
+    u = device.array(1e-4 * np.random.default_rng(0).normal(size=(problem.rows, 1)))
+    problem.constraint.project(u)
+    chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.08
+    constant, _ = constants_of(problem, u)
+    part = Rimmed(problem, EFFECTS, fem.space, chosen, constant, u)
+    settled = part.settled(u, 1e-9)
+    inside = np.setdiff1d(part.nodes, fem.space.table[~chosen])
+    moved = (settled.numpy() != u.numpy()).reshape(-1, 3).any(axis=1)
+    assert len(inside) and set(np.flatnonzero(moved)) <= set(inside.tolist())
+    free = problem.residual(settled)[0].numpy().reshape(-1, 3)
+    assert np.linalg.norm(free[inside]) <= 1.01e-9 < np.linalg.norm(free)
+
+
+@pytest.mark.parametrize("law", EVERY_LAW)
+def test_the_assembled_curvature_is_the_one_that_multiplies(law: str) -> None:
+    fem = Fem(BODY, (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(1e-8), "cpu", element="p2")
+    problem, random = fem.problem, np.random.default_rng(0)
+    u, p = (problem.device.array(scale * random.normal(size=(problem.rows, 1))) for scale in (3e-4, 1.0))
+    problem.linearise(u, np.zeros(1, bool))
+    expected = problem.device.zeros(problem.rows, 1)
+    problem.add_curvature(p, expected)
+    found = sum(term.curvature() @ p.numpy() for term in problem.terms if isinstance(term, ElasticityTerm))
+    np.testing.assert_allclose(found, expected.numpy(), atol=1e-10 * np.abs(expected.numpy()).max())
