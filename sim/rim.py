@@ -20,7 +20,7 @@ from .problem import Problem
 from .steering import DONE
 
 # What so many turns of L-BFGS leave is Newton's; a factor with which so many were taken is made anew.
-TURNS, STALE = 150, 8
+TURNS, STALE = 400, 25
 # Newton's budgets.
 OUTER, INNER = 60, 60
 
