@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import get_blas_funcs
 
 from .compile import compile_part
 from .discretisation import Discretisation
@@ -52,6 +53,7 @@ class Patch:
     def __init__(self, nodes: np.ndarray, part: Problem, compliance: np.ndarray):
         self.nodes, self.rows = nodes, (3 * nodes[:, None] + np.arange(3)).ravel()
         self._part, self._compliance = part, compliance
+        (self._product,) = get_blas_funcs(("symv",), (compliance,))  # reads half of it
         # Arrays on the device, and the same numbers on the host: to make either anew takes as long as a product.
         self._place, self._way, self._force = (part.device.zeros(part.rows, 1) for _ in range(3))
         self._place_host, self._way_host, self._force_host = (
@@ -77,7 +79,7 @@ class Patch:
             promised = -float(g @ d)
             if not promised > 0.0:  # round-off, or forces that are not finite
                 break
-            t = self._longest(u + x, d)
+            t = 1.0  # a step that an element forbids has forces that are not finite, and is cut
             for _ in range(CUTS):
                 turns += 1
                 moved = x + t * d
@@ -104,7 +106,7 @@ class Patch:
         for pair in reversed(pairs):
             along.append(pair.step @ pull / pair.work)
             pull -= along[-1] * pair.change
-        d = (self._compliance @ pull.astype(self._compliance.dtype)).astype(g.dtype)
+        d = self._product(1.0, self._compliance.T, pull).astype(g.dtype)
         for pair, share in zip(pairs, reversed(along), strict=True):
             more = share - pair.change @ d / pair.work
             d += more * pair.step

@@ -29,9 +29,7 @@ from .problem import Problem
 from .steering import BROKEN, DONE, FREE, LIVE, WHOLE
 
 # A patch has at most so many nodes, and less where what lies beyond has such a share of the forces.
-LARGEST, NEGLIGIBLE = 550, 0.01
-# Where the rest stiffness alone leaves at most such a share of the free force, there is none.
-LINEAR = 0.15
+LARGEST, NEGLIGIBLE = 550, 0.02
 CYCLES = 20
 # A patch is settled to a share of the whole residual, or of the tolerance.
 FORCING, ENOUGH = 0.03, 0.3
@@ -39,8 +37,9 @@ FORCING, ENOUGH = 0.03, 0.3
 LEFT = 0.3
 # A load whose free force was not halved in so many cycles goes elsewhere, and so does one that it rises so far with.
 PATIENCE, RISE = 5, 30.0
-# To know the compliance of the near part costs as much as this many loads gain.
-WORTH = 4
+# Who solves so many loads one by one will solve more: it pays to know the compliance of the near part then, a matrix
+# that is affordable up to so many nodes. (On the default brain it takes a second and 55 MB.)
+WORTH, LARGEST_NEAR = 4, 2000
 # What a descent has learnt: the nodes (1, n) of its patch.
 NODES = "patch"
 
@@ -126,21 +125,22 @@ class Patching:
     ) -> tuple[State, np.ndarray | None, np.ndarray]:
         """The next state, the nodes of the patch, and forces (N,) [N]: what is out of balance then, or the patch took.
 
-        Where the rest stiffness by itself is good enough, there is still no patch. `force` [N] may be left in one.
+        There is none where the rest stiffness alone leaves no more than `force` [N], as much as one may leave.
         """
         device = self._problem.device
         if nodes is None:
-            ahead = judged(self._moved(now.u, combined(device, now.g, -2.0, now.g, wp.empty_like(now.g))))
-            if ahead.free <= LINEAR * now.free:
+            ahead = self._answered(judged, now.u, combined(device, now.g, -2.0, now.g, wp.empty_like(now.g)))
+            if ahead.free <= force:
                 return ahead, None, _norms(ahead.g)
             nodes = self._strained(_norms(ahead.g))
         patch, reach = self._patch(nodes)
-        g = now.g.numpy()[:, 0]
+        u, g = now.u.numpy()[:, 0], now.g.numpy()[:, 0]
         with self._blas.limit(limits=1, user_api="blas"):
-            share, own = patch.settled(now.u.numpy()[patch.rows, 0], -(reach @ g[self._rows]), force)
+            e = -(reach @ g[self._rows].astype(reach.dtype)).astype(g.dtype)
+            share, own = patch.settled(u[patch.rows], e, force)
         pull = device.array(-share * g[:, None])
         pull.numpy()[patch.rows, 0] += own
-        new = judged(self._moved(now.u, pull))
+        new = self._answered(judged, now.u, pull)
         forces = _norms(new.g)
         forces[patch.nodes] = np.linalg.norm(own.reshape(-1, 3), axis=1)
         return new, nodes, forces
@@ -152,12 +152,15 @@ class Patching:
         free, largest = sums[FREE], max(square, own, float(sums[WHOLE] - sums[FREE]))
         return State(u, found.g, float(np.sqrt(free)), float(np.sqrt(largest)))
 
-    def _moved(self, u: wp.array, force: wp.array) -> wp.array:
-        """u (3N, 1) [m] and how the body moves from there under a force (3N, 1) [N], at rest, as far as terms allow."""
-        problem, step = self._problem, self._problem.device.zeros(*u.shape)
+    def _answered(self, judged: Callable[[wp.array], State], u: wp.array, force: wp.array) -> State:
+        """Where the body moves from u (3N, 1) [m] under a force (3N, 1) [N], at rest, or as far as terms allow."""
+        problem, device, step = self._problem, self._problem.device, self._problem.device.zeros(*u.shape)
         self._factor.apply(force, np.ones(1, bool), step)
         problem.constraint.project_nodes(step)  # what is rounded row by row leaves the planes it slides on
-        return combined(problem.device, u, float(problem.longest_step(u, step)[0]), step, step)
+        new = judged(combined(device, u, 1.0, step, wp.empty_like(step)))
+        if new.finite:
+            return new
+        return judged(combined(device, u, float(problem.longest_step(u, step)[0]), step, step))
 
     def _strained(self, forces: np.ndarray) -> np.ndarray:
         """The nodes (k,), ascending, of those tetrahedra that have the largest `forces` (N,) at their nodes."""
@@ -182,10 +185,18 @@ class Patching:
             chosen[self._near] = np.isin(self._table, nodes).all(axis=1)
             place = np.searchsorted(self._nodes, np.unique(self._space.table[chosen]))
             rows = (3 * place[:, None] + np.arange(3)).ravel()
-            reach = self._compliance[rows]
-            patch = patch_of(self._effects, self._space, self._problem, chosen, reach.take(rows, axis=1))
+            reach, own = self._room[0][: len(rows)], self._room[1][: len(rows) ** 2].reshape(len(rows), len(rows))
+            np.take(self._compliance, rows, axis=0, out=reach, mode="clip")
+            np.take(reach, rows, axis=1, out=own, mode="clip")
+            patch = patch_of(self._effects, self._space, self._problem, chosen, own)
             self._last = nodes, patch, reach
         return self._last[1:]
+
+    @cached_property
+    def _room(self) -> tuple[np.ndarray, np.ndarray]:
+        """Memory for a patch's rows of the compliance, and its own columns of these: the last patch stands there."""
+        rows, kind = min(3 * LARGEST, len(self._rows)), self._compliance.dtype
+        return np.empty((rows, len(self._rows)), kind), np.empty(rows**2, kind)
 
     @cached_property
     def _compliance(self) -> np.ndarray:
@@ -197,7 +208,7 @@ def patching(
 ) -> Callable[[], Patching | None]:
     """Asked at each single load: what solves it, if anything.
 
-    Nothing at first, nor on CUDA, nor on a body without a small opening.
+    Nothing at first, nor on CUDA, nor on a body without a small opening, nor where too many nodes are near it.
     """
     asked = count()
 
@@ -206,7 +217,9 @@ def patching(
         if problem.device.on_cuda or not isinstance(preconditioner, Factor):
             return None
         near = near_tetrahedra(space, problem.constraint)
-        return None if near is None else Patching(problem, preconditioner, effects, space, near)
+        if near is None or len(np.unique(space.table[near])) > LARGEST_NEAR:
+            return None
+        return Patching(problem, preconditioner, effects, space, near)
 
     return lambda: made() if next(asked) >= WORTH - 1 else None
 

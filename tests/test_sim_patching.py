@@ -101,7 +101,6 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
         return share, factor * force
 
     monkeypatch.setattr(Patch, "settled", exploded)
-    monkeypatch.setattr("sim.patching.LINEAR", 0.0)
     found = descent.descend(problem.device.zeros(problem.rows, 1), np.full(1, 1e-4), 100)
     assert found.status[0] == LIVE and not found.u.numpy().any()
 
@@ -130,13 +129,16 @@ def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
     np.testing.assert_allclose(patch._free(force), patch._free(taken), atol=1e-6 * np.abs(force).max())
 
 
-@pytest.mark.parametrize("kind", ["wide", "levels"])
-def test_where_it_would_not_serve_there_is_none(kind: str) -> None:
+@pytest.mark.parametrize("kind", ["wide", "levels", "fine"])
+def test_where_it_would_not_serve_there_is_none(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     law = "stable-neo-hookean"
     if kind == "wide":
         fem = Fem(base_held(box((3, 3, 3), 0.1)), (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(), "cpu")
         ask = patching(fem.problem, rest_solver(fem.problem), fem.effects, fem.space)
     else:
         problem, space = begun(law)
-        ask = patching(problem, BlockJacobi(problem.device), (Elasticity(tissue(law)), *EFFECTS), space)
+        solver = BlockJacobi(problem.device) if kind == "levels" else rest_solver(problem)
+        if kind == "fine":
+            monkeypatch.setattr("sim.patching.LARGEST_NEAR", 10)
+        ask = patching(problem, solver, (Elasticity(tissue(law)), *EFFECTS), space)
     assert [ask() for _ in range(WORTH + 1)] == [None] * (WORTH + 1)
