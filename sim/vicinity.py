@@ -30,9 +30,9 @@ from .steering import BROKEN, DONE, LIVE
 
 # The vicinity is what the linear answer strains more than this, the most strained tetrahedra first, of at most such a
 # share of all nodes; and all tetrahedra that touch these.
-STRAINED, LARGEST = 0.15, 0.02
-# Where a cycle leaves more than this share of the free force, so many nodes, which have most of it beyond the vicinity,
-# and what touches them are added to it.
+STRAINED, LARGEST = 0.15, 0.03
+# Where a cycle leaves more than this share of the free force, and so many nodes have most of what is beyond the
+# vicinity, these and what touches them are added to it.
 LEFT, ADDED = 0.8, 60
 CYCLES, PAIRS, CUTS = 30, 8, 6
 # A load whose free force was not halved in so many cycles goes elsewhere.
@@ -86,8 +86,10 @@ class Vicinity:
             new = self._lower(now, part, pairs, max(FORCING * now.free, ENOUGH * aim * now.scale))
             pairs.learn(now, new)
             if new.finite and new.free > LEFT * now.free:
-                chosen |= self._touching(self._left(new.g, part.nodes))
-                part = Rimmed(self.problem, self.effects, self.space, chosen, constant, new.u)
+                more = self._left(new.g, part.nodes)
+                if len(more):
+                    chosen |= self._touching(more)
+                    part = Rimmed(self.problem, self.effects, self.space, chosen, constant, new.u)
             now = new
         return _ended(best, status, cycle)
 
@@ -124,10 +126,11 @@ class Vicinity:
         return table[np.argsort(-strain)[:most]].ravel()
 
     def _left(self, g: wp.array, nodes: np.ndarray) -> np.ndarray:
-        """The nodes (k,) beyond these that have most of the free gradient g (3N, 1)."""
-        force = np.linalg.norm(g.numpy().reshape(-1, 3), axis=1)
-        force[nodes] = 0.0
-        return np.argsort(-force)[:ADDED]
+        """The few nodes (k,) beyond these that have most of the free gradient g (3N, 1) there; none if no few have."""
+        square = (g.numpy().reshape(-1, 3).astype(np.float64) ** 2).sum(axis=1)
+        square[nodes] = 0.0
+        most = np.argsort(-square)[:ADDED]
+        return most if 2.0 * square[most].sum() > square.sum() else most[:0]
 
     def _touching(self, nodes: np.ndarray) -> np.ndarray:
         """(T,) bool: the tetrahedra of these nodes (k,)."""
