@@ -53,7 +53,8 @@ class Fem:
     device
         "auto", "cpu", "cuda" or "cuda:1".
     batch
-        Most load cases that are solved together; None: as many as are worth it on this device.
+        Most load cases that are solved together; None: as many as are worth it on this device. Quadratic elements with
+        levels go one by one on the CPU.
     element
         One of `discretisation.ELEMENTS`; None: p1, or p2 on a mesh that brings mid-edge nodes of its own.
 
@@ -78,13 +79,14 @@ class Fem:
         self.space = discretise(anatomy.mesh, element)
         self._skin = Skin(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
         problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
-        self.batch = fitting_batch(problem.rows, problem.device) if batch is None else batch
         preconditioner = choose_preconditioner(problem, self.space, self._unsmoothed)
         self.preconditioner = name_of(preconditioner)
         near = cache(partial(eliminating, problem, preconditioner, self.effects, self.space))
         if problem.device.on_cuda:
             near()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
         vicinity = vicinity_of(problem, preconditioner, self.effects, self.space)
+        fitting = fitting_batch(problem.rows, problem.device) if batch is None else batch
+        self.batch = fitting if vicinity is None else 1  # each load has a vicinity of its own
         alone = patching(problem, preconditioner, self.effects, self.space) if vicinity is None else lambda: vicinity
         self._ladder = Ladder(problem, preconditioner, Inversion(self.space, problem.device), accuracy, near, alone)
 
