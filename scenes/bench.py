@@ -71,7 +71,7 @@ def rows(theatre: Theatre, player: Player, deformer: str, solves: int, batch: in
         "FEM, a single load", "ms", 1e3, runs, f"from rest, to {TRAIN.tolerance:g}", lambda i: fem.deform(single[i])
     )
 
-    live = Player(player.stage, theatre.fem(scene, LIVE))
+    live = Player(player.stage, theatre.fem(scene, LIVE, live=True))
     frames = [frame.seconds["deform"] for frame in live.frames()][WARM_UP:]
     yield Row(
         "FEM, live", 1e3 * float(np.median(frames)), 1e3 * float(np.percentile(frames, 95)), "ms", len(frames),

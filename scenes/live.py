@@ -102,7 +102,7 @@ def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:
 
 def live_fem(scene: Scene, site: Site, device: str, element: str) -> Fem:
     """Finite elements for live frames."""
-    return Fem(site.anatomy, scene.effects, LIVE, device, element=element)
+    return Fem(site.anatomy, scene.effects, LIVE, device, element=element, live=True)
 
 
 def errors(frames: Sequence[Frame], scene: Scene, site: Site, element: str) -> np.ndarray:

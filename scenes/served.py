@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from functools import partial
+
 import numpy as np
 
 from sim.accuracy import Accuracy
@@ -15,21 +18,21 @@ from sim.mesh import TetMesh
 from .serving import Case, Solve, serve
 
 
-def fem_of(case: Case) -> Fem:
-    """The finite elements of a case, in double precision on the CPU."""
+def fem_of(case: Case, live: bool = False) -> Fem:
+    """The finite elements of a case, in double precision on the CPU; `live` as `Fem` has it."""
     mesh = TetMesh(case.nodes, case.tets, np.zeros(len(case.tets), int))
     held = np.repeat(case.held[:, None], 3, axis=1)
     anatomy = Anatomy(mesh, held, np.zeros_like(mesh.nodes), ~case.held)
     tissue = Material("neo-hookean", case.young, case.poisson)
     effects: tuple[Effect, ...] = (Elasticity(tissue), Held(), NodalForce())
-    return Fem(anatomy, effects, Accuracy(case.tolerance), "cpu")
+    return Fem(anatomy, effects, Accuracy(case.tolerance), "cpu", live=live)
 
 
-def set_up(case: Case) -> Solve:
+def set_up(case: Case, live: bool = False) -> Solve:
     """Kernels and the factor, kept for all loads."""
-    fem = fem_of(case)
+    fem = fem_of(case, live)
     return lambda force: fem.deform(Loads((Nodal(force[None]),))).displacement[0]
 
 
 if __name__ == "__main__":
-    serve(set_up)
+    serve(partial(set_up, live="live" in sys.argv))

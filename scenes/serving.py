@@ -61,12 +61,12 @@ def answer_path(folder: Path, number: int) -> Path:
 
 
 def serve(set_up: Callable[[Case], Solve]) -> None:
-    """Solve the loads whose numbers come in, a line each; the command line names the folder and how many threads.
+    """Solve the loads whose numbers come in, a line each; the command line ends with the folder and how many threads.
 
     Says `READY` when everything is imported and read, then for each load a line of JSON: its seconds, and the reason if
     it failed. The seconds of the first include `set_up`. What an engine prints goes to standard error.
     """
-    folder, threads = Path(sys.argv[1]), int(sys.argv[2])
+    folder, threads = Path(sys.argv[-2]), int(sys.argv[-1])
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
     said = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)

@@ -69,6 +69,7 @@ def _peer(name: str, setting: str, *modules: str) -> Engine:
 
 
 OWN = Engine("sulcus", "float64; rest stiffness factorised once", (), ("-m", f"{__package__}.served"))
+LIVE = Engine("sulcus", "the same, live: set up for many single loads", (), (*OWN.words, "live"))
 PEERS = (
     _peer("torch-fem", "Newton, cutbacks; direct, PARDISO", "torchfem", "pypardiso"),
     _peer("scikit-fem", "Newton; basis kept, 2 threads, symmetric PARDISO", "skfem", "pypardiso"),

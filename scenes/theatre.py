@@ -51,17 +51,18 @@ class Theatre:
         """The learnt model of the tightest error bound; the finite elements where nothing was learnt."""
         return min(self.models, key=lambda name: self.models[name].bound, default="fem")
 
-    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64) -> Fem:
+    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem:
         """Finite elements for a scene's effects, with the tissue and the element that the models here were taught.
 
-        Where nothing was learnt, or the models do not say, tissue and element are the scene's.
+        Where nothing was learnt, or the models do not say, tissue and element are the scene's; `live` as `Fem` has it.
         """
         taught = next((model.training for model in self.models.values()), {})
         effects = scene.effects
         if "tissue" in taught:
             elasticity = Elasticity(tissue_from_json(taught["tissue"]))
             effects = tuple(elasticity if isinstance(effect, Elasticity) else effect for effect in effects)
-        return Fem(self.anatomy, effects, accuracy, self.device, batch, taught.get("element", scene.element))
+        element = taught.get("element", scene.element)
+        return Fem(self.anatomy, effects, accuracy, self.device, batch, element, live)
 
     def deformer(self, name: str, scene: Scene) -> Deformer:
         """A deformer by name; "fem" is made for the scene's accuracy.
@@ -72,7 +73,7 @@ class Theatre:
             A name that this theatre does not know.
         """
         if name == "fem":
-            return self.fem(scene, scene.accuracy)
+            return self.fem(scene, scene.accuracy, live=True)
         if name not in self.models:
             raise InputError(
                 f"no deformer is called {name!r} here: choose one of {', '.join(self.names)}; "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import warp as wp
 
 from . import narrow
@@ -72,3 +73,23 @@ def constants_of(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
             add_dots(device, own, own, square[number])
             combined(device, total, 1.0, own, total)
     return total, square
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """u (3N, 1) [m], its free gradient g (3N, 1) [N] and that one's 2-norm, and the norm it is measured against."""
+
+    u: wp.array
+    g: wp.array
+    free: float
+    scale: float
+
+    @property
+    def relative(self) -> float:
+        """The relative residual."""
+        return self.free / self.scale if self.free else 0.0
+
+    @property
+    def finite(self) -> bool:
+        """Whether it is a state at all: forces that overflow have no scale."""
+        return bool(np.isfinite(self.free) and np.isfinite(self.scale))

@@ -15,7 +15,7 @@ import numpy as np
 
 from .deformation import Cost, Deformation, Outcome
 from .frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, Frame
-from .heading import BEFORE, PUSHES, pushes_of, shares, way_of
+from .heading import BEFORE, PUSHES, knows, pushes_of, shares, way_of
 from .inversion import Inversion
 from .ladder import LEARNT_KEY, learnt_from
 from .lbfgs import LEARNT, rows_first
@@ -93,12 +93,10 @@ class Following:
                 return None
         self._make_way()
         way = way_of(now, last, start.history)
-        share = 0.0
-        if BEFORE in start.history and start.history[BEFORE].shape == last.T.shape:
-            share = shares(now, way[PUSHES][:, 1], start.history[PUSHES][:, 1])[0]
+        share = shares(now, way[PUSHES][:, 1], start.history[PUSHES][:, 1])[0] if knows(start.history, last) else 0.0
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
-        found = self._frame.push(point, radius, force, share)
         self._last = self._here = _gone
+        found = self._frame.push(point, radius, force, share)
         if found[STATUS] != DONE or found[INVERTED]:
             return None
         history = Kept(way, self._frame.state)
@@ -131,9 +129,8 @@ class Following:
         here = self._here()
         if here is not None:
             here.settle()
-        self._here = _gone
-        past = start.history[BEFORE].T if BEFORE in start.history else None
-        past = past if past is not None and past.shape == last.shape else None
+        self._last = self._here = _gone
+        past = start.history[BEFORE].T if knows(start.history, last) else None
         self._frame.take(last, past, learnt_from(cases, len(last)))
         return True
 

@@ -200,7 +200,8 @@ class Frame:
         columns = self._room.columns
         columns["u"].assign(u)
         self._past.assign(u if past is None else past)
-        columns["known"].zero_()
+        for name in ("s", "w", "known"):
+            columns[name].zero_()
         columns["head"].fill_(PAIRS - 1)
         for name, rows_first in learnt.items():
             columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))

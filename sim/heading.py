@@ -45,10 +45,17 @@ def shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
     return np.where(known, share.clip(BACK, ON), 0.0)
 
 
+def knows(history: Mapping[str, Any], last: np.ndarray) -> bool:
+    """Whether a history says how answers (3N, B) came about."""
+    if BEFORE not in history or PUSHES not in history:
+        return False
+    return history[BEFORE].shape == last.T.shape and history[PUSHES].shape == (last.shape[1], 2, 7)
+
+
 def moved_on(loads: Loads, last: np.ndarray, history: Mapping[str, Any]) -> np.ndarray:
     """Starts (3N, B) [m] for loads whose last answers (3N, B) have this history; those answers if it tells no way."""
     now = pushes_of(loads)
-    if now is None or BEFORE not in history or history[BEFORE].shape != last.T.shape:
+    if now is None or not knows(history, last):
         return last
     came, before = history[PUSHES][:, 0], history[PUSHES][:, 1]
     return last + shares(now, came, before) * (last - history[BEFORE].T)
@@ -58,6 +65,6 @@ def way_of(now: np.ndarray | None, last: np.ndarray | None, history: Mapping[str
     """What the answers to pushes (B, 7) hand on, whose last answers (3N, B) had this history, if there were any."""
     if now is None:
         return {}
-    if last is None or PUSHES not in history:
+    if last is None or PUSHES not in history or history[PUSHES].shape != (len(now), 2, 7):
         return {PUSHES: np.stack([now, now], axis=1)}
     return {PUSHES: np.stack([now, history[PUSHES][:, 0]], axis=1), BEFORE: last.T}

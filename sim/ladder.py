@@ -22,7 +22,7 @@ from .linear import Preconditioner
 from .newton import find_equilibrium
 from .patching import NODES, Patching
 from .problem import Problem
-from .steering import BROKEN, DONE
+from .steering import BROKEN, DONE, PAIRS
 from .term import Cases
 from .vicinity import Vicinity
 
@@ -88,7 +88,7 @@ class Ladder:
     near
         Makes, or has made, the elimination of the same problem's near part; None: nothing is eliminated.
     alone
-        What a single load goes through first, if anything; it is asked at every one.
+        What a single load goes through first, if anything.
     """
 
     problem: Problem
@@ -96,7 +96,7 @@ class Ladder:
     inversion: Inversion
     accuracy: Accuracy
     near: Callable[[], Elimination | None] = lambda: None
-    alone: Callable[[], Patching | Vicinity | None] = lambda: None
+    alone: Patching | Vicinity | None = None
 
     @cached_property
     def _lbfgs(self) -> Lbfgs:
@@ -104,7 +104,7 @@ class Ladder:
 
     @property
     def held(self) -> int:
-        """Bytes that L-BFGS keeps from batch to batch."""
+        """Bytes that L-BFGS keeps for the next batch to stand in."""
         return self._lbfgs.held
 
     def climb(self, cases: Cases, guess: np.ndarray | None) -> Answer:
@@ -142,7 +142,7 @@ class Ladder:
     def _whole(
         self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] | None = NOTHING
     ) -> Answer:
-        """The whole load at once, of a batch that has begun: elimination, L-BFGS, Newton, each from where one ended.
+        """The whole load at once, of a batch that has begun: eliminations, L-BFGS, Newton, each from where one ended.
 
         From rest without a start; `learnt` on the way to it, if anything was.
 
@@ -158,7 +158,7 @@ class Ladder:
         descents: list[tuple[Elimination | Patching | Vicinity | Lbfgs, Mapping[str, np.ndarray] | None]] = [
             (self._lbfgs, learnt)
         ]
-        near = self.near() if count >= WORTH else self.alone() if count == 1 else None
+        near = self.near() if count >= WORTH else self.alone if count == 1 else None
         if near is not None:
             patch = {NODES: cases.history[LEARNT_KEY + NODES]} if LEARNT_KEY + NODES in cases.history else {}
             descents = [(near, patch), (self._lbfgs, None)]
@@ -227,9 +227,14 @@ class Ladder:
 
 
 def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
-    """What an earlier descent on as many rows = 3N left in the history; nothing if there was none."""
-    found = {name: cases.history[LEARNT_KEY + name] for name in LEARNT if LEARNT_KEY + name in cases.history}
-    return found if found and found["s"].shape[-1] == rows else {}
+    """What an earlier descent on as many rows = 3N left in the history; nothing if that does not fit these cases."""
+    if any(LEARNT_KEY + name not in cases.history for name in LEARNT):
+        return {}
+    found = {name: np.asarray(cases.history[LEARNT_KEY + name]) for name in LEARNT}
+    shape = {"s": (PAIRS, rows), "w": (PAIRS, rows), "sy": (PAIRS, PAIRS), "yw": (PAIRS, PAIRS)}
+    fits = all(array.shape == (len(cases.loads), *shape.get(name, ())) for name, array in found.items())
+    most = {"head": PAIRS - 1, "known": PAIRS}
+    return found if fits and all(((found[name] >= 0) & (found[name] <= most[name])).all() for name in most) else {}
 
 
 def shortfall(problem: Problem, u: wp.array) -> np.ndarray:

@@ -8,15 +8,13 @@ it instead of five to twenty. `elimination.py` does so for batches, with one par
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from functools import cache, cached_property, partial
-from itertools import count
+from functools import partial
 
 import numpy as np
 import warp as wp
 from threadpoolctl import ThreadpoolController
 
-from .balance import balance, constants_of
+from .balance import State, balance, constants_of
 from .columns import combined
 from .discretisation import Discretisation
 from .effects import Effect
@@ -37,31 +35,11 @@ FORCING, ENOUGH = 0.03, 0.3
 LEFT = 0.3
 # A load whose free force was not halved in so many cycles goes elsewhere, and so does one that it rises so far with.
 PATIENCE, RISE = 5, 30.0
-# Who solves so many loads one by one will solve more: it pays to know the compliance of the near part then, a matrix
-# that is affordable up to so many nodes. (On the default brain it takes a second and 55 MB.)
-WORTH, LARGEST_NEAR = 4, 2000
+# The compliance of the near part is a matrix that is affordable up to so many nodes: of the default brain's 1,244 it
+# takes a second and 55 MB.
+LARGEST_NEAR = 2000
 # What a descent has learnt: the nodes (1, n) of its patch.
 NODES = "patch"
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """u (3N, 1) [m], its free gradient g (3N, 1) [N] and that one's 2-norm, and the norm it is measured against."""
-
-    u: wp.array
-    g: wp.array
-    free: float
-    scale: float
-
-    @property
-    def relative(self) -> float:
-        """The relative residual."""
-        return self.free / self.scale if self.free else 0.0
-
-    @property
-    def finite(self) -> bool:
-        """Whether it is a state at all: forces that overflow have no scale."""
-        return bool(np.isfinite(self.free) and np.isfinite(self.scale))
 
 
 class Patching:
@@ -86,6 +64,10 @@ class Patching:
         self._rows = (3 * self._nodes[:, None] + np.arange(3)).ravel()
         self._blas = ThreadpoolController()
         self._last: tuple[np.ndarray, Patch, np.ndarray] | None = None
+        self._compliance = factor.compliance(self._rows)
+        # A patch's rows of it, and its own columns of these: the last patch stands there.
+        rows, kind = min(3 * LARGEST, len(self._rows)), self._compliance.dtype
+        self._room = np.empty((rows, len(self._rows)), kind), np.empty(rows**2, kind)
 
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
@@ -176,7 +158,9 @@ class Patching:
     def _known(self, learnt: Mapping[str, np.ndarray] | None) -> np.ndarray | None:
         """The nodes of a patch that served before, if that was here."""
         nodes = (learnt or {}).get(NODES)
-        return nodes[0] if nodes is not None and np.isin(nodes, self._nodes).all() else None
+        if nodes is None or nodes.shape[1] > LARGEST or not np.isin(nodes, self._nodes).all():
+            return None
+        return nodes[0]
 
     def _patch(self, nodes: np.ndarray) -> tuple[Patch, np.ndarray]:
         """All tetrahedra of the near part on these nodes; and how they move (m, M) [m/N] with forces on all of it."""
@@ -185,6 +169,7 @@ class Patching:
             chosen[self._near] = np.isin(self._table, nodes).all(axis=1)
             place = np.searchsorted(self._nodes, np.unique(self._space.table[chosen]))
             rows = (3 * place[:, None] + np.arange(3)).ravel()
+            self._last = None
             reach, own = self._room[0][: len(rows)], self._room[1][: len(rows) ** 2].reshape(len(rows), len(rows))
             np.take(self._compliance, rows, axis=0, out=reach, mode="clip")
             np.take(reach, rows, axis=1, out=own, mode="clip")
@@ -192,36 +177,17 @@ class Patching:
             self._last = nodes, patch, reach
         return self._last[1:]
 
-    @cached_property
-    def _room(self) -> tuple[np.ndarray, np.ndarray]:
-        """Memory for a patch's rows of the compliance, and its own columns of these: the last patch stands there."""
-        rows, kind = min(3 * LARGEST, len(self._rows)), self._compliance.dtype
-        return np.empty((rows, len(self._rows)), kind), np.empty(rows**2, kind)
-
-    @cached_property
-    def _compliance(self) -> np.ndarray:
-        return self._factor.compliance(self._rows)
-
 
 def patching(
     problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
-) -> Callable[[], Patching | None]:
-    """Asked at each single load: what solves it, if anything.
-
-    Nothing at first, nor on CUDA, nor on a body without a small opening, nor where too many nodes are near it.
-    """
-    asked = count()
-
-    @cache
-    def made() -> Patching | None:
-        if problem.device.on_cuda or not isinstance(preconditioner, Factor):
-            return None
-        near = near_tetrahedra(space, problem.constraint)
-        if near is None or len(np.unique(space.table[near])) > LARGEST_NEAR:
-            return None
-        return Patching(problem, preconditioner, effects, space, near)
-
-    return lambda: made() if next(asked) >= WORTH - 1 else None
+) -> Patching | None:
+    """For single loads; None on CUDA, without a factor, without a small opening, or with too many nodes near it."""
+    if problem.device.on_cuda or not isinstance(preconditioner, Factor):
+        return None
+    near = near_tetrahedra(space, problem.constraint)
+    if near is None or len(np.unique(space.table[near])) > LARGEST_NEAR:
+        return None
+    return Patching(problem, preconditioner, effects, space, near)
 
 
 def _norms(force: wp.array) -> np.ndarray:

@@ -17,7 +17,7 @@ from .factor import Factor, node_of
 from .lbfgs import Lbfgs
 from .newton import find_equilibrium
 from .problem import Problem
-from .steering import DONE
+from .steering import BROKEN, DONE
 
 # What so many turns of L-BFGS leave is Newton's; a factor with which so many were taken is made anew.
 TURNS, STALE = 400, 25
@@ -61,11 +61,16 @@ class Rimmed:
             self._begin_with(self._part.rest_curvature())
 
     def settled(self, u: wp.array, force: float) -> wp.array:
-        """u (3N, 1) with the part in equilibrium, but for a free gradient of about `force` [N]."""
+        """u (3N, 1) with the part in equilibrium, but for a free gradient of about `force` [N].
+
+        As it is, where the part's forces are not finite.
+        """
         part, device, values = self._part, self._part.device, u.numpy().copy()
         part.constraint.begin(values[self._rows], None, None)
         found = self._lbfgs.descend(device.array(values[self._rows]), np.zeros(1), TURNS, None, np.array([force]))
         end = found.u
+        if found.status[0] == BROKEN:
+            return u
         if found.status[0] != DONE:
             _, _, scale = part.residual(end)
             aim = float(np.clip(force / scale[0], FLOOR[device.precision], 0.5))

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from .balance import constants_of
+from .balance import State, constants_of
 from .columns import combined, dots
 from .discretisation import Discretisation
 from .effects import Effect
@@ -23,7 +23,6 @@ from .element import linear_elements
 from .lbfgs import Descended
 from .linear import Preconditioner
 from .multigrid import TwoLevel
-from .patching import State
 from .problem import Problem
 from .rim import Rimmed
 from .steering import BROKEN, DONE, LIVE
@@ -84,8 +83,10 @@ class Vicinity:
                 break
             cycle += 1
             new = self._lower(now, part, pairs, max(FORCING * now.free, ENOUGH * aim * now.scale))
+            if new is None:
+                break
             pairs.learn(now, new)
-            if new.finite and new.free > LEFT * now.free:
+            if new.free > LEFT * now.free:
                 more = self._left(new.g, part.nodes)
                 if len(more):
                     chosen |= self._touching(more)
@@ -93,19 +94,23 @@ class Vicinity:
             now = new
         return _ended(best, status, cycle)
 
-    def _lower(self, now: State, part: Rimmed, pairs: Pairs, force: float) -> State:
-        """A step along the direction of L-BFGS that does not go too far, and the part settled to `force` [N] there."""
-        device, length = self.problem.device, 1.0
+    def _lower(self, now: State, part: Rimmed, pairs: Pairs, force: float) -> State | None:
+        """A step along the direction of L-BFGS that does not go too far, and the part settled to `force` [N] there.
+
+        None where no step that was tried leads on.
+        """
         d, promised = pairs.direction(now.g, self._solved)
-        new = now
+        if not promised > 0.0:
+            return None
+        device, length = self.problem.device, float(self.problem.longest_step(now.u, d)[0])
         for _ in range(CUTS):
             v = combined(device, now.u, length, d, wp.empty_like(d))
             new = self._at(part.settled(v, force))
             slope = float(dots(device, new.g, d)[0])
             if new.finite and slope <= OVERSHOOT * promised:
-                break
+                return new
             length *= float(np.clip(promised / (promised + slope), 0.1, 0.7)) if np.isfinite(slope) else 0.25
-        return new
+        return None
 
     def _at(self, u: wp.array) -> State:
         g, free, scale = self.problem.residual(u)

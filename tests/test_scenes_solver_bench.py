@@ -79,14 +79,16 @@ def test_every_answer_is_judged_by_one_routine(case, tmp_path):
     assert "checkout" in elsewhere.missing
 
 
-def test_the_command_says_it_in_json(box, tmp_path, capsys):
+@pytest.mark.parametrize(("more", "said_of_it"), [([], "factorised once"), (["--live"], "many single loads")])
+def test_the_command_says_it_in_json(box, tmp_path, capsys, more, said_of_it):
     write_anatomy(tmp_path / "box.vtu", box)
-    words = ["bench", "solver", "--mesh", str(tmp_path / "box.vtu"), "--loads", "2", "--starts", "1", "--json"]
+    words = ["bench", "solver", "--mesh", str(tmp_path / "box.vtu"), "--loads", "2", "--starts", "1", "--json", *more]
     assert main(words) == 0
     said = capsys.readouterr()
     found = json.loads(said.out)
     (mesh,) = found["meshes"]
     (row,) = mesh["rows"]
+    assert said_of_it in row["setting"]
     assert row["engine"].startswith("sulcus") and row["missing"] == "" and row["ratio"] is None
     assert mesh["nodes"] == len(box.mesh.nodes) and len(row["answers"]) == 2 and len(row["firsts"]) == 1
     assert all(answer["good"] and answer["residual"] <= found["tolerance"] for answer in row["answers"])

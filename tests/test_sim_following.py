@@ -147,3 +147,18 @@ def test_a_body_of_another_element_or_a_small_budget_is_not_followed():
     assert Fem(BODY, EFFECTS, replace(LIVE, outer=5), "cpu")._follower() is None
     assert Fem(BODY, EFFECTS, LIVE, "cpu", element="p2")._follower() is None
     assert MOST > 20
+
+
+def test_a_start_that_cannot_be_taken_leaves_no_state_behind(fem):
+    answers = ride(fem, 3)
+    expected = fem.deform(pushed(1.4e-3), replace(answers[1]))
+    last = fem.deform(pushed(1.4e-3), answers[1])
+    original = fem._following._frame.take
+    fem._following._frame.take = None
+    try:
+        with pytest.raises(TypeError):
+            fem.deform(pushed(2.1e-3), replace(answers[0]))
+    finally:
+        fem._following._frame.take = original
+    assert fem._following._last() is None
+    np.testing.assert_array_equal(last.displacement, expected.displacement)

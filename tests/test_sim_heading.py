@@ -105,3 +105,16 @@ def test_a_foreign_start_tells_no_way(body):
     second = fem.deform(pushed(1e-3), guess(first.displacement))
     assert BEFORE not in second.history
     np.testing.assert_allclose(fem.deform(pushed(2e-3), second).history[BEFORE][0], second.displacement.ravel())
+
+
+@pytest.mark.parametrize("spoilt", [PUSHES, "l-bfgs s", "l-bfgs known", "l-bfgs head"])
+def test_a_history_that_does_not_fit_is_none(body, spoilt):
+    fem = Fem(body, EFFECTS, LIVE, "cpu")
+    last = fem.deform(pushed(1e-3), fem.deform(pushed(0.0)))
+    lacking = {name: value for name, value in last.history.items() if name != spoilt}
+    strange = {**last.history, spoilt: 99 * np.ones((1, 3), int)}
+    bare = fem.deform(pushed(2e-3), replace(last, history={}))
+    for history in (lacking, strange):
+        answer = fem.deform(pushed(2e-3), replace(last, history=history))
+        assert answer.outcome[0].good
+        np.testing.assert_allclose(answer.displacement, bare.displacement, atol=2e-5)

@@ -45,7 +45,7 @@ def test_finds_the_equilibrium() -> None:
     fem, vicinity = fem_and_vicinity()
     load = pressed(0.6)
     answer = fem.deform(load)
-    fem._ladder = replace(fem._ladder, alone=lambda: None)
+    fem._ladder = replace(fem._ladder, alone=None)
     expected = fem.deform(load)
     moved = np.abs(expected.displacement).max()
     assert answer.outcome[0].good and moved > 5e-3
@@ -101,3 +101,28 @@ def test_the_assembled_curvature_is_the_one_that_multiplies(law: str) -> None:
     problem.add_curvature(p, expected)
     found = sum(term.curvature() @ p.numpy() for term in problem.terms if isinstance(term, ElasticityTerm))
     np.testing.assert_allclose(found, expected.numpy(), atol=1e-10 * np.abs(expected.numpy()).max())
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "ogden"])
+@pytest.mark.parametrize(("down", "aside"), [(2.0, 1.0), (2.0, 6.0)])
+def test_a_law_that_forbids_inversion_is_taken_as_far_as_it_goes(law: str, down: float, aside: float) -> None:
+    body = base_held(box((3, 3, 3), 0.1))
+    load = push(np.array([0.05, 0.05, 0.1]), np.array([aside, 0.0, -down]), 0.02)
+    fem = Fem(body, (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(1e-6), "cpu", element="p2")
+    answer = fem.deform(load)
+    fem._ladder = replace(fem._ladder, alone=None)
+    expected = fem.deform(load)
+    assert answer.outcome[0].good and expected.outcome[0].good and answer.inverted[0] == 0
+    moved = np.abs(expected.displacement).max()
+    np.testing.assert_allclose(answer.displacement, expected.displacement, atol=1e-4 * moved)
+
+
+def test_a_part_whose_forces_are_not_finite_stays_as_it_is() -> None:
+    fem = Fem(BODY, (Elasticity(tissue("neo-hookean")), Held(), ToolForce()), Accuracy(1e-8), "cpu", element="p2")
+    problem = fem.problem
+    problem.begin(Cases(pressed(0.6), np.zeros(1)))
+    rest = problem.device.zeros(problem.rows, 1)
+    folded = problem.device.array(-2.0 * fem.space.nodes.reshape(-1, 1) * (fem.space.nodes[:, 2:] > 0.0).repeat(3, 0))
+    chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.04
+    part = Rimmed(problem, fem.effects, fem.space, chosen, constants_of(problem, rest)[0], rest)
+    np.testing.assert_array_equal(part.settled(folded, 1e-9).numpy(), folded.numpy())

@@ -33,13 +33,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
     parser.add_argument("--starts", type=int, default=3, help="first answers of each engine (default %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="of every engine (default %(default)s)")
+    parser.add_argument("--live", action="store_true", help="ours is set up for many single loads, which takes longer")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 
 
 def run(args: argparse.Namespace) -> int:
     """Compare; 1 if one of our answers is off."""
     from ..bench import machine
-    from ..solver_bench import OWN, PEERS, TOLERANCE, case_of, compare
+    from ..solver_bench import LIVE, OWN, PEERS, TOLERANCE, case_of, compare
 
     if args.loads < 2 or args.starts < 1 or args.threads < 1:
         raise InputError(
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
             "--loads >= 2, --starts >= 1, --threads >= 1."
         )
     asked = () if args.peers is None else args.peers or NAMES
-    engines = (OWN, *(peer for peer in PEERS if peer.name in asked))
+    engines = (LIVE if args.live else OWN, *(peer for peer in PEERS if peer.name in asked))
     cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [template_path()]]
     table = sys.stderr if args.json else sys.stdout
     where = machine("cpu")
