@@ -81,7 +81,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Together:
-    """The tools of surgery on one tissue: their names, all their loads, and the seconds for all."""
+    """The tools of surgery on one tissue: their names, all their loads, the seconds for all, and to draw them."""
 
     law: str
     poisson: float
@@ -89,6 +89,7 @@ class Together:
     presets: tuple[str, ...]
     loads: int
     seconds: float
+    draw_seconds: float
 
     @property
     def rate(self) -> float | None:
@@ -163,7 +164,8 @@ def together(found: Sequence[Row]) -> list[Together]:
         mine = [row for row in found if (row.law, row.poisson) == (law, poisson)]
         tools = [row for row in mine if row.preset in TOOLS]
         loads, seconds = sum(row.loads for row in tools), sum(row.median for row in tools)
-        out.append(Together(law, poisson, mine[0].set_up, tuple(row.preset for row in tools), loads, seconds))
+        drawing = sum(row.draw_seconds for row in tools)
+        out.append(Together(law, poisson, mine[0].set_up, tuple(row.preset for row in tools), loads, seconds, drawing))
     return out
 
 

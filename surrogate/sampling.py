@@ -13,8 +13,8 @@ from sim.loads import Loads, Pushed
 from .patch import Patch, nearest, open_patch
 
 ATTEMPTS = 2000
-# Loads drawn together: more would only take more memory.
-BLOCK = 1024
+# Loads drawn together: more would only take more memory. A load has so many random numbers at each attempt.
+BLOCK, NUMBERS = 8192, 8
 # Deeper than this the tool has gone through the tissue; tissue harm begins at 2.7-4 kPa mean contact pressure.
 DEEPEST, HARDEST = 15e-3, 8e3
 # E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) judges a load before it is solved.
@@ -92,37 +92,51 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     if preset == "seed":
         return _published(anatomy, patch, count, seed)
     tools = list(TOOLS.values()) if preset == "mixed" else [{**TOOLS, BRUTAL.name: BRUTAL}[preset]]
+    key = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
     blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
-    rows = np.concatenate([_drawn(tools, patch, [np.random.default_rng((seed, i)) for i in block]) for block in blocks])
+    rows = np.concatenate([_drawn(tools, patch, key, block) for block in blocks])
     return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
 
 
-def _drawn(tools: list[Tool], patch: Patch, random: list[np.random.Generator]) -> np.ndarray:
-    """Point [m], force [N] and footprint [m] of one load from each generator: (n, 7)."""
-    kind = np.array([one.integers(len(tools)) for one in random])
-    out = np.zeros((len(random), 7))
+def _drawn(tools: list[Tool], patch: Patch, key: int, block: range) -> np.ndarray:
+    """Point [m], force [N] and footprint [m] of each load of a block: (n, 7)."""
+    kind = (len(tools) * _uniform(key, 0, block)[:, -1]).astype(int)
+    out = np.zeros((len(block), 7))
     for number, tool in enumerate(tools):
         rows = np.flatnonzero(kind == number)
-        out[rows] = _drawn_of(tool, patch, [random[row] for row in rows])
+        out[rows] = _drawn_of(tool, patch, key, block, rows)
     return out
 
 
-def _drawn_of(tool: Tool, patch: Patch, random: list[np.random.Generator]) -> np.ndarray:
-    """As `_drawn`, of one tool: who does not fit draws again."""
-    out, waiting = np.zeros((len(random), 7)), np.arange(len(random))
-    for _ in range(ATTEMPTS):
+def _uniform(key: int, attempt: int, block: range) -> np.ndarray:
+    """Numbers (n, NUMBERS) in [0, 1) of each load of a block.
+
+    Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": its counter makes any load's
+    numbers without those before.
+    """
+    source = np.random.Philox(key=np.array([key, attempt], np.uint64))
+    source.advance(block.start * NUMBERS // 4)  # each count of it makes four numbers
+    return np.random.Generator(source).random((len(block), NUMBERS))
+
+
+def _drawn_of(tool: Tool, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
+    """As `_drawn`, of one tool and some rows (k,) of the block: who does not fit draws again."""
+    out, waiting = np.zeros((len(block), 7)), rows
+    for attempt in range(ATTEMPTS):
         if not len(waiting):
-            return out
-        uniform = np.array([random[row].random(7) for row in waiting])
+            return out[rows]
+        uniform = _uniform(key, attempt, block)[waiting]
         footprint = _between(tool.footprint, uniform[:, 0])
         force = (
             _between(tool.force, uniform[:, 1]) if tool.even else np.exp(_between(np.log(tool.force), uniform[:, 1]))
         )
-        point, normal = patch.place(uniform[:, 2:5])
-        direction = _within_cone(normal, tool.cone, uniform[:, 5:])
-        fits = tool.admits(force, footprint) & (patch.rim_distance(point) >= footprint)
-        out[waiting[fits]] = np.column_stack([point, force[:, None] * direction, footprint])[fits]
-        waiting = waiting[~fits]
+        fits = np.flatnonzero(tool.admits(force, footprint))
+        point, normal = patch.place(uniform[fits, 2:5])
+        inside = patch.rim_distance(point) >= footprint[fits]
+        fits, point, normal = fits[inside], point[inside], normal[inside]
+        direction = _within_cone(normal, tool.cone, uniform[fits, 5:7])
+        out[waiting[fits]] = np.column_stack([point, force[fits, None] * direction, footprint[fits]])
+        waiting = np.delete(waiting, fits)
     raise InputError(
         f"in {ATTEMPTS} draws no {tool.name} of radius {1e3 * tool.footprint[0]:g}-{1e3 * tool.footprint[1]:g} mm "
         "fitted into the open cortex: widen the --craniotomy, or choose a smaller tool with --preset."
