@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
+# Pages answer visitors in time: these tests have the machine to themselves.
+PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py
 
 .PHONY: demo test lint template clean
 
@@ -9,7 +11,8 @@ demo: $(STAMP)
 	$(VENV)/bin/sulcus demo
 
 test: $(STAMP)
-	$(VENV)/bin/python -m pytest
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile $(PAGES:%=--ignore=%)
+	$(VENV)/bin/python -m pytest $(PAGES)
 
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
