@@ -143,15 +143,15 @@ class Elimination:
         return out
 
 
-def near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.ndarray | None:
-    """(T,) bool: those nearest to where the surface is free; None where that is no small part of it."""
+def near_tetrahedra(space: Discretisation, constraint: Constraint, share: float = NEAR) -> np.ndarray | None:
+    """(T,) bool: the share nearest to where the surface is free; None where that is no small part of it."""
     mesh = space.mesh
     surface = np.unique(mesh.surface)
     free = surface[~constraint.held[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
     if not 0 < len(free) <= LARGEST_OPENING * len(surface):
         return None
     distance, _ = KDTree(mesh.nodes[free]).query(mesh.nodes[mesh.tets].mean(axis=1))
-    return distance <= np.quantile(distance, NEAR)
+    return distance <= np.quantile(distance, share)
 
 
 def eliminating(

@@ -18,7 +18,7 @@ from .balance import State, balance, constants_of
 from .columns import combined
 from .discretisation import Discretisation
 from .effects import Effect
-from .elimination import near_tetrahedra
+from .elimination import NEAR, near_tetrahedra
 from .factor import Factor
 from .lbfgs import Descended
 from .linear import Preconditioner
@@ -35,8 +35,8 @@ FORCING, ENOUGH = 0.03, 0.3
 LEFT = 0.3
 # A load whose free force was not halved in so many cycles goes elsewhere, and so does one that it rises so far with.
 PATIENCE, RISE = 5, 30.0
-# The compliance of the near part is a matrix that is affordable up to so many nodes: of the default brain's 1,244 it
-# takes a second and 55 MB.
+# The near part has about so many nodes at most: its compliance is a matrix of three times as many rows. (Of the default
+# brain's 1,244 it takes a second and 55 MB.)
 LARGEST_NEAR = 2000
 # What a descent has learnt: the nodes (1, n) of its patch.
 NODES = "patch"
@@ -181,13 +181,11 @@ class Patching:
 def patching(
     problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> Patching | None:
-    """For single loads; None on CUDA, without a factor, without a small opening, or with too many nodes near it."""
+    """For single loads; None on CUDA, without a factor, or without a small opening."""
     if problem.device.on_cuda or not isinstance(preconditioner, Factor):
         return None
-    near = near_tetrahedra(space, problem.constraint)
-    if near is None or len(np.unique(space.table[near])) > LARGEST_NEAR:
-        return None
-    return Patching(problem, preconditioner, effects, space, near)
+    near = near_tetrahedra(space, problem.constraint, min(NEAR, LARGEST_NEAR / space.count))
+    return None if near is None else Patching(problem, preconditioner, effects, space, near)
 
 
 def _norms(force: wp.array) -> np.ndarray:

@@ -128,16 +128,24 @@ def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
     np.testing.assert_allclose(patch._free(force), patch._free(taken), atol=1e-6 * np.abs(force).max())
 
 
-@pytest.mark.parametrize("kind", ["wide", "levels", "fine"])
-def test_where_it_would_not_serve_there_is_none(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", ["wide", "levels"])
+def test_where_it_would_not_serve_there_is_none(kind: str) -> None:
     law = "stable-neo-hookean"
     if kind == "wide":
         fem = Fem(base_held(box((3, 3, 3), 0.1)), (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(), "cpu")
         found = patching(fem.problem, rest_solver(fem.problem), fem.effects, fem.space)
     else:
         problem, space = begun(law)
-        solver = BlockJacobi(problem.device) if kind == "levels" else rest_solver(problem)
-        if kind == "fine":
-            monkeypatch.setattr("sim.patching.LARGEST_NEAR", 10)
-        found = patching(problem, solver, (Elasticity(tissue(law)), *EFFECTS), space)
+        found = patching(problem, BlockJacobi(problem.device), (Elasticity(tissue(law)), *EFFECTS), space)
     assert found is None
+
+
+def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
+    law = "stable-neo-hookean"
+    problem, space = begun(law, total=TOTAL[1:2])
+    whole = patching_of(problem, space, law)
+    monkeypatch.setattr("sim.patching.LARGEST_NEAR", 60)
+    part = patching_of(problem, space, law)
+    assert len(part._nodes) < 0.8 * len(whole._nodes) and np.isin(part._nodes, whole._nodes).all()
+    found = part.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)
+    assert found.status[0] == DONE and found.residual[0] <= FINE
