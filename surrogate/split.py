@@ -26,7 +26,7 @@ class Split:
     radius
         Of each disc [m].
     disc
-        (B,) number of the disc that a load's point lies in, -1 for the training loads.
+        (B,) number of the disc that a load's point lies in, -1 for the training loads, -2 for those of no use.
     share
         Part of the patch's area that the discs cover.
     """
@@ -41,11 +41,16 @@ class Split:
         """(B,) bool."""
         return self.disc >= 0
 
+    @property
+    def taught(self) -> np.ndarray:
+        """(B,) bool."""
+        return self.disc == -1
+
     def summary(self) -> str:
         """What was left out, in one line for people (mm)."""
         return (
             f"{len(self.centres)} discs of {1e3 * self.radius:g} mm radius ({100 * self.share:.0f} % of the open "
-            f"cortex) left out: {int(self.test.sum())} loads to test, {int((~self.test).sum())} to learn from"
+            f"cortex) left out: {int(self.test.sum())} loads to test, {int(self.taught.sum())} to learn from"
         )
 
 

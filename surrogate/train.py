@@ -43,9 +43,14 @@ class Trained:
 
 
 def train(
-    data: Dataset, learners: Sequence[str] = LEARNERS, progress: Callable[[str], object] = lambda learner: None
+    data: Dataset,
+    learners: Sequence[str] = LEARNERS,
+    progress: Callable[[str], object] = lambda learner: None,
+    split: Split | None = None,
 ) -> Trained:
     """Fit `learners` to the loads outside the left-out discs, and score them inside.
+
+    Another `split` has a row for each load that converged.
 
     Every model knows the tumour and the open cortex; the cortex, which is drawn but not scored, is the compliance
     table's in all of them. Cases that did not converge are neither learnt nor scored.
@@ -69,18 +74,18 @@ def train(
     patch, nodes = open_patch(data.anatomy), data.anatomy.tumour_nodes
     if not len(nodes):
         raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
-    split = leave_discs_out(pushed.point, patch)
+    split = leave_discs_out(pushed.point, patch) if split is None else split
     with stage("table"):
         truth = data.displacement(nodes)[data.good]
         table = _compliance(data, nodes)
         open_nodes = np.setdiff1d(patch.nodes, nodes)
         cortex = (_compliance(data, open_nodes),) if len(open_nodes) else ()
-    taught, held_out = (_pushed(loads.rows(np.flatnonzero(rows))) for rows in (~split.test, split.test))
+    taught, held_out = (_pushed(loads.rows(np.flatnonzero(rows))) for rows in (split.taught, split.test))
     envelope = envelope_of(patch, taught, held_out)
     models, scores = {}, []
     for name in dict.fromkeys(learners):
         with stage(f"learn {name}"):
-            parts = (*_parts(name, table, patch, taught, truth[~split.test]), *cortex)
+            parts = (*_parts(name, table, patch, taught, truth[split.taught]), *cortex)
         model = Learned(data.anatomy, parts, envelope, training={"learner": name, **data.provenance})
         with stage("score"):
             models[name], row = _judged(name, model, loads.rows(np.flatnonzero(split.test)), truth[split.test], nodes)

@@ -69,7 +69,7 @@ def _for_machines(trained: Trained, out: str, failed: int) -> str:
             "discs": len(split.centres),
             "disc_radius_mm": 1e3 * split.radius,
             "share_of_patch": split.share,
-            "taught": int((~split.test).sum()),
+            "taught": int(split.taught.sum()),
             "held_out": int(split.test.sum()),
             "not_converged": failed,
         }
