@@ -20,13 +20,15 @@ from sim.mesh import digest_of
 from .ann import Ann
 from .encode import Basis
 from .envelope import Envelope
+from .gp import Gp
 from .learned import Learned, Part
 from .linear import Linear
+from .pcr import Pcr
 from .regressor import Regressor
 from .svr import Svr
 
 FORMAT = "sulcus model 1"
-REGRESSORS: dict[str, type[Regressor]] = {"linear": Linear, "ann": Ann, "svr": Svr}
+REGRESSORS: dict[str, type[Regressor]] = {"linear": Linear, "pcr": Pcr, "ann": Ann, "svr": Svr, "gp": Gp}
 
 
 def save(path: str | Path, models: Mapping[str, Learned]) -> None:

@@ -15,14 +15,25 @@ from .ann import Ann
 from .dataset import Dataset
 from .encode import ENCODERS, directions, reduce
 from .envelope import envelope_of
+from .gp import Gp
 from .learned import Learned, Part
 from .linear import Linear
 from .patch import Patch, open_patch
+from .pcr import Pcr
+from .regressor import Regressor
 from .score import Score, errors, score
 from .split import Split, leave_discs_out
 from .svr import Svr
 
-LEARNERS = ("linear", "ann", "svr", "residual")
+# Encoder and regressor of each but the table itself; principal components are those of the forces at the nodes.
+LEARNT: dict[str, tuple[str, Callable[[], Regressor]]] = {
+    "pcr": ("nodal", Pcr),
+    "ann": ("tool", Ann),
+    "svr": ("tool", Svr),
+    "gp": ("tool", Gp),
+    "residual": ("tool", Ann),
+}
+LEARNERS = ("linear", *LEARNT)
 # Share of the responses that a learner's basis may lose, and its most modes; and what the table may lose.
 TOLERANCE, MODES = 1e-3, 60
 TABLE_TOLERANCE = 1e-4
@@ -103,9 +114,9 @@ def _parts(name: str, table: Part, patch: Patch, taught: Pushed, truth: np.ndarr
     for part in before:
         response = response - part.response(ENCODERS[part.encoder](patch, taught))
     basis = reduce(table.basis.nodes, response, TOLERANCE, MODES)
-    regressor = Svr() if name == "svr" else Ann()
-    regressor.fit(ENCODERS["tool"](patch, taught), basis.encode(response))
-    return (*before, Part("tool", regressor, basis))
+    encoder, regressor = LEARNT[name]
+    fitted = regressor().fit(ENCODERS[encoder](patch, taught), basis.encode(response))
+    return (*before, Part(encoder, fitted, basis))
 
 
 def _compliance(data: Dataset, nodes: np.ndarray) -> Part:
