@@ -10,6 +10,7 @@ import socket
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import viser
@@ -41,7 +42,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Slider:
-    """A number that a visitor sets; `changed` takes it, on a thread of the page, and must return at once."""
+    """A number that a visitor sets; `changed` takes it, on the page's own thread, and must return at once."""
 
     label: str
     low: float
@@ -53,7 +54,7 @@ class Slider:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several names; `changed` takes it, on a thread of the page, and must return at once."""
+    """One of several names; `changed` takes it, on the page's own thread, and must return at once."""
 
     label: str
     options: tuple[str, ...]
@@ -143,7 +144,7 @@ class Browser:
 
         def send() -> None:
             self.picture.image = colour
-            self.frame.value = number
+            self.assign(self.frame, number)
 
         self.note("picture", send)
 
@@ -159,7 +160,7 @@ class Browser:
     def put(self, label: str, value: float | str) -> None:
         """Set a control without calling its `changed`, as when a script moves the tool."""
         control = self.inputs[label]
-        self.note(f"control {label}", lambda: setattr(control, "value", value))
+        self.note(f"control {label}", lambda: self.assign(control, value))
 
     def close(self) -> None:
         """Stop the page."""
@@ -180,6 +181,10 @@ class Browser:
             with self.server.atomic():
                 for send in newest.values():
                     send()
+
+    def assign(self, control: viser.GuiInputHandle, value: float | str) -> None:
+        """Set a control on the thread that hears the visitors: another could overwrite what is not yet read."""
+        self.server.get_event_loop().call_soon_threadsafe(setattr, control, "value", value)
 
     def dress(self, title: str, viewpoint: Viewpoint) -> None:
         """Colours, light, the panel's place and the first view of the 3-D scene."""
@@ -221,22 +226,27 @@ class Browser:
             button.icon = viser.Icon.PLAYER_PAUSE if plays else viser.Icon.PLAYER_PLAY
             playback.played(plays)
 
-        @self.frame.on_update
-        def seek(event: viser.GuiEvent) -> None:
-            # The page's own updates come through here too, without a client.
-            if event.client is not None:
-                playback.sought(int(self.frame.value))
+        self.hear(self.frame, playback.sought)
 
     def add_control(self, control: Slider | Choice) -> viser.GuiInputHandle:
         """A slider or a list."""
         gui = self.server.gui
         if isinstance(control, Slider):
             slider = gui.add_slider(control.label, control.low, control.high, control.step, control.start)
-            slider.on_update(lambda event: control.changed(slider.value) if event.client is not None else None)
+            self.hear(slider, control.changed)
             return slider
         menu = gui.add_dropdown(control.label, control.options, initial_value=control.start)
-        menu.on_update(lambda event: control.changed(menu.value) if event.client is not None else None)
+        self.hear(menu, control.changed)
         return menu
+
+    def hear(self, control: viser.GuiInputHandle, changed: Callable[[Any], None]) -> None:
+        """Pass on what visitors set, on the thread that they are heard on, before anything else happens there."""
+
+        @control.on_update
+        async def update(event: viser.GuiEvent) -> None:
+            # The page's own updates come through here too, without a client.
+            if event.client is not None:
+                changed(control.value)
 
     def add_body(self, body: Body) -> viser.MeshHandle:
         """A surface in the 3-D view, seen from both sides."""

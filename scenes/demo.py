@@ -69,7 +69,7 @@ class Demo:
             Playback(
                 len(scene.times),
                 lambda plays: self.wish.set(plays=plays),
-                self._seek,
+                lambda number: self._give(SCRIPT, number=number),
             ),
             self._controls(),
             title=f"sulcus: {scene.name}",
@@ -124,7 +124,7 @@ class Demo:
         wish = self.wish
         return [
             Choice("deformer", self.theatre.names, wish.deformer, lambda name: wish.set(deformer=name)),
-            Choice("tool", (SCRIPT, HAND), SCRIPT, lambda tool: wish.set(tool=tool)),
+            Choice("tool", (SCRIPT, HAND), SCRIPT, self._give),
             Slider("force [N]", 0.0, 0.4, 0.01, wish.touch.force, lambda value: self._take(force=value)),
             Slider("direction right [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(right=np.radians(value))),
             Slider("direction up [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(up=np.radians(value))),
@@ -132,10 +132,10 @@ class Demo:
             Slider("place up [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(y=1e-3 * value)),
         ]
 
-    def _seek(self, number: int) -> None:
-        """The frame slider was moved: the script has the tool."""
-        self.wish.set(number=number, tool=SCRIPT)
-        self.browser.put("tool", SCRIPT)
+    def _give(self, tool: str, **wishes: int) -> None:
+        """The menu, or the frame slider, gave the tool away; the menu says so after whatever is on its way to it."""
+        self.wish.set(tool=tool, **wishes)
+        self.browser.put("tool", tool)
 
     def _take(self, **values: float) -> None:
         """A slider was moved: the tool is in the visitor's hand."""

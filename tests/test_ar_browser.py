@@ -103,6 +103,22 @@ def test_several_visitors_see_the_page_and_are_heard(page, told):
     narrow.wire.close()
 
 
+def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(told, monkeypatch):
+    monkeypatch.setattr("ar.browser.PICTURES_PER_SECOND", 2000.0)
+    page = open_page(told, free_port())
+    visitor = Visitor(page, 1200)
+    assert wait_for(lambda: page.visitors == 1)
+    sought = list(range(50, 100)) * 4
+    for place, number in enumerate(sought):
+        page.show(place % 50, np.zeros((48, 64, 3), np.uint8))
+        visitor.set(page.frame, number)
+        time.sleep(1e-3)
+    assert wait_for(lambda: len(told["frame"]) == len(sought))
+    assert told["frame"] == sought
+    visitor.wire.close()
+    page.close()
+
+
 def test_the_button_pauses_and_plays(page, told):
     visitor = Visitor(page, 900)
     assert wait_for(lambda: page.visitors == 1)
