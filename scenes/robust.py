@@ -62,14 +62,14 @@ def shares(count: int) -> dict[str, int]:
 
 
 def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iterator[list[Record]]:
-    """Solve what is not `done` yet of `count` loads, to 1e-4 in single precision, batch by batch."""
+    """Solve what is not `done` yet of `count` loads, to 1e-4 in single precision, in the batches of a whole run."""
     fem, double = trial.fem(TRAIN), trial.fem(REFERENCE)
     for preset, wanted in shares(count).items():
         first = sum(record.preset == preset for record in done)
         if first >= wanted:
             continue
         loads = draw(preset, trial.anatomy, wanted, seed)
-        for start in range(first, len(loads), trial.batch):
+        for start in range(first // trial.batch * trial.batch, len(loads), trial.batch):
             index = np.arange(start, min(start + trial.batch, len(loads)))
             some = loads.rows(index)
             begun = clock.perf_counter()
@@ -79,7 +79,7 @@ def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iter
             chosen = np.flatnonzero(index % CHECKED == 0)
             if len(chosen):
                 again[chosen] = double.residual(some.rows(chosen), answer.rows(chosen))
-            yield _written(preset, index, some, answer, again, seconds)
+            yield _written(preset, index, some, answer, again, seconds)[max(first - start, 0) :]
 
 
 def _written(
