@@ -20,6 +20,7 @@ COMMANDS = {
     "demo": "play a scene on a page in the browser",
     "render": "write the frames of a scene as pictures, without display",
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
+    "sensitivity": "what else moves the tumour: tissue, skull, tool and element, each off by what is not known of it",
     "bench": "measure what each stage costs, what each element is worth, how robust and how fast the solver is",
     "check": "play the built-in scenes blank and hold their figures to their bounds",
 }

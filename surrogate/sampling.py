@@ -151,10 +151,16 @@ def _within_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndar
     """Unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniform by solid angle."""
     cosine = (1.0 - uniform[:, 0] * (1.0 - np.cos(angle)))[:, None]
     turn = (2.0 * np.pi * uniform[:, 1])[:, None]
+    first, second = across(axis)
+    sideways = np.cos(turn) * first + np.sin(turn) * second
+    return cosine * axis + np.sqrt(1.0 - cosine**2) * sideways
+
+
+def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (n, 3) each that stand upright on unit vectors `axis` (n, 3), and on each other."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    sideways = np.cos(turn) * first + np.sin(turn) * np.cross(axis, first)
-    return cosine * axis + np.sqrt(1.0 - cosine**2) * sideways
+    return first, np.cross(axis, first)
 
 
 POSITIONS, DIRECTIONS, MAGNITUDES = 11, 30, np.linspace(0.10, 1.05, 20)

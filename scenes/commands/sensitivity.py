@@ -1,0 +1,164 @@
+"""`sulcus sensitivity`: what else moves the tumour, beside what the surrogate is wrong by."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from sim.discretisation import ELEMENTS
+from sim.files import check_output, written_whole
+from surrogate.sampling import PRESETS, draw
+
+if TYPE_CHECKING:
+    from surrogate.learned import Learned
+
+    from ..sensitivity import Change, Row, Study
+
+FIGURES = ("mean [mm]", "p95", "95 in 100", "largest", "% of motion", "motion x")
+HEAD = ("what", "default", "now", *(f"force: {FIGURES[0]}", *FIGURES[1:]), *(f"motion: {FIGURES[0]}", *FIGURES[1:]))
+NOTE = """
+One thing is changed at a time. The left half has tools of known force; the right half the same tools of known motion,
+namely what those forces give by default. Distances are over load x vertex of the tumour; `95 in 100`: in 95 of 100
+loads no vertex is farther off, as a surrogate's bound is stated. What a tool is off by counts in every way in which it
+can be: more and less, about two axes, to four sides along the cortex.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument(
+        "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
+    )
+    parser.add_argument(
+        "--element", choices=ELEMENTS,
+        help="(default smoothed: linear tetrahedra lock as nu nears 0.5; p2 where the mesh brings mid-edge nodes)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--beside", nargs="+", choices=ELEMENTS, default=[], metavar="ELEMENT",
+        help="a row for each of these elements on the same mesh: what the mesh itself may be wrong by",
+    )  # fmt: skip
+    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
+    parser.add_argument("--count", type=int, default=32, help="loads to draw (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--out", type=Path, metavar="TABLE.csv", help="the table, unrounded")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve them all; 1 if one did not converge."""
+    from ..bench import machine
+    from ..sensitivity import Study, rows
+    from ..theatre import open_theatre
+    from ..variant import Body, variants
+
+    if args.out:
+        check_output(args.out, ".csv")
+    theatre = open_theatre(args.anatomy, args.model, args.device)
+    anatomy = theatre.anatomy
+    model = theatre.models.get(theatre.best)
+    loads = draw(args.preset, anatomy, args.count, args.seed)
+    body = Body(element=args.element or ("smoothed" if anatomy.mesh.middles is None else "p2"))
+    study = Study(anatomy, loads, body, device=args.device)
+    changed = variants(anatomy, body, args.beside)
+    found = list(tqdm(rows(study, changed), total=1 + len(changed), unit="row", file=sys.stderr))
+    table = [_flat(row) for row in found]
+    if args.out:
+        with written_whole(args.out, ".csv") as partial, open(partial, "w", newline="") as file:
+            writer = csv.DictWriter(file, table[0])
+            writer.writeheader()
+            writer.writerows(table)
+    failed = sum(row.force.failed + row.motion.failed for row in found)
+    if args.json:
+        stated = {"preset": args.preset, "loads": len(loads), "seed": args.seed, "default": asdict(body)}
+        surrogate = _stated(model) if model else None
+        whole = {"machine": machine(args.device), **stated, "failed": failed, "surrogate": surrogate, "rows": table}
+        print(json.dumps(_finite(whole), allow_nan=False))
+    else:
+        print("\n".join([f"{machine(args.device)}\n", _opening(study, args.preset), *_table(found, model), NOTE]))
+        print(*_remarks(study, args.beside, model, failed), sep="\n")
+    return 1 if failed else 0
+
+
+def _opening(study: Study, preset: str) -> str:
+    tissue, skull = study.body.tissue, "slides" if study.anatomy.slide_normal.any() else "is held"
+    return (
+        f"{len(study.loads)} {preset} loads on {len(study.anatomy.mesh.nodes)} vertices. By default: element "
+        f"{study.body.element}, {tissue.law}, E {tissue.young:g} Pa, nu {tissue.poisson:g}, the tumour "
+        f"{study.body.tumour:g} x as stiff; the skull side {skull}.\n"
+    )
+
+
+def _table(found: Sequence[Row], model: Learned | None) -> list[str]:
+    lines = [_line(HEAD), f"|{'---|' * len(HEAD)}"]
+    for row in found:
+        changed = row.variant
+        lines.append(_line((changed.what, changed.default, changed.now, *_cells(row.force), *_cells(row.motion))))
+    if model is not None and np.isfinite(model.bound):
+        bound = ("", "", f"{1e3 * model.bound:.3f}", "", "", "")
+        lines.append(_line(("surrogate's error", "", model.training.get("learner", "learnt"), *bound, *[""] * 6)))
+    return [*lines, ""]
+
+
+def _cells(change: Change) -> tuple[str, ...]:
+    if not change.solves:
+        return ("none converged", *[""] * 5)
+    lengths = (change.mean_mm, change.p95_mm, change.worst95_mm, change.largest_mm)
+    return *(f"{length:.3f}" for length in lengths), f"{change.percent:.1f}", f"{change.motion:.3f}"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _remarks(study: Study, beside: Sequence[str], model: Learned | None, failed: int) -> list[str]:
+    """What a reader of the table must know, in sentences."""
+    said = []
+    if failed:
+        said.append(f"{failed} solves did not converge: they are in no figure, nor is what has such a default.")
+    if model is None or not np.isfinite(model.bound):
+        said.append("No surrogate's error stands beside: no model with a bound lies beside this anatomy (--model).")
+    else:
+        stated = _stated(model)
+        said.append(
+            f"The surrogate's error is its stated bound on held-out {stated['preset']} loads against its own teacher, "
+            f"finite elements of the kind {stated['element']}; how far off those are, --beside tells."
+        )
+    if not beside:
+        said.append("The mesh's own error is not known here: --beside p2 compares quadratic elements on this mesh.")
+    if not study.anatomy.slide_normal.any():
+        said.append("No node of this anatomy slides along the skull: what holding them would do has no row.")
+    return said
+
+
+def _stated(model: Learned) -> dict[str, Any]:
+    """What a model says of itself."""
+    taught = model.training
+    about = {name: taught.get(name, "unknown") for name in ("learner", "preset")}
+    return {**about, "element": taught.get("element", "p1"), "bound_mm": 1e3 * model.bound}
+
+
+def _flat(row: Row) -> dict[str, Any]:
+    variant = row.variant
+    sides = {"force": row.force, "motion": row.motion}
+    figures = {f"{side} {name}": value for side, change in sides.items() for name, value in asdict(change).items()}
+    return {"what": variant.what, "default": variant.default, "now": variant.now, **figures}
+
+
+def _finite(value: Any) -> Any:
+    """The same without numbers that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,189 @@
+"""What else moves the tumour: changes whose size is known beforehand, and what does not converge is counted."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+
+from scenes.cli import main
+from scenes.sensitivity import Study, change, moved_alike, rows, skull_held
+from scenes.variant import Aim, Body, aimed, variants
+from sim.accuracy import Accuracy
+from sim.deformation import Outcome
+from sim.errors import InputError
+from sim.footprint import footprint_weights
+from sim.loads import Displaced, Pushed, push
+from sim.material import Material
+from sim.meshfile import write_anatomy
+from surrogate.patch import open_patch
+from surrogate.sampling import draw
+
+TIGHT = Accuracy(tolerance=1e-9)
+LINEAR = Body(Material("linear", 3000.0, 0.45), element="p1")
+
+
+@pytest.fixture(scope="module")
+def anatomy():
+    """A small box whose sides slide."""
+    box = make_box(cells=(8, 8, 5), spacing=9e-3, tumour=12e-3, opening=27e-3)
+    nodes = box.mesh.nodes
+    normal, held = np.zeros_like(nodes), box.held.copy()
+    for axis in (0, 1):
+        side = (np.abs(nodes[:, axis]) > 36e-3 - 1e-9) & (nodes[:, 2] > -45e-3 + 1e-9) & ~normal.any(axis=1)
+        normal[side, axis] = 1.0
+        held[side] = False
+    return replace(box, held=held, slide_normal=normal)
+
+
+@pytest.fixture(scope="module")
+def found(anatomy):
+    """All rows of the linear law, by what and now."""
+    study = Study(anatomy, draw("palpation", anatomy, 4, 0), LINEAR, TIGHT, "cpu")
+    all_rows = list(rows(study, variants(anatomy, LINEAR, ["smoothed"])))
+    return {(row.variant.what, row.variant.now): row for row in all_rows}
+
+
+def test_every_thing_has_its_row(found):
+    assert list(found) == [
+        ("motion itself", ""), ("force or motion", "5 % off"), ("its direction", "2 deg off"),
+        ("its position", "1 mm off"), ("E", "-20%"), ("E", "+20%"), ("nu", "0.49"), ("nu", "0.495"),
+        ("tumour's stiffness", "0.5 x"), ("tumour's stiffness", "2 x"), ("tumour's stiffness", "3 x"),
+        ("element", "smoothed"), ("skull side", "held"),
+    ]  # fmt: skip
+    for row in found.values():
+        for one in (row.force, row.motion):
+            assert one.failed == 0
+            assert max(one.mean_mm, one.p95_mm, one.worst95_mm) <= one.largest_mm
+    ways = [row.force.solves // 4 for row in found.values()]
+    assert ways == [1, 2, 2, 4] + [1] * 9
+
+
+@pytest.mark.parametrize(("now", "factor"), [("-20%", 1.0 / 0.8), ("+20%", 1.0 / 1.2)])
+def test_stiffness_matters_under_known_force_alone(found, now, factor):
+    """Displacement is in inverse proportion to E under dead forces, and does not depend on it where it is imposed."""
+    row = found["E", now]
+    assert row.force.motion == pytest.approx(factor, rel=1e-6)
+    assert row.force.percent == pytest.approx(100.0 * abs(factor - 1.0), rel=1e-5)
+    assert row.motion.largest_mm < 1e-6
+    assert row.motion.motion == pytest.approx(1.0, rel=1e-7)
+
+
+def test_a_linear_body_answers_in_proportion(found):
+    for one in (found["force or motion", "5 % off"].force, found["force or motion", "5 % off"].motion):
+        assert one.percent == pytest.approx(5.0, rel=1e-6)
+        assert one.motion == pytest.approx(1.0, rel=1e-7)
+        assert one.mean_mm == pytest.approx(0.05 * found["motion itself", ""].force.mean_mm, rel=1e-6)
+
+
+def test_known_motions_are_those_of_the_known_forces(found):
+    """The default is one and the same field."""
+    whole = found["motion itself", ""]
+    assert whole.force.percent == pytest.approx(100.0)
+    assert whole.motion.mean_mm == pytest.approx(whole.force.mean_mm, rel=1e-6)
+    assert whole.motion.largest_mm == pytest.approx(whole.force.largest_mm, rel=1e-6)
+
+
+def test_a_softer_tumour_moves_more_and_a_held_skull_less(found):
+    motion = [found["tumour's stiffness", now].force.motion for now in ("0.5 x", "2 x", "3 x")]
+    assert motion[0] > 1.0 > motion[1] > motion[2]
+    assert found["skull side", "held"].force.motion < 1.0
+
+
+def test_what_does_not_converge_is_counted_and_left_out(anatomy):
+    """With a budget that suffices for none."""
+    few = Accuracy(tolerance=1e-9, outer=1, inner=1, steps=0)
+    study = Study(anatomy, draw("palpation", anatomy, 3, 0), Body(element="p1"), few, "cpu")
+    one = next(rows(study, []))
+    assert (one.force.solves, one.force.failed) == (0, 3)
+    assert np.isnan(one.force.mean_mm)
+
+
+def test_a_load_counts_where_it_and_its_default_converged(pretender):
+    loads = push(np.zeros((3, 3)), np.array([[0.0, 0.0, -f] for f in (0.1, 0.2, 0.3)]), 7e-3)
+    nodes = pretender.anatomy.tumour_nodes
+    default, answer = (replace(pretender, fails_above=most).deform(loads, at=nodes) for most in (0.25, 0.15))
+    assert [outcome is Outcome.CONVERGED for outcome in default.outcome] == [True, True, False]
+    doubled = replace(answer, displacement=2.0 * answer.displacement)
+    found = change(doubled, default, default.displacement)
+    assert (found.solves, found.failed) == (1, 2)
+    assert found.percent == pytest.approx(100.0)
+    assert found.motion == pytest.approx(2.0)
+    assert found.mean_mm == pytest.approx(1e3 * np.linalg.norm(default.displacement[0], axis=1).mean())
+
+
+def test_tools_are_off_by_what_is_asked(anatomy):
+    loads, patch = draw("palpation", anatomy, 5, 1), open_patch(anatomy)
+    drawn = loads.of(Pushed)
+    size = np.linalg.norm(drawn.force, axis=1)
+    turned = aimed(loads, Aim(turn=0.2), patch).of(Pushed)
+    shifted = aimed(loads, Aim(shift=1e-3), patch).of(Pushed)
+    assert (len(turned.force), len(shifted.force)) == (10, 20)
+    np.testing.assert_allclose(np.linalg.norm(turned.force, axis=1), np.tile(size, 2))
+    cosine = np.einsum("bi,bi->b", turned.force, np.tile(drawn.force, (2, 1))) / np.tile(size, 2) ** 2
+    np.testing.assert_allclose(np.arccos(cosine), 0.2)
+    away = (turned.force - np.cos(0.2) * np.tile(drawn.force, (2, 1))).reshape(2, 5, 3)
+    np.testing.assert_allclose(np.einsum("bi,bi->b", *away), 0.0, atol=1e-15)
+    off = shifted.point.reshape(4, 5, 3) - drawn.point
+    np.testing.assert_allclose(np.linalg.norm(off, axis=2), 1e-3)
+    np.testing.assert_allclose(off[..., 2], 0.0, atol=1e-15)  # the cortex of this body is level
+    np.testing.assert_allclose(off.sum(axis=0), 0.0, atol=1e-15)
+    np.testing.assert_array_equal(shifted.force, np.tile(drawn.force, (4, 1)))
+
+
+def test_a_known_motion_is_the_footprints_mean(box, pretender):
+    loads = draw("palpation", box, 2, 0)
+    answer = pretender.deform(loads)
+    moved, pushed = moved_alike(box, loads, answer).of(Displaced), loads.of(Pushed)
+    weight = footprint_weights(box.mesh.nodes, box.mesh.surface, pushed.point, pushed.footprint)
+    for row in range(2):
+        np.testing.assert_allclose(moved.displacement[row], (weight[[row]] @ answer.displacement[row])[0])
+    with pytest.raises(InputError, match="Pushed"):
+        moved_alike(box, moved_alike(box, loads, answer), answer)
+
+
+def test_a_held_skull_holds_what_slid(anatomy):
+    held = skull_held(anatomy)
+    assert not held.slide_normal.any()
+    np.testing.assert_array_equal(held.held, anatomy.held | anatomy.slide_normal.any(axis=1)[:, None])
+
+
+def test_a_body_without_tumour_is_refused(anatomy):
+    whole = replace(anatomy, mesh=replace(anatomy.mesh, region=np.ones_like(anatomy.mesh.region)))
+    with pytest.raises(InputError, match="no tumour"):
+        next(rows(Study(whole, draw("palpation", anatomy, 1, 0), Body()), []))
+
+
+def test_the_command(tmp_path, capsys):
+    """On a body whose skull side is held already: every figure is in the file, and what is missing is said."""
+    write_anatomy(tmp_path / "box.vtu", make_box(cells=(5, 5, 3), spacing=15e-3, tumour=16e-3, opening=40e-3))
+    words = ["sensitivity", "--anatomy", str(tmp_path / "box.vtu"), "--count", "2", "--element", "p1"]
+    assert main([*words, "--device", "cpu", "--out", str(tmp_path / "table.csv")]) == 0
+    said = capsys.readouterr().out
+    for text in ("| force or motion | as drawn | 5 % off |", "No surrogate's error", "--beside p2", "No node of this"):
+        assert text in said
+    with open(tmp_path / "table.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert main([*words, "--device", "cpu", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["surrogate"] is None and told["failed"] == 0
+    assert [row["what"] for row in told["rows"]] == [row["what"] for row in table]
+    assert float(table[1]["force mean_mm"]) == told["rows"][1]["force mean_mm"] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--out", "table.txt"], ".csv"),
+        (["--anatomy", "none.vtu"], "no such file"),
+        (["--count", "0"], "--count >= 1"),
+    ],
+)
+def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sensitivity", *words]) == 2
+    assert reason in capsys.readouterr().err
