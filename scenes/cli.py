@@ -26,7 +26,7 @@ COMMANDS = {
 }
 
 # Commands with commands of their own; the first is meant where none is named.
-INNER = {"bench": ("stages", "elements", "robust", "live", "growth", "throughput", "solver")}
+INNER = {"bench": ("stages", "elements", "robust", "live", "growth", "throughput", "published", "solver")}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -101,7 +101,7 @@ class Learned:
                 f"{len(loads)} load cases."
             )
         begun = time.perf_counter()
-        pushed = _only_pushed(loads)
+        pushed = only_pushed(loads)
         nodes = self.nodes if at is None else np.asarray(at)
         strange = ~np.isin(nodes, self.nodes)
         if strange.any():
@@ -136,7 +136,14 @@ class Learned:
         )
 
 
-def _only_pushed(loads: Loads) -> Pushed:
+def only_pushed(loads: Loads) -> Pushed:
+    """The pushes of loads that are nothing else.
+
+    Raises
+    ------
+    InputError
+        Loads of another kind.
+    """
     pushed = loads.of(Pushed)
     if pushed is None or len(loads.causes) > 1:
         names = ", ".join(type(cause).__name__ for cause in loads.causes)

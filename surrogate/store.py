@@ -18,6 +18,7 @@ from sim.files import written_whole
 from sim.mesh import digest_of
 
 from .ann import Ann
+from .bayesian import Bayesian
 from .encode import Basis
 from .envelope import Envelope
 from .gp import Gp
@@ -28,7 +29,14 @@ from .regressor import Regressor
 from .svr import Svr
 
 FORMAT = "sulcus model 1"
-REGRESSORS: dict[str, type[Regressor]] = {"linear": Linear, "pcr": Pcr, "ann": Ann, "svr": Svr, "gp": Gp}
+REGRESSORS: dict[str, type[Regressor]] = {
+    "linear": Linear,
+    "pcr": Pcr,
+    "ann": Ann,
+    "svr": Svr,
+    "gp": Gp,
+    "bayesian": Bayesian,
+}
 
 
 def save(path: str | Path, models: Mapping[str, Learned]) -> None:

@@ -8,15 +8,16 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from surrogate.ann import Ann
+from surrogate.bayesian import Bayesian
 from surrogate.gp import Gp, matern, negative_likelihood
 from surrogate.linear import Linear
 from surrogate.pcr import Pcr
 from surrogate.store import REGRESSORS
 from surrogate.svr import Svr
 
-MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr, "gp": Gp}
+MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr, "gp": Gp, "bayesian": Bayesian}
 MAKE["pcr"] = lambda: Pcr(share=1.0)  # its features here have several units
-LEARNT = {"linear": 0.25, "pcr": 0.25, "ann": 0.05, "svr": 0.25, "gp": 0.01}
+LEARNT = {"linear": 0.25, "pcr": 0.25, "ann": 0.05, "svr": 0.25, "gp": 0.01, "bayesian": 0.05}
 """Error in the largest output against its deviation."""
 RANDOM = np.random.default_rng(3)
 MIX, BEND = RANDOM.normal(size=(5, 4)), RANDOM.normal(size=(5, 4))

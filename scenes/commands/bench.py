@@ -12,6 +12,7 @@ BENCHES = {
     "live": "what a frame of a moving tool takes, warm-started, and how far off it is",
     "growth": "what a load takes in seconds and memory, the finer the mesh the more, and what preconditions it",
     "throughput": "how many loads a second the finite elements solve: one mesh, thousands of loads",
+    "published": "how far the published learners are off, one force position left out at a time",
     "solver": "the first load on a mesh and a further one, beside other packages",
 }
 
