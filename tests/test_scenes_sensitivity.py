@@ -20,8 +20,13 @@ from sim.footprint import footprint_weights
 from sim.loads import Displaced, Pushed, push
 from sim.material import Material
 from sim.meshfile import write_anatomy
+from surrogate.encode import Basis
+from surrogate.envelope import envelope_of
+from surrogate.learned import Learned, Part
+from surrogate.linear import Linear
 from surrogate.patch import open_patch
 from surrogate.sampling import draw
+from surrogate.store import save
 
 TIGHT = Accuracy(tolerance=1e-9)
 LINEAR = Body(Material("linear", 3000.0, 0.45), element="p1")
@@ -158,19 +163,34 @@ def test_a_body_without_tumour_is_refused(anatomy):
         next(rows(Study(whole, draw("palpation", anatomy, 1, 0), Body()), []))
 
 
+def taught(anatomy):
+    """A model that knows nothing but its bound."""
+    patch, nodes = open_patch(anatomy), anatomy.tumour_nodes
+    width = 3 * len(patch.nodes)
+    part = Part("nodal", Linear().fit(np.eye(width), np.zeros((width, 1))), Basis(nodes, np.zeros((1, 3 * len(nodes)))))
+    pushed = draw("palpation", anatomy, 2, 0).of(Pushed)
+    training = {"learner": "table", "preset": "bipolar", "element": "p2"}
+    return Learned(anatomy, (part,), envelope_of(patch, pushed, pushed), 1.23e-4, training)
+
+
 def test_the_command(tmp_path, capsys):
-    """On a body whose skull side is held already: every figure is in the file, and what is missing is said."""
-    write_anatomy(tmp_path / "box.vtu", make_box(cells=(5, 5, 3), spacing=15e-3, tumour=16e-3, opening=40e-3))
+    """Every figure is in the file; what the surrogate is wrong by stands beside, or that nobody knows it."""
+    body = make_box(cells=(5, 5, 3), spacing=15e-3, tumour=16e-3, opening=40e-3)
+    write_anatomy(tmp_path / "box.vtu", body)
     words = ["sensitivity", "--anatomy", str(tmp_path / "box.vtu"), "--count", "2", "--element", "p1"]
-    assert main([*words, "--device", "cpu", "--out", str(tmp_path / "table.csv")]) == 0
-    said = capsys.readouterr().out
-    for text in ("| force or motion | as drawn | 5 % off |", "No surrogate's error", "--beside p2", "No node of this"):
-        assert text in said
-    with open(tmp_path / "table.csv", newline="") as file:
-        table = list(csv.DictReader(file))
     assert main([*words, "--device", "cpu", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["surrogate"] is None and told["failed"] == 0
+    save(tmp_path / "box.model.npz", {"table": taught(body)})
+    assert main([*words, "--device", "cpu", "--out", str(tmp_path / "table.csv")]) == 0
+    said = capsys.readouterr().out
+    for text in (
+        "| force or motion | as drawn | 5 % off |", "| surrogate's error |  | table |  |  | 0.123 |",
+        "held-out bipolar loads", "of the kind p2", "--beside p2", "No node of this anatomy slides",
+    ):  # fmt: skip
+        assert text in said
+    with open(tmp_path / "table.csv", newline="") as file:
+        table = list(csv.DictReader(file))
     assert [row["what"] for row in told["rows"]] == [row["what"] for row in table]
     assert float(table[1]["force mean_mm"]) == told["rows"][1]["force mean_mm"] > 0.0
 

@@ -71,7 +71,16 @@ def run(args: argparse.Namespace) -> int:
     body = Body(element=args.element or ("smoothed" if anatomy.mesh.middles is None else "p2"))
     study = Study(anatomy, loads, body, device=args.device)
     changed = variants(anatomy, body, args.beside)
-    found = list(tqdm(rows(study, changed), total=1 + len(changed), unit="row", file=sys.stderr))
+    where = machine(args.device)
+    lines = sys.stderr if args.json else sys.stdout
+    print(f"{where}\n\n{_opening(study, args.preset)}\n\n{_line(HEAD)}\n|{'---|' * len(HEAD)}", file=lines, flush=True)
+    found = []
+    with tqdm(total=1 + len(changed), unit="row", file=sys.stderr) as bar:
+        for row in rows(study, changed):
+            found.append(row)
+            what = (row.variant.what, row.variant.default, row.variant.now)
+            bar.write(_line((*what, *_cells(row.force), *_cells(row.motion))), file=lines)
+            bar.update()
     table = [_flat(row) for row in found]
     if args.out:
         with written_whole(args.out, ".csv") as partial, open(partial, "w", newline="") as file:
@@ -82,11 +91,10 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         stated = {"preset": args.preset, "loads": len(loads), "seed": args.seed, "default": asdict(body)}
         surrogate = _stated(model) if model else None
-        whole = {"machine": machine(args.device), **stated, "failed": failed, "surrogate": surrogate, "rows": table}
+        whole = {"machine": where, **stated, "failed": failed, "surrogate": surrogate, "rows": table}
         print(json.dumps(_finite(whole), allow_nan=False))
     else:
-        print("\n".join([f"{machine(args.device)}\n", _opening(study, args.preset), *_table(found, model), NOTE]))
-        print(*_remarks(study, args.beside, model, failed), sep="\n")
+        print("\n".join([*_bound(model), NOTE, *_remarks(study, args.beside, model, failed)]))
     return 1 if failed else 0
 
 
@@ -95,19 +103,16 @@ def _opening(study: Study, preset: str) -> str:
     return (
         f"{len(study.loads)} {preset} loads on {len(study.anatomy.mesh.nodes)} vertices. By default: element "
         f"{study.body.element}, {tissue.law}, E {tissue.young:g} Pa, nu {tissue.poisson:g}, the tumour "
-        f"{study.body.tumour:g} x as stiff; the skull side {skull}.\n"
+        f"{study.body.tumour:g} x as stiff; the skull side {skull}."
     )
 
 
-def _table(found: Sequence[Row], model: Learned | None) -> list[str]:
-    lines = [_line(HEAD), f"|{'---|' * len(HEAD)}"]
-    for row in found:
-        changed = row.variant
-        lines.append(_line((changed.what, changed.default, changed.now, *_cells(row.force), *_cells(row.motion))))
-    if model is not None and np.isfinite(model.bound):
-        bound = ("", "", f"{1e3 * model.bound:.3f}", "", "", "")
-        lines.append(_line(("surrogate's error", "", model.training.get("learner", "learnt"), *bound, *[""] * 6)))
-    return [*lines, ""]
+def _bound(model: Learned | None) -> list[str]:
+    """The surrogate's line of the table, if there is one."""
+    if model is None or not np.isfinite(model.bound):
+        return []
+    bound = ("", "", f"{1e3 * model.bound:.3f}", "", "", "")
+    return [_line(("surrogate's error", "", model.training.get("learner", "learnt"), *bound, *[""] * 6))]
 
 
 def _cells(change: Change) -> tuple[str, ...]:
@@ -126,14 +131,14 @@ def _remarks(study: Study, beside: Sequence[str], model: Learned | None, failed:
     said = []
     if failed:
         said.append(f"{failed} solves did not converge: they are in no figure, nor is what has such a default.")
-    if model is None or not np.isfinite(model.bound):
-        said.append("No surrogate's error stands beside: no model with a bound lies beside this anatomy (--model).")
-    else:
+    if model is not None and _bound(model):
         stated = _stated(model)
         said.append(
             f"The surrogate's error is its stated bound on held-out {stated['preset']} loads against its own teacher, "
             f"finite elements of the kind {stated['element']}; how far off those are, --beside tells."
         )
+    else:
+        said.append("No surrogate's error stands beside: no model with a bound lies beside this anatomy (--model).")
     if not beside:
         said.append("The mesh's own error is not known here: --beside p2 compares quadratic elements on this mesh.")
     if not study.anatomy.slide_normal.any():
