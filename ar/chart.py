@@ -14,9 +14,12 @@ FINER = 3
 WIDTH, HEIGHT = 640, 480
 LEFT, RIGHT, TOP, BOTTOM = 78, 20, 62, 62
 INK, FAINT, GRID, PAPER = (40, 40, 40), (120, 120, 120), (228, 228, 228), (255, 255, 255)
-COLOURS = ((31, 119, 180), (214, 96, 37), (44, 140, 72), (140, 86, 170), (150, 120, 40))
+COLOURS = ((31, 119, 180), (214, 96, 37), (44, 140, 72), (140, 86, 170), (150, 120, 40), (0, 150, 160), (200, 60, 110))
 """Red, green, blue of the curves, in turn."""
 FONT = cv2.FONT_HERSHEY_SIMPLEX
+# Radius of a dot, size of its name, and the sides of the dot where that may stand (across, down), the best first.
+DOT, SMALL = 5 * FINER, 0.4
+SIDES = ((1, 0), (-1, 0), (0, -1), (0, 1), (1, -1), (1, 1), (-1, -1), (-1, 1))
 
 
 @dataclass(frozen=True)
@@ -28,18 +31,34 @@ class Curve:
 
 
 @dataclass(frozen=True)
+class Dot:
+    """A point (x, y), both positive, with its name beside it, in the colour of its group; or pale."""
+
+    name: str
+    group: str
+    x: float
+    y: float
+    pale: bool = False
+
+
+@dataclass(frozen=True)
 class Panel:
-    """One pair of axes: title, what they show, curves, and `marks`: vertical lines at some x, with words beside."""
+    """One pair of axes: title, what they show, curves, dots, and `marks`: lines at some x, with words beside.
+
+    size: width and height [pixel].
+    """
 
     title: str
     x: str
     y: str
-    curves: tuple[Curve, ...]
+    curves: tuple[Curve, ...] = ()
     marks: tuple[tuple[float, str], ...] = ()
+    dots: tuple[Dot, ...] = ()
+    size: tuple[int, int] = (WIDTH, HEIGHT)
 
 
 def drawn(panels: Sequence[Panel]) -> np.ndarray:
-    """Panels side by side, (480, 640 n, 3) uint8.
+    """Panels of one height side by side, (height, sum of widths, 3) uint8.
 
     Raises
     ------
@@ -52,15 +71,17 @@ def drawn(panels: Sequence[Panel]) -> np.ndarray:
 
 
 def _drawn(panel: Panel) -> np.ndarray:
-    points = np.array([point for curve in panel.curves for point in curve.points], float).reshape(-1, 2)
+    pairs = [point for curve in panel.curves for point in curve.points] + [(dot.x, dot.y) for dot in panel.dots]
+    points = np.array(pairs, float).reshape(-1, 2)
     if not len(points) or not (points > 0.0).all():
         raise ValueError(f"{panel.title}: logarithmic axes show positive numbers, and at least one point.")
-    canvas = np.full((FINER * HEIGHT, FINER * WIDTH, 3), PAPER, np.uint8)
+    width, height = panel.size
+    canvas = np.full((FINER * height, FINER * width, 3), PAPER, np.uint8)
     low, high = _range(points[:, 0]), _range(points[:, 1])
 
     def place(x: float, y: float) -> tuple[int, int]:
         across, up = (np.log10(v / a) / np.log10(b / a) for v, (a, b) in ((x, low), (y, high)))
-        column, row = LEFT + across * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - up * (HEIGHT - TOP - BOTTOM)
+        column, row = LEFT + across * (width - LEFT - RIGHT), height - BOTTOM - up * (height - TOP - BOTTOM)
         return int(FINER * column), int(FINER * row)
 
     for x in _ticks(*low):
@@ -85,10 +106,56 @@ def _drawn(panel: Panel) -> np.ndarray:
         key = (FINER * (LEFT + 16), FINER * (TOP + 18 + 20 * number))
         _line(canvas, key, (key[0] + 22 * FINER, key[1]), colour, 3)
         _write(canvas, curve.name, (key[0] + 30 * FINER, key[1]), (0.0, 0.4), 0.45, INK)
+    _scatter(canvas, panel.dots, [place(dot.x, dot.y) for dot in panel.dots], place(low[0], high[0]))
     _write(canvas, panel.title, (FINER * LEFT, FINER * 28), (0.0, 0.5), 0.6, INK)
     _write(canvas, panel.y, (FINER * LEFT, FINER * 50), (0.0, 0.5), 0.42, FAINT)
-    _write(canvas, panel.x, (FINER * (WIDTH - RIGHT), FINER * (HEIGHT - 18)), (-1.0, 0.5), 0.45, INK)
-    return cv2.resize(canvas, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    _write(canvas, panel.x, (FINER * (width - RIGHT), FINER * (height - 18)), (-1.0, 0.5), 0.45, INK)
+    return cv2.resize(canvas, panel.size, interpolation=cv2.INTER_AREA)
+
+
+def _scatter(
+    canvas: np.ndarray, dots: Sequence[Dot], places: Sequence[tuple[int, int]], corner: tuple[int, int]
+) -> None:
+    """Dots and their names, each where it covers least; the groups above the lower left corner of the axes."""
+    groups = {group: COLOURS[number % len(COLOURS)] for number, group in enumerate({dot.group: 0 for dot in dots})}
+    taken = [_around(place, (-DOT, -DOT), (2 * DOT, 2 * DOT)) for place in places]
+    height, width = canvas.shape[:2]
+    taken += [(-width, 0, LEFT * FINER, height), (width - RIGHT * FINER, 0, 2 * width, height)]  # beyond the axes
+    for number, (group, colour) in enumerate(reversed(groups.items())):
+        key = corner[0] + 16 * FINER, corner[1] - (16 + 20 * number) * FINER
+        cv2.circle(canvas, key, DOT, colour, -1, cv2.LINE_AA)
+        _write(canvas, group, (key[0] + 14 * FINER, key[1]), (0.0, 0.4), 0.45, INK)
+        taken.append(_around(key, (0, -DOT), (170 * FINER, 2 * DOT)))
+    # The pale ones first, so that they cover nothing; they are named last, where room is left.
+    order = sorted(range(len(dots)), key=lambda number: not dots[number].pale)
+    for number in order:
+        ink = 0.35 * np.array(groups[dots[number].group]) + 0.65 * np.array(PAPER)
+        colour = ink.astype(int).tolist() if dots[number].pale else groups[dots[number].group]
+        cv2.circle(canvas, places[number], DOT, colour, -1, cv2.LINE_AA)
+    for number in reversed(order):
+        size, _ = cv2.getTextSize(dots[number].name, FONT, FINER * SMALL, FINER)
+        boxes = [_beside(places[number], side, size) for side in SIDES]
+        box = min(boxes, key=lambda box: sum(_common(box, other) for other in taken))
+        taken.append(box)
+        ink = FAINT if dots[number].pale else INK
+        cv2.putText(canvas, dots[number].name, (box[0], box[3]), FONT, FINER * SMALL, ink, FINER, cv2.LINE_AA)
+
+
+def _beside(place: tuple[int, int], side: tuple[int, int], size: Sequence[int]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of a text of a size, on one side of a dot."""
+    shift = [int(way * (DOT + FINER) + (way - 1) * length / 2) for way, length in zip(side, size, strict=True)]
+    return _around(place, shift, size)
+
+
+def _around(place: tuple[int, int], shift: Sequence[int], size: Sequence[int]) -> tuple[int, int, int, int]:
+    left, top = place[0] + shift[0], place[1] + shift[1]
+    return left, top, left + size[0], top + size[1]
+
+
+def _common(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> int:
+    """The area that two boxes share [pixel]."""
+    across, down = (min(one[k + 2], other[k + 2]) - max(one[k], other[k]) for k in (0, 1))
+    return max(across, 0) * max(down, 0)
 
 
 def _range(values: np.ndarray) -> tuple[float, float]:

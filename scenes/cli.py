@@ -22,6 +22,7 @@ COMMANDS = {
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
     "sensitivity": "what else moves the tumour: tissue, skull, tool and element, each off by what is not known of it",
     "bench": "measure what each stage costs, what each element is worth, how robust and how fast the solver is",
+    "report": "measure what accuracy costs in time, for every deformer, as a page",
     "check": "play the built-in scenes blank and hold their figures to their bounds",
 }
 

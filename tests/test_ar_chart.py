@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from ar.chart import BOTTOM, COLOURS, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Curve, Panel, drawn
+from ar.chart import BOTTOM, COLOURS, HEIGHT, LEFT, PAPER, RIGHT, TOP, WIDTH, Curve, Dot, Panel, drawn
+
+PALE = tuple(int(0.35 * ink + 0.65 * paper) for ink, paper in zip(COLOURS[0], PAPER, strict=True))
 
 
 def panel(*points, marks=()):
@@ -39,3 +41,28 @@ def test_what_has_no_logarithm_is_refused(points):
         drawn([panel(*points)])
     with pytest.raises(ValueError, match="nothing"):
         drawn([])
+
+
+def test_dots_lie_where_curves_do_and_pale_ones_are_pale():
+    points = ((1e1, 1e0), (1e2, 1e1), (1e3, 1e2))
+    dots = tuple(Dot("", "group", x, y, pale=x == 1e2) for x, y in points)
+    full, pale = (ink(drawn([Panel("title", "x", "y", dots=dots)]), c) for c in (COLOURS[0], PALE))
+    middle = [(TOP + HEIGHT - BOTTOM) / 2, (LEFT + WIDTH - RIGHT) / 2]
+    assert np.allclose(np.median(pale, axis=0), middle, atol=1.5)
+    assert full[:, 0].min() < middle[0] - 50
+
+
+def test_names_of_dots_near_each_other_do_not_cover_each_other():
+    """Ink of two names beside two dots that touch: as much as of each alone."""
+
+    def dark(*names):
+        dots = tuple(Dot(name, "g", 10.0 + 0.5 * k, 1.0) for k, name in enumerate(names))
+        return int((drawn([Panel("t", "x", "y", dots=dots)]) < 110).all(axis=-1).sum())
+
+    bare = dark("", "")
+    assert dark("horse", "tiger") - bare > 0.95 * (dark("horse", "") - bare + dark("", "tiger") - bare)
+
+
+def test_a_panel_has_its_size():
+    panels = [Panel("t", "x", "y", dots=(Dot("one", "g", 1.0, 2.0),), size=(300 + 100 * k, 360)) for k in range(2)]
+    assert drawn(panels).shape == (360, 700, 3)

@@ -1,0 +1,137 @@
+"""`sulcus report`: what accuracy costs in time, for every deformer there is, as a page, plots and tables."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time as clock
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from sim.errors import InputError
+from sim.files import check_output, written_whole
+
+if TYPE_CHECKING:
+    from ..report_page import Section
+    from ..report_study import Study
+
+# Loads of the data that is made where none is given; loads held against the reference; loads beyond the taught ones.
+QUICK, WHOLE = (320, 8, 24), (3000, 64, 120)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument(
+        "--quick", action="store_true", help=f"little data ({QUICK[0]} loads), few loads, a coarse reference"
+    )
+    size.add_argument(
+        "--full", action="store_true", help="all laws, elements, meshes, tolerances and precisions with each other"
+    )
+    parser.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="(default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument(
+        "--data", nargs="+", type=Path, default=[], metavar="DATA.h5",
+        help="data sets of `sulcus simulate`, each with rows of its own (default: one is made, smoothed, palpation)",
+    )  # fmt: skip
+    parser.add_argument("--anatomy", metavar="MESH.vtu", help="of the data that is made (default: the template)")
+    parser.add_argument("--loads", type=int, metavar="N", help=f"held against the reference ({QUICK[1]}, {WHOLE[1]})")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, row by row; 1 if a row could not be measured."""
+    from sim.device import find_device
+
+    from ..bench import machine
+    from ..report import UNBUILT, every, learners, rows, star
+    from ..report_page import Section, write_report
+    from ..report_reference import solve_beyond, solve_reference
+    from ..report_study import Study
+
+    find_device(args.device, "float32")
+    check_output(args.out / "index.html", ".html")
+    count, loads, beyond = QUICK if args.quick else WHOLE
+    if args.loads is not None and args.loads < 1:
+        raise InputError(f"--loads {args.loads} plays nothing: give at least 1.")
+    if args.data and args.anatomy:
+        raise InputError("--anatomy says nothing beside --data, which brings its own: leave one of them out.")
+    if len({path.stem for path in args.data}) < len(args.data):
+        raise InputError("two of the data sets have one name, which their rows would share: rename one.")
+    minutes = {}
+    paths = args.data
+    if not paths:
+        paths = [args.out / "palpation.h5"]
+        minutes = {paths[0]: _simulated(paths[0], args, count)}
+    studies = [Study(path, args.out, args.device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
+    sections = []
+    for study in studies:
+        specs = (*(every(study) if args.full else star(study)), *learners())
+        total = len(study.played) + len(study.outside) + len(specs) + len(UNBUILT)
+        found = []
+        with tqdm(total=total, desc=study.data.stem, unit="step", file=sys.stderr) as bar:
+            solve_reference(study, bar.update)
+            solve_beyond(study, bar.update)
+            for row in rows(study, specs):
+                found.append(row)
+                bar.update()
+        sections.append(Section(study.data.stem, _about(study), tuple(found), minutes.get(study.data)))
+        write_report(args.out, machine(args.device), sections)
+    _say(args, sections)
+    return 0 if all(row.state in ("measured", "not built yet") for part in sections for row in part.rows) else 1
+
+
+def _simulated(path: Path, args: argparse.Namespace, count: int) -> float | None:
+    """Make a data set; the minutes that it took, or None where an earlier run did some of it."""
+    from . import simulate
+
+    kept = path.with_suffix(".json")
+    whole = not path.with_name(path.name + ".partial").exists() and not path.exists()
+    parser = argparse.ArgumentParser()
+    simulate.add_arguments(parser)
+    words = ["--out", str(path), "--count", str(count), "--material", "neo-hookean", "--element", "smoothed"]
+    begun = clock.perf_counter()
+    asked = parser.parse_args([*([args.anatomy] if args.anatomy else []), *words, "--device", args.device])
+    if simulate.run(asked) != 0:
+        raise InputError(f"{path}: was not finished: give the same command again and it goes on.")
+    if whole:
+        with written_whole(kept, ".json") as partial:
+            partial.write_text(json.dumps({"minutes": (clock.perf_counter() - begun) / 60.0}))
+    return json.loads(kept.read_text())["minutes"] if kept.exists() else None
+
+
+def _about(study: Study) -> tuple[str, ...]:
+    from ..report_loads import KINDS
+    from ..report_reference import reference_of
+
+    truth, said = reference_of(study), study.dataset.provenance
+    mesh = "the same mesh with every edge halved" if study.fine else "the same mesh"
+    good = int(truth.good.sum())
+    return (
+        f"Data: {len(study.converged)} {said.get('preset', '')} loads on {len(study.anatomy.mesh.nodes)} vertices, "
+        f"{study.element} elements, {study.tissue}; {study.discs.summary()}.",
+        f"Reference: quadratic tetrahedra (p2) on {mesh}, the data's tissue, to 1e-8 in double precision, read at the "
+        f"same material points: {good} of {len(truth.good)} loads of the left-out discs converged, "
+        f"{truth.seconds.mean():.2g} s each. Beyond the taught range, in equal parts: {', '.join(KINDS)}.",
+    )
+
+
+def _say(args: argparse.Namespace, sections: Sequence[Section]) -> None:
+    page = args.out / "index.html"
+    if args.json:
+        print(json.dumps({"page": str(page), "sections": [asdict(section) for section in sections]}))
+        return
+    for section in sections:
+        print(f"{section.name}: mean and largest distance from the reference [mm], ms a load")
+        for row in section.rows:
+            if row.reference is None or row.median is None:
+                print(f"  {row.name:<18} {row.state}")
+                continue
+            mm = row.reference.mm
+            print(f"  {row.name:<18} {mm.mean:8.4f} {mm.largest:8.4f} {row.median:10.3g}  {row.against}")
+    print(f"written: {page}")

@@ -1,0 +1,197 @@
+"""The report as files: a page that needs nothing else, plots, a table for spreadsheets, and every number as JSON."""
+
+from __future__ import annotations
+
+import csv
+import json
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from ar.screen import write_png
+from sim.files import written_whole
+
+from .report_plots import against_solves, against_time, front
+from .report_row import Figures, Row
+
+SETS = {
+    "discs": "whole discs of cortex left out",
+    "sectors": "whole sectors of direction left out",
+    "beyond": "beyond the taught range",
+}
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1200px; margin: 2em auto; padding: 0 1em; }
+table { border-collapse: collapse; font-size: 13px; margin: 1em 0; }
+th, td { padding: 3px 8px; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top; }
+th { background: #f4f4f4; } th:first-child, td:first-child { text-align: left; }
+tr.front td:first-child { font-weight: bold; } tr.pale td { color: #777; } img { max-width: 100%; }
+figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption { font-size: 13px; }
+.wide { overflow-x: auto; }
+"""
+NOTES = (
+    "Two errors, never mixed: from the reference, which says what a row is worth; and from its own teacher, which says "
+    "what learning lost. What obeys another law than the reference has a model difference instead of an error.",
+    "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
+    "of those vertices. A row in bold, or full colour, is one that no other equals or beats in time and mean error.",
+    "Time: one load at a time, from rest, median; p99 where at least 1,000 were timed. Set-up, compiling and warm-up "
+    "are not in it. Memory: the largest resident size of the process that made and played the row alone, on the host.",
+    "Adapting: until the row answers within its stated error again after the tumour is debulked by a fifth.",
+)
+
+
+@dataclass(frozen=True)
+class Section:
+    """The rows of one data set; sentences about data and reference; minutes that the data took to solve, if known."""
+
+    name: str
+    about: tuple[str, ...]
+    rows: tuple[Row, ...]
+    minutes: float | None = None
+
+
+def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> None:
+    """Write `index.html`, `report.json`, and for each section `NAME.csv` and its plots, each whole."""
+    bodies = []
+    for section in sections:
+        plots = []
+        for kind, picture in (("time", against_time(section.rows)), ("solves", against_solves(section.rows))):
+            if picture is not None:
+                write_png(folder / f"{section.name}-{kind}.png", picture)
+                plots.append(folder / f"{section.name}-{kind}.png")
+        _write_csv(folder / f"{section.name}.csv", section.rows)
+        bodies.append(_section(section, folder, plots))
+    with written_whole(folder / "report.json", ".json") as partial:
+        partial.write_text(json.dumps({"machine": machine, "sections": [asdict(section) for section in sections]}))
+    notes = "".join(f"<p>{escape(note)}</p>" for note in NOTES)
+    with written_whole(folder / "index.html", ".html") as partial:
+        partial.write_text(
+            f'<!doctype html><html lang="en"><meta charset="utf-8"><title>What accuracy costs in time</title>'
+            f"<style>{STYLE}</style><h1>What accuracy costs in time</h1>{''.join(bodies)}<h2>How to read this</h2>"
+            f"{notes}<p>{escape(machine)}. Research software, not a medical device.</p></html>\n"
+        )
+
+
+def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
+    measured = [row for row in section.rows if row.reference is not None]
+    learnt = [row for row in section.rows if row.teacher]
+    about = "".join(f"<p>{escape(sentence)}</p>" for sentence in section.about)
+    first, *others = [_picture(plot, plot.stem) for plot in plots] or [""]
+    pictures = [
+        f"<figure>{_picture(folder / 'pictures' / row.picture, row.name)}"
+        f"<figcaption>{escape(row.name)}</figcaption></figure>"
+        for row in measured
+        if row.picture
+    ]
+    return (
+        f"<h2>{escape(section.name)}</h2>{first}{about}"
+        f"<h3>Against the reference</h3>{_against_reference(section)}"
+        + (f"<h3>Against its own teacher</h3>{_against_teacher(learnt)}{''.join(others)}" if learnt else "")
+        + f"<h3>By tenths of the force</h3>{_by_force(measured, learnt)}"
+        f"<h3>Worst cases</h3><p>The tumour as the row has it, and a yellow outline where the reference has it.</p>"
+        f"{''.join(pictures)}"
+    )
+
+
+def _against_reference(section: Section) -> str:
+    best = front(section.rows)
+    heads = (
+        "row", "distance", "loads", "mean mm", "p95", "p99.9", "largest", "mean %", "p95", "p99.9", "largest",
+        "median ms", "p99", "set-up s", "memory GiB", "solves", "minutes", "adapting s",
+    )  # fmt: skip
+    lines = []
+    for row in section.rows:
+        if row.state != "measured":
+            lines.append(("pale", (row.name, row.state, *[""] * (len(heads) - 2))))
+            continue
+        taught = row.taught is not None
+        solves = f"{row.taught} + {row.units} unit" if taught else ""
+        minutes = None if row.learning is None else row.learning / 60.0 + (section.minutes or 0.0)
+        short = "" if section.minutes is not None or not taught else " of fitting"
+        cells = (
+            row.name, row.against, _count(row), *_spread(row.reference), _text(row.median), _text(row.p99),
+            _text(row.set_up), _text(row.memory), solves, _text(minutes) + short, _text(row.adapt) or "not measured",
+        )  # fmt: skip
+        lines.append(("front" if row.name in best else "", cells))
+    return _table(heads, lines)
+
+
+def _count(row: Row) -> str:
+    loads = 0 if row.reference is None else row.reference.loads
+    return f"{loads}, {row.failed} failed" if row.failed else str(loads)
+
+
+def _against_teacher(rows: Sequence[Row]) -> str:
+    heads = (
+        "row", "loads of", "loads", "mean mm", "p95", "p99.9", "largest", "mean %", "p95", "p99.9", "largest",
+        "called extrapolated",
+    )  # fmt: skip
+    return _table(
+        heads,
+        (
+            ("", (row.name, words, str(figures.loads), *_spread(figures), f"{100.0 * row.flagged[name]:.0f} %"))
+            for row in rows
+            for name, words in SETS.items()
+            if (figures := row.teacher.get(name)) is not None
+        ),
+    )
+
+
+def _by_force(measured: Sequence[Row], learnt: Sequence[Row]) -> str:
+    """Of learners those against the teacher, of which there are more."""
+    lines = [(row.name, "reference", row.reference) for row in measured]
+    lines += [(row.name, "teacher", row.teacher["discs"]) for row in learnt if "discs" in row.teacher]
+    most = max((len(figures.tenths) for *_, figures in lines if figures), default=0)
+    heads = ("mean mm (largest)", "from", *(f"{k + 1}" for k in range(most)))
+    table = [
+        ("", (name, against, *(f"{_text(t.mean)} ({_text(t.largest)})" for t in figures.tenths)))
+        for name, against, figures in lines
+        if figures
+    ]
+    return _table(heads, table)
+
+
+def _spread(figures: Figures | None) -> tuple[str, ...]:
+    if figures is None:
+        return ("",) * 8
+    return tuple(_text(value) for each in (figures.mm, figures.percent) for value in asdict(each).values())
+
+
+def _text(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"
+
+
+def _table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
+    """Lines of a class and cells."""
+    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    body = "".join(
+        f'<tr class="{kind}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>' for kind, cells in lines
+    )
+    return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
+
+
+def _picture(path: Path, words: str) -> str:
+    """A picture inside the page."""
+    data = b64encode(path.read_bytes()).decode()
+    return f'<img alt="{escape(words)}" src="data:image/png;base64,{data}">'
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """One line a row; a number inside others is named by the way to it, as in reference.mm.mean."""
+    lines = [dict(_flat(asdict(row))) for row in rows]
+    names = dict.fromkeys(name for line in lines for name in line)
+    with written_whole(path, ".csv") as partial, partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(names))
+        writer.writeheader()
+        writer.writerows(lines)
+
+
+def _flat(value: Any, name: str = "") -> Iterable[tuple[str, Any]]:
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else None
+    if inside is None:
+        yield name, value
+        return
+    for key, each in inside:
+        yield from _flat(each, f"{name}.{key}" if name else str(key))

@@ -1,0 +1,54 @@
+"""The camera's view of a row's worst case: the tumour as predicted, and where the reference has it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ar.hud import panel
+from ar.overlay import composite
+from ar.view import render
+from sim.intensity import read_intensity, sidecar
+from sim.loads import Pushed
+
+from .report_reference import reference_of
+from .report_study import Study
+from .scene import Viewpoint, find_scene
+from .shipped import template_path
+from .site import site_of
+from .stage import TOOL, Stage
+from .tool import Probe
+
+VIEW = Viewpoint(fov=np.radians(16.0), width=400, height=300)
+REFERENCE_COLOUR = (1.0, 0.85, 0.2)
+
+
+def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 3) uint8 of the played load of the largest distance.
+
+    answer (n, k, 3) [m]: a row's displacements of the tumour's vertices.
+    """
+    truth, anatomy = reference_of(study), study.anatomy
+    tumour = np.isin(study.drawn, anatomy.tumour_nodes)
+    distance = np.linalg.norm(answer - truth.displacement[:, tumour], axis=2).max(axis=1) * truth.good
+    worst = int(distance.argmax())
+    there = anatomy.mesh.nodes.copy()
+    there[study.drawn] += truth.displacement[worst]
+    predicted = there.copy()
+    predicted[anatomy.tumour_nodes] = anatomy.mesh.nodes[anatomy.tumour_nodes] + answer[worst]
+    pushed = study.played.of(Pushed)
+    assert pushed is not None
+    site = site_of(anatomy)
+    scan = read_intensity(sidecar(template_path())) if study.of_template else None
+    camera = VIEW.camera(site)
+    place, radius = pushed.point[worst] - site.origin, float(pushed.footprint[worst])
+    tip = site.contact(float(place @ site.right), float(place @ site.up), radius).carried(there)
+    tool = Probe(radius)
+    stage = Stage(replace(find_scene("press"), viewpoint=VIEW, tool=tool), site, scan)
+    picture = render(camera, stage.layers(there, tool.pose(tip, site.axis, site.right)), stage.lamp)
+    shown = composite(picture, camera, stage.tumour(predicted), (TOOL,), "window")
+    shown = composite(shown, camera, replace(stage.tumour(there), colour=REFERENCE_COLOUR), (TOOL,), "contour")
+    force = float(np.linalg.norm(pushed.force[worst]))
+    lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"off by up to {1e3 * distance[worst]:.3f} mm"]
+    return panel(shown.colour, lines)

@@ -1,0 +1,42 @@
+"""One row of the report, measured in a process of its own: what it takes of memory is its own too."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from sim.errors import InputError
+
+from .report_elements import Elements, measure_elements
+from .report_learner import Learner, measure_learner
+from .report_row import Row
+from .report_study import Study
+
+Spec = Elements | Learner
+FAMILY = {Elements: "finite elements", Learner: "learnt"}
+
+
+def measured(study: Study, spec: Spec, picture: Path) -> Row:
+    """The row of a deformer, and the picture of its worst case; what cannot be had says why in `Row.state`."""
+    try:
+        row, field = measure_elements(study, spec) if isinstance(spec, Elements) else measure_learner(study, spec)
+    except InputError as error:
+        return Row(spec.name, FAMILY[type(spec)], state=str(error))
+    row = replace(row, memory=peak_memory())
+    # What pictures take is not the row's.
+    from ar.screen import write_png
+
+    from .report_picture import worst_picture
+
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    write_png(picture, worst_picture(study, field))
+    return replace(row, picture=picture.name)
+
+
+def peak_memory() -> float | None:
+    """The largest resident size of this process so far [GiB], as Linux tells it."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) / 2**20 for line in lines if line.startswith("VmHWM:")), None)

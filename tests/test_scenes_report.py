@@ -1,0 +1,234 @@
+"""`sulcus report`: its numbers by hand, runs that go on where they stopped, the front, a page that needs nothing."""
+
+import csv
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+
+from ar.screen import read_png
+from scenes.cli import main
+from scenes.report import UNBUILT, every, rows, star
+from scenes.report_elements import Elements
+from scenes.report_learner import Learner, counts
+from scenes.report_page import Section, write_report
+from scenes.report_plots import against_time, front
+from scenes.report_reference import beyond_of, reference_of, solve_beyond, solve_reference
+from scenes.report_row import Row, figures_of, row_from_json, row_to_json
+from scenes.report_rows import measured, peak_memory
+from scenes.report_study import Study
+from scenes.tissue import pushed_effects
+from sim.accuracy import REFERENCE, TRAIN
+from sim.effects import NodalForce
+from sim.fem import Fem
+from sim.loads import Pushed
+from sim.material import Material, tissue_to_json
+from surrogate.dataset import read_dataset
+from surrogate.envelope import envelope_of
+from surrogate.sampling import draw
+from surrogate.simulate import simulate
+from surrogate.train import train
+
+TISSUE = Material("neo-hookean", 3000.0, 0.45)
+SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"))
+
+
+def nothing(count):
+    """No progress is shown."""
+
+
+@pytest.fixture(scope="module")
+def box():
+    return make_box((8, 8, 5), tumour=9e-3, depth=14e-3, opening=20e-3)
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory, box):
+    """100 palpation loads on a small box; three of them are played."""
+    folder = tmp_path_factory.mktemp("report")
+    fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu")
+    said = {"tissue": tissue_to_json(TISSUE), "element": "p1", "preset": "palpation"}
+    simulate(folder / "data.h5", fem, draw("palpation", box, 100, 0), said)
+    study = Study(folder / "data.h5", folder, "cpu", loads=3, beyond=6, timed=30)
+    solve_reference(study, nothing)
+    solve_beyond(study, nothing)
+    return study
+
+
+@pytest.fixture(scope="module")
+def found(study):
+    return tuple(rows(study, SPECS, measured))
+
+
+@pytest.fixture(scope="module")
+def page(study, found):
+    write_report(study.folder, "this machine", [Section("data", ("About <this>.",), found, 2.0)])
+    return study.folder
+
+
+def figures_by_hand(distance, truth):
+    share = 100.0 * distance / np.linalg.norm(truth, axis=2).mean(axis=1)[:, None]
+    return [
+        f(v)
+        for v in (1e3 * distance, share)
+        for f in (np.mean, lambda x: np.percentile(x, 95), lambda x: np.percentile(x, 99.9), np.max)
+    ]
+
+
+def test_numbers_are_those_recomputed_by_hand(study, page, box):
+    """Quadratic reference, finite elements, and a learner against its teacher, each from its own source."""
+    stored = json.loads((page / "report.json").read_text())["sections"][0]["rows"]
+    with open(page / "data.csv") as file:
+        lines = list(csv.DictReader(file))
+    assert [line["name"] for line in lines] == [row["name"] for row in stored]
+    assert [row["name"] for row in stored] == [spec.name for spec in SPECS] + list(UNBUILT)
+    effects = pushed_effects(box, TISSUE)
+    truth = Fem(box, effects, REFERENCE, "cpu", element="p2").deform(study.played).at(box.tumour_nodes).displacement
+    answer = Fem(box, effects, TRAIN, "cpu").deform(study.played).at(box.tumour_nodes).displacement
+    wanted = figures_by_hand(np.linalg.norm(answer - truth, axis=2), truth)
+    for kind, values in (("mm", wanted[:4]), ("percent", wanted[4:])):
+        names = ("mean", "p95", "p999", "largest")
+        assert np.allclose([stored[0]["reference"][kind][name] for name in names], values, rtol=2e-3)
+        assert np.allclose([float(lines[0][f"reference.{kind}.{name}"]) for name in names], values, rtol=2e-3)
+    data = read_dataset(study.data)
+    test = study.discs.test
+    model = train(data, ["linear"], split=study.discs).models["linear"]
+    truth = data.displacement(box.tumour_nodes)[test]
+    guess = model.deform(data.loads.rows(np.flatnonzero(test)), at=box.tumour_nodes).displacement
+    wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
+    discs = stored[2]["teacher"]["discs"]
+    assert np.allclose([*discs["mm"].values(), *discs["percent"].values()], wanted, rtol=1e-6)
+    assert discs["loads"] == test.sum() and discs["values"] == test.sum() * len(box.tumour_nodes)
+    assert stored[2]["taught"] == study.discs.taught.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
+
+
+def test_rows_say_what_they_are(found):
+    fem, law, learner, *empty = found
+    assert (fem.against, law.against, learner.against) == ("error", "model difference", "error")
+    assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.teacher
+    assert set(learner.teacher) == {"discs", "sectors", "beyond"} and learner.flagged["beyond"] == 1.0
+    assert learner.teacher["beyond"].percent.mean > learner.teacher["discs"].percent.mean
+    assert (fem.timed, fem.p99, learner.timed) == (3, None, 30) and fem.median > learner.median > 0.0
+    assert {row.state for row in empty} == {"not built yet"} and all(row.reference is None for row in empty)
+    assert all(row.adapt is None for row in found) and learner.curve[-1] == (learner.taught, learner.teacher["discs"])
+    assert row_from_json(row_to_json(learner)) == learner
+    assert 0.05 < peak_memory() < 50.0
+
+
+def test_tenths_of_the_force_and_of_no_load_nothing():
+    truth = np.ones((20, 2, 3))
+    force = np.arange(20.0)[::-1]
+    distance = np.column_stack([force, 3.0 * force]) * 1e-3
+    tenths = figures_of(distance, truth, force).tenths
+    assert [(tenth.least, tenth.greatest) for tenth in tenths] == [(2.0 * k, 2.0 * k + 1.0) for k in range(10)]
+    assert [tenth.mean for tenth in tenths] == pytest.approx([4.0 * k + 1.0 for k in range(10)])
+    assert [tenth.largest for tenth in tenths] == pytest.approx([6.0 * k + 3.0 for k in range(10)])
+    assert figures_of(distance[:0], truth[:0], force[:0]) is None
+
+
+def test_only_what_lacks_is_measured_again(study, found, tmp_path):
+    """Stopped in the second row, begun again; then with other inputs; then with a file that is not whole."""
+    here = replace(study, folder=tmp_path)
+    asked = []
+
+    def run(study, spec, picture):
+        asked.append(spec.name)
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return next(row for row in found if row.name == spec.name)
+
+    with pytest.raises(KeyboardInterrupt):
+        list(rows(here, SPECS, run))
+    assert tuple(rows(here, SPECS, run)) == found
+    assert asked == ["FEM", "linear law", "linear law", "linear"]
+    assert tuple(rows(here, SPECS, run)) == found and len(asked) == 4
+    list(rows(replace(here, timed=31), SPECS[:1], run))
+    assert asked[4:] == ["FEM"]
+    kept = tmp_path / "rows" / "data-linear.json"
+    kept.write_text(kept.read_text()[:-9])
+    list(rows(here, SPECS, run))
+    assert asked[5:] == ["FEM", "linear"], "the first file held other inputs, the last was not whole"
+
+
+def test_a_reference_goes_on_load_by_load(study, monkeypatch):
+    before = reference_of(study)
+    lost = sorted((study.folder / "answers").glob("reference-*"))[1]
+    lost.unlink()
+    solved = []
+    monkeypatch.setattr(Fem, "deform", lambda self, loads, *rest: solved.append(len(loads)) or deform(self, loads))
+    told = []
+    solve_reference(study, told.append)
+    assert solved == [1] and told == [2, 1]
+    assert np.allclose(reference_of(study).displacement, before.displacement, atol=1e-12) and before.good.all()
+
+
+deform = Fem.deform
+
+
+def test_the_front_is_what_nobody_beats():
+    figures = figures_of(np.ones((1, 1)), np.ones((1, 1, 3)), np.ones(1))
+
+    def row(name, time, error, against="error"):
+        mm = replace(figures.mm, mean=error)
+        return Row(name, "f", against=against, reference=replace(figures, mm=mm), median=time)
+
+    rows = [row("fast", 1.0, 9.0), row("near", 9.0, 1.0), row("between", 3.0, 3.0), row("beaten", 4.0, 3.0)]
+    rows += [row("slow", 10.0, 10.0), row("other law", 0.5, 0.5, "model difference")]
+    rows += [Row("none", "f", state="not built yet")]
+    assert front(rows) == {"fast", "near", "between"}
+    assert against_time(rows).std() > 5.0 and against_time(rows[-1:]) is None
+
+
+def test_the_page_needs_nothing_but_itself(page, found):
+    text = (page / "index.html").read_text()
+    assert not re.search(r"https?:|<script|<link|@import|url\(", text)
+    sources = re.findall(r'src="([^"]{0,30})', text)
+    assert len(sources) == 2 + 3 and all(source.startswith("data:image/png;base64,") for source in sources)
+    for words in ("not built yet", "not measured", "model difference", "About &lt;this&gt;.", *UNBUILT):
+        assert words in text
+    assert text.index("<img") < text.index("<table"), "error against time comes first"
+    for row in found[:3]:
+        assert read_png(page / "pictures" / row.picture).std() > 5.0
+
+
+def test_what_lies_beyond_is_outside_the_envelope(study):
+    taught, test = (study.converged.rows(np.flatnonzero(r)).of(Pushed) for r in (study.discs.taught, study.discs.test))
+    outside = study.outside.of(Pushed)
+    assert not envelope_of(study.patch, taught, test).holds(study.patch, outside).any()
+    size = np.linalg.norm(outside.force, axis=1)
+    assert (size[::3] > 1.19 * np.linalg.norm(taught.force, axis=1).max()).all()
+    assert (study.patch.rim_distance(outside.point[2::3]) < outside.footprint[2::3]).all()
+    assert beyond_of(study).displacement.shape == (6, len(study.anatomy.tumour_nodes), 3)
+
+
+def test_plans(study):
+    names = [spec.name for spec in star(study)]
+    assert names[0] == "FEM" and len(set(names)) == len(names) == 12 and "FEM halved edges" in names
+    assert star(study)[0].accuracy == TRAIN and star(study)[-1].law != TISSUE.law
+    product = every(study)
+    assert len({spec.name for spec in product}) == len(product) == 4 * 3 * 2 * (3 + 5)
+    assert counts(300) == [64, 128, 256] and counts(64) == []
+
+
+def test_what_cannot_be_had_is_a_row_that_says_why(study, tmp_path):
+    row = measured(study, Elements("odd", element="cube"), tmp_path / "odd.png")
+    assert "no element is called 'cube'" in row.state and row.reference is None and row.family == "finite elements"
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--loads", "0"], "--loads 0"),
+        (["--device", "abacus"], "abacus"),
+        (["--data", "a/x.h5", "b/x.h5"], "one name"),
+        (["--data", "a.h5", "--anatomy", "b.vtu"], "--anatomy"),
+        (["--data", "a.h5"], "no such file"),
+    ],
+)
+def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", *words]) == 2
+    assert reason in capsys.readouterr().err

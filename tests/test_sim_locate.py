@@ -1,0 +1,24 @@
+"""Points of one mesh read in another."""
+
+import numpy as np
+from boxes import box
+
+from sim.locate import locate
+
+
+def test_a_linear_field_is_read_exactly_and_a_vertex_at_itself():
+    mesh = box((4, 3, 5), distortion=0.2)
+    points = np.random.default_rng(0).uniform(0.0, 1.0, (200, 3)) * mesh.nodes.max(axis=0)
+    slope = np.random.default_rng(1).normal(size=(2, 3, 3))
+    field = np.einsum("bki,vi->bvk", slope, mesh.nodes)
+    found = locate(mesh, points)
+    assert np.allclose(found.read(field), np.einsum("bki,ni->bnk", slope, points), atol=1e-12)
+    assert (found.weights >= 0.0).all() and np.allclose(found.weights.sum(axis=1), 1.0)
+    at_home = locate(mesh, mesh.nodes[:50])
+    assert np.allclose(at_home.read(field), field[:, :50], atol=1e-12)
+
+
+def test_what_lies_outside_is_read_nearby():
+    mesh = box((2, 2, 2), size=0.1)
+    found = locate(mesh, np.array([[0.03, 0.04, 0.11]]))
+    assert np.allclose(found.read(mesh.nodes[None]), [[[0.03, 0.04, 0.1]]], atol=0.01)
