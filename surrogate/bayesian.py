@@ -8,6 +8,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from .regressor import filled
+
 # The damping of MATLAB's `trainbr`: the first, its factors after a good and a bad step, and where a network ends.
 DAMPING, DOWN, UP, MOST_DAMPING = 5e-3, 0.1, 10.0, 1e10
 # Least summed squared error, of outputs in [-1, 1], that is told from none.
@@ -77,10 +79,7 @@ class Bayesian:
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
         """From `state`."""
-        model = cls()
-        for name, array in state.items():
-            setattr(model, f"{name}_", array)
-        return model
+        return filled(cls(), state)
 
 
 class Expansion(NamedTuple):

@@ -12,7 +12,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from .regressor import standardisation
+from .regressor import filled, standardisation
 
 # Lengths in standard deviations of a feature, and noise against the variance of an output.
 LENGTHS, NOISE = (0.05, 1e3), (1e-8, 1.0)
@@ -38,7 +38,7 @@ class Gp:
     """
 
     rows: int = 600
-    most: int = 6000
+    most: int = 4000
     strongest: int = 20
     seed: int = 0
 
@@ -88,10 +88,7 @@ class Gp:
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
         """From `state`."""
-        model = cls()
-        for name, array in state.items():
-            setattr(model, f"{name}_", array)
-        return model
+        return filled(cls(), state)
 
     def _distance(self, X: np.ndarray) -> np.ndarray:
         return cdist((X - self.mean_) / (self.deviation_ * self.length_), self.seen_)

@@ -8,6 +8,8 @@ from typing import Self
 
 import numpy as np
 
+from .regressor import filled
+
 # A component smaller than this against the largest is rounding.
 RANK = 1e-9
 
@@ -50,7 +52,4 @@ class Pcr:
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
         """From `state`."""
-        model = cls()
-        for name, array in state.items():
-            setattr(model, f"{name}_", array)
-        return model
+        return filled(cls(), state)

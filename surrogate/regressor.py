@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -33,3 +33,13 @@ def standardisation(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and deviation (f,) of the columns of X (n, f); a column that does not vary has the deviation one."""
     deviation = X.std(axis=0)
     return X.mean(axis=0), np.where(deviation > 1e-9 * np.abs(X).max(axis=0), deviation, 1.0)
+
+
+R = TypeVar("R", bound=Regressor)
+
+
+def filled(model: R, state: Mapping[str, np.ndarray]) -> R:
+    """The model with each array of `state` as the attribute of that name and an underscore."""
+    for name, array in state.items():
+        setattr(model, f"{name}_", array)
+    return model

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from .regressor import standardisation
+from .regressor import filled, standardisation
 
 
 class Svr:
@@ -59,7 +59,4 @@ class Svr:
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
         """From `state`."""
-        model = cls()
-        for name, array in state.items():
-            setattr(model, f"{name}_", array)
-        return model
+        return filled(cls(), state)
