@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from . import narrow
+from . import trial
 from .columns import CHUNK, add_dots, combined
 from .problem import Problem
-from .steering import OWN, PAIRS, SOME, SUMS, kernels_of
+from .steering import OWN, PAIRS, SUMS, kernels_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ def balance(
     In the arrays of `room`, if it is given.
     """
     device, (rows, count) = problem.device, v.shape
-    room, k = room or _balance_room(problem, count), kernels_of(problem.device, PAIRS)
+    room = room or _balance_room(problem, count)
     varying = [term for term in problem.terms if not term.constant]
     room.sums.zero_()
     wp.copy(room.g, constant)
@@ -48,16 +48,16 @@ def balance(
         varying[0].add_gradient(v, room.g)
         room = replace(room, own=room.sums[OWN : OWN + 1])
     else:
+        absorb = kernels_of(device, PAIRS).absorb
         room.own.zero_()
         for number, term in enumerate(varying):
             term.add_gradient(v, room.part)
-            device.launch(k.absorb, (-(-rows // CHUNK), count), [], [room.part, room.g, room.own[number]])
+            device.launch(absorb, (-(-rows // CHUNK), count), [], [room.part, room.g, room.own[number]])
     inputs = [constant, *problem.constraint.nodes, v if d is None else d]
-    if count == 1:
-        one = narrow.kernels_of(device, PAIRS)
-        device.launch(one.finish, (narrow.threads(device, rows // 3),), inputs, [room.g, room.sums])
-    else:
-        device.launch(k.finish, (-(-rows // (3 * SOME)), count), inputs, [room.g, room.sums])
+    spread = trial.spread_of(device, count)
+    device.launch(
+        trial.kernels_of(device, spread).finish, (spread.threads(rows // 3), count), inputs, [room.g, room.sums]
+    )
     return room
 
 

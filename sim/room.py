@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from . import narrow
+from . import trial
 from .balance import Balance, balance, constants_of
 from .columns import add_dots, combined, gathered
 from .linear import Preconditioner
+from .narrow import multiply_of
 from .problem import Problem
 from .steering import DONE, PAIRS, PRODUCTS, SOME, SUMS, few_of, kernels_of
 
@@ -189,9 +190,9 @@ class Room:
         a, k = self.columns, self._kernels
         problem, device = self._problem, self._problem.device
         rows, count = a["u"].shape
-        alone, one, some = narrow.kernels_of(device, PAIRS), (count,), (-(-rows // SOME), count)
-        step, dim = (alone.step, (narrow.threads(device, rows),)) if count == 1 else (k.step, some)
-        device.launch(step, dim, [a["u"], a["t"], a["d"]], [a["v"]])
+        spread, one = trial.spread_of(device, count), (count,)
+        step = trial.kernels_of(device, spread).step
+        device.launch(step, (spread.threads(rows), count), [a["u"], a["t"], a["d"]], [a["v"]])
         found = balance(problem, a["v"], a["constant"], a["d"], self._trial)
         inputs = [a["loud"], found.own, a["tolerance"], a["force"], found.sums, a["promised"]]
         names = ("status", "accepted", "steps", "cut", "t", "gone", "residual", "slot", "aiming")
@@ -219,8 +220,8 @@ class Room:
         a["products"].zero_()
         inputs, outputs = [a["known"], a["s"], a["w"], a["g"], a["z"], g, a["new_z"]], [a["products"]]
         if count == 1 and device.on_cuda:
-            dim = (len(a["products"]), narrow.threads(device, rows))
-            device.launch(narrow.kernels_of(device, PAIRS).multiply, dim, inputs, outputs)
+            dim = (len(a["products"]), trial.spread_of(device, 1).threads(rows))
+            device.launch(multiply_of(device, PAIRS), dim, inputs, outputs)
         else:
             device.launch(k.multiply, (-(-rows // SOME), count), inputs, outputs)
         inputs = [a["aiming"], a["gone"], self._trial.sums, a["products"]]

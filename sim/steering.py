@@ -38,9 +38,7 @@ PRODUCTS = 3
 class Kernels:
     """Arithmetic of one scalar type and number of pairs."""
 
-    step: wp.Kernel
     absorb: wp.Kernel
-    finish: wp.Kernel
     multiply: wp.Kernel
     judge: wp.Kernel
     aim: wp.Kernel
@@ -56,31 +54,15 @@ def few_of(device: Device) -> int:
 @cache
 def kernels_of(device: Device, pairs: int) -> Kernels:
     """Kernels of a device's scalar type for columns that keep so many pairs."""
-    scalar, vec = device.scalar, device.vector
+    scalar = device.scalar
     several, few_scalars = (wp.types.vector(length=length, dtype=scalar) for length in (SOME, few_of(device)))
     weights = wp.types.vector(length=pairs, dtype=wp.float64)
     products_of_pairs = wp.types.matrix(shape=(pairs, pairs), dtype=wp.float64)
     m, chunk, some, few = pairs, CHUNK, SOME, few_of(device)
     overshoot, least_kept, kept, most_kept = OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT
     cuts, least_curvature = CUTS, LEAST_CURVATURE
-    own_row, whole_row, free_row, slope_row = OWN, WHOLE, FREE, SLOPE
+    whole_row, free_row, slope_row = WHOLE, FREE, SLOPE
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW
-
-    @wp.kernel(module="unique")
-    def step(
-        u: wp.array2d(dtype=scalar),
-        t: wp.array(dtype=wp.float64),
-        d: wp.array2d(dtype=scalar),
-        # outputs
-        v: wp.array2d(dtype=scalar),
-    ):
-        """v = u + t_c d."""
-        block, c = wp.tid()
-        length = scalar(t[c])
-        for k in range(some):
-            r = some * block + k
-            if r < u.shape[0]:
-                v[r, c] = u[r, c] + length * d[r, c]
 
     @wp.kernel(module="unique")
     def absorb(
@@ -98,36 +80,6 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             own[r, c] = scalar(0.0)
             squares += wp.float64(x) * wp.float64(x)
         wp.atomic_add(square, c, squares)
-
-    @wp.kernel(module="unique")
-    def finish(
-        constant: wp.array2d(dtype=scalar),
-        held: wp.array2d(dtype=wp.int8),
-        normal: wp.array(dtype=vec),
-        d: wp.array2d(dtype=scalar),
-        # outputs
-        total: wp.array2d(dtype=scalar),
-        sums: wp.array2d(dtype=wp.float64),
-    ):
-        """Project the gradient; sums: |total - constant|^2, |total|^2, |free|^2, free . d."""
-        block, c = wp.tid()
-        own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-        for i in range(block * some, wp.min((block + 1) * some, held.shape[0])):
-            x = vec(total[3 * i, c], total[3 * i + 1, c], total[3 * i + 2, c])
-            y = x - vec(constant[3 * i, c], constant[3 * i + 1, c], constant[3 * i + 2, c])
-            own += wp.float64(wp.dot(y, y))
-            whole += wp.float64(wp.dot(x, x))
-            n = normal[i]
-            x -= wp.dot(n, x) * n
-            for k in range(3):
-                f = wp.where(held[i, k] == wp.int8(0), x[k], scalar(0.0))
-                total[3 * i + k, c] = f
-                free += wp.float64(f) * wp.float64(f)
-                slope += wp.float64(f) * wp.float64(d[3 * i + k, c])
-        wp.atomic_add(sums, own_row, c, own)
-        wp.atomic_add(sums, whole_row, c, whole)
-        wp.atomic_add(sums, free_row, c, free)
-        wp.atomic_add(sums, slope_row, c, slope)
 
     @wp.kernel(module="unique")
     def multiply(
@@ -388,4 +340,4 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         t[c] = wp.min(t[c], wp.float64(bound[c]))
         bound[c] = scalar(1.0)
 
-    return Kernels(step, absorb, finish, multiply, judge, aim, move, clamp)
+    return Kernels(absorb, multiply, judge, aim, move, clamp)

@@ -18,7 +18,7 @@ ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim"
 TIERS = (
     {"device", "lanes", "columns", "rows", "product", "sparse", "sweep", "term", "constraint", "footprint"},
     {"terms", "problem"},
-    {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering", "narrow"},
+    {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering", "narrow", "trial"},
     {"newton", "balance", "room", "lbfgs", "multigrid", "amg", "inversion", "patch", "rim"},
     {"precondition", "condensation", "elimination", "patching", "vicinity", "ladder", "frame", "following"},
     {"fem"},

@@ -1,4 +1,4 @@
-"""The kernels for one column do what those for many do."""
+"""The kernels do for one column, whose rows they share, what they do for many."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim import narrow, steering
+from sim import trial
 from sim.columns import add_dots
 from sim.device import find_device
-from sim.steering import PAIRS, PRODUCTS, SOME, SUMS
+from sim.narrow import multiply_of
+from sim.steering import PAIRS, PRODUCTS, SOME, SUMS, kernels_of
+from sim.trial import spread_of
 
 NODES = 1500
 """More than one thread takes."""
 ROWS = 3 * NODES
 DEVICE = find_device("cpu", "float64")
+ONE, MANY = spread_of(DEVICE, 1), spread_of(DEVICE, 2)
 RNG = np.random.default_rng(0)
 
 
@@ -29,8 +32,8 @@ def double(*shape: int) -> wp.array:
 def test_a_step():
     u, d, t, one, many = column(ROWS), column(ROWS), double(1), column(ROWS), column(ROWS)
     t.fill_(0.3)
-    DEVICE.launch(narrow.kernels_of(DEVICE, PAIRS).step, (narrow.threads(DEVICE, ROWS),), [u, t, d], [one])
-    DEVICE.launch(steering.kernels_of(DEVICE, PAIRS).step, (-(-ROWS // SOME), 1), [u, t, d], [many])
+    for spread, out in ((ONE, one), (MANY, many)):
+        DEVICE.launch(trial.kernels_of(DEVICE, spread).step, (spread.threads(ROWS), 1), [u, t, d], [out])
     np.testing.assert_array_equal(one.numpy(), many.numpy())
 
 
@@ -41,8 +44,8 @@ def test_a_gradient_is_finished():
     constant, d, total = column(ROWS), column(ROWS), column(ROWS)
     one, many, sums, other = wp.clone(total), wp.clone(total), double(SUMS, 1), double(SUMS, 1)
     inputs = [constant, held, normal, d]
-    DEVICE.launch(narrow.kernels_of(DEVICE, PAIRS).finish, (narrow.threads(DEVICE, NODES),), inputs, [one, sums])
-    DEVICE.launch(steering.kernels_of(DEVICE, PAIRS).finish, (-(-NODES // SOME), 1), inputs, [many, other])
+    for spread, out in ((ONE, [one, sums]), (MANY, [many, other])):
+        DEVICE.launch(trial.kernels_of(DEVICE, spread).finish, (spread.threads(NODES), 1), inputs, out)
     np.testing.assert_array_equal(one.numpy(), many.numpy())
     np.testing.assert_allclose(sums.numpy(), other.numpy(), rtol=1e-12)
 
@@ -52,9 +55,9 @@ def test_products_with_the_pairs_that_are_known(count):
     s, w, vectors = column(PAIRS, ROWS), column(PAIRS, ROWS), [column(ROWS) for _ in range(4)]
     known = wp.array([count], dtype=wp.int32, device="cpu")
     one, many = double(2 * PAIRS + PRODUCTS, 1), double(2 * PAIRS + PRODUCTS, 1)
-    inputs, dim = [known, s, w, *vectors], (len(one), narrow.threads(DEVICE, ROWS))
-    DEVICE.launch(narrow.kernels_of(DEVICE, PAIRS).multiply, dim, inputs, [one])
-    DEVICE.launch(steering.kernels_of(DEVICE, PAIRS).multiply, (-(-ROWS // SOME), 1), inputs, [many])
+    inputs, dim = [known, s, w, *vectors], (len(one), ONE.threads(ROWS))
+    DEVICE.launch(multiply_of(DEVICE, PAIRS), dim, inputs, [one])
+    DEVICE.launch(kernels_of(DEVICE, PAIRS).multiply, (-(-ROWS // SOME), 1), inputs, [many])
     np.testing.assert_allclose(one.numpy(), many.numpy(), rtol=1e-9, atol=1e-9)
     assert np.count_nonzero(one.numpy()) == 2 * count + PRODUCTS
 
