@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import numpy as np
+import pytest
 from boxes import box, hold, surface_nodes
 from oracle import tissue
 
@@ -12,6 +16,7 @@ from sim.device import find_device
 from sim.discretisation import Discretisation, discretise
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide
 from sim.lbfgs import Lbfgs
+from sim.linear import Preconditioner
 from sim.loads import Loads, Nodal
 from sim.precondition import rest_solver
 from sim.problem import Problem
@@ -24,6 +29,12 @@ OPENING = TOP & (np.abs(MESH.nodes[:, :2] - 0.04).max(axis=1) < 0.021)
 TOTAL = np.array([[0.0, 0.0, -0.05], [0.1, 0.05, -0.3], [0.0, 0.0, 0.3], [-0.2, 0.1, -0.8], [0.0, 0.0, 0.0]])
 EFFECTS: tuple[Effect, ...] = (Held(), Slide(), NodalForce())
 FINE = 1e-8
+LAWS_AND_ELEMENTS = pytest.mark.parametrize(
+    ("law", "element"),
+    [("linear", "p1"), ("neo-hookean", "p1"), ("stable-neo-hookean", "p1"), ("ogden", "p1"),
+     ("stable-neo-hookean", "smoothed"), ("stable-neo-hookean", "p2")],
+)  # fmt: skip
+Descent = TypeVar("Descent")
 
 
 def body(element: str = "p1") -> tuple[Anatomy, Discretisation]:
@@ -47,6 +58,18 @@ def begun(law: str, element: str = "p1", total: np.ndarray = TOTAL) -> tuple[Pro
     problem = compile_problem((Elasticity(tissue(law)), *EFFECTS), anatomy, find_device("cpu", "float64"), space)
     problem.begin(Cases(loads_of(total), np.zeros(len(total))))
     return problem, space
+
+
+def descent_of(
+    make: Callable[[Problem, Preconditioner, tuple[Effect, ...], Discretisation], Descent | None],
+    problem: Problem,
+    space: Discretisation,
+    law: str,
+) -> Descent:
+    """What `make` makes of a problem that is `begun`."""
+    found = make(problem, rest_solver(problem), (Elasticity(tissue(law)), *EFFECTS), space)
+    assert found is not None
+    return found
 
 
 def equilibria(problem: Problem, total: np.ndarray = TOTAL) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from boxes import base_held
-from openings import EFFECTS, FINE, MESH, TOTAL, begun, body, equilibria, loads_of
+from openings import EFFECTS, FINE, LAWS_AND_ELEMENTS, MESH, TOTAL, begun, body, descent_of, equilibria, loads_of
 from oracle import tissue
 
 from scenes.shipped import template_path
@@ -16,34 +16,23 @@ from sim.accuracy import TRAIN, Accuracy
 from sim.compile import compile_part, compile_problem
 from sim.condensation import condensed
 from sim.device import find_device
-from sim.discretisation import Discretisation, discretise
+from sim.discretisation import discretise
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.elimination import PATIENCE, Elimination, eliminating, near_tetrahedra
 from sim.fem import Fem
 from sim.meshfile import read_anatomy
 from sim.precondition import rest_solver
-from sim.problem import Problem
 from sim.steering import BROKEN, DONE, LIVE
 from sim.term import Cases
 from sim.terms.exterior import Exterior
 from surrogate.sampling import draw
 
 
-def elimination_of(problem: Problem, space: Discretisation, law: str) -> Elimination:
-    found = eliminating(problem, rest_solver(problem), (Elasticity(tissue(law)), *EFFECTS), space)
-    assert found is not None
-    return found
-
-
-@pytest.mark.parametrize(
-    ("law", "element"),
-    [("linear", "p1"), ("neo-hookean", "p1"), ("stable-neo-hookean", "p1"), ("ogden", "p1"),
-     ("stable-neo-hookean", "smoothed"), ("stable-neo-hookean", "p2")],
-)  # fmt: skip
+@LAWS_AND_ELEMENTS
 def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
     problem, space = begun(law, element)
     start = problem.device.zeros(problem.rows, len(TOTAL))
-    found = elimination_of(problem, space, law).descend(start, np.full(len(TOTAL), FINE), 100)
+    found = descent_of(eliminating, problem, space, law).descend(start, np.full(len(TOTAL), FINE), 100)
     assert (found.status == DONE).all() and (found.residual <= FINE).all()
     expected = equilibria(problem)
     np.testing.assert_allclose(found.u.numpy(), expected, atol=1e-5 * np.abs(expected).max())
@@ -69,7 +58,7 @@ def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
 def test_columns_go_each_by_itself() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law)
-    elimination = elimination_of(problem, space, law)
+    elimination = descent_of(eliminating, problem, space, law)
     together = elimination.descend(problem.device.zeros(problem.rows, len(TOTAL)), np.full(len(TOTAL), 1e-5), 100)
     for row in range(len(TOTAL)):
         problem.begin(Cases(loads_of(TOTAL[[row]]), np.zeros(1)))
@@ -81,7 +70,7 @@ def test_columns_go_each_by_itself() -> None:
 def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law)
-    elimination = elimination_of(problem, space, law)
+    elimination = descent_of(eliminating, problem, space, law)
     start = problem.device.zeros(problem.rows, len(TOTAL)).numpy()
     start[:, 1] = np.nan
     found = elimination.descend(problem.device.array(start), np.full(len(TOTAL), 1e-12), 1)
@@ -101,7 +90,7 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
     device = find_device("cpu", "float32")
     problem = compile_problem((Elasticity(tissue(law)), *EFFECTS), anatomy, device, space)
     problem.begin(Cases(loads_of(TOTAL[:4]), np.zeros(4)))
-    elimination = elimination_of(problem, space, law)
+    elimination = descent_of(eliminating, problem, space, law)
     inside = Elimination._corrected
     monkeypatch.setattr(
         Elimination, "_corrected", lambda *args: device.array(factor * inside(*args).numpy().astype(np.float64))
@@ -114,7 +103,7 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
 def test_rounding_of_what_follows_leaves_no_plane() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law)
-    elimination, random = elimination_of(problem, space, law), np.random.default_rng(0)
+    elimination, random = descent_of(eliminating, problem, space, law), np.random.default_rng(0)
 
     def rounded(x: wp.array, out: wp.array) -> None:
         elimination.follow(x, out)
@@ -129,7 +118,7 @@ def test_rounding_of_what_follows_leaves_no_plane() -> None:
 def test_what_gets_no_nearer_is_left_to_others() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[:1])
-    elimination = elimination_of(problem, space, law)
+    elimination = descent_of(eliminating, problem, space, law)
     found = elimination.descend(problem.device.zeros(problem.rows, 1), np.zeros(1), 100)
     assert found.status[0] == LIVE and found.residual[0] < 1e-12
     assert found.steps[0] < 20 + PATIENCE

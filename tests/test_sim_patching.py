@@ -5,40 +5,28 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from boxes import base_held, box
-from openings import EFFECTS, FINE, TOTAL, begun, equilibria, loads_of
+from openings import EFFECTS, FINE, LAWS_AND_ELEMENTS, TOTAL, begun, descent_of, equilibria, loads_of
 from oracle import tissue
 
 from scenes.shipped import template_path
 from sim.accuracy import TRAIN, Accuracy
 from sim.deformation import Outcome
-from sim.discretisation import Discretisation
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
 from sim.linear import BlockJacobi
 from sim.meshfile import read_anatomy
 from sim.patch import Patch
-from sim.patching import CYCLES, NODES, PATIENCE, Patching, patching
+from sim.patching import CYCLES, NODES, PATIENCE, patching
 from sim.precondition import rest_solver
-from sim.problem import Problem
 from sim.steering import BROKEN, DONE, LIVE
 from sim.term import Cases
 from surrogate.sampling import draw
 
 
-def patching_of(problem: Problem, space: Discretisation, law: str) -> Patching:
-    found = patching(problem, rest_solver(problem), (Elasticity(tissue(law)), *EFFECTS), space)
-    assert found is not None
-    return found
-
-
-@pytest.mark.parametrize(
-    ("law", "element"),
-    [("linear", "p1"), ("neo-hookean", "p1"), ("stable-neo-hookean", "p1"), ("ogden", "p1"),
-     ("stable-neo-hookean", "smoothed"), ("stable-neo-hookean", "p2")],
-)  # fmt: skip
+@LAWS_AND_ELEMENTS
 def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
     problem, space = begun(law, element)
-    descent, expected = patching_of(problem, space, law), equilibria(problem)
+    descent, expected = descent_of(patching, problem, space, law), equilibria(problem)
     for row in range(len(TOTAL)):
         problem.begin(Cases(loads_of(TOTAL[[row]]), np.zeros(1)))
         found = descent.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)
@@ -62,7 +50,8 @@ def test_on_a_brain_hard_pushes_take_few_looks_at_the_whole() -> None:
 def test_the_next_frame_begins_with_the_patch_of_the_last() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[3:4])
-    descent, rest, tolerance = patching_of(problem, space, law), problem.device.zeros(problem.rows, 1), np.full(1, FINE)
+    descent = descent_of(patching, problem, space, law)
+    rest, tolerance = problem.device.zeros(problem.rows, 1), np.full(1, FINE)
     first = descent.descend(rest, tolerance, 100, {})
     again = descent.descend(rest, tolerance, 100, first.learnt)
     np.testing.assert_array_equal(first.learnt[NODES], np.unique(first.learnt[NODES])[None])
@@ -78,7 +67,7 @@ def test_the_next_frame_begins_with_the_patch_of_the_last() -> None:
 def test_the_budget_leaves_the_best_state_and_says_so() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[3:4])
-    descent, rest = patching_of(problem, space, law), problem.device.zeros(problem.rows, 1)
+    descent, rest = descent_of(patching, problem, space, law), problem.device.zeros(problem.rows, 1)
     found = descent.descend(rest, np.full(1, 1e-12), 2)
     assert found.status[0] == LIVE and found.steps[0] == 2
     _, free, scale = problem.residual(found.u)
@@ -92,7 +81,7 @@ def test_the_budget_leaves_the_best_state_and_says_so() -> None:
 def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[3:4])
-    descent = patching_of(problem, space, law)
+    descent = descent_of(patching, problem, space, law)
     inside = Patch.settled
 
     def exploded(*args) -> tuple[float, np.ndarray]:
@@ -107,7 +96,7 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
 def test_what_gets_no_nearer_is_left_to_others() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[:1])
-    found = patching_of(problem, space, law).descend(problem.device.zeros(problem.rows, 1), np.zeros(1), 100)
+    found = descent_of(patching, problem, space, law).descend(problem.device.zeros(problem.rows, 1), np.zeros(1), 100)
     assert found.status[0] == LIVE and found.residual[0] < 1e-12
     assert found.steps[0] <= CYCLES and found.steps[0] < 12 + PATIENCE
 
@@ -115,7 +104,7 @@ def test_what_gets_no_nearer_is_left_to_others() -> None:
 def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[3:4])
-    descent = patching_of(problem, space, law)
+    descent = descent_of(patching, problem, space, law)
     patch, reach = descent._patch(np.unique(descent._table[:80]))
     inner = reach[:, np.isin(descent._nodes, patch.nodes).repeat(3)]
     pull = problem.device.zeros(problem.rows, 1)
@@ -143,9 +132,9 @@ def test_where_it_would_not_serve_there_is_none(kind: str) -> None:
 def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[1:2])
-    whole = patching_of(problem, space, law)
+    whole = descent_of(patching, problem, space, law)
     monkeypatch.setattr("sim.patching.LARGEST_NEAR", 60)
-    part = patching_of(problem, space, law)
+    part = descent_of(patching, problem, space, law)
     assert len(part._nodes) < 0.8 * len(whole._nodes) and np.isin(part._nodes, whole._nodes).all()
     found = part.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)
     assert found.status[0] == DONE and found.residual[0] <= FINE
