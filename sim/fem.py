@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache, cached_property, partial
 
 import numpy as np
@@ -14,6 +14,7 @@ from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
 from .columns import unstacked
 from .compile import check_causes, compile_problem
+from .correction import step_from
 from .deformation import Cost, Deformation
 from .device import find_device
 from .discretisation import discretise
@@ -25,7 +26,7 @@ from .footprint import Skin
 from .frame import Frame
 from .heading import moved_on, pushes_of, way_of
 from .inversion import Inversion
-from .ladder import FEWEST, LEARNT_KEY, Ladder, shortfall
+from .ladder import FEWEST, LEARNT_KEY, Answer, Ladder, shortfall
 from .lbfgs import TAUGHT
 from .loads import MAGNITUDE, Displaced, Loads, Pushed
 from .memory import check_fits, fitting_batch
@@ -168,6 +169,28 @@ class Fem:
         self.problem.begin(Cases(loads, answer.time, answer.history))
         return shortfall(self.problem, self.problem.device.array(self._guess(loads, answer)))
 
+    def corrected(self, loads: Loads, answer: Deformation) -> tuple[Deformation, np.ndarray, np.ndarray]:
+        """One step towards equilibrium from somebody's answers at every vertex, as `correction.step_from`.
+
+        The answers after it; the relative residual (B,) before it; and what is still missing (B, V, 3) [m], as the rest
+        stiffness has it.
+
+        Raises
+        ------
+        InputError
+            As `deform`.
+        """
+        check_causes(self.effects, loads)
+        guess, cases = self._guess(loads, answer), Cases(loads, answer.time, answer.history)
+        vertices, parts = np.arange(len(self._anatomy.mesh.nodes)), []
+        for first in range(0, max(len(loads), 1), self.batch):
+            rows = slice(first, first + self.batch)
+            step = step_from(self._ladder, cases.rows(rows), guess[:, rows])
+            left = unstacked(self.problem.device, step.left, vertices)
+            parts.append((self._answered(cases.rows(rows), step.answer, {}, None, step.seconds), step.before, left))
+        answers, before, left = zip(*parts, strict=True)
+        return _joined(list(answers)), np.concatenate(before), np.concatenate(left)
+
     def _guess(self, loads: Loads, start: Deformation) -> np.ndarray:
         """First guesses (3N, B). A case without any load starts at rest: its answer is exactly zero."""
         vertices = len(self._anatomy.mesh.nodes)
@@ -187,11 +210,22 @@ class Fem:
     def _solve(self, cases: Cases, last: np.ndarray | None, at: np.ndarray | None) -> Deformation:
         clock = time.perf_counter()
         found = self._ladder.climb(cases, None if last is None else self._moved_on(cases, last))
+        seconds = {"equilibrium": time.perf_counter() - clock}
+        way = way_of(pushes_of(cases.loads), last, cases.history) if len(cases.loads) <= TAUGHT else {}
+        return self._answered(cases, found, way, at, seconds)
+
+    def _answered(
+        self,
+        cases: Cases,
+        found: Answer,
+        more: Mapping[str, np.ndarray],
+        at: np.ndarray | None,
+        seconds: Mapping[str, float],
+    ) -> Deformation:
+        """What was found, as a deformation: reactions, and `more` history; it took `seconds` by stage."""
         solved = time.perf_counter()
         self.problem.begin(cases)
-        history = {**self.problem.end(found.u), **found.learnt}
-        if len(cases.loads) <= TAUGHT:
-            history |= way_of(pushes_of(cases.loads), last, cases.history)
+        history = {**self.problem.end(found.u), **found.learnt, **more}
         on_footprint = None
         if cases.loads.of(Displaced) is not None:
             on_footprint = self.problem.constraint.force_on_footprint(self.problem.gradient(found.u))
@@ -213,7 +247,7 @@ class Fem:
             time=cases.loads.times,
             reaction=reaction,
             history=history,
-            cost=Cost({"equilibrium": solved - clock, "reactions": time.perf_counter() - solved}),
+            cost=Cost({**seconds, "reactions": time.perf_counter() - solved}),
             reached=found.reached,
             inverted=found.inverted,
         )

@@ -20,7 +20,17 @@ TIERS = (
     {"terms", "problem"},
     {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering", "narrow", "trial"},
     {"newton", "balance", "room", "lbfgs", "multigrid", "amg", "inversion", "patch", "rim"},
-    {"precondition", "condensation", "elimination", "patching", "vicinity", "ladder", "frame", "following"},
+    {
+        "precondition",
+        "condensation",
+        "elimination",
+        "patching",
+        "vicinity",
+        "ladder",
+        "correction",
+        "frame",
+        "following",
+    },
     {"fem"},
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""

@@ -1,0 +1,65 @@
+"""Which deformer to take, given how far off it may be or how long it may take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sim.errors import InputError
+
+
+@dataclass(frozen=True)
+class Offer:
+    """A deformer's name, the error that it states [mm], and the median time of one load [ms]."""
+
+    name: str
+    error_mm: float
+    median_ms: float
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.error_mm:.3g} mm, {self.median_ms:.3g} ms)"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The offer taken, and a sentence that says why."""
+
+    offer: Offer
+    reason: str
+
+
+def choose(offers: Sequence[Offer], within_mm: float | None = None, within_ms: float | None = None) -> Choice:
+    """The fastest offer within an error; without one, the most accurate within a time. Both may be given.
+
+    Raises
+    ------
+    InputError
+        No offer is within what is given, or nothing is given; an error or a time that is not positive.
+    """
+    given = {"mm": within_mm, "ms": within_ms}
+    bounds = [f"{bound:g} {unit}" for unit, bound in given.items() if bound is not None]
+    if not bounds or any(bound is not None and not bound > 0.0 for bound in given.values()):
+        raise InputError(
+            f"no deformer can be chosen within {' and '.join(bounds) or 'no bound'}: give --within-mm, --within-ms or "
+            "both, positive."
+        )
+    exact = [offer for offer in offers if within_mm is None or offer.error_mm <= within_mm]
+    fast = [offer for offer in offers if within_ms is None or offer.median_ms <= within_ms]
+    both = [offer for offer in exact if offer in fast]
+    asked = " and ".join(bounds)
+    if not both:
+        near = [
+            f"the {word} is {min(some, key=key)}"
+            for word, some, key in (("most accurate", fast or offers, _error), ("fastest", exact or offers, _time))
+        ]
+        raise InputError(f"no deformer here is within {asked}: {'; '.join(dict.fromkeys(near))}. Allow more.")
+    taken, word = (min(both, key=_error), "most accurate") if within_mm is None else (min(both, key=_time), "fastest")
+    return Choice(taken, f"{taken} is the {word} of {len(both)} deformers within {asked}, of {len(offers)} here")
+
+
+def _error(offer: Offer) -> tuple[float, float]:
+    return offer.error_mm, offer.median_ms
+
+
+def _time(offer: Offer) -> tuple[float, float]:
+    return offer.median_ms, offer.error_mm
