@@ -10,13 +10,12 @@ import numpy as np
 
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.footprint import nearest_on
 from sim.loads import Loads, push
 from sim.material import Material
-
-from .tissue import pushed_effects
 
 # Fine enough that what is left is the mesh's error, and within reach of float64 at any Poisson's ratio.
 ACCURACY = Accuracy(tolerance=1e-5)

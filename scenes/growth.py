@@ -20,6 +20,7 @@ import warp as wp
 
 from ar.chart import Curve, Panel
 from sim.accuracy import TRAIN
+from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN
@@ -27,8 +28,6 @@ from sim.meshfile import read_anatomy, write_anatomy
 from sim.subject import Plan, make_anatomy
 from sim.template import Tumour, template_subject
 from surrogate.sampling import draw
-
-from .tissue import pushed_effects
 
 # Batches are solved until so many loads, or so many seconds, are spent.
 LOADS, PATIENCE = 12, 60.0
@@ -76,7 +75,7 @@ class Trial:
 def measured(trial: Trial, size: int, batch: int) -> Row:
     """Solve palpation loads on one mesh, to 1e-4 in single precision, in this process."""
     anatomy = read_anatomy(trial.mesh(size))
-    with _watched(trial.device) as card:
+    with watched_card(trial.device) as card:
         begun = clock.perf_counter()
         fem = Fem(anatomy, pushed_effects(anatomy, BRAIN), TRAIN, trial.device, batch, trial.element)
         wp.synchronize()
@@ -178,7 +177,7 @@ def _kind(name: str) -> str:
 
 
 @contextmanager
-def _watched(device: str) -> Iterator[list[int]]:
+def watched_card(device: str) -> Iterator[list[int]]:
     """The bytes of the card that are taken while the block runs, beyond those taken before; zero without a card."""
     where = wp.get_device(None if device == "auto" else device)
     taken = [0]

@@ -9,6 +9,7 @@ import numpy as np
 
 from sim.accuracy import FLOOR, Accuracy, Precision
 from sim.anatomy import Anatomy
+from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.footprint import nearest_on
@@ -22,7 +23,6 @@ from sim.template import Tumour, template_subject
 
 from .report_row import Row, against_reference, of_times
 from .report_study import Study
-from .tissue import pushed_effects
 
 OWN, HALVED = "own", "halved"
 # The tolerance of data sets.
@@ -79,7 +79,7 @@ def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
         spec.name,
         "finite elements",
         against="error" if tissue == study.tissue else "model difference",
-        reference=against_reference(study, field, np.array(good)),
+        reference=against_reference(study, field, np.array(good), own.tumour_nodes),
         failed=good.count(False),
         set_up=set_up,
         **of_times(seconds),

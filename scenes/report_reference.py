@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import REFERENCE, TRAIN
+from sim.effects import pushed_effects
 from sim.fem import Fem
 from sim.files import written_whole
 from sim.loads import Loads
@@ -16,7 +17,6 @@ from sim.locate import Located, locate
 from sim.refine import refined
 
 from .report_study import Study
-from .tissue import pushed_effects
 
 # Loads that are solved together where a batch is worth it: a stop loses no more than these.
 TOGETHER = 16

@@ -10,14 +10,13 @@ import numpy as np
 from sim.accuracy import TRAIN, Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.deformation import Deformation, guess
-from sim.effects import Elasticity, ToolDisplacement
+from sim.effects import Elasticity, ToolDisplacement, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.footprint import footprint_weights
 from sim.loads import Displaced, Loads, Pushed
 from surrogate.patch import open_patch
 
-from .tissue import pushed_effects
 from .variant import Body, Variant, aimed
 
 

@@ -11,13 +11,13 @@ import warp as wp
 
 from sim.accuracy import REFERENCE, TRAIN
 from sim.anatomy import Anatomy
+from sim.effects import pushed_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
 from surrogate.sampling import TOOLS, draw
 
 from .robust import CHECKED, Trial
-from .tissue import pushed_effects
 
 SEED = 0
 # However few the loads, so many have their residual computed again in double precision.

@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 
-from sim.anatomy import Anatomy
 from sim.discretisation import ELEMENTS
-from sim.effects import Effect, Elasticity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
 
@@ -44,12 +42,6 @@ def add_element_argument(parser: argparse.ArgumentParser) -> None:
         help="; ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
         + " (default p1, or p2 where the mesh brings mid-edge nodes of its own)",
     )
-
-
-def pushed_effects(anatomy: Anatomy, tissue: Tissue) -> tuple[Effect, ...]:
-    """What a tool that pushes on a body of this tissue calls for; sliding where the anatomy has it."""
-    slide = (Slide(),) if anatomy.slide_normal.any() else ()
-    return (Elasticity(tissue), Held(), *slide, ToolForce())
 
 
 def tissue_of(args: argparse.Namespace) -> Tissue:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from .anatomy import Anatomy
 from .material import BRAIN, Tissue
 
 
@@ -46,3 +47,9 @@ class NodalForce:
 
 Effect = Elasticity | Held | Slide | ToolForce | ToolDisplacement | NodalForce
 """Everything that a scene may ask for."""
+
+
+def pushed_effects(anatomy: Anatomy, tissue: Tissue) -> tuple[Effect, ...]:
+    """What a tool that pushes on a body of this tissue calls for; sliding where the anatomy has it."""
+    slide = (Slide(),) if anatomy.slide_normal.any() else ()
+    return (Elasticity(tissue), Held(), *slide, ToolForce())

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from sim.discretisation import ELEMENTS
+from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.meshfile import read_anatomy
 
 from ..shipped import template_path
-from ..tissue import add_tissue_arguments, pushed_effects, tissue_of
+from ..tissue import add_tissue_arguments, tissue_of
 
 if TYPE_CHECKING:
     from ..live import Tally

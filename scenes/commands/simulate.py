@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from sim.accuracy import Accuracy
 from sim.deformation import Outcome
-from sim.effects import NodalForce
+from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
 from sim.files import check_output
 from sim.material import tissue_to_json
@@ -25,7 +25,7 @@ from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import Solved, simulate
 
 from ..shipped import template_path
-from ..tissue import add_element_argument, add_tissue_arguments, pushed_effects, tissue_of
+from ..tissue import add_element_argument, add_tissue_arguments, tissue_of
 
 INTERRUPTED = 130
 
