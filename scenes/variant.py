@@ -73,10 +73,10 @@ def variants(anatomy: Anatomy, body: Body, elements: Sequence[str] = ()) -> list
             Variant("tumour's stiffness", tumour, f"{ratio:g} x", replace(body, tumour=ratio))
             for ratio in (0.5, 1.0, 2.0, 3.0)
         ),
-        *(Variant("element", body.element, element, replace(body, element=element)) for element in elements),
     ]
     if anatomy.slide_normal.any():
         changed.append(Variant("skull side", "slides", "held", replace(body, held=True)))
+    changed += [Variant("element", body.element, element, replace(body, element=element)) for element in elements]
     return [variant for variant in changed if variant.body != body or variant.aim != Aim()]
 
 

@@ -130,7 +130,7 @@ def _remarks(study: Study, beside: Sequence[str], model: Learned | None, failed:
     """What a reader of the table must know, in sentences."""
     said = []
     if failed:
-        said.append(f"{failed} solves did not converge: they are in no figure, nor is what has such a default.")
+        said.append(f"{failed} solves did not converge: they, and what is compared with them, are in no figure.")
     if model is not None and _bound(model):
         stated = _stated(model)
         said.append(
