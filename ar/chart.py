@@ -17,6 +17,8 @@ INK, FAINT, GRID, PAPER = (40, 40, 40), (120, 120, 120), (228, 228, 228), (255, 
 COLOURS = ((31, 119, 180), (214, 96, 37), (44, 140, 72), (140, 86, 170), (150, 120, 40), (0, 150, 160), (200, 60, 110))
 """Red, green, blue of the curves, in turn."""
 FONT = cv2.FONT_HERSHEY_SIMPLEX
+# How wide the names of curves are taken to be [pixel].
+KEYS = 160
 # Radius of a dot, size of its name, and the sides of the dot where that may stand (across, down), the best first.
 DOT, SMALL = 5 * FINER, 0.4
 SIDES = ((1, 0), (-1, 0), (0, -1), (0, 1), (1, -1), (1, 1), (-1, -1), (-1, 1))
@@ -96,6 +98,7 @@ def _drawn(panel: Panel) -> np.ndarray:
             _line(canvas, (top[0], row), (top[0], row + 5 * FINER), FAINT, 1)
         _write(canvas, name, (top[0] + 5 * FINER, bottom[1] - 8 * FINER), (0.0, 0.0), 0.42, FAINT)
     cv2.rectangle(canvas, place(low[0], high[1]), place(low[1], high[0]), FAINT, FINER)
+    left = _column_of_keys(panel, [place(*point) for point in pairs])
     for number, curve in enumerate(panel.curves):
         colour = COLOURS[number % len(COLOURS)]
         where = [place(*point) for point in sorted(curve.points)]
@@ -103,7 +106,7 @@ def _drawn(panel: Panel) -> np.ndarray:
             _line(canvas, first, second, colour, 2)
         for point in where:
             cv2.circle(canvas, point, 4 * FINER, colour, -1, cv2.LINE_AA)
-        key = (FINER * (LEFT + 16), FINER * (TOP + 18 + 20 * number))
+        key = (FINER * left, FINER * (TOP + 18 + 20 * number))
         _line(canvas, key, (key[0] + 22 * FINER, key[1]), colour, 3)
         _write(canvas, curve.name, (key[0] + 30 * FINER, key[1]), (0.0, 0.4), 0.45, INK)
     _scatter(canvas, panel.dots, [place(dot.x, dot.y) for dot in panel.dots], place(low[0], high[0]))
@@ -111,6 +114,13 @@ def _drawn(panel: Panel) -> np.ndarray:
     _write(canvas, panel.y, (FINER * LEFT, FINER * 50), (0.0, 0.5), 0.42, FAINT)
     _write(canvas, panel.x, (FINER * (width - RIGHT), FINER * (height - 18)), (-1.0, 0.5), 0.45, INK)
     return cv2.resize(canvas, panel.size, interpolation=cv2.INTER_AREA)
+
+
+def _column_of_keys(panel: Panel, places: Sequence[tuple[int, int]]) -> int:
+    """Where the keys of the curves begin [pixel]: at the left, unless fewer points lie under them at the right."""
+    columns = LEFT + 16, panel.size[0] - RIGHT - KEYS
+    low = FINER * (TOP + 18 + 20 * len(panel.curves))
+    return min(columns, key=lambda x: sum(FINER * x <= at[0] <= FINER * (x + KEYS) and at[1] <= low for at in places))
 
 
 def _scatter(

@@ -17,6 +17,7 @@ from sim.accuracy import FLOOR, Precision
 from sim.files import written_whole
 from sim.material import LAWS
 from sim.mesh import digest_of
+from surrogate.published import MACHINES
 from surrogate.train import LEARNERS
 
 from .report_elements import HALVED, OWN, STANDARD, Elements
@@ -59,8 +60,8 @@ def every(study: Study) -> tuple[Elements, ...]:
 
 
 def learners() -> tuple[Learner, ...]:
-    """Whatever `surrogate.train` knows."""
-    return tuple(Learner(name) for name in LEARNERS)
+    """Whatever `surrogate` knows, the published ones last."""
+    return tuple(Learner(name) for name in (*LEARNERS, *MACHINES))
 
 
 def apart(study: Study, spec: Spec, picture: Path) -> Row:

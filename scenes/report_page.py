@@ -37,7 +37,8 @@ NOTES = (
     "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
     "of those vertices. A row in bold, or full colour, is one that no other equals or beats in time and mean error.",
     "Time: one load at a time, from rest, median; p99 where at least 1,000 were timed. Set-up, compiling and warm-up "
-    "are not in it. Memory: the largest resident size of the process that made and played the row alone, on the host.",
+    "are not in it. Memory: the largest resident size of the process that made and played the row alone; card: what "
+    "it took of the graphics card.",
     "Adapting: until the row answers within its stated error again after the tumour is debulked by a fifth.",
 )
 
@@ -99,7 +100,7 @@ def _against_reference(section: Section) -> str:
     best = front(section.rows)
     heads = (
         "row", "distance", "loads", "mean mm", "p95", "p99.9", "largest", "mean %", "p95", "p99.9", "largest",
-        "median ms", "p99", "set-up s", "memory GiB", "solves", "minutes", "adapting s",
+        "median ms", "p99", "set-up s", "memory GiB", "card", "solves", "minutes", "adapting s",
     )  # fmt: skip
     lines = []
     for row in section.rows:
@@ -110,9 +111,10 @@ def _against_reference(section: Section) -> str:
         solves = f"{row.taught} + {row.units} unit" if taught else ""
         minutes = None if row.learning is None else row.learning / 60.0 + (section.minutes or 0.0)
         short = "" if section.minutes is not None or not taught else " of fitting"
+        cost = (row.median, row.p99, row.set_up, row.memory, row.card)
         cells = (
-            row.name, row.against, _count(row), *_spread(row.reference), _text(row.median), _text(row.p99),
-            _text(row.set_up), _text(row.memory), solves, _text(minutes) + short, _text(row.adapt) or "not measured",
+            row.name, row.against, _count(row), *_spread(row.reference), *map(_text, cost), solves,
+            _text(minutes) + short, _text(row.adapt) or "not measured",
         )  # fmt: skip
         lines.append(("front" if row.name in best else "", cells))
     return _table(heads, lines)

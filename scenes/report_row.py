@@ -77,12 +77,12 @@ def figures_between(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> Figu
     return figures_of(np.linalg.norm(answer - truth, axis=2), truth, directions(pushed)[0])
 
 
-def against_reference(study: Study, answer: np.ndarray, good: np.ndarray) -> Figures | None:
-    """Figures of answers (n, k, 3) [m] at the tumour to the played loads, those left out that are not `good` (n,)."""
+def against_reference(study: Study, answer: np.ndarray, good: np.ndarray, nodes: np.ndarray) -> Figures | None:
+    """Figures of answers (n, k, 3) [m] at vertices (k,) to the played loads, if both are good: `good` (n,)."""
     truth = reference_of(study)
     rows = np.flatnonzero(good & truth.good)
-    tumour = np.isin(study.drawn, study.anatomy.tumour_nodes)
-    return figures_between(answer[rows], truth.displacement[rows][:, tumour], study.played.rows(rows))
+    known = np.isin(study.drawn, nodes)
+    return figures_between(answer[rows], truth.displacement[rows][:, known], study.played.rows(rows))
 
 
 def of_times(seconds: Sequence[float]) -> dict[str, Any]:
@@ -123,8 +123,8 @@ class Row:
         How many loads were timed.
     set_up
         Seconds before the first load.
-    memory
-        Of its process at the peak [GiB].
+    memory, card
+        Of its process, and of the graphics card, at the peak [GiB].
     taught, units
         Solves that it was taught with: loads, and unit responses of the open cortex.
     learning
@@ -150,6 +150,7 @@ class Row:
     timed: int = 0
     set_up: float | None = None
     memory: float | None = None
+    card: float | None = None
     taught: int | None = None
     units: int | None = None
     learning: float | None = None

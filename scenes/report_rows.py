@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sim.errors import InputError
 
+from .growth import watched_card
 from .report_elements import Elements, measure_elements
 from .report_learner import Learner, measure_learner
 from .report_row import Row
@@ -19,10 +20,13 @@ FAMILY = {Elements: "finite elements", Learner: "learnt"}
 def measured(study: Study, spec: Spec, picture: Path) -> Row:
     """The row of a deformer, and the picture of its worst case; what cannot be had says why in `Row.state`."""
     try:
-        row, field = measure_elements(study, spec) if isinstance(spec, Elements) else measure_learner(study, spec)
+        with watched_card(study.device) as card:
+            row, field = measure_elements(study, spec) if isinstance(spec, Elements) else measure_learner(study, spec)
     except InputError as error:
         return Row(spec.name, FAMILY[type(spec)], state=str(error))
-    row = replace(row, memory=peak_memory())
+    row = replace(row, memory=peak_memory(), card=max(card) / 2**30 or None)
+    if field.shape[1] < len(study.anatomy.tumour_nodes):
+        return row  # what knows some vertices alone has no surface to draw
     # What pictures take is not the row's.
     from ar.screen import write_png
 

@@ -20,20 +20,20 @@ from scenes.report_reference import beyond_of, reference_of, solve_beyond, solve
 from scenes.report_row import Row, figures_of, row_from_json, row_to_json
 from scenes.report_rows import measured, peak_memory
 from scenes.report_study import Study
-from scenes.tissue import pushed_effects
 from sim.accuracy import REFERENCE, TRAIN
-from sim.effects import NodalForce
+from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
 from sim.loads import Pushed
 from sim.material import Material, tissue_to_json
 from surrogate.dataset import read_dataset
 from surrogate.envelope import envelope_of
+from surrogate.published import published_nodes
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
 from surrogate.train import train
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
-SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"))
+SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"), Learner("published-svr"))
 
 
 def nothing(count):
@@ -105,13 +105,14 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
     assert stored[2]["taught"] == study.discs.taught.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
 
 
-def test_rows_say_what_they_are(found):
-    fem, law, learner, *empty = found
+def test_rows_say_what_they_are(found, box):
+    fem, law, learner, published, *empty = found
     assert (fem.against, law.against, learner.against) == ("error", "model difference", "error")
     assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.teacher
     assert set(learner.teacher) == {"discs", "sectors", "beyond"} and learner.flagged["beyond"] == 1.0
     assert learner.teacher["beyond"].percent.mean > learner.teacher["discs"].percent.mean
     assert (fem.timed, fem.p99, learner.timed) == (3, None, 30) and fem.median > learner.median > 0.0
+    assert published.reference.values == 3 * len(published_nodes(box)) and published.picture is None
     assert {row.state for row in empty} == {"not built yet"} and all(row.reference is None for row in empty)
     assert all(row.adapt is None for row in found) and learner.curve[-1] == (learner.taught, learner.teacher["discs"])
     assert row_from_json(row_to_json(learner)) == learner
@@ -143,14 +144,14 @@ def test_only_what_lacks_is_measured_again(study, found, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         list(rows(here, SPECS, run))
     assert tuple(rows(here, SPECS, run)) == found
-    assert asked == ["FEM", "linear law", "linear law", "linear"]
-    assert tuple(rows(here, SPECS, run)) == found and len(asked) == 4
+    assert asked == ["FEM", "linear law", "linear law", "linear", "published-svr"]
+    assert tuple(rows(here, SPECS, run)) == found and len(asked) == 5
     list(rows(replace(here, timed=31), SPECS[:1], run))
-    assert asked[4:] == ["FEM"]
+    assert asked[5:] == ["FEM"]
     kept = tmp_path / "rows" / "data-linear.json"
     kept.write_text(kept.read_text()[:-9])
     list(rows(here, SPECS, run))
-    assert asked[5:] == ["FEM", "linear"], "the first file held other inputs, the last was not whole"
+    assert asked[6:] == ["FEM", "linear"], "the first file held other inputs, the last was not whole"
 
 
 def test_a_reference_goes_on_load_by_load(study, monkeypatch):
