@@ -62,7 +62,8 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0)
         Naming what it takes, what is free, and what would fit.
     """
     column = _column(rows, device)
-    each, host = ANSWER_COPIES * 8 * rows, SHARE * host_bytes()
+    free = host_bytes()  # read once: Linux counts for a good part of a millisecond
+    each, host = ANSWER_COPIES * 8 * rows, SHARE * free
     answers, alone = each * count, 0 if device.on_cuda else column
     if answers + alone > host:
         fitting = int((host - alone) / each)
@@ -70,7 +71,7 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0)
             f"the answers to {count} loads take about {_gigabytes(answers)}, and {_gigabytes(host)} are free: "
             + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
         )
-    room = SHARE * free_bytes(device) + held - (0 if device.on_cuda else answers)
+    room = SHARE * (free_bytes(device) if device.on_cuda else free) + held - (0 if device.on_cuda else answers)
     columns = min(batch, count)
     if column * columns > room:
         fitting = int(room / column)
