@@ -113,10 +113,9 @@ def first_weights(outputs: int, features: int, hidden: int, random: np.random.Ge
 def forward(weights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Hidden units (r, n, hidden) and outputs (r, n) of the networks `weights` (r, P) at x (n, f)."""
     hidden = (weights.shape[1] - 1) // (x.shape[1] + 2)
-    inner, outer = np.split(weights, [hidden * (x.shape[1] + 1)], axis=1)
-    inner = inner.reshape(len(weights), hidden, -1)
+    inner = weights[:, : -hidden - 1].reshape(len(weights), hidden, -1)
     units = np.tanh(x @ inner[:, :, :-1].transpose(0, 2, 1) + inner[:, None, :, -1])
-    return units, np.einsum("rnh,rh->rn", units, outer[:, :-1]) + outer[:, -1:]
+    return units, (units @ weights[:, -hidden - 1 : -1, None])[:, :, 0] + weights[:, -1:]
 
 
 def expansion(weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> Expansion:

@@ -2,8 +2,9 @@
 
 Tonutti, Gras, Yang 2017, "A machine learning approach for real-time modelling of tissue deformation in image-guided
 neurosurgery", Artif. Intell. Med. 80:39-47. Substitutes: `Bayesian` for MATLAB's `trainbr`; `Svr` for its `fitrsvm`,
-whose automatic kernel scale, a heuristic on a random subsample, becomes the square root of the number of features. The
-distance to the brain's centroid is the loaded point's, as a vertex's own never varies.
+whose automatic kernel scale, a heuristic on a random subsample, becomes the square root of the number of features (the
+mean error is 0.37, 0.36, 0.40 and 0.53 mm at scales of 7.2, 5.1, 3.6, which that is, and 2.5: it depends little). The
+distance to the brain's centroid, the mean of its vertices, is the loaded point's, as a vertex's own never varies.
 """
 
 from __future__ import annotations
@@ -59,6 +60,10 @@ class Published:
     def _patch(self) -> Patch:
         return open_patch(self.anatomy)
 
+    @cached_property
+    def _sites(self) -> tuple[np.ndarray, np.ndarray]:
+        return sites_of(self.anatomy, self.nodes)
+
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Predict the static answer to `Pushed` loads; `start` has no influence.
 
@@ -69,7 +74,7 @@ class Published:
         """
         begun = time.perf_counter()
         pushed = only_pushed(loads)
-        features = thirteen(self.anatomy, self.nodes, pushed)
+        features = thirteen(*self._sites, pushed)
         angular = [machine.predict(X) for machine, X in zip(self.machines, features, strict=True)]
         displacement = from_angles(np.stack(angular, axis=1).astype(np.float64))
         inside = self.envelope.holds(self._patch, pushed)
@@ -91,25 +96,28 @@ def published_nodes(anatomy: Anatomy) -> np.ndarray:
     return anatomy.tumour_nodes[::EVERY]
 
 
-def thirteen(anatomy: Anatomy, nodes: np.ndarray, pushed: Pushed) -> np.ndarray:
-    """The published features of B loads as each vertex of `nodes` (k,) sees them: (k, B, 13).
+def sites_of(anatomy: Anatomy, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the vertices `nodes` (k,) lie, (k, 3) [m], and the mean of all vertices, (3,) [m]."""
+    return anatomy.mesh.nodes[nodes], anatomy.mesh.nodes.mean(axis=0)
 
-    Force [N] (3), its direction angles [rad] (3), distance from point to vertex [m], distance from point to the brain's
-    centroid [m], angle between force and the way to the vertex [rad], and the axis (3) and angle [rad] of the rotation
-    that turns one into the other.
+
+def thirteen(sites: np.ndarray, centroid: np.ndarray, pushed: Pushed) -> np.ndarray:
+    """The published features of B loads as seen from `sites` (k, 3) [m]: (k, B, 13).
+
+    Force [N] (3), its direction angles [rad] (3), distances from point to site and to `centroid` (3,) [m], angle [rad]
+    between force and the way to the site, and the axis (3) and angle [rad] of the rotation from one to the other.
     """
     _, direction = directions(pushed)
-    way = anatomy.mesh.nodes[nodes][:, None] - pushed.point
+    way = sites[:, None] - pushed.point
     distance = np.linalg.norm(way, axis=2, keepdims=True)
     way = way / np.maximum(distance, np.finfo(float).tiny)
     axis = np.cross(direction, way)
     sine = np.linalg.norm(axis, axis=2, keepdims=True)
     angle = np.arctan2(sine, np.einsum("bi,kbi->kb", direction, way)[:, :, None])
     axis = axis / np.maximum(sine, np.finfo(float).tiny)
-    centroid = anatomy.mesh.nodes.mean(axis=0)
     own = np.column_stack([pushed.force, np.arccos(np.clip(direction, -1.0, 1.0))])
     off = np.linalg.norm(pushed.point - centroid, axis=1)[:, None]
-    seen = [np.broadcast_to(part, (len(nodes), *part.shape)) for part in (own, off)]
+    seen = [np.broadcast_to(part, (len(sites), *part.shape)) for part in (own, off)]
     return np.concatenate([seen[0], distance, seen[1], angle, axis, angle], axis=2)
 
 
@@ -152,5 +160,5 @@ def taught(
 
     envelope = envelope_of(open_patch(anatomy), pushed, only_pushed(held_out))
     with ThreadPoolExecutor() as pool:
-        machines = pool.map(learn, thirteen(anatomy, nodes, pushed), angular.transpose(1, 0, 2))
+        machines = pool.map(learn, thirteen(*sites_of(anatomy, nodes), pushed), angular.transpose(1, 0, 2))
         return Published(anatomy, nodes, tuple(machines), envelope)

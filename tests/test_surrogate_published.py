@@ -13,7 +13,7 @@ from sim.errors import InputError
 from sim.loads import Displaced, Loads, Pushed, push
 from surrogate import published
 from surrogate.bayesian import Bayesian, descended, expansion, first_weights, forward, strengths, well_determined
-from surrogate.published import MACHINES, from_angles, published_nodes, taught, thirteen, to_angles
+from surrogate.published import MACHINES, from_angles, published_nodes, sites_of, taught, thirteen, to_angles
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
 from surrogate.turns import positions_of, taught_in_turn
@@ -115,7 +115,7 @@ def test_the_network_tells_noise_from_signal():
 def test_features_are_those_of_the_paper(box):
     loads = draw("seed", box, 20, 3).of(Pushed)
     nodes = published_nodes(box)
-    X = thirteen(box, nodes, loads)
+    X = thirteen(*sites_of(box, nodes), loads)
     assert X.shape == (len(nodes), 20, 13)
     force, angles, distance, off, angle, axis, again = np.split(X, [3, 6, 7, 8, 9, 12], axis=2)
     way = box.mesh.nodes[nodes][:, None] - loads.point
@@ -154,7 +154,7 @@ def test_a_position_left_out_is_never_shown(box, loads, truth, monkeypatch):
     pushed, seen = loads.of(Pushed), []
     model = taught_in_turn("published-svr", box, loads, truth, lambda: seen.append(1))
     assert 2 <= len(model.positions) <= 11 and len(seen) == len(model.positions) * len(truth[0])
-    features = thirteen(box, model.nodes, pushed)
+    features = thirteen(*sites_of(box, model.nodes), pushed)
     for site, part in zip(model.positions, model.models, strict=True):
         here = np.linalg.norm(pushed.point - site, axis=1) < 1e-6
         assert here.any() and not here.all()
