@@ -25,7 +25,7 @@ SETS = {
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1200px; margin: 2em auto; padding: 0 1em; }
 table { border-collapse: collapse; font-size: 13px; margin: 1em 0; }
-th, td { padding: 3px 8px; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top; }
+th, td { padding: 3px 8px; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top; white-space: nowrap; }
 th { background: #f4f4f4; } th:first-child, td:first-child { text-align: left; }
 tr.front td:first-child { font-weight: bold; } tr.pale td { color: #777; } img { max-width: 100%; }
 figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption { font-size: 13px; }
@@ -33,7 +33,8 @@ figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption
 """
 NOTES = (
     "Two errors, never mixed: from the reference, which says what a row is worth; and from its own teacher, which says "
-    "what learning lost. What obeys another law than the reference has a model difference instead of an error.",
+    "what learning lost. What obeys another law than the reference has a model difference instead of an error; the "
+    "reference's own elements, less exactly solved, show their tolerance alone and are not drawn.",
     "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
     "of those vertices. A row in bold, or full colour, is one that no other equals or beats in time and mean error.",
     "Time: one load at a time, from rest, median; p99 where at least 1,000 were timed. Set-up, compiling and warm-up "
@@ -91,7 +92,8 @@ def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
         f"<h3>Against the reference</h3>{_against_reference(section)}"
         + (f"<h3>Against its own teacher</h3>{_against_teacher(learnt)}{''.join(others)}" if learnt else "")
         + f"<h3>By tenths of the force</h3>{_by_force(measured, learnt)}"
-        f"<h3>Worst cases</h3><p>The tumour as the row has it, and a yellow outline where the reference has it.</p>"
+        "<h3>Worst cases</h3><p>The tumour as the row has it, and dashed in yellow where the reference has it; a pixel "
+        "is about 0.1 mm.</p>"
         f"{''.join(pictures)}"
     )
 
@@ -162,7 +164,10 @@ def _spread(figures: Figures | None) -> tuple[str, ...]:
 
 
 def _text(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
+    """Three digits, as people write them."""
+    if value is None:
+        return ""
+    return "< 0.0001" if 0.0 < value < 1e-4 else f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
 
 
 def _table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ar.camera import look_at
 from ar.hud import panel
-from ar.overlay import composite
+from ar.overlay import composite, dash, outlines, silhouette
 from ar.view import render
 from sim.intensity import read_intensity, sidecar
 from sim.loads import Pushed
@@ -20,8 +21,9 @@ from .site import site_of
 from .stage import TOOL, Stage
 from .tool import Probe
 
-VIEW = Viewpoint(fov=np.radians(16.0), width=400, height=300)
-REFERENCE_COLOUR = (1.0, 0.85, 0.2)
+# So narrow that a pixel is a tenth of a millimetre.
+VIEW = Viewpoint(fov=np.radians(9.0), width=400, height=300)
+YELLOW = (255, 215, 50)
 
 
 def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
@@ -41,14 +43,17 @@ def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
     assert pushed is not None
     site = site_of(anatomy)
     scan = read_intensity(sidecar(template_path())) if study.of_template else None
-    camera = VIEW.camera(site)
+    middle = there[anatomy.tumour_nodes].mean(axis=0)
+    camera = look_at(VIEW.camera(site).centre, middle, site.up, VIEW.fov, VIEW.width, VIEW.height)
     place, radius = pushed.point[worst] - site.origin, float(pushed.footprint[worst])
     tip = site.contact(float(place @ site.right), float(place @ site.up), radius).carried(there)
     tool = Probe(radius)
     stage = Stage(replace(find_scene("press"), viewpoint=VIEW, tool=tool), site, scan)
     picture = render(camera, stage.layers(there, tool.pose(tip, site.axis, site.right)), stage.lamp)
-    shown = composite(picture, camera, stage.tumour(predicted), (TOOL,), "window")
-    shown = composite(shown, camera, replace(stage.tumour(there), colour=REFERENCE_COLOUR), (TOOL,), "contour")
+    shown = composite(picture, camera, stage.tumour(predicted), (TOOL,), "window").colour
+    reference = stage.tumour(there)
+    for outline in outlines(silhouette(camera, reference.vertices, reference.triangles)):
+        dash(shown, outline, YELLOW)
     force = float(np.linalg.norm(pushed.force[worst]))
     lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"off by up to {1e3 * distance[worst]:.3f} mm"]
-    return panel(shown.colour, lines)
+    return panel(shown, lines)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ar.chart import Curve, Dot, Panel, drawn
 
-from .report_row import Row
+from .report_row import ERROR, TOLERANCE_ALONE, Row
 
 SIZE = (880, 560)
 DIFFERENT = "another law: model difference"
@@ -17,9 +17,9 @@ DIFFERENT = "another law: model difference"
 def front(rows: Sequence[Row]) -> frozenset[str]:
     """Names of the rows that no other equals or beats in both milliseconds and mean distance from the reference.
 
-    Another law is no error, so that such rows neither stand on the front nor beat any.
+    Only errors count: another law is none, and the reference's own elements have none of their mesh.
     """
-    points = {row.name: place_of(row) for row in rows if row.against == "error"}
+    points = {row.name: place_of(row) for row in rows if row.against == ERROR}
     known = {name: place for name, place in points.items() if place is not None}
     return frozenset(
         name
@@ -36,12 +36,15 @@ def place_of(row: Row) -> tuple[float, float] | None:
 
 
 def against_time(rows: Sequence[Row]) -> np.ndarray | None:
-    """Error against time, (H, W, 3) uint8; the rows off the front pale. None without rows."""
+    """Error against time, (H, W, 3) uint8; the rows off the front pale. None without rows.
+
+    What shows its tolerance alone would stand far below all others, and is left out.
+    """
     best = front(rows)
     dots = tuple(
-        Dot(row.name, row.family if row.against == "error" else DIFFERENT, *place, pale=row.name not in best)
+        Dot(row.name, row.family if row.against == ERROR else DIFFERENT, *place, pale=row.name not in best)
         for row in rows
-        if (place := place_of(row)) is not None
+        if (place := place_of(row)) is not None and row.against != TOLERANCE_ALONE
     )
     title = "Error against time: full colour where no other row is both faster and nearer"
     y = "mean distance from the reference at the tumour [mm]"

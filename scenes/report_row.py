@@ -15,6 +15,8 @@ from surrogate.encode import directions
 from .report_reference import reference_of
 from .report_study import Study
 
+# What a distance from the reference is: of the same law, of another, or of the reference's own elements.
+ERROR, DIFFERENCE, TOLERANCE_ALONE = "error", "model difference", "its tolerance alone"
 TENTHS, FEWEST_FOR_P99 = 10, 1000
 
 
@@ -108,7 +110,7 @@ class Row:
     state
         "measured", or a sentence that says why not.
     against
-        What its distance from the reference is: "error", or "model difference" where its law is another.
+        `ERROR`; `DIFFERENCE` where its law is another; `TOLERANCE_ALONE` where its elements are the reference's own.
     reference
         Distances from the reference on the played loads.
     teacher
@@ -140,7 +142,7 @@ class Row:
     name: str
     family: str
     state: str = "measured"
-    against: str = "error"
+    against: str = ERROR
     reference: Figures | None = None
     teacher: Mapping[str, Figures] = field(default_factory=dict)
     flagged: Mapping[str, float] = field(default_factory=dict)
