@@ -209,7 +209,8 @@ class Fem:
 
     def _solve(self, cases: Cases, last: np.ndarray | None, at: np.ndarray | None) -> Deformation:
         clock = time.perf_counter()
-        found = self._ladder.climb(cases, None if last is None else self._moved_on(cases, last))
+        guesses = () if last is None else (moved_on(cases.loads, last, cases.history), last)
+        found = self._ladder.climb(cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
         way = way_of(pushes_of(cases.loads), last, cases.history) if len(cases.loads) <= TAUGHT else {}
         return self._answered(cases, found, way, at, seconds)
@@ -251,13 +252,6 @@ class Fem:
             reached=found.reached,
             inverted=found.inverted,
         )
-
-    def _moved_on(self, cases: Cases, last: np.ndarray) -> np.ndarray:
-        """Starts (3N, B) moved on from the last answers (3N, B), where that turns nothing inside out."""
-        start = moved_on(cases.loads, last, cases.history)
-        if start is last:
-            return last
-        return np.where(self._ladder.inversion.count(self.problem.device.array(start)) > 0, last, start)
 
     def _reaction(self, loads: Loads, on_footprint: np.ndarray | None) -> np.ndarray:
         """(B, tools, 6): force and moment about its point that each tool exerts [N, N m]."""

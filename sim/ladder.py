@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -107,19 +107,19 @@ class Ladder:
         """Bytes that L-BFGS keeps for the next batch to stand in."""
         return self._lbfgs.held
 
-    def climb(self, cases: Cases, guess: np.ndarray | None) -> Answer:
-        """The equilibria of B cases, from guess (3N, B) [m]; from rest without one.
+    def climb(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
+        """The equilibria of B cases, each from the first of its guesses (3N, B) [m] that will do; from rest without.
 
         A start that lies inside out is left alone, and so is a state that does to which a start led: a body turned
         over or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
-        if guess is None:
+        if not guesses:
             answer, astray = self._whole(cases), np.zeros(count, bool)
         else:
+            guess, astray = self._upright(guesses)
             started = guess.any(axis=0)
-            astray = started & (self.inversion.count(device.array(guess)) > 0)
             learnt = NOTHING if astray.any() else learnt_from(cases, problem.rows)
             answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
             lost = np.where(answer.good, answer.inverted > 0, self._lost(answer))
@@ -134,6 +134,16 @@ class Ladder:
         if len(lost):
             answer.put(lost, self._in_steps(cases.rows(lost), answer, lost), device)
         return answer
+
+    def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The first of some guesses (3N, B) [m] of each case that is not inside out; which cases (B,) have none."""
+        device = self.problem.device
+        guess, astray = guesses[0], self.inversion.count(device.array(guesses[0])) > 0
+        for other in guesses[1:]:
+            if astray.any():
+                guess = np.where(astray, other, guess)
+                astray = self.inversion.count(device.array(guess)) > 0
+        return guess, astray
 
     def _lost(self, answer: Answer) -> np.ndarray:
         """Which cases (B,) another rung may save: at round-off none is nearer to equilibrium."""
