@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from sim.anatomy import Anatomy
 from sim.deformation import Cost, Deformation, Outcome
@@ -159,6 +160,7 @@ def taught(
         return machine
 
     envelope = envelope_of(open_patch(anatomy), pushed, only_pushed(held_out))
-    with ThreadPoolExecutor() as pool:
+    # Matrices of 61 rows are no work for several cores: their threads would wait for each other, twelve times as long.
+    with ThreadpoolController().limit(limits=1, user_api="blas"), ThreadPoolExecutor() as pool:
         machines = pool.map(learn, thirteen(*sites_of(anatomy, nodes), pushed), angular.transpose(1, 0, 2))
         return Published(anatomy, nodes, tuple(machines), envelope)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from scenes.cli import main
 from sim.deformation import Deformer, Outcome
@@ -137,12 +138,14 @@ def test_angles_and_back():
 
 @dataclass
 class Spy:
-    """Remembers its rows, and predicts their number."""
+    """Remembers its rows, and predicts their number; tells how many threads its matrix products would take."""
 
     rows: list = field(default_factory=list)
+    threads: set = field(default_factory=set)
 
     def fit(self, X, Y):
         self.rows = X
+        self.threads = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
         return self
 
     def predict(self, X):
@@ -152,14 +155,15 @@ class Spy:
 def test_a_position_left_out_is_never_shown(box, loads, truth, monkeypatch):
     monkeypatch.setitem(published.MACHINES, "published-svr", Spy)
     pushed, seen = loads.of(Pushed), []
-    model = taught_in_turn("published-svr", box, loads, truth, lambda: seen.append(1))
+    with threadpool_limits(2, "blas"):
+        model = taught_in_turn("published-svr", box, loads, truth, lambda: seen.append(1))
     assert 2 <= len(model.positions) <= 11 and len(seen) == len(model.positions) * len(truth[0])
     features = thirteen(*sites_of(box, model.nodes), pushed)
     for site, part in zip(model.positions, model.models, strict=True):
         here = np.linalg.norm(pushed.point - site, axis=1) < 1e-6
         assert here.any() and not here.all()
         for node, machine in enumerate(part.machines):
-            assert np.array_equal(machine.rows, features[node][~here])
+            assert np.array_equal(machine.rows, features[node][~here]) and machine.threads == {1}
         # Each load is answered by the model that was taught without its position, in the order that was asked.
         first = model.deform(loads).displacement[here][:, :, 0]
         assert np.allclose(first, (~here).sum())
