@@ -33,9 +33,9 @@ TOLERANCES = (1e-2, 1e-3, STANDARD, 1e-5, 1e-6)
 Run = Callable[[Study, Spec, Path], Row]
 
 
-def star(study: Study) -> tuple[Elements, ...]:
-    """The data's own finite elements, and others that differ from them in one thing."""
-    meshes = MESHES if study.of_template else {"halved edges": HALVED}
+def star(study: Study, remesh: bool = True) -> tuple[Elements, ...]:
+    """The data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`."""
+    meshes = {} if not remesh else MESHES if study.of_template else {"halved edges": HALVED}
     return (
         Elements("FEM"),
         *(Elements(f"FEM {name}", element=name) for name in ELEMENTS if name != study.element),

@@ -10,9 +10,11 @@ import pytest
 from conftest import make_box
 
 from ar.screen import read_png
+from scenes import report
 from scenes.cli import main
+from scenes.commands import report as command
 from scenes.report import UNBUILT, every, rows, star
-from scenes.report_elements import Elements
+from scenes.report_elements import OWN, Elements
 from scenes.report_learner import Learner, counts
 from scenes.report_page import Section, write_report
 from scenes.report_plots import against_time, front
@@ -209,6 +211,7 @@ def test_plans(study):
     names = [spec.name for spec in star(study)]
     assert names[0] == "FEM" and len(set(names)) == len(names) == 12 and "FEM halved edges" in names
     assert star(study)[0].accuracy == TRAIN and star(study)[-1].law != TISSUE.law
+    assert not any(spec.mesh != OWN for spec in star(study, remesh=False)) and len(star(study, remesh=False)) == 11
     product = every(study)
     assert len({spec.name for spec in product}) == len(product) == 4 * 3 * 2 * (3 + 5)
     assert counts(300) == [64, 128, 256] and counts(64) == []
@@ -233,3 +236,17 @@ def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["report", *words]) == 2
     assert reason in capsys.readouterr().err
+
+
+def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, found, monkeypatch, capsys):
+    """Everything is solved already; the rows are those found."""
+    monkeypatch.setattr(command, "QUICK", (100, study.loads, study.beyond))
+    words = ["report", "--quick", "--data", str(study.data), "--out", str(study.folder), "--device", "cpu"]
+    monkeypatch.setattr(report, "rows", lambda study, specs: iter(found))
+    assert main([*words, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in said["sections"][0]["rows"]] == [row.name for row in found]
+    assert "quadratic tetrahedra (p2) on the same mesh" in (study.folder / "index.html").read_text()
+    monkeypatch.setattr(report, "rows", lambda study, specs: iter([Row("odd", "f", state="no memory")]))
+    assert main(words) == 1
+    assert "no memory" in capsys.readouterr().out

@@ -28,7 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     size = parser.add_mutually_exclusive_group()
     size.add_argument(
-        "--quick", action="store_true", help=f"little data ({QUICK[0]} loads), few loads, a coarse reference"
+        "--quick",
+        action="store_true",
+        help=f"little data ({QUICK[0]} loads), few loads, one mesh, on which the reference is too",
     )
     size.add_argument(
         "--full", action="store_true", help="all laws, elements, meshes, tolerances and precisions with each other"
@@ -71,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     studies = [Study(path, args.out, args.device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
     sections = []
     for study in studies:
-        specs = (*(every(study) if args.full else star(study)), *learners())
+        specs = (*(every(study) if args.full else star(study, not args.quick)), *learners())
         total = len(study.played) + len(study.outside) + len(specs) + len(UNBUILT)
         found = []
         with tqdm(total=total, desc=study.data.stem, unit="step", file=sys.stderr) as bar:
