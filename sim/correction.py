@@ -22,8 +22,9 @@ from .problem import Problem
 from .search import search
 from .term import Cases
 
-# The linear residual that may be left. What is settled before leaves so little that more iterations are not seen.
-FORCING = 0.2
+# The linear residual that may be left, and the most iterations: what is settled before leaves so little that more are
+# not seen.
+FORCING, ITERATIONS = 0.2, 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ def _solved(problem: Problem, ladder: Ladder, u: wp.array, rhs: wp.array, tolera
             definite = definite | found.truncated
         problem.linearise(u, definite)
         ladder.preconditioner.prepare(problem, rhs.shape[1])
-        found = conjugate_gradients(problem, ladder.preconditioner, wp.clone(rhs), tolerance, ladder.accuracy.inner)
+        found = conjugate_gradients(problem, ladder.preconditioner, wp.clone(rhs), tolerance, ITERATIONS)
     return found
 
 

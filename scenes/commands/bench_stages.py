@@ -9,7 +9,7 @@ from dataclasses import asdict
 
 from sim.errors import InputError
 
-from .demo import add_theatre
+from .demo import add_theatre, deformer_name
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--batch {args.batch} solves nothing: give a whole number from 1 up.")
     scene = find_scene(args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    name = args.deformer or theatre.best
+    name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
     found = []
     where = machine(args.device)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sim.files import check_output
 
-from .demo import add_theatre
+from .demo import add_theatre, deformer_name
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
 
     scene = find_scene(args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    name = args.deformer or theatre.best
+    name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
     out = check_output(args.out, ".h5")
     report = collect(

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sim.errors import InputError
+
+if TYPE_CHECKING:
+    from ..scene import Scene
+    from ..theatre import Theatre
 
 
 def add_theatre(parser: argparse.ArgumentParser) -> None:
@@ -14,8 +20,35 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
     )
-    parser.add_argument("--deformer", help="linear, ann, svr, ... or fem (default: the learnt one of least error)")
+    parser.add_argument(
+        "--deformer", help="linear, ann, svr, ... or fem; auto: by budget (default: the learnt one of least error)"
+    )
+    budget = parser.add_argument_group("a budget, in place of a deformer; the error is what each states")
+    budget.add_argument("--within-mm", type=float, metavar="MM", help="the fastest that is off by no more")
+    budget.add_argument("--within-ms", type=float, metavar="MS", help="the most accurate that takes no longer a frame")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+
+
+def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> str:
+    """The deformer that `add_theatre`'s arguments ask for; one that a budget chose is said, and why.
+
+    Raises
+    ------
+    InputError
+        A deformer and a budget, or a budget that none here meets.
+    """
+    budget = args.within_mm, args.within_ms
+    if args.deformer != "auto" and budget == (None, None):
+        return args.deformer or theatre.best
+    if args.deformer not in (None, "auto"):
+        raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
+    from surrogate.choose import choose
+
+    from ..offers import offers
+
+    choice = choose(offers(theatre, scene), *budget)
+    print(f"sulcus {args.command}: {choice.reason}", file=sys.stderr)
+    return choice.offer.name
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"no page on host {args.host}, port {args.port} ({error}): choose others.") from error
     scene = find_scene(args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    name = args.deformer or theatre.best
+    name = deformer_name(args, theatre, scene)
     demo = Demo(theatre, scene, name, args.host, args.port)
     print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
     if not theatre.models:

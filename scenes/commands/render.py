@@ -11,7 +11,7 @@ from ar.screen import Film, read_png, write_film
 from sim.errors import InputError
 from sim.files import check_output
 
-from .demo import add_theatre
+from .demo import add_theatre, deformer_name
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     if args.film is not None and args.film.suffix not in (".mp4", ".gif", ".webp"):
         raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    name = args.deformer or theatre.best
+    name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
     if args.film is not None:
         check_output(args.film, args.film.suffix)

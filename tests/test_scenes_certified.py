@@ -1,0 +1,72 @@
+"""Certificates frame by frame on the command line, and deformers that a budget chose."""
+
+import json
+
+import pytest
+from theatres import put, theatre_of
+
+from scenes.cli import main
+from scenes.offers import offers
+from scenes.scene import find_scene
+from surrogate.certify import SCOPE
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module")
+def anatomy(theatre, tmp_path_factory):
+    return str(put(theatre, tmp_path_factory.mktemp("certified") / "box.vtu"))
+
+
+def check(anatomy, *words):
+    return main(["check", "press", "--anatomy", anatomy, "--every", "40", "--device", "cpu", *words])
+
+
+def test_every_frame_has_its_certificate(anatomy, capsys):
+    check(anatomy, "--deformer", "linear", "--certify", "--json")
+    out, error = capsys.readouterr()
+    (row,) = json.loads(out)["scenes"]
+    assert len(row["certificates"]) == row["frames"] > 2
+    loaded = [frame for frame in row["certificates"] if frame["error_mm"] > 1e-3]
+    assert len(loaded) >= 2 and all(frame["sound"] for frame in row["certificates"])
+    for frame in loaded:
+        assert 0.8 < frame["estimate_mm"] / frame["error_mm"] < 1.25
+        assert frame["corrected_mm"] < 0.2 * frame["error_mm"]
+        assert min(frame["predict_ms"], frame["estimate_ms"], frame["correct_ms"]) > 0.0
+    assert f"frame {loaded[0]['frame']}: {loaded[0]['estimate_mm']:.4f} mm off by estimate" in error and SCOPE in error
+
+
+def test_without_certify_nothing_is_certified(anatomy, capsys):
+    check(anatomy, "--deformer", "linear", "--json")
+    out, error = capsys.readouterr()
+    assert "certificates" not in out and SCOPE not in error
+
+
+def test_a_budget_chooses_the_deformer_and_says_which(theatre, anatomy, capsys):
+    stated = {offer.name: offer for offer in offers(theatre, find_scene("press"))}
+    assert set(stated) == set(theatre.names) and all(offer.median_ms > 0.0 for offer in stated.values())
+    learnt = [offer for offer in stated.values() if offer.name != "fem"]
+    assert stated["linear"].error_mm == pytest.approx(1e3 * theatre.models["linear"].bound)
+    assert stated["fem"].error_mm < min(offer.error_mm for offer in learnt)
+    within = 1.01 * stated["fem"].error_mm
+    for words in (["--within-mm", f"{within:g}"], ["--deformer", "auto", "--within-mm", f"{within:g}"]):
+        check(anatomy, *words, "--json")
+        out, error = capsys.readouterr()
+        assert json.loads(out)["deformer"] == "fem" and "fem (0.05 mm" in error and "fastest of 1" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--deformer", "linear", "--within-mm", "0.1"], "--deformer linear leaves a budget nothing to choose"),
+        (["--deformer", "auto"], "give --within-mm, --within-ms or both"),
+        (["--within-mm", "1e-6"], "most accurate is fem"),
+        (["--within-ms", "nan"], "positive"),
+    ],
+)
+def test_budgets_that_buy_nothing_are_sentences(anatomy, capsys, words, reason):
+    assert check(anatomy, *words) == 2
+    assert reason in capsys.readouterr().err
