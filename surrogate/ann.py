@@ -30,9 +30,8 @@ def one_thread() -> Iterator[None]:
 class Ann:
     """Two hidden layers of tanh units, fitted by L-BFGS with weight decay.
 
-    The published network (Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47) has four units per tumour node under
-    Levenberg-Marquardt with Bayesian regularisation, which torch lacks. One network for all nodes, a quasi-Newton
-    method on the whole set and a fixed weight decay stand for it.
+    One network for all vertices, where the published one (`bayesian.py`) has four units for each output of each vertex;
+    a quasi-Newton method on the whole set, and a fixed weight decay.
 
     Parameters
     ----------

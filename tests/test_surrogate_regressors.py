@@ -160,6 +160,13 @@ def test_the_process_knows_how_wrong_it_is():
     assert np.array_equal(twice.fit(x[:150], y[:150]).deviation(x), model.deviation(x))
 
 
+def test_a_subset_stands_for_too_many_rows():
+    X, Y = rows(300, 0)
+    few = Gp(rows=40, most=120).fit(X, Y)
+    assert len({*map(tuple, few.seen_)}) == 120
+    assert np.abs(few.predict(X) - Y)[:, 0].max() < 0.2 * Y[:, 0].std()
+
+
 def test_outputs_that_do_not_vary_are_told_exactly():
     X, _ = rows(30, 0)
     assert np.allclose(Gp().fit(X, np.full((30, 2), 3.0)).predict(X + 1.0), 3.0)
