@@ -27,6 +27,7 @@ from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
 from sim.loads import Pushed
 from sim.material import Material, tissue_to_json
+from sim.meshfile import write_anatomy
 from surrogate.dataset import read_dataset
 from surrogate.envelope import envelope_of
 from surrogate.published import published_nodes
@@ -250,3 +251,23 @@ def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, found
     monkeypatch.setattr(report, "rows", lambda study, specs: iter([Row("odd", "f", state="no memory")]))
     assert main(words) == 1
     assert "no memory" in capsys.readouterr().out
+
+    def stopped(study, specs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "rows", stopped)
+    assert main(words) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+
+
+def test_a_command_without_data_makes_its_own(box, tmp_path, monkeypatch, capsys):
+    """Neo-Hookean, smoothed; what it says goes elsewhere than the line for machines."""
+    monkeypatch.setattr(command, "QUICK", (30, 1, 3))
+    monkeypatch.setattr(report, "rows", lambda study, specs: iter([]))
+    write_anatomy(tmp_path / "box.vtu", box)
+    words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device", "cpu"]
+    assert main([*words, "--json"]) == 0
+    (section,) = json.loads(capsys.readouterr().out)["sections"]
+    assert "30 palpation loads" in section["about"][0] and section["minutes"] > 0.0
+    data = read_dataset(tmp_path / "palpation.h5")
+    assert data.provenance["element"] == "smoothed" and "neo-hookean" in data.provenance["tissue"]

@@ -7,6 +7,7 @@ import json
 import sys
 import time as clock
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 # Loads of the data that is made where none is given; loads held against the reference; loads beyond the taught ones.
 QUICK, WHOLE = (320, 8, 24), (3000, 64, 120)
+INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,6 +50,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a row could not be measured."""
+    try:
+        sections = _measured(args)
+    except KeyboardInterrupt:
+        print(f"stopped; the same command goes on from {args.out}", file=sys.stderr)
+        return INTERRUPTED
+    _say(args, sections)
+    return 0 if all(row.state in ("measured", "not built yet") for part in sections for row in part.rows) else 1
+
+
+def _measured(args: argparse.Namespace) -> list[Section]:
+    """The rows of each data set; the page is written anew after each."""
     from sim.device import find_device
 
     from ..bench import machine
@@ -84,8 +97,7 @@ def run(args: argparse.Namespace) -> int:
                 bar.update()
         sections.append(Section(study.data.stem, _about(study), tuple(found), minutes.get(study.data)))
         write_report(args.out, machine(args.device), sections)
-    _say(args, sections)
-    return 0 if all(row.state in ("measured", "not built yet") for part in sections for row in part.rows) else 1
+    return sections
 
 
 def _simulated(path: Path, args: argparse.Namespace, count: int) -> float | None:
@@ -99,8 +111,9 @@ def _simulated(path: Path, args: argparse.Namespace, count: int) -> float | None
     words = ["--out", str(path), "--count", str(count), "--material", "neo-hookean", "--element", "smoothed"]
     begun = clock.perf_counter()
     asked = parser.parse_args([*([args.anatomy] if args.anatomy else []), *words, "--device", args.device])
-    if simulate.run(asked) != 0:
-        raise InputError(f"{path}: was not finished: give the same command again and it goes on.")
+    with redirect_stdout(sys.stderr):
+        if simulate.run(asked) != 0:
+            raise KeyboardInterrupt
     if whole:
         with written_whole(kept, ".json") as partial:
             partial.write_text(json.dumps({"minutes": (clock.perf_counter() - begun) / 60.0}))
