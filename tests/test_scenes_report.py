@@ -10,7 +10,7 @@ import pytest
 from conftest import make_box
 
 from ar.screen import read_png
-from scenes import report
+from scenes import report, report_reference
 from scenes.cli import main
 from scenes.commands import report as command
 from scenes.report import UNBUILT, every, rows, star
@@ -170,6 +170,17 @@ def test_a_reference_goes_on_load_by_load(study, monkeypatch):
 
 
 deform = Fem.deform
+
+
+def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path, monkeypatch):
+    """On a coarse box halving every edge changes the motion by some percent, not by half."""
+    monkeypatch.setattr(report_reference, "REFERENCE", TRAIN)
+    one, fine = (replace(study, folder=tmp_path, loads=1, fine=fine) for fine in (False, True))
+    for each in (one, fine):
+        solve_reference(each, nothing)
+    coarse, finer = reference_of(one).displacement, reference_of(fine).displacement
+    off = np.linalg.norm(coarse - finer, axis=2).mean() / np.linalg.norm(finer, axis=2).mean()
+    assert 1e-3 < off < 0.3
 
 
 def test_the_front_is_what_nobody_beats():
