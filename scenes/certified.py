@@ -43,11 +43,11 @@ class Certified:
     sound: bool
 
     def __str__(self) -> str:
-        doubt = "" if self.sound else "; not certain: too much is left after two steps"
+        doubt = "" if self.sound else "; not certain, for too much is left after two steps"
         return (
-            f"frame {self.frame}: {self.estimate_mm:.4f} mm off by estimate (is {self.error_mm:.4f}), corrected to "
-            f"{self.left_mm:.4f} mm (is {self.corrected_mm:.4f}); predicted in {self.predict_ms:.1f} ms, estimated in "
-            f"{self.estimate_ms:.0f}, corrected in {self.correct_ms:.0f} more{doubt}"
+            f"frame {self.frame}: off by {self.estimate_mm:.4f} mm as estimated ({self.error_mm:.4f} if solved to the "
+            f"end), by {self.left_mm:.4f} ({self.corrected_mm:.4f}) when corrected; {self.predict_ms:.1f} ms to "
+            f"predict, {self.estimate_ms:.0f} to estimate, {self.correct_ms:.0f} to correct{doubt}"
         )
 
 

@@ -48,11 +48,9 @@ def choose(offers: Sequence[Offer], within_mm: float | None = None, within_ms: f
     both = [offer for offer in exact if offer in fast]
     asked = " and ".join(bounds)
     if not both:
-        near = [
-            f"the {word} is {min(some, key=key)}"
-            for word, some, key in (("most accurate", fast or offers, _error), ("fastest", exact or offers, _time))
-        ]
-        raise InputError(f"no deformer here is within {asked}: {'; '.join(dict.fromkeys(near))}. Allow more.")
+        near = [f"the most accurate is {min(fast or offers, key=_error)}"] if within_mm is not None else []
+        near += [f"the fastest is {min(exact or offers, key=_time)}"] if within_ms is not None else []
+        raise InputError(f"no deformer here is within {asked}: {'; '.join(near)}. Allow more.")
     taken, word = (min(both, key=_error), "most accurate") if within_mm is None else (min(both, key=_time), "fastest")
     return Choice(taken, f"{taken} is the {word} of {len(both)} deformers within {asked}, of {len(offers)} here")
 
