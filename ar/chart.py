@@ -126,11 +126,15 @@ def _column_of_keys(panel: Panel, places: Sequence[tuple[int, int]]) -> int:
 def _scatter(
     canvas: np.ndarray, dots: Sequence[Dot], places: Sequence[tuple[int, int]], corner: tuple[int, int]
 ) -> None:
-    """Dots and their names, each where it covers least; the groups above the lower left corner of the axes."""
+    """Dots and their names, each where it covers least; the groups above the lower left corner of the axes.
+
+    A pale dot without room for its name has none.
+    """
     groups = {group: COLOURS[number % len(COLOURS)] for number, group in enumerate({dot.group: 0 for dot in dots})}
     taken = [_around(place, (-DOT, -DOT), (2 * DOT, 2 * DOT)) for place in places]
     height, width = canvas.shape[:2]
-    taken += [(-width, 0, LEFT * FINER, height), (width - RIGHT * FINER, 0, 2 * width, height)]  # beyond the axes
+    beyond = (-width, 0, LEFT * FINER, height), (width - RIGHT * FINER, 0, 2 * width, height)
+    taken += [*beyond, (0, 0, width, TOP * FINER), (0, height - BOTTOM * FINER, width, height)]
     for number, (group, colour) in enumerate(reversed(groups.items())):
         key = corner[0] + 16 * FINER, corner[1] - (16 + 20 * number) * FINER
         cv2.circle(canvas, key, DOT, colour, -1, cv2.LINE_AA)
@@ -145,7 +149,10 @@ def _scatter(
     for number in reversed(order):
         size, _ = cv2.getTextSize(dots[number].name, FONT, FINER * SMALL, FINER)
         boxes = [_beside(places[number], side, size) for side in SIDES]
-        box = min(boxes, key=lambda box: sum(_common(box, other) for other in taken))
+        covered = [sum(_common(box, other) for other in taken) for box in boxes]
+        box = boxes[int(np.argmin(covered))]
+        if min(covered) and dots[number].pale:
+            continue
         taken.append(box)
         ink = FAINT if dots[number].pale else INK
         cv2.putText(canvas, dots[number].name, (box[0], box[3]), FONT, FINER * SMALL, ink, FINER, cv2.LINE_AA)

@@ -63,6 +63,20 @@ def test_names_of_dots_near_each_other_do_not_cover_each_other():
     assert dark("horse", "tiger") - bare > 0.95 * (dark("horse", "") - bare + dark("", "tiger") - bare)
 
 
+def test_a_pale_dot_without_room_has_no_name():
+    """Where 60 dots crowd; the one in full colour is named all the same."""
+
+    def picture(pale, full, crowd=60):
+        pales = [Dot(pale, "g", 10.0 + 0.01 * k, 1.0 + 0.01 * k, pale=True) for k in range(crowd)]
+        return drawn([Panel("t", "x", "y", dots=(*pales, Dot(full, "g", 10.3, 1.3)))])
+
+    def changed(one, other):
+        return (one != other).any(axis=-1).sum()
+
+    assert changed(picture("horse", ""), picture("", "")) < 20 * changed(picture("horse", "", 1), picture("", "", 1))
+    assert changed(picture("horse", "tiger"), picture("horse", ""))
+
+
 def test_a_panel_has_its_size():
     panels = [Panel("t", "x", "y", dots=(Dot("one", "g", 1.0, 2.0),), size=(300 + 100 * k, 360)) for k in range(2)]
     assert drawn(panels).shape == (360, 700, 3)
