@@ -14,9 +14,10 @@ from typing import Any
 from ar.screen import write_png
 from sim.files import written_whole
 
-from .report_plots import against_solves, against_time, front
+from .report_plots import against_solves, against_time, front, learners_against_time
 from .report_row import Figures, Row
 
+PLOTS = {"time": against_time, "learners": learners_against_time, "solves": against_solves}
 SETS = {
     "discs": "whole discs of cortex left out",
     "sectors": "whole sectors of direction left out",
@@ -59,7 +60,8 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
     bodies = []
     for section in sections:
         plots = []
-        for kind, picture in (("time", against_time(section.rows)), ("solves", against_solves(section.rows))):
+        for kind, plot in PLOTS.items():
+            picture = plot(section.rows)
             if picture is not None:
                 write_png(folder / f"{section.name}-{kind}.png", picture)
                 plots.append(folder / f"{section.name}-{kind}.png")

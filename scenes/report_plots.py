@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from ar.chart import Curve, Dot, Panel, drawn
 
-from .report_row import ERROR, TOLERANCE_ALONE, Row
+from .report_row import ERROR, TOLERANCE_ALONE, Figures, Row
 
 SIZE = (880, 560)
 DIFFERENT = "another law: model difference"
+TIME = "milliseconds a load, one at a time"
+Place = tuple[float, float]
 
 
 def front(rows: Sequence[Row]) -> frozenset[str]:
@@ -19,20 +21,7 @@ def front(rows: Sequence[Row]) -> frozenset[str]:
 
     Only errors count: another law is none, and the reference's own elements have none of their mesh.
     """
-    points = {row.name: place_of(row) for row in rows if row.against == ERROR}
-    known = {name: place for name, place in points.items() if place is not None}
-    return frozenset(
-        name
-        for name, (time, error) in known.items()
-        if not any(t <= time and e <= error and (t, e) != (time, error) for t, e in known.values())
-    )
-
-
-def place_of(row: Row) -> tuple[float, float] | None:
-    """Milliseconds a load and mean distance from the reference [mm]; None where one is lacking or zero."""
-    if row.median is None or row.reference is None or row.reference.mm.mean <= 0.0:
-        return None
-    return row.median, row.reference.mm.mean
+    return _unbeaten(_places((row, row.reference) for row in rows if row.against == ERROR))
 
 
 def against_time(rows: Sequence[Row]) -> np.ndarray | None:
@@ -40,15 +29,18 @@ def against_time(rows: Sequence[Row]) -> np.ndarray | None:
 
     What shows its tolerance alone would stand far below all others, and is left out.
     """
-    best = front(rows)
-    dots = tuple(
-        Dot(row.name, row.family if row.against == ERROR else DIFFERENT, *place, pale=row.name not in best)
-        for row in rows
-        if (place := place_of(row)) is not None and row.against != TOLERANCE_ALONE
-    )
+    places = _places((row, row.reference) for row in rows if row.against != TOLERANCE_ALONE)
+    group = {row.name: row.family if row.against == ERROR else DIFFERENT for row in rows}
     title = "Error against time: full colour where no other row is both faster and nearer"
-    y = "mean distance from the reference at the tumour [mm]"
-    return drawn([Panel(title, "milliseconds a load, one at a time", y, dots=dots, size=SIZE)]) if dots else None
+    return _scatter(title, "mean distance from the reference at the tumour [mm]", places, group, front(rows))
+
+
+def learners_against_time(rows: Sequence[Row]) -> np.ndarray | None:
+    """What learning lost against time, (H, W, 3) uint8. None without learners."""
+    places = _places((row, row.teacher.get("discs")) for row in rows)
+    title = "What learning lost, against time: distance from the teacher on left-out discs"
+    group = {row.name: row.family for row in rows}
+    return _scatter(title, "mean distance from the teacher at the tumour [mm]", places, group, _unbeaten(places))
 
 
 def against_solves(rows: Sequence[Row]) -> np.ndarray | None:
@@ -58,3 +50,27 @@ def against_solves(rows: Sequence[Row]) -> np.ndarray | None:
     )
     y = "mean distance from the teacher on left-out discs [mm]"
     return drawn([Panel("Error against solves", "loads taught", y, curves, size=SIZE)]) if curves else None
+
+
+def _places(found: Iterable[tuple[Row, Figures | None]]) -> dict[str, Place]:
+    """Milliseconds a load and mean distance [mm] by name, where both are there and can stand on logarithmic axes."""
+    return {
+        row.name: (row.median, figures.mm.mean)
+        for row, figures in found
+        if row.median is not None and figures is not None and figures.mm.mean > 0.0
+    }
+
+
+def _unbeaten(places: Mapping[str, Place]) -> frozenset[str]:
+    return frozenset(
+        name
+        for name, (time, error) in places.items()
+        if not any(t <= time and e <= error and (t, e) != (time, error) for t, e in places.values())
+    )
+
+
+def _scatter(
+    title: str, y: str, places: Mapping[str, Place], group: Mapping[str, str], best: frozenset[str]
+) -> np.ndarray | None:
+    dots = tuple(Dot(name, group[name], *place, pale=name not in best) for name, place in places.items())
+    return drawn([Panel(title, TIME, y, dots=dots, size=SIZE)]) if dots else None

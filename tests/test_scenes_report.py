@@ -201,7 +201,7 @@ def test_the_page_needs_nothing_but_itself(page, found):
     text = (page / "index.html").read_text()
     assert not re.search(r"https?:|<script|<link|@import|url\(", text)
     sources = re.findall(r'src="([^"]{0,30})', text)
-    assert len(sources) == 2 + 3 and all(source.startswith("data:image/png;base64,") for source in sources)
+    assert len(sources) == 3 + 3 and all(source.startswith("data:image/png;base64,") for source in sources)
     for words in ("not built yet", "not measured", "model difference", "About &lt;this&gt;.", *UNBUILT):
         assert words in text
     assert text.index("<img") < text.index("<table"), "error against time comes first"
