@@ -24,7 +24,7 @@ from .term import Cases
 
 # The linear residual that may be left, and the most iterations: what is settled before leaves so little that more are
 # not seen.
-FORCING, ITERATIONS = 0.2, 30
+FORCING, ITERATIONS = 0.2, 12
 
 
 @dataclass(frozen=True, eq=False)

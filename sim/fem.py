@@ -169,11 +169,13 @@ class Fem:
         self.problem.begin(Cases(loads, answer.time, answer.history))
         return shortfall(self.problem, self.problem.device.array(self._guess(loads, answer)))
 
-    def corrected(self, loads: Loads, answer: Deformation) -> tuple[Deformation, np.ndarray, np.ndarray]:
+    def corrected(
+        self, loads: Loads, answer: Deformation, at: np.ndarray
+    ) -> tuple[Deformation, np.ndarray, np.ndarray]:
         """One step towards equilibrium from somebody's answers at every vertex, as `correction.step_from`.
 
-        The answers after it; the relative residual (B,) before it; and what is still missing (B, V, 3) [m], as the rest
-        stiffness has it.
+        The answers after it, at every vertex; the relative residual (B,) before it; and what is still missing
+        (B, n, 3) [m] at vertices `at` (n,), as the rest stiffness has it.
 
         Raises
         ------
@@ -181,12 +183,14 @@ class Fem:
             As `deform`.
         """
         check_causes(self.effects, loads)
+        self._check_vertices(at)
+        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
         guess, cases = self._guess(loads, answer), Cases(loads, answer.time, answer.history)
-        vertices, parts = np.arange(len(self._anatomy.mesh.nodes)), []
+        parts = []
         for first in range(0, max(len(loads), 1), self.batch):
             rows = slice(first, first + self.batch)
             step = step_from(self._ladder, cases.rows(rows), guess[:, rows])
-            left = unstacked(self.problem.device, step.left, vertices)
+            left = unstacked(self.problem.device, step.left, at)
             parts.append((self._answered(cases.rows(rows), step.answer, {}, None, step.seconds), step.before, left))
         answers, before, left = zip(*parts, strict=True)
         return _joined(list(answers)), np.concatenate(before), np.concatenate(left)

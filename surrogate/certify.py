@@ -79,15 +79,16 @@ def certify(fem: Fem, loads: Loads, prediction: Deformation) -> Certificate:
     every = len(prediction.nodes) == len(mesh.nodes)
     start = prediction if every else guess(np.zeros((len(loads), *mesh.nodes.shape)))
     predicted = prediction.at(tumour).displacement
-    corrected, before, missing = fem.corrected(loads, start)
-    left, seconds = _largest(missing[:, tumour]), dict(corrected.cost.seconds)
+    corrected, before, missing = fem.corrected(loads, start, tumour)
+    left, seconds = _largest(missing), dict(corrected.cost.seconds)
     for _ in range(STEPS - 1):
         estimate = _largest(corrected.displacement[:, tumour] - predicted)
         again = np.flatnonzero(~_sound(corrected, left, estimate))
         if not len(again):
             break
-        further, _, missing = fem.corrected(loads.rows(again), corrected.rows(again))
-        corrected, left[again] = _put(corrected, again, further), _largest(missing[:, tumour])
+        further, _, missing = fem.corrected(loads.rows(again), corrected.rows(again), tumour)
+        lower = np.flatnonzero(further.residual < corrected.residual[again])
+        corrected, left[again[lower]] = _put(corrected, again[lower], further.rows(lower)), _largest(missing[lower])
         seconds = {stage: spent + further.cost.seconds[stage] for stage, spent in seconds.items()}
     correction = corrected.displacement[:, prediction.nodes] - prediction.displacement
     cost = Cost({**seconds, "rest": time.perf_counter() - begun - sum(seconds.values())})
