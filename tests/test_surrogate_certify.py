@@ -77,6 +77,18 @@ def test_what_is_corrected_is_nearer_to_equilibrium_and_what_is_left_is_told(fem
     assert all(outcome in (Outcome.CONVERGED, Outcome.BUDGET) for outcome in found.corrected.outcome)
 
 
+def test_loads_that_two_steps_do_not_settle_are_not_sound(fem, loads, box):
+    """Six times as much force as palpation has creases the surface."""
+    hard = loads.rows(np.arange(12)).scaled(6.0)
+    known = fem.deform(hard).at(box.tumour_nodes)
+    error = 0.02 * np.linalg.norm(known.displacement, axis=2).max(axis=1)
+    found = certify(fem, hard, replace(known, displacement=1.02 * known.displacement, history={}))
+    effectivity = found.estimate / error
+    assert 4 < found.sound.sum() < 12 and (found.corrected.iterations == 2).any()
+    assert (abs(effectivity - 1.0) < 0.2)[found.sound].all() and effectivity[~found.sound].max() > 2.0
+    assert (found.after < found.before).all()
+
+
 def test_one_load_alone_says_the_same_as_in_a_batch(box, loads, predicted, fem):
     alone, row = Fem(box, EFFECTS, FINE, "cpu", live=True), np.array([4])
     together = certify(fem, loads, predicted)
