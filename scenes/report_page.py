@@ -38,9 +38,9 @@ NOTES = (
     "reference's own elements, less exactly solved, show their tolerance alone and are not drawn.",
     "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
     "of those vertices. A row in bold, or full colour, is one that no other equals or beats in time and mean error.",
-    "Time: one load at a time, from rest, median; p99 where at least 1,000 were timed. Set-up, compiling and warm-up "
-    "are not in it. Memory: the largest resident size of the process that made and played the row alone; card: what "
-    "it took of the graphics card.",
+    "Time: one load at a time, from rest, learners on one core; median, and p99 where at least 1,000 were timed. "
+    "Set-up, compiling and warm-up are not in it. Memory: the largest resident size of the process that made and "
+    "played the row alone; card: what it took of the graphics card.",
     "Adapting: until the row answers within its stated error again after the tumour is debulked by a fifth.",
 )
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
 from sim.errors import InputError
 
 from .growth import watched_card
@@ -21,7 +24,7 @@ def measured(study: Study, spec: Spec, picture: Path) -> Row:
     """The row of a deformer, and the picture of its worst case; what cannot be had says why in `Row.state`."""
     try:
         with watched_card(study.device) as card:
-            row, field = measure_elements(study, spec) if isinstance(spec, Elements) else measure_learner(study, spec)
+            row, field = measure_elements(study, spec) if isinstance(spec, Elements) else _on_one_core(study, spec)
     except InputError as error:
         return Row(spec.name, FAMILY[type(spec)], state=str(error))
     row = replace(row, memory=peak_memory(), card=max(card) / 2**30 or None)
@@ -35,6 +38,12 @@ def measured(study: Study, spec: Spec, picture: Path) -> Row:
     picture.parent.mkdir(parents=True, exist_ok=True)
     write_png(picture, worst_picture(study, field))
     return replace(row, picture=picture.name)
+
+
+def _on_one_core(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
+    """Products this small take longer on several, and say less."""
+    with ThreadpoolController().limit(limits=1, user_api="blas"):
+        return measure_learner(study, spec)
 
 
 def peak_memory() -> float | None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..report_study import Study
 
 # Loads of the data that is made where none is given; loads held against the reference; loads beyond the taught ones.
-QUICK, WHOLE = (320, 8, 24), (3000, 64, 120)
+QUICK, WHOLE = (256, 8, 24), (3000, 64, 120)
 INTERRUPTED = 130
 
 
@@ -143,10 +143,11 @@ def _say(args: argparse.Namespace, sections: Sequence[Section]) -> None:
         return
     for section in sections:
         print(f"{section.name}: mean and largest distance from the reference [mm], ms a load")
+        width = max((len(row.name) for row in section.rows), default=0)
         for row in section.rows:
             if row.reference is None or row.median is None:
-                print(f"  {row.name:<18} {row.state}")
+                print(f"  {row.name:<{width}} {row.state}")
                 continue
             mm = row.reference.mm
-            print(f"  {row.name:<18} {mm.mean:8.4f} {mm.largest:8.4f} {row.median:10.3g}  {row.against}")
+            print(f"  {row.name:<{width}} {mm.mean:8.4f} {mm.largest:8.4f} {row.median:10.3g}  {row.against}")
     print(f"written: {page}")
