@@ -14,7 +14,17 @@ FINER = 3
 WIDTH, HEIGHT = 640, 480
 LEFT, RIGHT, TOP, BOTTOM = 78, 20, 62, 62
 INK, FAINT, GRID, PAPER = (40, 40, 40), (120, 120, 120), (228, 228, 228), (255, 255, 255)
-COLOURS = ((31, 119, 180), (214, 96, 37), (44, 140, 72), (140, 86, 170), (150, 120, 40), (0, 150, 160), (200, 60, 110))
+COLOURS = (
+    (31, 119, 180),
+    (214, 96, 37),
+    (44, 140, 72),
+    (140, 86, 170),
+    (150, 120, 40),
+    (0, 150, 160),
+    (200, 60, 110),
+    (110, 110, 110),
+    (90, 170, 220),
+)
 """Red, green, blue of the curves, in turn."""
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 # How wide the names of curves are taken to be [pixel].
