@@ -34,13 +34,14 @@ def add_tissue_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bulk", type=float, metavar="K", help="bulk modulus of --material ogden [Pa]")
 
 
-def add_element_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare --element."""
+def add_element_argument(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """Declare --element; without a default, the mesh decides."""
+    meant = default or "p1, or p2 where the mesh brings mid-edge nodes of its own"
     parser.add_argument(
         "--element",
         choices=ELEMENTS,
-        help="; ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
-        + " (default p1, or p2 where the mesh brings mid-edge nodes of its own)",
+        default=default,
+        help="; ".join(f"{name}, {text}" for name, text in ELEMENTS.items()) + f" (default {meant})",
     )
 
 

@@ -80,6 +80,9 @@ class Deformation:
         merely the last accepted state. NaN from a deformer that does not know.
     inverted
         (B,) whole numbers: tetrahedra that lie inside out, or collapsed; -1 from a deformer that does not know.
+    bound
+        (2, B) [m]: with probability 0.95, and 0.99, no tumour vertex is farther off what the deformer was taught; NaN
+        from one that promises nothing.
     """
 
     displacement: np.ndarray
@@ -93,11 +96,14 @@ class Deformation:
     cost: Cost = Cost()
     reached: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     inverted: np.ndarray = field(default_factory=lambda: np.array(-1))
+    bound: np.ndarray = field(default_factory=lambda: np.array(np.nan))
 
     def __post_init__(self) -> None:
         for name in ("reached", "inverted"):
             if getattr(self, name).shape != (len(self),):
                 object.__setattr__(self, name, np.broadcast_to(getattr(self, name), len(self)))
+        if self.bound.shape != (2, len(self)):
+            object.__setattr__(self, "bound", np.broadcast_to(self.bound, (2, len(self))))
         if not np.isfinite(self.displacement).all():
             raise AssertionError("a deformer let a displacement pass that is not finite: a defect of the deformer")
 
@@ -116,6 +122,7 @@ class Deformation:
             reaction=self.reaction[index],
             reached=self.reached[index],
             inverted=self.inverted[index],
+            bound=self.bound[:, index],
             history={name: value[index] for name, value in self.history.items()},
         )
 

@@ -12,7 +12,7 @@ import warp as wp
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
-from .columns import unstacked
+from .columns import norms, unstacked
 from .compile import check_causes, compile_problem
 from .correction import step_from
 from .deformation import Cost, Deformation
@@ -28,16 +28,20 @@ from .heading import moved_on, pushes_of, way_of
 from .inversion import Inversion
 from .ladder import FEWEST, LEARNT_KEY, Answer, Ladder, shortfall
 from .lbfgs import TAUGHT
-from .loads import MAGNITUDE, Displaced, Loads, Pushed
+from .linear import Preconditioner, conjugate_gradients
+from .loads import MAGNITUDE, Displaced, Loads, Nodal, Pushed
 from .memory import check_fits, fitting_batch
 from .patching import patching
-from .precondition import choose_preconditioner, is_exact, name_of
+from .precondition import choose_preconditioner, is_exact, name_of, rest_solver
 from .problem import Problem
+from .series import taylor
 from .term import Cases
 from .vicinity import vicinity_of
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"
+# Relative residual of a series' linear solves.
+SERIES_TOLERANCE = 1e-9
 
 
 class Fem:
@@ -194,6 +198,53 @@ class Fem:
             parts.append((self._answered(cases.rows(rows), step.answer, {}, None, step.seconds), step.before, left))
         answers, before, left = zip(*parts, strict=True)
         return _joined(list(answers)), np.concatenate(before), np.concatenate(left)
+
+    def series(self, loads: Loads, orders: int, at: np.ndarray) -> np.ndarray:
+        """Power series (orders, B, n, 3) [m] of the answers at vertices `at` (n,) in the size of the loads.
+
+        Under s times the loads, u(s) = s u_1 + s^2 u_2 + ..., as `series.taylor` has it, as far as it converges.
+
+        Raises
+        ------
+        InputError
+            As `deform`; loads that prescribe motion, which no force is in proportion to; a solver in float32, whose
+            round-off would be taken for the higher orders.
+        """
+        check_causes(self.effects, loads)
+        self._check_vertices(at)
+        if self.problem.device.precision != "float64":
+            raise InputError("a series of differences needs float64: ask for an Accuracy of that precision.")
+        for cause in loads.causes:
+            if not isinstance(cause, Pushed | Nodal):
+                raise InputError(f"{type(cause).__name__} is no force: a series is had of `Pushed` and `Nodal` loads.")
+        edge = float(np.cbrt(self._anatomy.mesh.volumes.mean() * 6.0))
+        parts = []
+        for first in range(0, len(loads), self.batch):
+            cases = Cases(
+                loads.rows(slice(first, first + self.batch)), np.zeros(len(loads))[first : first + self.batch]
+            )
+            self.problem.begin(cases)
+            found = taylor(self.problem, self._at_rest, len(cases.loads), edge, orders)
+            parts.append(np.stack([unstacked(self.problem.device, term, at) for term in found]))
+        return np.concatenate(parts, axis=1)
+
+    @cached_property
+    def _exact(self) -> Preconditioner | None:
+        """The inverse of the rest stiffness in the solver's own precision, where there is one in any."""
+        return rest_solver(self.problem) if is_exact(self._ladder.preconditioner) else None
+
+    def _at_rest(self, force: wp.array) -> wp.array:
+        """Motions (3N, b) [m] that the stiffness at rest answers forces (3N, b) [N] with; the forces are lost."""
+        problem, columns = self.problem, force.shape[1]
+        if self._exact is not None:
+            out = problem.device.zeros(*force.shape)
+            self._exact.apply(force, np.ones(columns, bool), out)
+            problem.constraint.project(out)
+            return out
+        problem.linearise(problem.device.zeros(*force.shape), np.zeros(columns, bool))
+        self._ladder.preconditioner.prepare(problem, columns)
+        wanted = SERIES_TOLERANCE * norms(problem.device, force)
+        return conjugate_gradients(problem, self._ladder.preconditioner, force, wanted, self.accuracy.inner).x
 
     def _guess(self, loads: Loads, start: Deformation) -> np.ndarray:
         """First guesses (3N, B). A case without any load starts at rest: its answer is exactly zero."""

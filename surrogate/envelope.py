@@ -47,22 +47,33 @@ class Envelope:
 
     def holds(self, patch: Patch, pushed: Pushed) -> np.ndarray:
         """(B,) bool: whether each load lies inside."""
-        magnitude, angle, overhang = _measures(patch, pushed)
-        return (
-            (nearest(pushed.point, self.points)[1] <= self.reach + SLACK)
-            & (overhang <= self.overhang + SLACK)
-            & ((angle <= self.angle + SLACK) | (magnitude == 0.0))
-            & (magnitude <= self.force[1] * (1.0 + SLACK))
-            & (magnitude <= self.line_force * pushed.footprint * (1.0 + SLACK))
-            & (pushed.footprint >= self.footprint[0] * (1.0 - SLACK))
-            & (pushed.footprint <= self.footprint[1] * (1.0 + SLACK))
+        return self.excess(patch, pushed) == 0.0
+
+    def excess(self, patch: Patch, pushed: Pushed) -> np.ndarray:
+        """How far outside each load lies (B,), in shares of what was taught; zero inside.
+
+        The largest of: millimetres beyond the reach or over the rim, radians beyond the angle, and the shares by which
+        force, radius and force over radius are too large or too small.
+        """
+        magnitude, angle, overhang = measures(patch, pushed)
+        beyond = np.stack(
+            [
+                1e3 * (nearest(pushed.point, self.points)[1] - self.reach - SLACK),
+                1e3 * (overhang - self.overhang - SLACK),
+                np.where(magnitude == 0.0, 0.0, angle - self.angle - SLACK),
+                magnitude / self.force[1] - 1.0 - SLACK,
+                magnitude / (self.line_force * pushed.footprint) - 1.0 - SLACK,
+                self.footprint[0] / pushed.footprint - 1.0 - SLACK,
+                pushed.footprint / self.footprint[1] - 1.0 - SLACK,
+            ]
         )
+        return np.maximum(beyond.max(axis=0), 0.0)
 
 
 def envelope_of(patch: Patch, taught: Pushed, held_out: Pushed) -> Envelope:
     """The envelope of the `taught` loads, as far in place as the `held_out` loads on which errors were measured."""
-    magnitude, angle, overhang = _measures(patch, taught)
-    overhang = np.append(overhang, _measures(patch, held_out)[2])
+    magnitude, angle, overhang = measures(patch, taught)
+    overhang = np.append(overhang, measures(patch, held_out)[2])
     return Envelope(
         taught.point.astype(np.float32),
         float(nearest(held_out.point, taught.point)[1].max()),
@@ -74,7 +85,7 @@ def envelope_of(patch: Patch, taught: Pushed, held_out: Pushed) -> Envelope:
     )
 
 
-def _measures(patch: Patch, pushed: Pushed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def measures(patch: Patch, pushed: Pushed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Force [N], angle to the inward normal [rad], footprint beyond the rim [m]: (B,) each."""
     magnitude, direction = directions(pushed)
     cosine = np.einsum("bi,bi->b", direction, patch.normal_near(pushed.point))

@@ -14,10 +14,11 @@ from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
 
+from .bound import Bound, features_of
 from .encode import ENCODERS, Basis, directions
 from .envelope import Envelope
 from .patch import Patch, open_patch
-from .regressor import Regressor
+from .regressor import Fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +36,7 @@ class Part:
     """
 
     encoder: str
-    regressor: Regressor
+    regressor: Fitted
     basis: Basis
 
     def response(self, features: np.ndarray) -> np.ndarray:
@@ -60,6 +61,8 @@ class Learned:
         The loads that it was taught.
     bound
         Of 95 in 100 held-out loads the worst tumour vertex was within this distance [m] of the finite elements.
+    bounds
+        What it promises of each load, if loads were kept apart to calibrate it.
     training
         What it was taught with, as text.
     """
@@ -68,6 +71,7 @@ class Learned:
     parts: tuple[Part, ...]
     envelope: Envelope
     bound: float = float("nan")
+    bounds: Bound | None = None
     training: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
@@ -110,8 +114,8 @@ class Learned:
                 f"{nodes[strange][0]}: ask the finite elements for it."
             )
         magnitude, direction = directions(pushed)
-        at_least = np.maximum(magnitude, self.envelope.force[0])
-        asked = replace(pushed, force=at_least[:, None] * direction)
+        # Beyond the taught forces the response stays what it was at the nearest of them.
+        asked = replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
         features: dict[str, np.ndarray] = {}  # of each encoder that is needed
         displacement = np.zeros((len(loads), len(nodes), 3))
         for part, row_of in zip(self.parts, self._row, strict=True):
@@ -122,18 +126,38 @@ class Learned:
                     features[part.encoder] = ENCODERS[part.encoder](self._patch, asked)
                 response = part.response(features[part.encoder])
                 displacement[:, here] += magnitude[:, None, None] * response[:, row[here]]
-        inside = self.envelope.holds(self._patch, pushed)
+        excess = self.envelope.excess(self._patch, pushed)
+        promised = np.array(np.nan)
+        if self.bounds is not None:
+            # As the motion, so its error: in proportion to a force weaker than any that was taught.
+            weaker = np.minimum(magnitude / self.envelope.force[0], 1.0)
+            promised = self.bounds.of(features_of(self._patch, asked), magnitude, excess) * weaker
         reaction = np.concatenate([pushed.force, np.zeros_like(pushed.force)], axis=1)[:, None]
         return Deformation(
             displacement,
             nodes,
-            tuple(Outcome.PREDICTED if good else Outcome.EXTRAPOLATED for good in inside),
+            tuple(Outcome.EXTRAPOLATED if far else Outcome.PREDICTED for far in excess > 0.0),
             np.zeros(len(loads), int),
             np.full(len(loads), np.nan),
             loads.times,
             reaction,
             cost=Cost({"predict": time.perf_counter() - begun}),
+            bound=promised,
         )
+
+    def margin(self, answer: Deformation) -> np.ndarray:
+        """A field (B, n) [m] over `anatomy.tumour_nodes`, scaled from an answer's bound at 0.95: where it is needed.
+
+        The bound itself is promised, for the largest error; how it is shared out is what calibration loads had.
+
+        Raises
+        ------
+        InputError
+            A model without calibrated bounds.
+        """
+        if self.bounds is None:
+            raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
+        return answer.bound[0][:, None] * self.bounds.profile
 
 
 def only_pushed(loads: Loads) -> Pushed:

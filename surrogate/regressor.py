@@ -8,24 +8,28 @@ from typing import Protocol, Self, TypeVar
 import numpy as np
 
 
-class Regressor(Protocol):
-    """A map from features X (B, f) to coefficients Y (B, r). `fit` sets attributes that end in an underscore."""
-
-    def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Learn from rows X (n, f), Y (n, r)."""
-        ...
+class Fitted(Protocol):
+    """A map from features X (B, f) to coefficients Y (B, r)."""
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of features (B, f)."""
         ...
 
     def state(self) -> dict[str, np.ndarray]:
-        """What `fit` learnt, as plain arrays."""
+        """What it knows, as plain arrays."""
         ...
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """The regressor that `state` came from."""
+        """The one that `state` came from."""
+        ...
+
+
+class Regressor(Fitted, Protocol):
+    """A map that is learnt from rows. `fit` sets attributes that end in an underscore."""
+
+    def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
+        """Learn from rows X (n, f), Y (n, r)."""
         ...
 
 

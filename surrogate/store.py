@@ -19,16 +19,19 @@ from sim.mesh import digest_of
 
 from .ann import Ann
 from .bayesian import Bayesian
+from .bound import Bound
 from .encode import Basis
 from .envelope import Envelope
 from .gp import Gp
 from .learned import Learned, Part
 from .linear import Linear
 from .pcr import Pcr
-from .regressor import Regressor
+from .regressor import Fitted, Regressor
+from .remainder import Remainder
+from .series import Series
 from .svr import Svr
 
-FORMAT = "sulcus model 1"
+FORMAT = "sulcus model 2"
 REGRESSORS: dict[str, type[Regressor]] = {
     "linear": Linear,
     "pcr": Pcr,
@@ -37,6 +40,8 @@ REGRESSORS: dict[str, type[Regressor]] = {
     "gp": Gp,
     "bayesian": Bayesian,
 }
+# These two know the tool's features, and their meaning.
+FITTED: dict[str, type[Fitted]] = {**REGRESSORS, "series": Series, "remainder": Remainder}
 
 
 def save(path: str | Path, models: Mapping[str, Learned]) -> None:
@@ -98,7 +103,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
 
 
 def _described(model: Learned, put: Any) -> dict[str, Any]:
-    names = {kind: name for name, kind in REGRESSORS.items()}
+    names = {kind: name for name, kind in FITTED.items()}
     parts = [
         {
             "encoder": part.encoder,
@@ -110,14 +115,21 @@ def _described(model: Learned, put: Any) -> dict[str, Any]:
         for part in model.parts
     ]
     envelope = {**asdict(model.envelope), "points": put(model.envelope.points)}
-    return {"parts": parts, "envelope": envelope, "bound": model.bound, "training": dict(model.training)}
+    bounds = None if model.bounds is None else {name: put(array) for name, array in vars(model.bounds).items()}
+    return {
+        "parts": parts,
+        "envelope": envelope,
+        "bound": model.bound,
+        "bounds": bounds,
+        "training": dict(model.training),
+    }
 
 
 def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:
     parts = tuple(
         Part(
             part["encoder"],
-            REGRESSORS[part["regressor"]].restored({name: arrays[key] for name, key in part["state"].items()}),
+            FITTED[part["regressor"]].restored({name: arrays[key] for name, key in part["state"].items()}),
             Basis(arrays[part["nodes"]], arrays[part["modes"]]),
         )
         for part in description["parts"]
@@ -126,4 +138,6 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
     envelope["points"] = arrays[envelope["points"]]
     for name in ("force", "footprint"):
         envelope[name] = tuple(envelope[name])
-    return Learned(anatomy, parts, Envelope(**envelope), description["bound"], description["training"])
+    promised = description["bounds"]
+    bounds = None if promised is None else Bound(**{name: arrays[key] for name, key in promised.items()})
+    return Learned(anatomy, parts, Envelope(**envelope), description["bound"], bounds, description["training"])

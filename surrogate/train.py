@@ -1,9 +1,9 @@
-"""From a data set to models and their scores."""
+"""From a data set to models, their scores, and what they promise."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,70 +11,82 @@ from sim.errors import InputError
 from sim.loads import Loads, Pushed
 from sim.stages import stage
 
-from .ann import Ann
+from .bound import LEVELS, conformal, features_of, fitted_bound
 from .dataset import Dataset
-from .encode import ENCODERS, directions, reduce
+from .encode import directions
 from .envelope import envelope_of
-from .gp import Gp
-from .learned import Learned, Part
-from .linear import Linear
-from .patch import Patch, open_patch
-from .pcr import Pcr
-from .regressor import Regressor
+from .learned import Learned
+from .parts import EXPANDED, LEARNT, Classroom, Lesson, parts_of
+from .patch import open_patch
 from .score import Score, errors, score
 from .split import Split, leave_discs_out
-from .svr import Svr
 
-# Encoder and regressor of each but the table itself; principal components are those of the forces at the nodes.
-LEARNT: dict[str, tuple[str, Callable[[], Regressor]]] = {
-    "pcr": ("nodal", Pcr),
-    "ann": ("tool", Ann),
-    "svr": ("tool", Svr),
-    "gp": ("tool", Gp),
-    "residual": ("tool", Ann),
-}
-LEARNERS = ("linear", *LEARNT)
-# Share of the responses that a learner's basis may lose, and its most modes; and what the table may lose.
-TOLERANCE, MODES = 1e-3, 60
-TABLE_TOLERANCE = 1e-4
-COVERAGE = 0.95
+LEARNERS = ("linear", *LEARNT, *EXPANDED)
+# One load in so many, and at most so many, is kept apart to calibrate bounds.
+APART, MOST_APART = 4, 2000
 
 
 @dataclass(frozen=True, eq=False)
 class Trained:
     """Models by learner, how they scored on the discs left out, and what those were.
 
-    `motion` is the mean displacement [m] of the tumour over the held-out loads.
+    `motion` is the mean displacement [m] of the tumour over the held-out loads, `calibrated` the number of loads by
+    which the models' bounds were calibrated.
     """
 
     models: dict[str, Learned]
     scores: tuple[Score, ...]
     split: Split
     motion: float
+    calibrated: int
+
+
+def learners_for(data: Dataset) -> tuple[str, ...]:
+    """All that a data set can teach: series need finite elements, of a tissue that the data names."""
+    return tuple(name for name in LEARNERS if name not in EXPANDED or "tissue" in data.provenance)
 
 
 def train(
     data: Dataset,
-    learners: Sequence[str] = LEARNERS,
+    learners: Sequence[str] | None = None,
     progress: Callable[[str], object] = lambda learner: None,
     split: Split | None = None,
+    most: int | None = None,
+    device: str = "auto",
+    tabulating: Callable[[int, int], object] = lambda done, total: None,
 ) -> Trained:
-    """Fit `learners` to the loads outside the left-out discs, and score them inside.
+    """Fit `learners`, by default all that the data can teach: first to be scored, then to be used.
 
-    Another `split` has a row for each load that converged.
+    Scored is what was taught outside discs of the cortex, on the loads inside them. What is returned was taught all
+    those loads, and its bounds were calibrated on others, which no fit has seen. Another `split`, with a row for each
+    load that converged, calibrates nothing and returns what was taught by it.
 
-    Every model knows the tumour and the open cortex; the cortex, which is drawn but not scored, is the compliance
-    table's in all of them. Cases that did not converge are neither learnt nor scored.
+    Every model knows the tumour and the open cortex; the cortex is not scored, and the compliance table's where the
+    learner is not one of `EXPANDED`. Cases that did not converge are left aside.
+
+    Parameters
+    ----------
+    progress
+        Hears the name of each learner that is done.
+    most
+        Loads that are taught, at most; those that calibrate or test are not counted.
+    device
+        Where finite elements make the series.
+    tabulating
+        Hears which place of the series is done, and of how many.
 
     Raises
     ------
     InputError
-        Unknown learners, data with other causes than `Pushed`, an anatomy without tumour, too few loads, or unit
-        responses that did not converge.
+        Unknown learners, nothing to teach, data with other causes than `Pushed`, an anatomy without tumour, too few
+        loads, or unit responses that did not converge.
     """
-    unknown = [name for name in learners if name not in LEARNERS]
-    if unknown or not learners:
+    wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
+    unknown = [name for name in wanted if name not in LEARNERS]
+    if unknown or not wanted:
         raise InputError(f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {', '.join(LEARNERS)}.")
+    if most is not None and most < 1:
+        raise InputError(f"{most} loads teach nothing: give at least 1.")
     if not data.unit_good.all():
         raise InputError(
             f"{data.path}: {int((~data.unit_good).sum())} unit responses did not converge, so there is no compliance "
@@ -85,52 +97,70 @@ def train(
     patch, nodes = open_patch(data.anatomy), data.anatomy.tumour_nodes
     if not len(nodes):
         raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
-    split = leave_discs_out(pushed.point, patch) if split is None else split
-    with stage("table"):
+    apart = np.zeros(len(loads), bool)
+    if split is None:
+        apart[len(loads) - min(len(loads) // APART, MOST_APART) :] = True
+        split = _without(leave_discs_out(pushed.point[~apart], patch), apart)
+    with stage("read"):
         truth = data.displacement(nodes)[data.good]
-        table = _compliance(data, nodes)
-        open_nodes = np.setdiff1d(patch.nodes, nodes)
-        cortex = (_compliance(data, open_nodes),) if len(open_nodes) else ()
-    taught, held_out = (_pushed(loads.rows(np.flatnonzero(rows))) for rows in (split.taught, split.test))
-    envelope = envelope_of(patch, taught, held_out)
+        cortex = data.displacement(np.setdiff1d(patch.nodes, nodes))[data.good]
+
+    def lesson(rows: np.ndarray) -> Lesson:
+        return Lesson(_pushed(loads.rows(np.flatnonzero(rows))), truth[rows], cortex[rows])
+
+    first = lesson(_first(split.taught, most))
+    room = Classroom(data, patch, first, device, tabulating)
+    test = loads.rows(np.flatnonzero(split.test))
     models, scores = {}, []
-    for name in dict.fromkeys(learners):
+    for name in wanted:
         with stage(f"learn {name}"):
-            parts = (*_parts(name, table, patch, taught, truth[split.taught]), *cortex)
-        model = Learned(data.anatomy, parts, envelope, training={"learner": name, **data.provenance})
+            model = Learned(
+                data.anatomy,
+                parts_of(name, room, first),
+                envelope_of(patch, first.loads, _pushed(test)),
+                training={"learner": name, **data.provenance},
+            )
         with stage("score"):
-            models[name], row = _judged(name, model, loads.rows(np.flatnonzero(split.test)), truth[split.test], nodes)
-        scores.append(row)
+            scores.append(score(name, model, test, truth[split.test], nodes))
+            held_out = errors(model, test, truth[split.test], nodes).max(axis=1)
+        models[name] = replace(model, bound=conformal(held_out, LEVELS[0]))
+        if apart.any():
+            with stage(f"learn {name}"):
+                again = lesson(_first(~apart, most))
+                whole = replace(
+                    models[name],
+                    parts=parts_of(name, room, again),
+                    envelope=envelope_of(patch, again.loads, lesson(apart).loads),
+                )
+            with stage("calibrate"):
+                seen = (features_of(patch, _pushed(test)), held_out)
+                models[name] = calibrated(whole, seen, loads.rows(np.flatnonzero(apart)), truth[apart])
         progress(name)
-    return Trained(models, tuple(scores), split, float(np.linalg.norm(truth[split.test], axis=2).mean()))
+    motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
+    return Trained(models, tuple(scores), split, motion, int(apart.sum()))
 
 
-def _parts(name: str, table: Part, patch: Patch, taught: Pushed, truth: np.ndarray) -> tuple[Part, ...]:
-    """The summands of one learner, for displacements `truth` (n, k, 3) [m] of the tumour."""
-    if name == "linear":
-        return (table,)
-    response = truth / directions(taught)[0][:, None, None]
-    before = (table,) if name == "residual" else ()
-    for part in before:
-        response = response - part.response(ENCODERS[part.encoder](patch, taught))
-    basis = reduce(table.basis.nodes, response, TOLERANCE, MODES)
-    encoder, regressor = LEARNT[name]
-    fitted = regressor().fit(ENCODERS[encoder](patch, taught), basis.encode(response))
-    return (*before, Part(encoder, fitted, basis))
+def calibrated(model: Learned, seen: tuple[np.ndarray, np.ndarray], loads: Loads, truth: np.ndarray) -> Learned:
+    """A model with bounds, calibrated by what `loads` do: truth (B, n, 3) [m] at the tumour's vertices.
+
+    `seen`: features (m, f) and largest errors (m,) [m] of loads that it was not taught, which are not among these.
+    """
+    pushed, nodes = _pushed(loads), model.anatomy.tumour_nodes
+    error = errors(model, loads, truth, nodes)
+    features = features_of(open_patch(model.anatomy), pushed)
+    return replace(model, bounds=fitted_bound(seen, features, directions(pushed)[0], error))
 
 
-def _compliance(data: Dataset, nodes: np.ndarray) -> Part:
-    """The compliance table of some vertices, from the unit responses, in as many modes as it needs."""
-    response = data.unit_response(nodes)
-    basis = reduce(nodes, response, TABLE_TOLERANCE, len(response))
-    return Part("nodal", Linear().fit(np.eye(len(response)), basis.encode(response)), basis)
+def _first(rows: np.ndarray, most: int | None) -> np.ndarray:
+    """The first `most` of the chosen rows (B,) bool."""
+    return rows if most is None else rows & (np.cumsum(rows) <= most)
 
 
-def _judged(name: str, model: Learned, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> tuple[Learned, Score]:
-    worst = np.sort(errors(model, loads, truth, nodes).max(axis=1))
-    rank = min(len(worst), int(np.ceil(COVERAGE * (len(worst) + 1))))
-    bounded = Learned(model.anatomy, model.parts, model.envelope, float(worst[rank - 1]), model.training)
-    return bounded, score(name, bounded, loads, truth, nodes)
+def _without(split: Split, apart: np.ndarray) -> Split:
+    """A split of the rows that are not `apart` (B,), as one of all rows."""
+    disc = np.full(len(apart), -2)
+    disc[~apart] = split.disc
+    return replace(split, disc=disc)
 
 
 def _pushed(loads: Loads) -> Pushed:

@@ -19,7 +19,7 @@ TIERS = (
     {"device", "lanes", "columns", "rows", "product", "sparse", "sweep", "term", "constraint", "footprint"},
     {"terms", "problem"},
     {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering", "narrow", "trial"},
-    {"newton", "balance", "room", "lbfgs", "multigrid", "amg", "inversion", "patch", "rim"},
+    {"newton", "series", "balance", "room", "lbfgs", "multigrid", "amg", "inversion", "patch", "rim"},
     {
         "precondition",
         "condensation",
@@ -93,7 +93,7 @@ def importers(library):
 def test_the_reader_of_imports_reads():
     """What all other tests here stand on."""
     assert "sim.errors.InputError" in imports(HOUSE / "sim/mesh.py")
-    assert "surrogate.ann.Ann" in imports(HOUSE / "surrogate/train.py")
+    assert "surrogate.ann.Ann" in imports(HOUSE / "surrogate/parts.py")
     assert "sim.terms.dead_force.DeadForce" in imports(HOUSE / "sim/compile.py")
     assert "sim.terms.dead_force.DeadForce" not in imports(HOUSE / "sim/compile.py", everywhere=False)
     assert "scenes.check.measure" in imports(HOUSE / "scenes/commands/check.py") and len(FILES) > 80

@@ -72,15 +72,18 @@ def test_simulate_takes_quadratic_anatomies_as_they_are(body, tmp_path, capsys) 
     assert "take p2" in capsys.readouterr().err and not (tmp_path / "no.h5").exists()
 
 
-@pytest.mark.parametrize("words", [(), ("--element", "smoothed")])
-def test_a_patient_hands_the_element_on(tmp_path, monkeypatch, words) -> None:
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [((), ("neo-hookean", "smoothed")), (("--element", "p2", "--material", "corotational"), ("corotational", "p2"))],
+)
+def test_a_patient_hands_tissue_and_element_on(tmp_path, monkeypatch, words, told) -> None:
     steps: list[list[str]] = []
     monkeypatch.setattr("scenes.cli.main", lambda step: steps.append(step) or 0)
     labels = ["labels.nii.gz", "--brain", "1", "--tumour", "2"]
     assert main(["patient", *labels, "--out", str(tmp_path / "me.vtu"), "--device", "cpu", *words]) == 0
     assert [step[0] for step in steps] == ["anatomy", "simulate", "train"]
-    assert ["--element" in step for step in steps] == [False, bool(words), False]
-    assert steps[1][len(steps[1]) - len(words) :] == list(words)
+    assert steps[1][-4:] == ["--material", told[0], "--element", told[1]]
+    assert steps[2][-4:] == ["--learners", "linear,series-gp", "--device", "cpu"]
 
 
 def physics(theatre: Theatre, scene: Scene) -> tuple[str, Tissue | None]:

@@ -12,6 +12,7 @@ from sim.accuracy import TRAIN
 from sim.device import find_device
 from sim.errors import InputError
 from sim.files import check_output
+from sim.material import LAWS
 from sim.stages import listened
 from surrogate.sampling import PRESETS
 from surrogate.split import FEWEST
@@ -30,7 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--craniotomy", type=float, default=50.0, help="diameter [mm] (default %(default)s)")
     parser.add_argument("--count", type=int, default=1000, help="loads to simulate (default %(default)s)")
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
-    add_element_argument(parser)
+    parser.add_argument("--material", choices=LAWS, default="neo-hookean", help="tissue law (default %(default)s)")
+    add_element_argument(parser, "smoothed")
+    parser.add_argument(
+        "--learners", default="linear,series-gp", help="as `sulcus train` has them (default %(default)s)"
+    )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
     parser.add_argument("--json", action="store_true", help="a JSON line of each step, then one of the seconds")
 
@@ -47,13 +52,12 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--count {args.count} is too few to learn from and to leave {FEWEST} discs out: give more.")
     data, model = args.out.with_suffix(".h5"), model_path(args.out)
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]
-    element = [] if args.element is None else ["--element", args.element]
     steps = [
         ["anatomy", "--labels", str(args.labels), "--brain", args.brain, "--tumour", args.tumour, *t1,
          "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), "--out", str(args.out)],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--preset", args.preset,
-         "--device", args.device, *element],
-        ["train", str(data), "--out", str(model)],
+         "--device", args.device, "--material", args.material, "--element", args.element],
+        ["train", str(data), "--out", str(model), "--learners", args.learners, "--device", args.device],
     ]  # fmt: skip
     began = time.perf_counter()
     with listened() as seconds:

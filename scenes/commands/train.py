@@ -15,7 +15,7 @@ from sim.stages import stage
 from surrogate.dataset import read_dataset
 from surrogate.score import table, winner
 from surrogate.store import save
-from surrogate.train import LEARNERS, Trained, train
+from surrogate.train import LEARNERS, Trained, learners_for, train
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", metavar="DATA.h5", help="from `sulcus simulate`; nothing else is needed")
     parser.add_argument("--out", required=True, metavar="MODEL.npz", help="the models, all in one file")
     parser.add_argument(
-        "--learners", default=",".join(LEARNERS), help="which, separated by commas (default %(default)s)"
+        "--learners", help=f"which of {', '.join(LEARNERS)}, separated by commas (default: all that the data can teach)"
+    )
+    parser.add_argument("--most", type=int, metavar="LOADS", help="teach at most so many of the loads (default: all)")
+    parser.add_argument(
+        "--device",
+        default="auto",
+        help="where finite elements make the series: auto, cpu or cuda (default %(default)s)",
     )
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 
@@ -33,9 +39,16 @@ def run(args: argparse.Namespace) -> int:
     out = check_output(args.out, ".npz")
     with stage("read the data"):
         data = read_dataset(args.data)
-    learners = [name.strip() for name in args.learners.split(",")]
+    learners = learners_for(data) if args.learners is None else [name.strip() for name in args.learners.split(",")]
     with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
-        trained = train(data, learners, lambda learner: bar.update())
+        trained = train(
+            data,
+            learners,
+            lambda learner: bar.update(),
+            most=args.most,
+            device=args.device,
+            tabulating=lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"),
+        )
     with stage("save"):
         save(out, trained.models)
     failed = int(np.sum(~data.good))
@@ -53,6 +66,7 @@ def _for_people(trained: Trained, out: str, failed: int) -> str:
             "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
             table(trained.scores, 1e3 * trained.motion),
             f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}",
+            f"the models written were taught all loads but {trained.calibrated}, by which their bounds were calibrated",
             f"written: {out}",
         ]
     )
@@ -71,6 +85,7 @@ def _for_machines(trained: Trained, out: str, failed: int) -> str:
             "share_of_patch": split.share,
             "taught": int(split.taught.sum()),
             "held_out": int(split.test.sum()),
+            "calibrated": trained.calibrated,
             "not_converged": failed,
         }
     )

@@ -1,0 +1,130 @@
+"""The finite elements' power series in the force, tabulated over the open cortex: what needs no learning."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+ORDERS = 3
+# Exponents of the products of direction components, order by order: 3, 6 and 10 of them.
+POWERS = [
+    np.array([(i, j, order - i - j) for i in range(order, -1, -1) for j in range(order - i, -1, -1)])
+    for order in range(1, ORDERS + 1)
+]
+# Which of them are each order's.
+SPANS = (slice(0, 3), slice(3, 9), slice(9, 19))
+TERMS = SPANS[-1].stop
+# So many radii carry a parabola.
+STENCIL = 3
+CHUNK = 64
+# What a share of -1 counts for, as a height [m].
+BESIDE = 1e-2
+
+
+def forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """The products (B, 19) of the components of directions (B, 3), times force^(order - 1) of forces (B,) [N]."""
+    columns = [
+        np.prod(direction[:, None, :] ** powers, axis=2) * force[:, None] ** (order - 1)
+        for order, powers in enumerate(POWERS, start=1)
+    ]
+    return np.concatenate(columns, axis=1)
+
+
+@dataclass(eq=False)
+class Series:
+    """A regressor that predicts the response to one newton by the first orders of the power series in the force.
+
+    Between tabulated places and radii it interpolates: parabolas on each triangle, and through three radii. In the
+    direction every order is a form of its degree, so that the table is exact there.
+
+    Parameters
+    ----------
+    corners
+        (V, 3) [m], of the open cortex.
+    triangles
+        (S, 6): three corners, then the middles of the edges that lie opposite, as numbers of places.
+    radii
+        (R,) [m], rising.
+    table
+        (places, R, 19, r) float32: coefficients of the basis's modes.
+    """
+
+    corners: np.ndarray
+    triangles: np.ndarray
+    radii: np.ndarray
+    table: np.ndarray
+
+    def predict(self, X: np.ndarray) -> np.ndarray:
+        """Coefficients (B, r) float32 of `tool_features` (B, 8)."""
+        parts = [self._predicted(X[first : first + CHUNK]) for first in range(0, max(len(X), 1), CHUNK)]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _predicted(self, X: np.ndarray) -> np.ndarray:
+        place, share = self._located(X[:, :3])
+        radius, weight = self._between_radii(X[:, 7])
+        row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(len(X), -1)
+        factor = (share[:, :, None] * weight[:, None]).reshape(len(X), 1, -1).astype(np.float32)
+        products = forms(X[:, 3:6], X[:, 6]).astype(np.float32)
+        flat = self.table.reshape(len(self.table) * len(self.radii), -1)
+        mixed = (factor @ flat[row]).reshape(len(X), TERMS, -1)
+        return (products[:, None] @ mixed)[:, 0]
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Places, radii, and the table in half precision, in units of its largest number for each term and mode."""
+        unit = np.abs(self.table).max(axis=(0, 1)) + np.finfo(np.float32).tiny
+        known = {name: getattr(self, name) for name in ("corners", "triangles", "radii")}
+        return {**known, "unit": unit, "share": (self.table / unit).astype(np.float16)}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """From `state`: the table is what half precision kept of it, to 1 in 2,000."""
+        table = state["share"].astype(np.float32) * state["unit"]
+        return cls(state["corners"], state["triangles"], state["radii"], table)
+
+    def from_second_order(self) -> Self:
+        """The same without its first order: what nonlinearity adds."""
+        table = self.table.copy()
+        table[:, :, SPANS[0]] = 0.0
+        return type(self)(self.corners, self.triangles, self.radii, table)
+
+    @cached_property
+    def _frames(self) -> np.ndarray:
+        """(4 S, 4): from (point, 1) to the shares of a triangle's three corners and the height over it [m]."""
+        a, b, c = (self.corners[self.triangles[:, corner]] for corner in range(3))
+        normal = np.cross(b - a, c - a)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        frame = np.zeros((len(a), 4, 4))
+        frame[:, :3, 0], frame[:, :3, 1], frame[:, :3, 2], frame[:, :3, 3] = a, b, c, normal
+        frame[:, 3, :3] = 1.0
+        return np.linalg.inv(frame).reshape(-1, 4)
+
+    def _located(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Six places (B, 6) of the triangle nearest to each point (B, 3) [m], and their shares of it (B, 6)."""
+        count = len(self.triangles)
+        local = (self._frames @ np.column_stack([point, np.ones(len(point))]).T).reshape(count, 4, -1)
+        miss = np.abs(local[:, 3]) - BESIDE * np.minimum(local[:, :3].min(axis=1), 0.0)
+        best, rows = miss.argmin(axis=0), np.arange(len(point))
+        corner = local[best, :3, rows].clip(min=0.0)
+        corner /= corner.sum(axis=1, keepdims=True)
+        share = np.concatenate(
+            [corner * (2.0 * corner - 1.0), 4.0 * corner[:, [1, 2, 0]] * corner[:, [2, 0, 1]]], axis=1
+        )
+        return self.triangles[best], share
+
+    def _between_radii(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which radii (B, k), and their weights (B, k): the parabola through the three about each radius (B,) [m]."""
+        if len(self.radii) == 1:
+            return np.zeros((len(radius), 1), int), np.ones((len(radius), 1))
+        inside = np.clip(radius, self.radii[0], self.radii[-1])
+        first = np.clip(np.searchsorted(self.radii, inside) - 2, 0, len(self.radii) - STENCIL)
+        index = first[:, None] + np.arange(STENCIL)
+        at, x = np.log(self.radii[index]), np.log(inside)[:, None]
+        weight = np.ones(index.shape)
+        for other in range(1, STENCIL):
+            beside = np.roll(at, other, axis=1)
+            weight *= (x - beside) / (at - beside)
+        return index, weight

@@ -1,0 +1,145 @@
+"""The tabulated series, and what is learnt of its remainder."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim.accuracy import REFERENCE, TRAIN
+from sim.effects import NodalForce, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Pushed
+from sim.material import Material, tissue_to_json
+from surrogate.dataset import read_dataset
+from surrogate.encode import Basis, directions, tool_features
+from surrogate.parts import EXPANDED
+from surrogate.patch import open_patch
+from surrogate.series import ORDERS, Series, forms
+from surrogate.simulate import simulate
+from surrogate.store import load, save
+from surrogate.tabulate import radii_between, tabulated, with_middles
+from surrogate.train import learners_for, train
+
+TISSUE = Material("neo-hookean", 3000.0, 0.45)
+
+
+@pytest.fixture(scope="module")
+def patch(box):
+    return open_patch(box)
+
+
+def pushes(patch, count, seed, radius=(6e-3, 8e-3), most=0.15):
+    random = np.random.default_rng(seed)
+    point, normal = patch.place(random.random((count, 3)))
+    force = random.uniform(0.02, most, (count, 1)) * (normal + 0.3 * random.normal(size=(count, 3)))
+    return Pushed(point, force, random.uniform(*radius, count))
+
+
+def test_fields_of_second_degree_are_met_between_the_places(patch):
+    triangles, places = with_middles(patch)
+    radii = radii_between(5e-3, 8e-3)
+    random = np.random.default_rng(1)
+    shape = random.normal(size=(3, 3))
+
+    def field(point):
+        return 1e4 * np.einsum("ni,ij,nj->n", point, shape, point)
+
+    table = np.zeros((len(places), len(radii), 19, 2), np.float32)
+    table[:, :, 0, 0] = field(places)[:, None] + np.log(radii / 5e-3) ** 2
+    table[:, :, 18, 1] = 1.0  # the form d_z^3
+    series = Series(patch.points, triangles, radii, table)
+    loads = pushes(patch, 200, 2, (5e-3, 8e-3))
+    size, direction = directions(loads)
+    told = series.predict(tool_features(patch, loads))
+    wanted = direction[:, 0] * (field(loads.point) + np.log(loads.footprint / 5e-3) ** 2)
+    assert np.allclose(told[:, 0], wanted, atol=1e-4 * np.abs(wanted).max())
+    assert np.allclose(told[:, 1], size**2 * direction[:, 2] ** 3, atol=1e-6)
+    alone = np.concatenate([series.predict(tool_features(patch, _row(loads, k))) for k in range(5)])
+    assert np.allclose(alone, told[:5], rtol=1e-5, atol=1e-7)
+
+
+def _row(loads, k):
+    return Pushed(loads.point[k : k + 1], loads.force[k : k + 1], loads.footprint[k : k + 1])
+
+
+def test_forms_are_those_of_their_degree():
+    random = np.random.default_rng(0)
+    direction = random.normal(size=(40, 3))
+    values = forms(direction, np.ones(40))
+    assert np.allclose(forms(2.0 * direction, np.ones(40)), values * np.repeat([2.0, 4.0, 8.0], [3, 6, 10]))
+    for columns, degree in ((slice(0, 3), 1), (slice(3, 9), 2), (slice(9, 19), 3)):
+        wanted = (direction @ random.normal(size=3)) ** degree
+        found = np.linalg.lstsq(values[:, columns], wanted, rcond=None)[0]
+        assert np.allclose(values[:, columns] @ found, wanted)
+
+
+def test_the_table_is_the_finite_elements_series(box, patch):
+    fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", batch=200, element="p1")
+    nodes = box.tumour_nodes
+    loads = pushes(patch, 30, 3, (7e-3, 7e-3))
+    exact = fem.series(Loads((loads,)), ORDERS, nodes)
+    basis = Basis(nodes, np.eye(3 * len(nodes), dtype=np.float32))
+    places = with_middles(patch)[1]
+    heard = []
+    (series,) = tabulated(fem, patch, np.array([7e-3]), (basis,), lambda done, total: heard.append((done, total)))
+    assert heard[-1] == (len(places), len(places))
+    size, _ = directions(loads)
+    told = series.predict(tool_features(patch, loads)) * size[:, None]
+    wanted = exact.sum(axis=0).reshape(len(size), -1)
+    # The box's triangles are as long as the tool is wide.
+    assert np.linalg.norm(told - wanted) < 0.02 * np.linalg.norm(wanted)
+    linear = exact[0].reshape(len(size), -1)
+    assert np.linalg.norm(told - wanted) < 0.3 * np.linalg.norm(linear - wanted)
+    more = series.from_second_order().predict(tool_features(patch, loads)) * size[:, None]
+    assert np.allclose(more, told - _first_order(series, loads, patch), atol=1e-4 * np.abs(told).max())
+
+
+def _first_order(series, loads, patch):
+    """Of a force so weak that the others vanish."""
+    size, direction = directions(loads)
+    weak = Pushed(loads.point, 1e-9 * direction, loads.footprint)
+    return series.predict(tool_features(patch, weak)) * size[:, None]
+
+
+@pytest.fixture(scope="module")
+def data(box, tmp_path_factory):
+    path = tmp_path_factory.mktemp("series") / "data.h5"
+    fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
+    loads = Loads((pushes(open_patch(box), 160, 5, (7e-3, 7e-3), 0.25),))
+    simulate(path, fem, loads, {"tissue": tissue_to_json(TISSUE), "element": "p1"})
+    return read_dataset(path)
+
+
+@pytest.fixture(scope="module")
+def trained(data):
+    return train(data, ["linear", *EXPANDED], device="cpu")
+
+
+def test_a_series_beats_the_table_of_first_order(trained):
+    linear, series, learnt = trained.scores
+    # A hundred loads teach the process nothing yet: it must do no harm.
+    assert series.mean_mm < 0.2 * linear.mean_mm and learnt.mean_mm < 1.5 * series.mean_mm
+
+
+def test_the_cortex_moves_as_the_finite_elements_say(trained, data, box, patch):
+    cortex = np.setdiff1d(patch.nodes, box.tumour_nodes)
+    truth = data.displacement(cortex)
+    miss = {name: np.linalg.norm(model.deform(data.loads, at=cortex).displacement - truth, axis=2).mean()
+            for name, model in trained.models.items()}  # fmt: skip
+    assert miss["series"] < 0.7 * miss["linear"] and miss["series-gp"] < 0.7 * miss["linear"]
+
+
+def test_stored_series_answer_alike(trained, data, box, tmp_path):
+    save(tmp_path / "model.npz", trained.models)
+    again = load(tmp_path / "model.npz", box)
+    for name in EXPANDED:
+        before, after = trained.models[name].deform(data.loads), again[name].deform(data.loads)
+        assert np.array_equal(before.displacement, after.displacement) and np.array_equal(before.bound, after.bound)
+
+
+def test_series_need_a_tissue(data):
+    untold = replace(data, provenance={})
+    assert not set(EXPANDED) & set(learners_for(untold)) and set(EXPANDED) < set(learners_for(data))
+    with pytest.raises(InputError, match="what tissue"):
+        train(untold, ["series"])
