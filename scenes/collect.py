@@ -29,7 +29,7 @@ DEPTH_SCALE = 1e-5
 JPEG_QUALITY = 95
 UNITS = {
     "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
-    "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "seconds": "s",
+    "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "bound": "m", "seconds": "s",
     "depth": f"{DEPTH_SCALE:g} m (PNG, 16 bit)",
 }  # fmt: skip
 
@@ -90,6 +90,7 @@ def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
         "contact": player.scene.contact(player.site, frame.touch).point,
         "tumour_predicted": player.positions(frame.deformation)[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
+        "bound": frame.deformation.bound[:, 0],
         "seconds": np.array([frame.seconds[stage] for stage in STAGES]),
     }
 

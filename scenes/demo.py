@@ -193,4 +193,7 @@ class Demo:
             f"ms a stage: {stages}",
             verdict,
         ]
+        bound = frame.deformation.bound[0, 0]
+        if np.isfinite(bound):
+            lines.insert(1, f"in 95 of 100 loads no vertex of the tumour is off by more than {1e3 * bound:.2f} mm")
         return "\n\n".join(lines)

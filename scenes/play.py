@@ -96,7 +96,8 @@ class Player:
         loads = self.scene.loads(self.site, touch, time)
         # A learnt model knows the drawn vertices alone; the finite elements start from their whole last answer.
         if isinstance(self.deformer, Learned):
-            margin, deformation = self.deformer.bound, self.deformer.deform(loads, at=self.stage.nodes)
+            deformation = self.deformer.deform(loads, at=self.stage.nodes)
+            margin = self._margin(self.deformer, deformation)
         else:
             margin, deformation = 0.0, self.deformer.deform(loads, start=last)
         solved = clock.perf_counter()
@@ -113,6 +114,12 @@ class Player:
             number, time, touch, loads, deformation, self.camera, pose, tip, picture, over.colour, gauge.distance,
             dict(zip(STAGES, np.diff([begun, solved, rendered, clock.perf_counter()]).tolist(), strict=True)),
         )  # fmt: skip
+
+    def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
+        """How far each vertex of the drawn tumour may be off [m]: what the model promises of this load, if it does."""
+        if model.bounds is None:
+            return model.bound
+        return model.margin(answer)[0][np.searchsorted(model.anatomy.tumour_nodes, self.stage.tumour_vertices)]
 
     def frames(self, every: int = 1) -> Iterator[Frame]:
         """The frames of the scene, or every so many of them."""

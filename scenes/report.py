@@ -17,6 +17,7 @@ from sim.accuracy import FLOOR, Precision
 from sim.files import written_whole
 from sim.material import LAWS
 from sim.mesh import digest_of
+from surrogate.parts import EXPANDED
 from surrogate.published import MACHINES
 from surrogate.train import LEARNERS
 
@@ -59,9 +60,14 @@ def every(study: Study) -> tuple[Elements, ...]:
     )
 
 
-def learners() -> tuple[Learner, ...]:
-    """Whatever `surrogate` knows, the published ones last."""
-    return tuple(Learner(name) for name in (*LEARNERS, *MACHINES))
+def left_out() -> tuple[Row, ...]:
+    """Those that a quick report has no time for."""
+    return tuple(Row(name, FAMILY[Learner], state="left out of --quick") for name in EXPANDED)
+
+
+def learners(quick: bool = False) -> tuple[Learner, ...]:
+    """Whatever `surrogate` knows, the published ones last; a quick report does not wait for series."""
+    return tuple(Learner(name) for name in (*LEARNERS, *MACHINES) if not (quick and name in EXPANDED))
 
 
 def apart(study: Study, spec: Spec, picture: Path) -> Row:

@@ -75,6 +75,11 @@ class Stage:
         vertices, triangles = self._tumour
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
+    @property
+    def tumour_vertices(self) -> np.ndarray:
+        """Mesh vertices (n,) of the tumour's surface, in the order in which they are drawn."""
+        return self._tumour[0]
+
     @cached_property
     def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
         vertices, triangles = np.unique(self.site.anatomy.tumour_surface, return_inverse=True)

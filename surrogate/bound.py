@@ -14,8 +14,7 @@ import numpy as np
 
 from sim.loads import Pushed
 
-from .envelope import measures
-from .patch import Patch
+from .envelope import Measured
 from .regressor import standardisation
 
 LEVELS = (0.95, 0.99)
@@ -90,11 +89,10 @@ def fitted_bound(
     return Bound(mean, deviation, weights, edges, quantile, share)
 
 
-def features_of(patch: Patch, pushed: Pushed) -> np.ndarray:
+def features_of(pushed: Pushed, known: Measured) -> np.ndarray:
     """What an error's size is told from (B, 7): logarithms of force and radius, angle, overhang and point [mm]."""
-    magnitude, angle, overhang = measures(patch, pushed)
-    size = np.log(np.maximum(magnitude, np.finfo(float).tiny))
-    return np.column_stack([size, np.log(pushed.footprint), angle, 1e3 * overhang, 1e3 * pushed.point])
+    force = np.log(np.maximum(known.magnitude, np.finfo(float).tiny))
+    return np.column_stack([force, np.log(pushed.footprint), known.angle, 1e3 * known.overhang, 1e3 * pushed.point])
 
 
 def conformal(ratio: np.ndarray, level: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,14 @@ from .patch import Patch, nearest
 
 # Round-off must not put a taught load outside.
 SLACK = 1e-6
+
+
+class Measured(NamedTuple):
+    """Force [N], angle to the inward normal [rad], footprint beyond the rim [m]: (B,) each."""
+
+    magnitude: np.ndarray
+    angle: np.ndarray
+    overhang: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +56,15 @@ class Envelope:
 
     def holds(self, patch: Patch, pushed: Pushed) -> np.ndarray:
         """(B,) bool: whether each load lies inside."""
-        return self.excess(patch, pushed) == 0.0
+        return self.excess(pushed, measured(patch, pushed)) == 0.0
 
-    def excess(self, patch: Patch, pushed: Pushed) -> np.ndarray:
+    def excess(self, pushed: Pushed, known: Measured) -> np.ndarray:
         """How far outside each load lies (B,), in shares of what was taught; zero inside.
 
         The largest of: millimetres beyond the reach or over the rim, radians beyond the angle, and the shares by which
         force, radius and force over radius are too large or too small.
         """
-        magnitude, angle, overhang = measures(patch, pushed)
+        magnitude, angle, overhang = known
         beyond = np.stack(
             [
                 1e3 * (nearest(pushed.point, self.points)[1] - self.reach - SLACK),
@@ -72,8 +81,8 @@ class Envelope:
 
 def envelope_of(patch: Patch, taught: Pushed, held_out: Pushed) -> Envelope:
     """The envelope of the `taught` loads, as far in place as the `held_out` loads on which errors were measured."""
-    magnitude, angle, overhang = measures(patch, taught)
-    overhang = np.append(overhang, measures(patch, held_out)[2])
+    magnitude, angle, overhang = measured(patch, taught)
+    overhang = np.append(overhang, measured(patch, held_out).overhang)
     return Envelope(
         taught.point.astype(np.float32),
         float(nearest(held_out.point, taught.point)[1].max()),
@@ -85,8 +94,9 @@ def envelope_of(patch: Patch, taught: Pushed, held_out: Pushed) -> Envelope:
     )
 
 
-def measures(patch: Patch, pushed: Pushed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Force [N], angle to the inward normal [rad], footprint beyond the rim [m]: (B,) each."""
+def measured(patch: Patch, pushed: Pushed) -> Measured:
+    """What decides whether loads lie inside."""
     magnitude, direction = directions(pushed)
     cosine = np.einsum("bi,bi->b", direction, patch.normal_near(pushed.point))
-    return magnitude, np.arccos(np.clip(cosine, -1.0, 1.0)), pushed.footprint - patch.rim_distance(pushed.point)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return Measured(magnitude, angle, pushed.footprint - patch.rim_distance(pushed.point))

@@ -16,7 +16,7 @@ from sim.loads import Loads, Pushed
 
 from .bound import Bound, features_of
 from .encode import ENCODERS, Basis, directions
-from .envelope import Envelope
+from .envelope import Envelope, measured
 from .patch import Patch, open_patch
 from .regressor import Fitted
 
@@ -84,12 +84,31 @@ class Learned:
         return open_patch(self.anatomy)
 
     @cached_property
-    def _row(self) -> tuple[np.ndarray, ...]:
-        """Per part, (V,) the row of each mesh vertex in the part's basis, or -1."""
-        rows = tuple(np.full(len(self.anatomy.mesh.nodes), -1) for _ in self.parts)
-        for row, part in zip(rows, self.parts, strict=True):
-            row[part.basis.nodes] = np.arange(len(part.basis.nodes))
-        return rows
+    def _by_basis(self) -> tuple[tuple[list[Part], np.ndarray], ...]:
+        """Parts of one basis, and (V,) the row of each mesh vertex in it, or -1."""
+        groups: dict[int, list[Part]] = {}
+        for part in self.parts:
+            groups.setdefault(id(part.basis.modes), []).append(part)
+        rows = np.full((len(groups), len(self.anatomy.mesh.nodes)), -1)
+        for row, parts in zip(rows, groups.values(), strict=True):
+            row[parts[0].basis.nodes] = np.arange(len(parts[0].basis.nodes))
+        return tuple(zip(groups.values(), rows, strict=True))
+
+    @cached_property
+    def _knows(self) -> np.ndarray:
+        """(V,) bool."""
+        known = np.zeros(len(self.anatomy.mesh.nodes), bool)
+        known[self.nodes] = True
+        return known
+
+    def _demand_known(self, nodes: np.ndarray) -> None:
+        inside = (nodes >= 0) & (nodes < len(self._knows))
+        strange = ~(inside & self._knows[np.where(inside, nodes, 0)])
+        if strange.any():
+            raise InputError(
+                f"this model knows the {len(self.nodes)} vertices of tumour and open cortex, not vertex "
+                f"{nodes[strange][0]}: ask the finite elements for it."
+            )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Predict the static answer to `Pushed` loads; `start` has no influence.
@@ -107,31 +126,30 @@ class Learned:
         begun = time.perf_counter()
         pushed = only_pushed(loads)
         nodes = self.nodes if at is None else np.asarray(at)
-        strange = ~np.isin(nodes, self.nodes)
-        if strange.any():
-            raise InputError(
-                f"this model knows the {len(self.nodes)} vertices of tumour and open cortex, not vertex "
-                f"{nodes[strange][0]}: ask the finite elements for it."
-            )
+        self._demand_known(nodes)
         magnitude, direction = directions(pushed)
         # Beyond the taught forces the response stays what it was at the nearest of them.
-        asked = replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
+        within = np.clip(magnitude, *self.envelope.force)
+        asked = replace(pushed, force=within[:, None] * direction)
         features: dict[str, np.ndarray] = {}  # of each encoder that is needed
         displacement = np.zeros((len(loads), len(nodes), 3))
-        for part, row_of in zip(self.parts, self._row, strict=True):
+        for parts, row_of in self._by_basis:
             row = row_of[nodes]
             here = row >= 0
             if here.any():
-                if part.encoder not in features:
-                    features[part.encoder] = ENCODERS[part.encoder](self._patch, asked)
-                response = part.response(features[part.encoder])
+                for encoder in {part.encoder for part in parts} - set(features):
+                    features[encoder] = ENCODERS[encoder](self._patch, asked)
+                coefficients = sum(part.regressor.predict(features[part.encoder]) for part in parts)
+                response = parts[0].basis.decode(np.asarray(coefficients))
                 displacement[:, here] += magnitude[:, None, None] * response[:, row[here]]
-        excess = self.envelope.excess(self._patch, pushed)
+        known = measured(self._patch, pushed)
+        excess = self.envelope.excess(pushed, known)
         promised = np.array(np.nan)
         if self.bounds is not None:
             # As the motion, so its error: in proportion to a force weaker than any that was taught.
             weaker = np.minimum(magnitude / self.envelope.force[0], 1.0)
-            promised = self.bounds.of(features_of(self._patch, asked), magnitude, excess) * weaker
+            told = features_of(pushed, known._replace(magnitude=within))
+            promised = self.bounds.of(told, magnitude, excess) * weaker
         reaction = np.concatenate([pushed.force, np.zeros_like(pushed.force)], axis=1)[:, None]
         return Deformation(
             displacement,

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations_with_replacement
 from typing import Self
 
 import numpy as np
 
 ORDERS = 3
-# Exponents of the products of direction components, order by order: 3, 6 and 10 of them.
-POWERS = [
-    np.array([(i, j, order - i - j) for i in range(order, -1, -1) for j in range(order - i, -1, -1)])
-    for order in range(1, ORDERS + 1)
-]
+# Which components of the direction are multiplied, order by order: 3, 6 and 10 products.
+FACTORS = [np.array(list(combinations_with_replacement(range(3), order))).T for order in range(1, ORDERS + 1)]
 # Which of them are each order's.
 SPANS = (slice(0, 3), slice(3, 9), slice(9, 19))
 TERMS = SPANS[-1].stop
@@ -27,10 +25,12 @@ BESIDE = 1e-2
 
 def forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
     """The products (B, 19) of the components of directions (B, 3), times force^(order - 1) of forces (B,) [N]."""
-    columns = [
-        np.prod(direction[:, None, :] ** powers, axis=2) * force[:, None] ** (order - 1)
-        for order, powers in enumerate(POWERS, start=1)
-    ]
+    columns = [direction[:, FACTORS[0][0]]]
+    for order, factors in enumerate(FACTORS[1:], start=1):
+        products = direction[:, factors[0]]
+        for factor in factors[1:]:
+            products = products * direction[:, factor]
+        columns.append(products * force[:, None] ** order)
     return np.concatenate(columns, axis=1)
 
 

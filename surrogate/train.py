@@ -14,10 +14,10 @@ from sim.stages import stage
 from .bound import LEVELS, conformal, features_of, fitted_bound
 from .dataset import Dataset
 from .encode import directions
-from .envelope import envelope_of
+from .envelope import envelope_of, measured
 from .learned import Learned
 from .parts import EXPANDED, LEARNT, Classroom, Lesson, parts_of
-from .patch import open_patch
+from .patch import Patch, open_patch
 from .score import Score, errors, score
 from .split import Split, leave_discs_out
 
@@ -133,7 +133,7 @@ def train(
                     envelope=envelope_of(patch, again.loads, lesson(apart).loads),
                 )
             with stage("calibrate"):
-                seen = (features_of(patch, _pushed(test)), held_out)
+                seen = (_features(patch, _pushed(test)), held_out)
                 models[name] = calibrated(whole, seen, loads.rows(np.flatnonzero(apart)), truth[apart])
         progress(name)
     motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
@@ -147,8 +147,12 @@ def calibrated(model: Learned, seen: tuple[np.ndarray, np.ndarray], loads: Loads
     """
     pushed, nodes = _pushed(loads), model.anatomy.tumour_nodes
     error = errors(model, loads, truth, nodes)
-    features = features_of(open_patch(model.anatomy), pushed)
+    features = _features(open_patch(model.anatomy), pushed)
     return replace(model, bounds=fitted_bound(seen, features, directions(pushed)[0], error))
+
+
+def _features(patch: Patch, pushed: Pushed) -> np.ndarray:
+    return features_of(pushed, measured(patch, pushed))
 
 
 def _first(rows: np.ndarray, most: int | None) -> np.ndarray:

@@ -1,6 +1,8 @@
 """The loop: a tool that rests on the tissue, one picture a moment, and a picture that is a function of its moment."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from scenes.play import STAGES, labelled
 from scenes.scene import SCENES, find_scene
 from scenes.shipped import template_path
 from scenes.stage import CORTEX, TOOL
-from scenes.theatre import model_path, open_theatre
+from scenes.theatre import Theatre, model_path, open_theatre
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.intensity import sidecar
@@ -173,6 +175,25 @@ def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch
         labelled(play.draw(0, 0.0, Touch(force=force)), "linear")
     within, beyond = told
     assert beyond[-1] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
+
+
+def test_what_is_drawn_round_the_tumour_is_what_the_model_promises(theatre, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("scenes.play.composite", lambda *parts, margin, **more: drawn.append(margin) or _blank())
+    model = theatre.models["linear"]
+    surface = np.unique(theatre.anatomy.tumour_surface)
+    for force in (0.1, 0.3, 5.0):
+        frame = player(theatre, short(), "linear").draw(0, 0.0, Touch(force=force))
+        field = dict(zip(theatre.anatomy.tumour_nodes, model.margin(frame.deformation)[0], strict=True))
+        assert np.array_equal(drawn[-1], [field[vertex] for vertex in surface])
+    assert drawn[0].max() < drawn[1].max() < drawn[2].max()
+    promising = Theatre(theatre.anatomy, None, {"linear": replace(model, bounds=None)}, "cpu")
+    player(promising, short(), "linear").draw(0, 0.0, Touch(force=0.1))
+    assert drawn[-1] == model.bound
+
+
+def _blank():
+    return SimpleNamespace(colour=np.zeros((2, 2, 3), np.uint8))
 
 
 def test_a_theatre_is_read_from_its_files(theatre, tmp_path):

@@ -108,7 +108,7 @@ class TestEpisode:
         units = {name: file[name].attrs["unit"] for name in file if "unit" in file[name].attrs}
         assert units == {
             "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
-            "tumour_predicted": "m", "tumour_fem": "m", "seconds": "s", "tumour_rest": "m",
+            "tumour_predicted": "m", "tumour_fem": "m", "seconds": "s", "tumour_rest": "m", "bound": "m",
         }  # fmt: skip
         assert "1e-05 m" in file["pictures/depth"].attrs["unit"]
         assert file.attrs["anatomy"] == theatre.anatomy.digest and file.attrs["deformer"] == "linear"
@@ -116,6 +116,7 @@ class TestEpisode:
         for label in (f"{CORTEX} cortex", f"{DRAPE} drape", f"{TOOL} tool"):
             assert label in file.attrs["segmentation"]
         assert [name.decode() for name in file["outcome_predicted"][:]] == 7 * ["PREDICTED"]
+        assert file["bound"].shape == (7, 2) and (np.diff(file["bound"][:]) >= 0.0).all()
         assert report["frames"] == 7 and report["fem"] == {"converged": 7}
 
     @pytest.mark.parametrize("blow", [KeyboardInterrupt, RuntimeError])

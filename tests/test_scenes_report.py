@@ -13,7 +13,7 @@ from ar.screen import read_png
 from scenes import report, report_reference
 from scenes.cli import main
 from scenes.commands import report as command
-from scenes.report import UNBUILT, every, rows, star
+from scenes.report import UNBUILT, every, learners, left_out, rows, star
 from scenes.report_elements import OWN, Elements
 from scenes.report_learner import Learner, counts
 from scenes.report_page import Section, write_report
@@ -30,6 +30,7 @@ from sim.material import Material, tissue_to_json
 from sim.meshfile import write_anatomy
 from surrogate.dataset import read_dataset
 from surrogate.envelope import envelope_of
+from surrogate.parts import EXPANDED
 from surrogate.published import published_nodes
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
@@ -120,6 +121,12 @@ def test_rows_say_what_they_are(found, box):
     assert all(row.adapt is None for row in found) and learner.curve[-1] == (learner.taught, learner.teacher["discs"])
     assert row_from_json(row_to_json(learner)) == learner
     assert 0.05 < peak_memory() < 50.0
+
+
+def test_a_quick_report_says_what_it_leaves_out():
+    quick, whole = ({spec.name for spec in learners(quick)} for quick in (True, False))
+    assert whole - quick == set(EXPANDED) == {row.name for row in left_out()}
+    assert {row.state for row in left_out()} == {"left out of --quick"}
 
 
 def test_tenths_of_the_force_and_of_no_load_nothing():

@@ -64,7 +64,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     from sim.device import find_device
 
     from ..bench import machine
-    from ..report import UNBUILT, every, learners, rows, star
+    from ..report import UNBUILT, every, learners, left_out, rows, star
     from ..report_page import Section, write_report
     from ..report_reference import solve_beyond, solve_reference
     from ..report_study import Study
@@ -86,7 +86,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     studies = [Study(path, args.out, args.device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
     sections = []
     for study in studies:
-        specs = (*(every(study) if args.full else star(study, not args.quick)), *learners())
+        specs = (*(every(study) if args.full else star(study, not args.quick)), *learners(args.quick))
         total = len(study.played) + len(study.outside) + len(specs) + len(UNBUILT)
         found = []
         with tqdm(total=total, desc=study.data.stem, unit="step", file=sys.stderr) as bar:
@@ -95,6 +95,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
             for row in rows(study, specs):
                 found.append(row)
                 bar.update()
+        found += left_out() if args.quick else ()
         sections.append(Section(study.data.stem, _about(study), tuple(found), minutes.get(study.data)))
         write_report(args.out, machine(args.device), sections)
     return sections
