@@ -132,3 +132,25 @@ def test_a_damaged_data_file_is_a_sentence(folder, tmp_path, capsys):
         file["anatomy/nodes"][0] += 1e-4
     assert main(["train", str(damaged), "--out", str(tmp_path / "model.npz")]) == 2
     assert "was changed" in capsys.readouterr().err
+
+
+def test_models_are_judged_by_loads_that_they_have_never_seen(folder, box, capsys):
+    data, model, fresh = (str(folder / name) for name in ("data.h5", "table.npz", "fresh.h5"))
+    assert main(["train", data, "--out", model, "--learners", "linear", "--json"]) == 0
+    words = ["--count", "60", "--device", "cpu", "--json"]
+    assert main(["simulate", str(folder / "box.vtu"), "--out", fresh, "--seed", "9", *words]) == 0
+    capsys.readouterr()
+    assert main(["judge", model, fresh, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    answers = read_dataset(fresh)
+    guess = load(model, box)["linear"].deform(answers.loads, at=box.tumour_nodes)
+    miss = np.linalg.norm(guess.displacement - answers.displacement(box.tumour_nodes), axis=2)
+    assert said["scores"][0]["mean_mm"] == pytest.approx(1e3 * miss.mean(), rel=1e-6)
+    found = said["coverage"]["linear"]
+    assert found["held"] == [np.mean(miss.max(axis=1) <= row) for row in guess.bound]
+    assert np.mean(found["tenths"]) == pytest.approx(found["held"][0]) and len(found["tenths"]) == 10
+    assert found["bound_mm"] == pytest.approx(1e3 * np.median(guess.bound[0])) and found["loads"] == 60
+    assert main(["judge", model, fresh]) == 0
+    assert "bounds held for" in capsys.readouterr().out
+    assert main(["judge", model, data]) == 2
+    assert "was taught: simulate others" in capsys.readouterr().err

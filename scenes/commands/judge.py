@@ -1,0 +1,64 @@
+"""`sulcus judge`: hold models to a data set that they have never seen: their errors, and whether their bounds hold."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+
+import numpy as np
+
+from sim.errors import InputError
+from surrogate.bound import LEVELS
+from surrogate.coverage import Coverage, coverage
+from surrogate.dataset import read_dataset
+from surrogate.learned import only_pushed
+from surrogate.score import score, table
+from surrogate.store import load
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("model", metavar="MODEL.npz", help="from `sulcus train`")
+    parser.add_argument("data", metavar="FRESH.h5", help="from `sulcus simulate` on the same mesh, with another --seed")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the tables")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Returns 0: what the figures are is for the reader to judge.
+
+    Raises
+    ------
+    InputError
+        Loads that the models were taught.
+    """
+    data = read_dataset(args.data)
+    models = load(args.model, data.anatomy)
+    loads = data.loads.rows(np.flatnonzero(data.good))
+    nodes = data.anatomy.tumour_nodes
+    truth = data.displacement(nodes)[data.good]
+    point = only_pushed(loads).point.astype(np.float32)
+    for name, model in models.items():
+        if (model.envelope.points[:, None] == point[: len(point) : max(1, len(point) // 100)]).all(axis=2).any():
+            raise InputError(f"{args.data}: holds loads that {name} was taught: simulate others, with another --seed.")
+    scores = [score(name, model, loads, truth, nodes) for name, model in models.items()]
+    promised = {name: coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None}
+    motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())
+    if args.json:
+        told = {name: asdict(found) for name, found in promised.items()}
+        print(json.dumps({"scores": [asdict(row) for row in scores], "coverage": told, "motion_mm": motion}))
+    else:
+        print(f"{len(loads)} loads, against the finite elements that answered them:\n{table(scores, motion)}")
+        print("\n".join(f"{name}: {_told(found)}" for name, found in promised.items()))
+    return 0
+
+
+def _told(found: Coverage) -> str:
+    held = ", ".join(
+        f"{100 * share:.1f} % at {100 * level:g} %" for share, level in zip(found.held, LEVELS, strict=True)
+    )
+    tenths = " ".join(f"{100 * share:.0f}" for share in found.tenths)
+    return (
+        f"bounds held for {held}; by tenths of force {tenths}; median bound {found.bound_mm:.4f} mm, median of the "
+        f"largest error {found.error_mm:.4f} mm; {found.extrapolated} loads outside what was taught"
+    )

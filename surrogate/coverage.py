@@ -1,0 +1,68 @@
+"""Whether a model keeps what it promises: its bounds against the errors on loads that it has never seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.deformation import Outcome
+from sim.errors import InputError
+from sim.loads import Loads
+
+from .encode import directions
+from .learned import Learned, only_pushed
+
+TENTHS = 10
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Bounds and errors over n loads.
+
+    Parameters
+    ----------
+    loads
+        n.
+    held
+        Shares of the loads whose largest error at the tumour lies below the bound, for `bound.LEVELS`.
+    tenths
+        The same for the first level, by tenths of the force, from weak to strong.
+    bound_mm, error_mm
+        Medians over the loads of the bound at the first level, and of the largest error [mm].
+    extrapolated
+        Loads that the model says it was not taught.
+    """
+
+    loads: int
+    held: tuple[float, float]
+    tenths: tuple[float, ...]
+    bound_mm: float
+    error_mm: float
+    extrapolated: int
+
+
+def coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
+    """How often a model's bounds held, against displacements `truth` (B, n, 3) [m] of the tumour's vertices.
+
+    Raises
+    ------
+    InputError
+        A model without bounds, or fewer loads than tenths.
+    """
+    if model.bounds is None:
+        raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
+    if len(loads) < TENTHS:
+        raise InputError(f"{len(loads)} loads have no tenths: simulate at least {TENTHS}.")
+    answer = model.deform(loads, at=model.anatomy.tumour_nodes)
+    worst = np.linalg.norm(answer.displacement - truth, axis=2).max(axis=1)
+    held = worst <= answer.bound
+    by_force = np.array_split(np.argsort(directions(only_pushed(loads))[0], kind="stable"), TENTHS)
+    return Coverage(
+        len(loads),
+        (float(held[0].mean()), float(held[1].mean())),
+        tuple(float(held[0][rows].mean()) for rows in by_force),
+        1e3 * float(np.median(answer.bound[0])),
+        1e3 * float(np.median(worst)),
+        answer.outcome.count(Outcome.EXTRAPOLATED),
+    )
