@@ -92,7 +92,7 @@ def counts(most: int) -> list[int]:
 def _taught(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> Deformer:
     """Fitted to the loads that a split teaches; truth (B, k, 3) [m] of all loads that converged."""
     if spec.name not in MACHINES:
-        return train(study.dataset, [spec.name], split=split).models[spec.name]
+        return train(study.dataset, [spec.name], split=split, expansion=study.expansion).models[spec.name]
     rows, held_out = np.flatnonzero(split.taught), study.converged.rows(np.flatnonzero(split.test))
     return taught(spec.name, study.anatomy, study.converged.rows(rows), truth[rows], held_out)
 

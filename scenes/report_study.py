@@ -17,6 +17,7 @@ from sim.mesh import digest_of
 from sim.meshfile import read_anatomy
 from surrogate.dataset import Dataset, read_dataset
 from surrogate.encode import directions
+from surrogate.parts import Expansion
 from surrogate.patch import Patch, open_patch
 from surrogate.split import Split, leave_discs_out
 
@@ -54,6 +55,11 @@ class Study:
     def dataset(self) -> Dataset:
         """The data."""
         return read_dataset(self.data)
+
+    @cached_property
+    def expansion(self) -> Expansion:
+        """The series of its finite elements, which every training on the data shares."""
+        return Expansion(self.dataset, self.device)
 
     @property
     def anatomy(self) -> Anatomy:

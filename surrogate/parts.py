@@ -19,14 +19,15 @@ from .ann import Ann
 from .dataset import Dataset
 from .encode import ENCODERS, Basis, directions, reduce
 from .gp import Gp
-from .learned import Part
+from .learned import Part, only_pushed
 from .linear import Linear
-from .patch import Patch
+from .patch import Patch, open_patch
 from .pcr import Pcr
 from .regressor import Regressor
 from .remainder import Remainder
+from .series import Series
 from .svr import Svr
-from .tabulate import radii_between, tabulated
+from .tabulate import radii_between, series_of, tabulated
 
 # Encoder and regressor of each but the table itself; principal components are those of the forces at the nodes.
 LEARNT: dict[str, tuple[str, Callable[[], Regressor]]] = {
@@ -62,6 +63,62 @@ class Lesson:
 
 
 @dataclass(frozen=True, eq=False)
+class Expansion:
+    """The power series of a data set's finite elements, made once, when it is first asked for.
+
+    Parameters
+    ----------
+    data
+        Its anatomy, tissue and element; its loads say how wide tools are.
+    device
+        Where the finite elements work.
+    progress
+        Hears which place is done, and of how many.
+    """
+
+    data: Dataset
+    device: str = "auto"
+    progress: Callable[[int, int], object] = lambda done, total: None
+
+    def on(self, basis: Basis) -> Series:
+        """The series as coefficients of a basis of tumour or open cortex.
+
+        Raises
+        ------
+        InputError
+            Data that do not say what tissue they are of.
+        """
+        return series_of(self._table, self._nodes, self._patch, self._radii, basis)
+
+    @cached_property
+    def _patch(self) -> Patch:
+        return open_patch(self.data.anatomy)
+
+    @cached_property
+    def _nodes(self) -> np.ndarray:
+        return np.union1d(self._patch.nodes, self.data.anatomy.tumour_nodes)
+
+    @cached_property
+    def _radii(self) -> np.ndarray:
+        footprint = only_pushed(self.data.loads).footprint
+        return radii_between(float(footprint.min()), float(footprint.max()))
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        return tabulated(self._fem(), self._patch, self._radii, self._nodes, self.progress)
+
+    def _fem(self) -> Fem:
+        said = self.data.provenance
+        if "tissue" not in said:
+            raise InputError(
+                f"{self.data.path}: does not say what tissue it is of, so no series can be had of it: choose other "
+                "learners, or simulate anew."
+            )
+        effects = pushed_effects(self.data.anatomy, tissue_from_json(said["tissue"]))
+        return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=said.get("element"))
+
+
+@dataclass(frozen=True, eq=False)
 class Classroom:
     """What every learner of a data set is given, made when it is asked for.
 
@@ -73,17 +130,14 @@ class Classroom:
         Its open cortex.
     basis_from
         The lesson whose responses the series' bases span.
-    device
-        Where the finite elements make their series.
-    progress
-        Hears which place of the series is done, and of how many.
+    expansion
+        Of the same data.
     """
 
     data: Dataset
     patch: Patch
     basis_from: Lesson
-    device: str = "auto"
-    progress: Callable[[int, int], object] = lambda done, total: None
+    expansion: Expansion
 
     @cached_property
     def tumour(self) -> np.ndarray:
@@ -115,20 +169,9 @@ class Classroom:
             # A dent as small as its tool is no sum of a few modes, but what nonlinearity adds to it is.
             linear = sum(part.response(ENCODERS[part.encoder](self.patch, taught.loads)) for part in self.cortex_table)
             bases.append(reduce(self.cortex, taught.cortex / size - linear, TOLERANCE, MODES))
-        radii = radii_between(float(taught.loads.footprint.min()), float(taught.loads.footprint.max()))
-        found = tabulated(self._fem(), self.patch, radii, tuple(bases), self.progress)
+        found = [self.expansion.on(basis) for basis in bases]
         at_cortex = Part("tool", found[1].from_second_order(), bases[1]) if len(self.cortex) else None
         return Part("tool", found[0], bases[0]), at_cortex
-
-    def _fem(self) -> Fem:
-        said = self.data.provenance
-        if "tissue" not in said:
-            raise InputError(
-                f"{self.data.path}: does not say what tissue it is of, so no series can be had of it: choose other "
-                "learners, or simulate anew."
-            )
-        effects = pushed_effects(self.data.anatomy, tissue_from_json(said["tissue"]))
-        return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=said.get("element"))
 
     def _compliance(self, nodes: np.ndarray) -> Part:
         """The compliance table of some vertices, from the unit responses, in as many modes as it needs."""

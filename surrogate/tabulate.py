@@ -33,16 +33,17 @@ def tabulated(
     fem: Fem,
     patch: Patch,
     radii: np.ndarray,
-    bases: tuple[Basis, ...],
+    nodes: np.ndarray,
     progress: Callable[[int, int], object] = lambda done, total: None,
-) -> tuple[Series, ...]:
-    """One series for each basis, from the finite elements; `progress` hears places done and all."""
-    triangles, places = with_middles(patch)
+) -> np.ndarray:
+    """What `forms` are multiplied by at each place of `with_middles` and each radius: (P, R, 19, n, 3) float32.
+
+    For the responses of vertices `nodes` (n,); `progress` hears places done and all.
+    """
+    places = with_middles(patch)[1]
     directions = AXES / np.linalg.norm(AXES, axis=1, keepdims=True)
     solver = [np.linalg.pinv(forms(directions, np.ones(len(directions)))[:, rows]) for rows in SPANS]
-    nodes = np.unique(np.concatenate([basis.nodes for basis in bases]))
-    rows = [np.searchsorted(nodes, basis.nodes) for basis in bases]
-    tables = [np.zeros((len(places), len(radii), TERMS, len(basis.modes)), np.float32) for basis in bases]
+    table = np.zeros((len(places), len(radii), TERMS, len(nodes), 3), np.float32)
     some = max(1, fem.batch // (len(radii) * len(directions)))
     for first in range(0, len(places), some):
         here = places[first : first + some]
@@ -51,13 +52,19 @@ def tabulated(
         force = np.broadcast_to(directions, (*shape, 3)).reshape(-1, 3)
         radius = np.broadcast_to(radii[:, None], shape).reshape(-1)
         found = fem.series(Loads((Pushed(point, force, radius),)), ORDERS, nodes).astype(np.float32)
-        for table, basis, row in zip(tables, bases, rows, strict=True):
-            for order, span in enumerate(SPANS):
-                coefficients = basis.encode(found[order][:, row]).reshape(*shape, -1)
-                table[first : first + some, :, span] = np.einsum("td,prdm->prtm", solver[order], coefficients)
+        for order, span in enumerate(SPANS):
+            answers = found[order].reshape(*shape, len(nodes), 3)
+            table[first : first + some, :, span] = np.einsum("td,prdnk->prtnk", solver[order], answers)
         progress(min(first + some, len(places)), len(places))
-    exact = (Series(patch.points, triangles, radii, table) for table in tables)
-    return tuple(Series.restored(series.state()) for series in exact)  # what is used is what can be stored
+    return table
+
+
+def series_of(table: np.ndarray, nodes: np.ndarray, patch: Patch, radii: np.ndarray, basis: Basis) -> Series:
+    """A table of `tabulated` for sorted vertices `nodes` (n,), as coefficients of a basis of some of them."""
+    known = table[:, :, :, np.searchsorted(nodes, basis.nodes)]
+    coefficients = known.reshape(*table.shape[:3], -1) @ basis.modes.T
+    exact = Series(patch.points, with_middles(patch)[0], radii, coefficients)
+    return Series.restored(exact.state())  # what is used is what can be stored
 
 
 def with_middles(patch: Patch) -> tuple[np.ndarray, np.ndarray]:

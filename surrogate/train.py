@@ -16,7 +16,7 @@ from .dataset import Dataset
 from .encode import directions
 from .envelope import envelope_of, measured
 from .learned import Learned
-from .parts import EXPANDED, LEARNT, Classroom, Lesson, parts_of
+from .parts import EXPANDED, LEARNT, Classroom, Expansion, Lesson, parts_of
 from .patch import Patch, open_patch
 from .score import Score, errors, score
 from .split import Split, leave_discs_out
@@ -52,8 +52,7 @@ def train(
     progress: Callable[[str], object] = lambda learner: None,
     split: Split | None = None,
     most: int | None = None,
-    device: str = "auto",
-    tabulating: Callable[[int, int], object] = lambda done, total: None,
+    expansion: Expansion | None = None,
 ) -> Trained:
     """Fit `learners`, by default all that the data can teach: first to be scored, then to be used.
 
@@ -70,10 +69,9 @@ def train(
         Hears the name of each learner that is done.
     most
         Loads that are taught, at most; those that calibrate or test are not counted.
-    device
-        Where finite elements make the series.
-    tabulating
-        Hears which place of the series is done, and of how many.
+    expansion
+        The series of these data, by default made anew wherever there is a device: minutes on a CPU, so that whoever
+        trains on them again hands it on.
 
     Raises
     ------
@@ -109,7 +107,7 @@ def train(
         return Lesson(_pushed(loads.rows(np.flatnonzero(rows))), truth[rows], cortex[rows])
 
     first = lesson(_first(split.taught, most))
-    room = Classroom(data, patch, first, device, tabulating)
+    room = Classroom(data, patch, first, expansion or Expansion(data))
     test = loads.rows(np.flatnonzero(split.test))
     models, scores = {}, []
     for name in wanted:

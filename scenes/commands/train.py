@@ -13,6 +13,7 @@ from tqdm import tqdm
 from sim.files import check_output
 from sim.stages import stage
 from surrogate.dataset import read_dataset
+from surrogate.parts import Expansion
 from surrogate.score import table, winner
 from surrogate.store import save
 from surrogate.train import LEARNERS, Trained, learners_for, train
@@ -41,14 +42,10 @@ def run(args: argparse.Namespace) -> int:
         data = read_dataset(args.data)
     learners = learners_for(data) if args.learners is None else [name.strip() for name in args.learners.split(",")]
     with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
-        trained = train(
-            data,
-            learners,
-            lambda learner: bar.update(),
-            most=args.most,
-            device=args.device,
-            tabulating=lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"),
+        expansion = Expansion(
+            data, args.device, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places")
         )
+        trained = train(data, learners, lambda learner: bar.update(), most=args.most, expansion=expansion)
     with stage("save"):
         save(out, trained.models)
     failed = int(np.sum(~data.good))
