@@ -27,6 +27,8 @@ from .report_row import Row, row_from_json, row_to_json
 from .report_rows import FAMILY, Spec, measured
 from .report_study import Study
 
+# States of rows that nothing is wrong with.
+LATER, SKIPPED = "not built yet", "left out of --quick"
 UNBUILT = ("mass-spring", "meshless", "boundary element", "geometry-based")
 ELEMENTS = ("p1", "smoothed", "p2")
 MESHES = {"2.5k": "2500", "17k": "17000"}
@@ -62,7 +64,7 @@ def every(study: Study) -> tuple[Elements, ...]:
 
 def left_out() -> tuple[Row, ...]:
     """Those that a quick report has no time for."""
-    return tuple(Row(name, FAMILY[Learner], state="left out of --quick") for name in EXPANDED)
+    return tuple(Row(name, FAMILY[Learner], state=SKIPPED) for name in EXPANDED)
 
 
 def learners(quick: bool = False) -> tuple[Learner, ...]:
@@ -96,7 +98,7 @@ def rows(study: Study, specs: Sequence[Spec], run: Run = apart) -> Iterator[Row]
                 with written_whole(path, ".json") as partial:
                     partial.write_text(json.dumps({"digest": digest, "row": json.loads(row_to_json(kept))}))
         yield kept
-    yield from (Row(name, name, state="not built yet") for name in UNBUILT)
+    yield from (Row(name, name, state=LATER) for name in UNBUILT)
 
 
 def _power(tolerance: float) -> str:

@@ -67,12 +67,12 @@ class Gp:
             start = fitted.x
         self.length_, self.noise_ = np.exp(start[:-1]), np.exp(start[-1])
         self.seen_ = x / self.length_
-        self.dual_ = cho_solve(self._factor, y).astype(np.float32)
+        self.dual_ = cho_solve(self._factor, y)
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of features (B, f): the mean of the posterior."""
-        return matern(self._distance(X)).astype(np.float32) @ self.dual_ + self.offset_.astype(np.float32)
+        return (matern(self._distance(X)) @ self.dual_ + self.offset_).astype(np.float32)
 
     def deviation(self, X: np.ndarray) -> np.ndarray:
         """Standard deviation (B,) of the posterior, noise included, against that of the prior."""

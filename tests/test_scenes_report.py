@@ -264,7 +264,7 @@ def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, found
     monkeypatch.setattr(report, "rows", lambda study, specs: iter(found))
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert [row["name"] for row in said["sections"][0]["rows"]] == [row.name for row in found]
+    assert [row["name"] for row in said["sections"][0]["rows"]] == [row.name for row in (*found, *left_out())]
     assert "quadratic tetrahedra (p2) on the same mesh" in (study.folder / "index.html").read_text()
     monkeypatch.setattr(report, "rows", lambda study, specs: iter([Row("odd", "f", state="no memory")]))
     assert main(words) == 1

@@ -50,13 +50,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a row could not be measured."""
+    from ..report import LATER, SKIPPED
+
     try:
         sections = _measured(args)
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on from {args.out}", file=sys.stderr)
         return INTERRUPTED
     _say(args, sections)
-    return 0 if all(row.state in ("measured", "not built yet") for part in sections for row in part.rows) else 1
+    return 0 if all(row.state in ("measured", LATER, SKIPPED) for part in sections for row in part.rows) else 1
 
 
 def _measured(args: argparse.Namespace) -> list[Section]:
