@@ -244,7 +244,13 @@ class Fem:
         problem.linearise(problem.device.zeros(*force.shape), np.zeros(columns, bool))
         self._ladder.preconditioner.prepare(problem, columns)
         wanted = SERIES_TOLERANCE * norms(problem.device, force)
-        return conjugate_gradients(problem, self._ladder.preconditioner, force, wanted, self.accuracy.inner).x
+        found = conjugate_gradients(problem, self._ladder.preconditioner, force, wanted, self.accuracy.inner)
+        if (norms(problem.device, force) > 10.0 * wanted).any():
+            raise InputError(
+                f"a linear solve of the series did not reach {SERIES_TOLERANCE:g} in {self.accuracy.inner} iterations: "
+                "ask for an Accuracy of more `inner` ones."
+            )
+        return found.x
 
     def _guess(self, loads: Loads, start: Deformation) -> np.ndarray:
         """First guesses (3N, B). A case without any load starts at rest: its answer is exactly zero."""

@@ -82,8 +82,9 @@ def fitted_bound(
     worst = error.max(axis=1)
     ratio = worst / np.exp(_monomials(_standard(features, mean, deviation)) @ weights)
     count = int(np.clip(len(ratio) // CLASS, 1, CLASSES))
-    edges = np.quantile(force, np.arange(1, count) / count)
-    member = np.searchsorted(edges, force)
+    edges = np.unique(np.quantile(force, np.arange(1, count) / count))
+    edges = edges[edges < force.max()]  # equal forces are of one class
+    count, member = len(edges) + 1, np.searchsorted(edges, force)
     quantile = np.array([[conformal(ratio[member == k], level) for k in range(count)] for level in LEVELS])
     share = np.quantile(error / np.maximum(worst, np.finfo(float).tiny)[:, None], LEVELS[0], axis=0)
     return Bound(mean, deviation, weights, edges, quantile, share)
@@ -96,9 +97,9 @@ def features_of(pushed: Pushed, known: Measured) -> np.ndarray:
 
 
 def conformal(ratio: np.ndarray, level: float) -> float:
-    """The ceil(level (n + 1))-th smallest of `ratio` (n,): the largest, where n is too small for the level."""
-    rank = min(len(ratio), int(np.ceil(level * (len(ratio) + 1))))
-    return float(np.sort(ratio)[rank - 1])
+    """The ceil(level (n + 1))-th smallest of `ratio` (n,): infinite, where n is too small for the level."""
+    rank = int(np.ceil(level * (len(ratio) + 1)))
+    return float(np.sort(ratio)[rank - 1]) if rank <= len(ratio) else np.inf
 
 
 def _standard(features: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:

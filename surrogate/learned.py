@@ -149,7 +149,7 @@ class Learned:
             # As the motion, so its error: in proportion to a force weaker than any that was taught.
             weaker = np.minimum(magnitude / self.envelope.force[0], 1.0)
             told = features_of(pushed, known._replace(magnitude=within))
-            promised = self.bounds.of(told, magnitude, excess) * weaker
+            promised = np.where(weaker > 0.0, self.bounds.of(told, magnitude, excess), 0.0) * weaker
         reaction = np.concatenate([pushed.force, np.zeros_like(pushed.force)], axis=1)[:, None]
         return Deformation(
             displacement,

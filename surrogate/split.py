@@ -12,6 +12,8 @@ from .patch import Patch, nearest
 from .sampling import spread
 
 FEWEST, MOST, SHARE = 6, 200, 0.15
+# One load in so many, and at most so many, is kept apart from every split, to calibrate bounds.
+APART, MOST_APART = 4, 2000
 RADII = (6e-3, 5e-3, 4e-3, 3e-3, 2e-3, 1e-3)
 
 

@@ -13,9 +13,15 @@ from .encode import Basis
 from .patch import Patch
 from .series import ORDERS, SPANS, STENCIL, TERMS, Series, forms
 
-# Ten axes that tell any form of the third degree, and none by much more than its own size.
+# The ten axes of a dodecahedron tell any form of the third degree.
+GOLDEN = 0.5 * (1.0 + np.sqrt(5.0))
 AXES = np.array(
-    [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1), (1, 1, 0), (0, 1, 1), (1, 0, 1)]
+    [(1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)]
+    + [
+        axis
+        for sign in (1.0, -1.0)
+        for axis in ((0, 1 / GOLDEN, sign * GOLDEN), (sign * GOLDEN, 0, 1 / GOLDEN), (1 / GOLDEN, sign * GOLDEN, 0))
+    ]
 )
 # Neighbouring radii differ by this factor at most.
 RATIO = 1.5

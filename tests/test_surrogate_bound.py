@@ -48,4 +48,12 @@ def test_weak_vertices_have_a_small_share(bound):
 def test_conformal_takes_the_rank_that_covers_one_more():
     values = np.arange(1.0, 100.0)  # 99 of them
     assert conformal(values, 0.95) == 95.0 and conformal(values, 0.99) == 99.0
-    assert conformal(values[:9], 0.95) == 9.0
+    assert conformal(values[:9], 0.95) == np.inf
+
+
+def test_loads_of_one_force_are_one_class():
+    features, _, error = drawn(500, 4)
+    bound = fitted_bound((features, error.max(axis=1)), features, np.full(500, 0.2), error)
+    assert not len(bound.edges) and bound.quantile.shape == (2, 1)
+    told = bound.of(features, np.full(500, 0.2), np.zeros(500))
+    assert np.mean(error.max(axis=1) <= told[0]) >= 0.95

@@ -152,5 +152,9 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, box, capsy
     assert found["bound_mm"] == pytest.approx(1e3 * np.median(guess.bound[0])) and found["loads"] == 60
     assert main(["judge", model, fresh]) == 0
     assert "bounds held for" in capsys.readouterr().out
+    other = str(folder / "other.h5")
+    assert main(["simulate", str(folder / "box.vtu"), "--out", other, "--seed", "9", "--young", "6000", *words]) == 0
+    assert main(["judge", model, other]) == 2
+    assert "difference of two bodies" in capsys.readouterr().err
     assert main(["judge", model, data]) == 2
     assert "was taught: simulate others" in capsys.readouterr().err

@@ -18,8 +18,9 @@ from surrogate.patch import open_patch
 from surrogate.sampling import draw
 from surrogate.score import score, winner
 from surrogate.simulate import simulate
+from surrogate.split import APART
 from surrogate.store import load, save
-from surrogate.train import APART, LEARNERS, train
+from surrogate.train import LEARNERS, train
 
 
 @pytest.fixture(scope="module")

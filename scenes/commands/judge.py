@@ -30,17 +30,27 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        Loads that the models were taught.
+        Loads at places that the models were taught, or of another tissue or element.
     """
     data = read_dataset(args.data)
     models = load(args.model, data.anatomy)
     loads = data.loads.rows(np.flatnonzero(data.good))
     nodes = data.anatomy.tumour_nodes
     truth = data.displacement(nodes)[data.good]
+    for name, model in models.items():
+        for what in ("tissue", "element"):
+            taught, here = model.training.get(what), data.provenance.get(what)
+            if taught != here:
+                raise InputError(
+                    f"{args.data}: its {what} is {here}, but {name} was taught {taught}: that would judge the "
+                    "difference of two bodies. Simulate with the model's own."
+                )
     point = only_pushed(loads).point.astype(np.float32)
     for name, model in models.items():
         if (model.envelope.points[:, None] == point[: len(point) : max(1, len(point) // 100)]).all(axis=2).any():
-            raise InputError(f"{args.data}: holds loads that {name} was taught: simulate others, with another --seed.")
+            raise InputError(
+                f"{args.data}: holds loads at places where {name} was taught: simulate others, with another --seed."
+            )
     scores = [score(name, model, loads, truth, nodes) for name, model in models.items()]
     promised = {name: coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None}
     motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())

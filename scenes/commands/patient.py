@@ -15,7 +15,7 @@ from sim.files import check_output
 from sim.material import LAWS
 from sim.stages import listened
 from surrogate.sampling import PRESETS
-from surrogate.split import FEWEST
+from surrogate.split import APART, FEWEST
 
 from ..tissue import add_element_argument
 
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     # Said now, not after minutes of meshing.
     check_output(args.out, ".vtu")
     find_device(args.device, TRAIN.precision)
-    if args.count < FEWEST + 1:
+    if args.count - args.count // APART < FEWEST + 1:
         raise InputError(f"--count {args.count} is too few to learn from and to leave {FEWEST} discs out: give more.")
     data, model = args.out.with_suffix(".h5"), model_path(args.out)
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]

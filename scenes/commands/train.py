@@ -63,7 +63,7 @@ def _for_people(trained: Trained, out: str, failed: int) -> str:
             "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
             table(trained.scores, 1e3 * trained.motion),
             f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}",
-            f"the models written were taught all loads but {trained.calibrated}, by which their bounds were calibrated",
+            f"the models written were taught {trained.taught} loads; {trained.calibrated} others calibrated bounds",
             f"written: {out}",
         ]
     )
