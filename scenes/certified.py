@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from sim.deformation import Deformation
 from sim.fem import Fem
-from surrogate.certify import certify
+from surrogate.certify import certify, largest
 
 from .play import Frame
 
@@ -58,20 +56,16 @@ def certified(fem: Fem, frames: Sequence[Frame], truth: Deformation) -> Iterator
         certify(fem, frames[0].loads, frames[0].deformation)
     for row, frame in enumerate(frames):
         found = certify(fem, frame.loads, frame.deformation)
-        true = truth.at(tumour).displacement[row]
+        true = truth.at(tumour).displacement[row : row + 1]
         searched = found.cost.seconds["search"]
         yield Certified(
             frame.number,
             1e3 * float(found.estimate[0]),
             1e3 * float(found.left[0]),
-            1e3 * _largest(frame.deformation.at(tumour).displacement[0] - true),
-            1e3 * _largest(found.corrected.at(tumour).displacement[0] - true),
+            1e3 * float(largest(frame.deformation.at(tumour).displacement - true)[0]),
+            1e3 * float(largest(found.corrected.at(tumour).displacement - true)[0]),
             1e3 * frame.deformation.cost.total,
             1e3 * (found.cost.total - searched),
             1e3 * searched,
             bool(found.sound[0]),
         )
-
-
-def _largest(motion: np.ndarray) -> float:
-    return float(np.linalg.norm(motion, axis=1).max(initial=0.0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Protocol, runtime_checkable
@@ -145,6 +145,30 @@ class Deformation:
                 f"{len(self.nodes)} vertices."
             )
         return replace(self, displacement=self.displacement[:, position], nodes=np.asarray(nodes))
+
+
+def joined(parts: Sequence[Deformation]) -> Deformation:
+    """Answers of the same vertices, one part after the other; seconds add up, and of histories stays what all have."""
+
+    def stacked(name: str) -> np.ndarray:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    shared = set.intersection(*(set(part.history) for part in parts))
+    stages = parts[0].cost.seconds
+    return Deformation(
+        displacement=stacked("displacement"),
+        nodes=parts[0].nodes,
+        outcome=tuple(outcome for part in parts for outcome in part.outcome),
+        iterations=stacked("iterations"),
+        residual=stacked("residual"),
+        time=stacked("time"),
+        reaction=stacked("reaction"),
+        history={key: np.concatenate([part.history[key] for part in parts]) for key in sorted(shared)},
+        cost=Cost({stage: sum(part.cost.seconds[stage] for part in parts) for stage in stages}),
+        reached=stacked("reached"),
+        inverted=stacked("inverted"),
+        bound=np.concatenate([part.bound for part in parts], axis=1),
+    )
 
 
 def guess(displacement: np.ndarray) -> Deformation:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import cache, cached_property, partial
 
 import numpy as np
@@ -15,7 +16,7 @@ from .anatomy import Anatomy
 from .columns import norms, unstacked
 from .compile import check_causes, compile_problem
 from .correction import step_from
-from .deformation import Cost, Deformation
+from .deformation import Cost, Deformation, joined
 from .device import find_device
 from .discretisation import discretise
 from .effects import Effect
@@ -130,11 +131,16 @@ class Fem:
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
         last = None if start is None else self._guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads))) if start is None else Cases(loads, start.time, start.history)
-        parts = []
-        for first in range(0, max(len(loads), 1), self.batch):
-            rows = slice(first, first + self.batch)
-            parts.append(self._solve(cases.rows(rows), None if last is None else last[:, rows], at))
-        return _joined(parts)
+        return _joined(
+            [
+                self._solve(cases.rows(rows), None if last is None else last[:, rows], at)
+                for rows in self._batches(len(loads))
+            ]
+        )
+
+    def _batches(self, count: int) -> Iterator[slice]:
+        """The rows of each batch, at least one."""
+        return (slice(first, first + self.batch) for first in range(0, max(count, 1), self.batch))
 
     @cached_property
     def _following(self) -> Following | None:
@@ -191,8 +197,7 @@ class Fem:
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
         guess, cases = self._guess(loads, answer), Cases(loads, answer.time, answer.history)
         parts = []
-        for first in range(0, max(len(loads), 1), self.batch):
-            rows = slice(first, first + self.batch)
+        for rows in self._batches(len(loads)):
             step = step_from(self._ladder, cases.rows(rows), guess[:, rows])
             left = unstacked(self.problem.device, step.left, at)
             parts.append((self._answered(cases.rows(rows), step.answer, {}, None, step.seconds), step.before, left))
@@ -219,12 +224,10 @@ class Fem:
                 raise InputError(f"{type(cause).__name__} is no force: a series is had of `Pushed` and `Nodal` loads.")
         edge = float(np.cbrt(self._anatomy.mesh.volumes.mean() * 6.0))
         parts = []
-        for first in range(0, len(loads), self.batch):
-            cases = Cases(
-                loads.rows(slice(first, first + self.batch)), np.zeros(len(loads))[first : first + self.batch]
-            )
-            self.problem.begin(cases)
-            found = taylor(self.problem, self._at_rest, len(cases.loads), edge, orders)
+        for rows in self._batches(len(loads)):
+            some = loads.rows(rows)
+            self.problem.begin(Cases(some, np.zeros(len(some))))
+            found = taylor(self.problem, self._at_rest, len(some), edge, orders)
             parts.append(np.stack([unstacked(self.problem.device, term, at) for term in found]))
         return np.concatenate(parts, axis=1)
 
@@ -328,27 +331,8 @@ class Fem:
 
 
 def _joined(parts: list[Deformation]) -> Deformation:
-    """Batches, one after the other, as one deformation; seconds add up. What they learnt is not for all of them."""
+    """Batches, one after the other, as one deformation. What they learnt is not for all of them."""
     if len(parts) == 1:
         return parts[0]
-
-    def stacked(name: str) -> np.ndarray:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    shared = set.intersection(*(set(part.history) for part in parts))
-    keys = sorted(key for key in shared if not key.startswith(LEARNT_KEY))
-    history = {key: np.concatenate([part.history[key] for part in parts]) for key in keys}
-    stages = parts[0].cost.seconds
-    return Deformation(
-        displacement=stacked("displacement"),
-        nodes=parts[0].nodes,
-        outcome=tuple(outcome for part in parts for outcome in part.outcome),
-        iterations=stacked("iterations"),
-        residual=stacked("residual"),
-        time=stacked("time"),
-        reaction=stacked("reaction"),
-        history=history,
-        cost=Cost({stage: sum(part.cost.seconds[stage] for part in parts) for stage in stages}),
-        reached=stacked("reached"),
-        inverted=stacked("inverted"),
-    )
+    kept = [{key: value for key, value in part.history.items() if not key.startswith(LEARNT_KEY)} for part in parts]
+    return joined([replace(part, history=history) for part, history in zip(parts, kept, strict=True)])

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.deformation import Cost, Deformation, guess
+from sim.deformation import Cost, Deformation, guess, joined
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads
@@ -80,20 +80,23 @@ def certify(fem: Fem, loads: Loads, prediction: Deformation) -> Certificate:
     start = prediction if every else guess(np.zeros((len(loads), *mesh.nodes.shape)))
     predicted = prediction.at(tumour).displacement
     corrected, before, missing = fem.corrected(loads, start, tumour)
-    left, seconds = _largest(missing), dict(corrected.cost.seconds)
+    left, seconds = largest(missing), dict(corrected.cost.seconds)
     for _ in range(STEPS - 1):
-        estimate = _largest(corrected.displacement[:, tumour] - predicted)
+        estimate = largest(corrected.displacement[:, tumour] - predicted)
         again = np.flatnonzero(~_sound(corrected, left, estimate))
         if not len(again):
             break
         further, _, missing = fem.corrected(loads.rows(again), corrected.rows(again), tumour)
         lower = np.flatnonzero(further.residual < corrected.residual[again])
-        corrected, left[again[lower]] = _put(corrected, again[lower], further.rows(lower)), _largest(missing[lower])
+        rows, pick = again[lower], np.arange(len(loads))
+        pick[rows] = len(loads) + lower
+        steps = replace(further, iterations=corrected.iterations[again] + further.iterations)
+        corrected, left[rows] = joined([corrected, steps]).rows(pick), largest(missing[lower])
         seconds = {stage: spent + further.cost.seconds[stage] for stage, spent in seconds.items()}
     correction = corrected.displacement[:, prediction.nodes] - prediction.displacement
     cost = Cost({**seconds, "rest": time.perf_counter() - begun - sum(seconds.values())})
     return Certificate(
-        _largest(corrected.displacement[:, tumour] - predicted),
+        largest(corrected.displacement[:, tumour] - predicted),
         left,
         correction,
         replace(corrected, cost=cost),
@@ -108,27 +111,9 @@ def _sound(corrected: Deformation, left: np.ndarray, estimate: np.ndarray) -> np
     return converged | ((left <= SHARE * estimate) & (corrected.residual <= SETTLED))
 
 
-def _largest(motion: np.ndarray) -> np.ndarray:
+def largest(motion: np.ndarray) -> np.ndarray:
     """The largest distance (B,) [m] of motions (B, n, 3) [m]."""
     return np.linalg.norm(motion, axis=2).max(axis=1)
-
-
-def _put(answers: Deformation, index: np.ndarray, further: Deformation) -> Deformation:
-    """Answers of which the rows `index` (k,) have gone further."""
-
-    def put(values: np.ndarray, new: np.ndarray) -> np.ndarray:
-        values = values.copy()
-        values[index] = new
-        return values
-
-    arrays = ("displacement", "residual", "reached", "inverted")
-    return replace(
-        answers,
-        outcome=tuple(put(np.array(answers.outcome, object), np.array(further.outcome, object))),
-        iterations=put(answers.iterations, answers.iterations[index] + further.iterations),
-        history={name: put(values, further.history[name]) for name, values in answers.history.items()},
-        **{name: put(getattr(answers, name), getattr(further, name)) for name in arrays},
-    )
 
 
 def _check(vertices: int, tumour: np.ndarray, loads: Loads, prediction: Deformation) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.deformation import Cost, Deformation
+from sim.deformation import Deformation, joined
 from sim.errors import InputError
 from sim.loads import Loads
 
@@ -56,20 +56,7 @@ class InTurn:
         turn = nearest(only_pushed(loads).point, self.positions)[0]
         rows = [np.flatnonzero(turn == which) for which in np.unique(turn)]
         answers = [self.models[turn[some[0]]].deform(loads.rows(some), at=at) for some in rows]
-        if len(answers) == 1:
-            return answers[0]
-        outcome = [each for answer in answers for each in answer.outcome]
-        place = np.argsort(np.concatenate(rows))
-        return Deformation(
-            np.concatenate([answer.displacement for answer in answers])[place],
-            answers[0].nodes,
-            tuple(outcome[row] for row in place),
-            np.zeros(len(loads), int),
-            np.full(len(loads), np.nan),
-            loads.times,
-            np.concatenate([answer.reaction for answer in answers])[place],
-            cost=Cost({"predict": sum(answer.cost.total for answer in answers)}),
-        )
+        return joined(answers).rows(np.argsort(np.concatenate(rows)))
 
 
 def positions_of(loads: Loads) -> np.ndarray:
