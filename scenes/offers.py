@@ -9,11 +9,10 @@ import numpy as np
 from surrogate.choose import Offer
 from surrogate.learned import Learned
 
+from .live import PROMISED
 from .scene import Scene
 from .theatre import Theatre
 
-# What a live answer of the finite elements may be off those solved to the end (`sim.accuracy.LIVE`).
-LIVE_MM = 0.05
 # Frames that are timed, after one that is not.
 TIMED = 24
 
@@ -26,7 +25,7 @@ def offers(theatre: Theatre, scene: Scene) -> list[Offer]:
     for name in theatre.names:
         deformer = theatre.deformer(name, scene)
         learnt, seconds, last = isinstance(deformer, Learned), [], None
-        error_mm = 1e3 * deformer.bound if isinstance(deformer, Learned) else LIVE_MM
+        error_mm = 1e3 * deformer.bound if isinstance(deformer, Learned) else 1e3 * PROMISED
         if np.isnan(error_mm):
             continue
         for load in loads:

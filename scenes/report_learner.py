@@ -11,6 +11,7 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
 from surrogate.published import MACHINES, published_nodes, taught
+from surrogate.score import single_seconds
 from surrogate.sectors import leave_sectors_out
 from surrogate.split import Split
 from surrogate.train import train
@@ -19,7 +20,7 @@ from .report_reference import beyond_of
 from .report_row import Figures, Row, against_reference, figures_between, of_times
 from .report_study import Study
 
-WARM_UP, FEWEST_TAUGHT = 20, 64
+FEWEST_TAUGHT = 64
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         units=len(study.dataset.unit_good),
         learning=learning,
         curve=tuple((count, each) for count, each in [*curve, (len(order), of_discs[0])] if each is not None),
-        **of_times(_single(study, model, nodes)),
+        **of_times(single_seconds(model, study.converged.rows(np.flatnonzero(discs.test)), nodes, study.timed)),
     )
     return row, field
 
@@ -102,15 +103,3 @@ def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -
     answer = model.deform(loads, at=nodes)
     flagged = [outcome is Outcome.EXTRAPOLATED for outcome in answer.outcome]
     return figures_between(answer.displacement, truth, loads), float(np.mean(flagged)) if flagged else 0.0
-
-
-def _single(study: Study, model: Deformer, nodes: np.ndarray) -> list[float]:
-    """Seconds of single loads of the discs, over and over again."""
-    rows = np.flatnonzero(study.discs.test)
-    single = [study.converged.rows(rows[k : k + 1]) for k in np.arange(WARM_UP + study.timed) % len(rows)]
-    seconds = []
-    for one in single:
-        begun = clock.perf_counter()
-        model.deform(one, at=nodes)
-        seconds.append(clock.perf_counter() - begun)
-    return seconds[WARM_UP:]

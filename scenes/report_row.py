@@ -11,6 +11,7 @@ import numpy as np
 
 from sim.loads import Loads, Pushed
 from surrogate.encode import directions
+from surrogate.score import spread
 
 from .report_reference import reference_of
 from .report_study import Study
@@ -68,7 +69,12 @@ def figures_of(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> Fi
         for r in parts
     )
     return Figures(
-        len(distance), distance.size, 1e3 * float(motion.mean()), _spread(mm), _spread(percent), tuple(tenths)
+        len(distance),
+        distance.size,
+        1e3 * float(motion.mean()),
+        Spread(*spread(mm)),
+        Spread(*spread(percent)),
+        tuple(tenths),
     )
 
 
@@ -92,11 +98,6 @@ def of_times(seconds: Sequence[float]) -> dict[str, Any]:
     ms = 1e3 * np.array(seconds)
     p99 = float(np.percentile(ms, 99.0)) if len(ms) >= FEWEST_FOR_P99 else None
     return {"median": float(np.median(ms)), "p99": p99, "timed": len(ms)}
-
-
-def _spread(values: np.ndarray) -> Spread:
-    p95, p999 = np.percentile(values, (95.0, 99.9))
-    return Spread(float(values.mean()), float(p95), float(p999), float(values.max()))
 
 
 @dataclass(frozen=True)

@@ -106,8 +106,8 @@ class Study:
         InputError
             Loads of another kind.
         """
-        pushed = self.converged.of(Pushed)
-        if pushed is None or len(self.converged.causes) > 1:
+        pushed = self.converged.only(Pushed)
+        if pushed is None:
             raise InputError(f"{self.data}: holds other loads than pushes: simulate pushes.")
         return pushed
 

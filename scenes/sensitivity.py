@@ -140,8 +140,8 @@ def moved_alike(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
 
     The mean motion of each footprint, from the motion of the mesh's own vertices: on quadratic elements nearly.
     """
-    cause = loads.of(Pushed)
-    if cause is None or len(loads.causes) > 1:
+    cause = loads.only(Pushed)
+    if cause is None:
         raise InputError("known motions are derived from forces: give `Pushed` loads alone.")
     mesh = anatomy.mesh
     weight = footprint_weights(mesh.nodes, mesh.surface, cause.point, cause.footprint).toarray()

@@ -22,9 +22,9 @@ BACK, ON = -1.0, 2.0
 
 def pushes_of(loads: Loads) -> np.ndarray | None:
     """Point [m], force [N] and footprint [m] (B, 7) of each load; None where anything but a push acts."""
-    if len(loads.causes) != 1 or not isinstance(loads.causes[0], Pushed):
+    push = loads.only(Pushed)
+    if push is None:
         return None
-    push = loads.causes[0]
     return np.column_stack([push.point, push.force, push.footprint])
 
 

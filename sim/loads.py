@@ -101,6 +101,10 @@ class Loads:
         """The cause of one kind, or None."""
         return next((cause for cause in self.causes if isinstance(cause, kind)), None)
 
+    def only(self, kind: type[C]) -> C | None:
+        """The cause of one kind, or None where there is none, or another beside it."""
+        return self.of(kind) if len(self.causes) == 1 else None
+
     def rows(self, index: slice | np.ndarray) -> Loads:
         """Some of the load cases, as loads."""
         causes = tuple(

@@ -150,18 +150,7 @@ class Learned:
             weaker = np.minimum(magnitude / self.envelope.force[0], 1.0)
             told = features_of(pushed, known._replace(magnitude=within))
             promised = np.where(weaker > 0.0, self.bounds.of(told, magnitude, excess), 0.0) * weaker
-        reaction = np.concatenate([pushed.force, np.zeros_like(pushed.force)], axis=1)[:, None]
-        return Deformation(
-            displacement,
-            nodes,
-            tuple(Outcome.EXTRAPOLATED if far else Outcome.PREDICTED for far in excess > 0.0),
-            np.zeros(len(loads), int),
-            np.full(len(loads), np.nan),
-            loads.times,
-            reaction,
-            cost=Cost({"predict": time.perf_counter() - begun}),
-            bound=promised,
-        )
+        return predicted(displacement, nodes, loads, excess > 0.0, begun, promised)
 
     def margin(self, answer: Deformation) -> np.ndarray:
         """A field (B, n) [m] over `anatomy.tumour_nodes`, scaled from an answer's bound at 0.95: where it is needed.
@@ -178,6 +167,27 @@ class Learned:
         return answer.bound[0][:, None] * self.bounds.profile
 
 
+def predicted(
+    displacement: np.ndarray, nodes: np.ndarray, loads: Loads, outside: np.ndarray, begun: float, bound: np.ndarray
+) -> Deformation:
+    """What a learnt model, asked at `begun` [s], answers pushes with; `outside` (B,) of what it was taught or not.
+
+    displacement (B, n, 3) [m] of `nodes` (n,); bound as in `Deformation`.
+    """
+    force = only_pushed(loads).force
+    return Deformation(
+        displacement,
+        nodes,
+        tuple(Outcome.EXTRAPOLATED if far else Outcome.PREDICTED for far in outside),
+        np.zeros(len(loads), int),
+        np.full(len(loads), np.nan),
+        loads.times,
+        np.concatenate([force, np.zeros_like(force)], axis=1)[:, None],
+        cost=Cost({"predict": time.perf_counter() - begun}),
+        bound=bound,
+    )
+
+
 def only_pushed(loads: Loads) -> Pushed:
     """The pushes of loads that are nothing else.
 
@@ -186,8 +196,8 @@ def only_pushed(loads: Loads) -> Pushed:
     InputError
         Loads of another kind.
     """
-    pushed = loads.of(Pushed)
-    if pushed is None or len(loads.causes) > 1:
+    pushed = loads.only(Pushed)
+    if pushed is None:
         names = ", ".join(type(cause).__name__ for cause in loads.causes)
         raise InputError(
             f"the loads have the causes {names}, but this model was taught pushing forces only: give `Pushed` alone, "

@@ -19,14 +19,14 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from sim.anatomy import Anatomy
-from sim.deformation import Cost, Deformation, Outcome
+from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
 
 from .bayesian import Bayesian
 from .encode import directions
 from .envelope import Envelope, envelope_of
-from .learned import only_pushed
+from .learned import only_pushed, predicted
 from .patch import Patch, open_patch
 from .regressor import Regressor
 from .svr import Svr
@@ -78,17 +78,8 @@ class Published:
         features = thirteen(*self._sites, pushed)
         angular = [machine.predict(X) for machine, X in zip(self.machines, features, strict=True)]
         displacement = from_angles(np.stack(angular, axis=1).astype(np.float64))
-        inside = self.envelope.holds(self._patch, pushed)
-        answer = Deformation(
-            displacement,
-            self.nodes,
-            tuple(Outcome.PREDICTED if good else Outcome.EXTRAPOLATED for good in inside),
-            np.zeros(len(loads), int),
-            np.full(len(loads), np.nan),
-            loads.times,
-            np.concatenate([pushed.force, np.zeros_like(pushed.force)], axis=1)[:, None],
-            cost=Cost({"predict": time.perf_counter() - begun}),
-        )
+        outside = ~self.envelope.holds(self._patch, pushed)
+        answer = predicted(displacement, self.nodes, loads, outside, begun, np.array(np.nan))
         return answer if at is None else answer.at(np.asarray(at))
 
 

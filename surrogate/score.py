@@ -53,21 +53,26 @@ def score(name: str, deformer: Deformer, loads: Loads, truth: np.ndarray, nodes:
     motion = np.linalg.norm(truth, axis=2).mean(axis=1, keepdims=True)
     return Score(
         name,
-        *_figures(1e3 * distance),
-        *_figures(100.0 * distance / motion),
+        *spread(1e3 * distance),
+        *spread(100.0 * distance / motion),
         microseconds(deformer, loads, nodes),
     )
 
 
 def microseconds(deformer: Deformer, loads: Loads, nodes: np.ndarray) -> float:
     """Median wall time [us] of one load at a time."""
-    single = [loads.rows(slice(row, row + 1)) for row in np.arange(WARM_UP + TIMED) % len(loads)]
+    return 1e6 * float(np.median(single_seconds(deformer, loads, nodes, TIMED)))
+
+
+def single_seconds(deformer: Deformer, loads: Loads, nodes: np.ndarray, count: int) -> list[float]:
+    """Wall times [s] of `count` answers to one load at a time, the loads in turns, warm-up excluded."""
+    single = [loads.rows(slice(row, row + 1)) for row in np.arange(WARM_UP + count) % len(loads)]
     seconds = []
     for one in single:
         begun = time.perf_counter()
         deformer.deform(one, at=nodes)
         seconds.append(time.perf_counter() - begun)
-    return 1e6 * float(np.median(seconds[WARM_UP:]))
+    return seconds[WARM_UP:]
 
 
 def winner(scores: Sequence[Score]) -> Score:
@@ -90,7 +95,7 @@ def table(scores: Sequence[Score], motion_mm: float) -> str:
     return "\n".join([head, *rows, f"{verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"])
 
 
-def _figures(values: np.ndarray) -> tuple[float, float, float, float]:
+def spread(values: np.ndarray) -> tuple[float, float, float, float]:
     """Mean, 95 and 99.9 percentile, and maximum."""
     p95, p999 = np.percentile(values, (95.0, 99.9))
     return float(values.mean()), float(p95), float(p999), float(values.max())

@@ -11,6 +11,7 @@ from sim.loads import Pushed
 
 from .encode import directions
 from .patch import Patch
+from .sampling import across
 from .split import Split
 
 # Of so many sectors two are left out, which lie opposite; a force within so many degrees of the normal lies in none.
@@ -45,9 +46,7 @@ def leave_sectors_out(pushed: Pushed, patch: Patch) -> Sectors:
     """
     axis = patch.inward.mean(axis=0)
     axis /= np.linalg.norm(axis)
-    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    first /= np.linalg.norm(first)
-    second = np.cross(axis, first)
+    first, second = (side[0] for side in across(axis[None]))
     force = directions(pushed)[1]
     angle = np.arctan2(force @ second, force @ first) % (2.0 * np.pi)
     # The first sector lies round `first`, so that a lattice of directions which begins there is not cut at its rim.

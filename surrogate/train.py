@@ -17,7 +17,7 @@ from .encode import directions
 from .envelope import envelope_of, measured
 from .learned import Learned
 from .parts import EXPANDED, LEARNT, Classroom, Expansion, Lesson, parts_of
-from .patch import Patch, open_patch
+from .patch import open_patch
 from .score import Score, errors, score
 from .split import APART, MOST_APART, Split, leave_discs_out
 
@@ -107,18 +107,21 @@ def train(
     def lesson(rows: np.ndarray) -> Lesson:
         return Lesson(_pushed(loads.rows(np.flatnonzero(rows))), truth[rows], cortex[rows])
 
-    first = lesson(_first(split.taught, most))
-    again = lesson(_first(~apart, most))
     shared = expansion or Expansion(data)
-    rooms = [Classroom(data, patch, each, shared) for each in (first, again)]
-    test = loads.rows(np.flatnonzero(split.test))
+    lessons = [lesson(_first(split.taught, most)), *([lesson(_first(~apart, most))] if apart.any() else [])]
+    rooms = [Classroom(data, patch, each, shared) for each in lessons]
+    test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
+    envelopes = [envelope_of(patch, lessons[0].loads, _pushed(test))]
+    features = [features_of(each, measured(patch, each)) for each in (_pushed(test), _pushed(fresh))]
+    if apart.any():
+        envelopes.append(envelope_of(patch, lessons[1].loads, _pushed(fresh)))
     models, scores = {}, []
     for name in wanted:
         with stage(f"learn {name}"):
             model = Learned(
                 data.anatomy,
-                parts_of(name, rooms[0], first),
-                envelope_of(patch, first.loads, _pushed(test)),
+                parts_of(name, rooms[0], lessons[0]),
+                envelopes[0],
                 training={"learner": name, **data.provenance},
             )
         with stage("score"):
@@ -127,34 +130,17 @@ def train(
         models[name] = replace(model, bound=min(conformal(held_out, LEVELS[0]), float(held_out.max())))
         if apart.any():
             with stage(f"learn {name}"):
-                models[name] = replace(
-                    models[name],
-                    parts=parts_of(name, rooms[1], again),
-                    envelope=envelope_of(patch, again.loads, lesson(apart).loads),
-                )
+                parts = parts_of(name, rooms[1], lessons[1])
+                models[name] = replace(models[name], parts=parts, envelope=envelopes[1])
         if apart.sum() >= FEWEST_APART:
             with stage("calibrate"):
-                seen = (_features(patch, _pushed(test)), held_out)
-                models[name] = calibrated(models[name], seen, loads.rows(np.flatnonzero(apart)), truth[apart])
+                size = directions(_pushed(fresh))[0]
+                error = errors(models[name], fresh, truth[apart], nodes)
+                bounds = fitted_bound((features[0], held_out), features[1], size, error)
+                models[name] = replace(models[name], bounds=bounds)
         progress(name)
     motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
-    taught = len((again if apart.any() else first).loads.point)
-    return Trained(models, tuple(scores), split, motion, int(apart.sum()), taught)
-
-
-def calibrated(model: Learned, seen: tuple[np.ndarray, np.ndarray], loads: Loads, truth: np.ndarray) -> Learned:
-    """A model with bounds, calibrated by what `loads` do: truth (B, n, 3) [m] at the tumour's vertices.
-
-    `seen`: features (m, f) and largest errors (m,) [m] of loads that it was not taught, which are not among these.
-    """
-    pushed, nodes = _pushed(loads), model.anatomy.tumour_nodes
-    error = errors(model, loads, truth, nodes)
-    features = _features(open_patch(model.anatomy), pushed)
-    return replace(model, bounds=fitted_bound(seen, features, directions(pushed)[0], error))
-
-
-def _features(patch: Patch, pushed: Pushed) -> np.ndarray:
-    return features_of(pushed, measured(patch, pushed))
+    return Trained(models, tuple(scores), split, motion, int(apart.sum()), len(lessons[-1].loads.point))
 
 
 def _first(rows: np.ndarray, most: int | None) -> np.ndarray:
@@ -170,7 +156,7 @@ def _without(split: Split, apart: np.ndarray) -> Split:
 
 
 def _pushed(loads: Loads) -> Pushed:
-    pushed = loads.of(Pushed)
-    if pushed is None or len(loads.causes) > 1:
+    pushed = loads.only(Pushed)
+    if pushed is None:
         raise InputError("the data holds other loads than `Pushed`, which the learners do not take: simulate pushes.")
     return pushed
