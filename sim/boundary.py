@@ -10,10 +10,13 @@ from .anatomy import Anatomy
 from .errors import InputError
 from .geodesic import distances
 from .mesh import TetMesh
+from .normals import blurred_normals
 
 Skull = Literal["slide", "held"]
 STEM = 0.15  # of the brain's height: in the template 21 mm, the medulla and what touches it
 FEWEST_OPEN = 6  # nodes; fewer do not carry a tool
+# [m], a standard deviation: the skull's inside is smoother than a brain, whose folds must not catch in it.
+BLUR = 6e-3
 
 
 def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) -> Anatomy:
@@ -21,8 +24,8 @@ def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) ->
 
     Stem: surface nodes within 0.15 of the brain's height from the lowest one (least superior); held. Craniotomy:
     surface nodes within half of the diameter `craniotomy` [m] along the surface from the point nearest to `site`;
-    free. Skull: the rest of the surface; it slides (no motion along the outward area-weighted vertex normal) or is
-    held.
+    free. Skull: the rest of the surface; it slides (no motion along the outward normal of the body seen through a
+    blur of 6 mm) or is held.
 
     Raises
     ------
@@ -47,16 +50,7 @@ def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) ->
     if not rest.any():
         raise InputError(f"a craniotomy of {craniotomy * 1e3:g} mm leaves no skull: ask for a smaller one.")
     held = stem | (rest & (skull == "held"))
-    normals = np.where((rest & ~held)[:, None], vertex_normals(mesh.nodes, surface), 0.0)
+    normals = np.zeros_like(mesh.nodes)
+    if skull == "slide":
+        normals[rest] = blurred_normals(mesh.nodes, surface, mesh.nodes[rest], BLUR)
     return Anatomy(mesh, np.repeat(held[:, None], 3, axis=1), normals, opened)
-
-
-def vertex_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3) at nodes (V, 3) [m] of outward triangles (S, 3): their area-weighted mean; zero off them."""
-    corners = nodes[triangles]
-    twice = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(nodes)
-    for corner in triangles.T:
-        np.add.at(total, corner, twice)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return total / np.where(length > 0.0, length, 1.0)

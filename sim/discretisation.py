@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from .element import Elements, linear_elements, quadratic_elements
 from .errors import InputError
 from .mesh import QUADRATIC_EDGES, TRIANGLE_EDGES, TetMesh, row_keys
+from .normals import unit
 from .smoothed import edge_elements, node_elements
 
 ELEMENTS = {
@@ -18,6 +19,10 @@ ELEMENTS = {
     "p2": "quadratic tetrahedra: the most accurate, seven times as many nodes",
     "smoothed": "linear tetrahedra with strains averaged over edges and nodes: nearly as accurate as p2 on p1's nodes",
 }
+
+
+# The least cosine between a wall's triangles and a slide normal that is theirs; less than 45 degrees.
+FACING = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +110,8 @@ class Discretisation:
         """Slide normals (N, 3) from the mesh's own (V, 3); held (V, 3) bool.
 
         An added node slides where its edge lies on a surface triangle whose corners all slide or are held. Its normal
-        is the mean of these triangles', by area: nothing flows through the surface then, whatever its nodes do.
+        is the mean of its ends', of which one that does not face as these triangles do (the edge of a box, say, has
+        another plane's too) does not count beside one that does.
         """
         out = np.zeros((self.count, 3))
         out[: len(normal)] = normal
@@ -115,9 +121,16 @@ class Discretisation:
         slides = (normal != 0.0).any(axis=1)
         wall = (slides | held.all(axis=1))[corners].all(axis=1) & slides[corners].any(axis=1)
         a, b, c = np.moveaxis(self.mesh.nodes[corners[wall]], 1, 0)
-        np.add.at(out, self.surface[wall, 3:], np.cross(b - a, c - a)[:, None])
-        length = np.linalg.norm(out[len(normal) :], axis=1, keepdims=True)
-        out[len(normal) :] /= np.where(length > 0.0, length, 1.0)
+        facing = np.zeros_like(out)
+        np.add.at(facing, self.surface[wall, 3:], np.cross(b - a, c - a)[:, None])
+        facing = unit(facing[len(normal) :])
+        ends = normal[self.edges]
+        counts = np.einsum("nei,ni->ne", ends, facing) > FACING
+        counts |= ~counts.any(axis=1, keepdims=True)
+        mean = np.einsum("ne,nei->ni", counts, ends)
+        # Between ends that are both held it slides along its triangles.
+        mean = np.where((mean != 0.0).any(axis=1, keepdims=True), mean, facing)
+        out[len(normal) :] = np.where((facing != 0.0).any(axis=1, keepdims=True), unit(mean), 0.0)
         return out
 
     def interpolated(self, field: np.ndarray) -> np.ndarray:

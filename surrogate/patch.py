@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from sim.anatomy import Anatomy
-from sim.boundary import vertex_normals
 from sim.errors import InputError
+from sim.normals import vertex_normals
 
 if TYPE_CHECKING:
     from sim.footprint import Skin

@@ -86,38 +86,57 @@ def sliding() -> tuple[Discretisation, np.ndarray, np.ndarray, np.ndarray]:
     return space, held, normal, space.sliding(normal, held)
 
 
-def test_an_added_node_slides_on_the_triangles_beside_it() -> None:
+def test_an_added_node_slides_where_a_wall_is_as_its_ends_do() -> None:
+    """Brute force over edges; between two held ends as the triangles beside it."""
     space, held, normal, found = sliding()
     np.testing.assert_array_equal(found[: len(normal)], normal)
     slides = (normal != 0.0).any(axis=1)
+    between_held = 0
     for edge, got in zip(space.edges, found[len(normal) :], strict=True):
-        total = np.zeros(3)
-        for triangle in triangles_round(ROUND, edge):
-            if (slides | held.all(axis=1))[triangle].all() and slides[triangle].any():
-                a, b, c = ROUND.nodes[triangle]
-                total += np.cross(b - a, c - a)
-        np.testing.assert_allclose(got, total / max(np.linalg.norm(total), 1e-30), atol=1e-12)
+        walls = [
+            triangle
+            for triangle in triangles_round(ROUND, edge)
+            if (slides | held.all(axis=1))[triangle].all() and slides[triangle].any()
+        ]
+        expected = normal[edge].sum(axis=0)
+        if not slides[edge].any():
+            between_held += len(walls)
+            corners = ROUND.nodes[walls].reshape(-1, 3, 3)
+            expected = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+        expected = expected / np.linalg.norm(expected) if walls else np.zeros(3)
+        np.testing.assert_allclose(got, expected, atol=1e-12)
     many = (found[len(normal) :] != 0.0).any(axis=1).sum()
     assert 20 < many < len(space.edges)
+    assert between_held
 
 
-def test_nothing_flows_through_a_wall_that_slides() -> None:
-    """Integral of u . n over the whole surface, all of which slides: zero, however its nodes move."""
+def test_on_a_ball_that_slides_every_normal_is_the_balls() -> None:
     surface = np.zeros(len(ROUND.nodes), bool)
     surface[ROUND.surface] = True
-    normal = np.where(surface[:, None], ARM / LENGTH, 0.0)
     space = discretise(ROUND, "p2")
-    normals = space.sliding(normal, np.zeros(normal.shape, bool))
-    u = np.random.default_rng(2).normal(size=space.nodes.shape)
+    found = space.sliding(np.where(surface[:, None], ARM / LENGTH, 0.0), np.zeros((len(surface), 3), bool))
+    wall = np.unique(space.surface)
+    radial = space.nodes / np.maximum(np.linalg.norm(space.nodes, axis=1, keepdims=True), 1e-9)
+    np.testing.assert_allclose(found[wall], radial[wall], atol=1e-12)
+    assert not np.delete(found, wall, axis=0).any()
 
-    def flow(u: np.ndarray) -> float:
-        """Quadratic shapes on a straight triangle: corners integrate to 0, middles to a third of its area each."""
-        a, b, c = np.moveaxis(space.nodes[space.surface[:, :3]], 1, 0)
-        return float(np.einsum("si,sai->", np.cross(b - a, c - a), u[space.surface[:, 3:]]) / 6.0)
 
-    tangential = u - (u * normals).sum(axis=1, keepdims=True) * normals
-    assert abs(flow(tangential)) < 1e-15
-    assert abs(flow(u)) > 1e-4
+def test_beside_the_edge_of_a_box_a_face_slides_in_its_own_plane() -> None:
+    """Nodes on an edge have one normal between two planes, or slide in one and have a component held."""
+    x, y = THIN.nodes[:, 0] == 0.0, THIN.nodes[:, 1] == 0.0
+    for bound in (False, True):
+        normal = np.where(x[:, None], [-1.0, 0.0, 0.0], 0.0) + np.where(y[:, None], [0.0, -1.0, 0.0], 0.0)
+        normal[x & y] = [-1.0, 0.0, 0.0] if bound else [-np.sqrt(0.5), -np.sqrt(0.5), 0.0]
+        held = np.zeros(normal.shape, bool)
+        held[x & y, 1] = bound
+        space = discretise(THIN, "p2")
+        found = space.sliding(normal, held)[len(normal) :]
+        middle = space.nodes[len(normal) :]
+        on_x, on_y = middle[:, 0] == 0.0, middle[:, 1] == 0.0
+        for face, axis in ((on_x & ~on_y, 0), (on_y & ~on_x, 1)):
+            sliding = face & (found != 0.0).any(axis=1)
+            assert sliding.sum() > 5
+            np.testing.assert_allclose(np.abs(found[sliding][:, axis]), 1.0)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,43 @@
+"""Which way a triangulated surface faces: at its nodes, and seen through a blur."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+# Blurs, beyond which nothing counts; points whose surroundings are summed at once.
+REACH, TOGETHER = 3.5, 2_000
+
+
+def blurred_normals(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, blur: float) -> np.ndarray:
+    """Unit normals (n, 3) at points (n, 3) [m] of the body within outward triangles (S, 3), seen through a blur.
+
+    The gradient of a body's indicator after a Gaussian of standard deviation `blur` [m] is, by the divergence theorem,
+    the integral over its surface of the Gaussian times the inward normal: of folds narrower than the blur nothing is
+    left, and the finer the mesh, the less the normals depend on it.
+    """
+    a, b, c = np.moveaxis(nodes[triangles], 1, 0)
+    twice, middle = np.cross(b - a, c - a), KDTree((a + b + c) / 3.0)
+    out = np.zeros_like(points)
+    for first in range(0, len(points), TOGETHER):
+        some = slice(first, first + TOGETHER)
+        near = KDTree(points[some]).sparse_distance_matrix(middle, REACH * blur, output_type="coo_matrix").tocsr()
+        near.data = np.exp(-0.5 * (near.data / blur) ** 2)
+        out[some] = near @ twice
+    return unit(out)
+
+
+def vertex_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Unit normals (V, 3) at nodes (V, 3) [m] of outward triangles (S, 3): their area-weighted mean; zero off them."""
+    corners = nodes[triangles]
+    twice = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(nodes)
+    for corner in triangles.T:
+        np.add.at(total, corner, twice)
+    return unit(total)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (n, 3) at unit length; zero stays zero."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0.0, length, 1.0)

@@ -1,0 +1,62 @@
+"""Normals at nodes, and of bodies seen through a blur."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from sim.normals import blurred_normals, unit, vertex_normals
+
+BALL = trimesh.creation.icosphere(subdivisions=5, radius=0.07)  # edges of 2.5 mm
+ARM = unit(BALL.vertices)
+
+
+def folded(height: float, waves: int) -> np.ndarray:
+    """The ball's nodes (V, 3) [m] with folds of so many waves round it."""
+    turn = np.arctan2(ARM[:, 1], ARM[:, 0])
+    return BALL.vertices + height * (np.sin(waves * turn) * (1.0 - ARM[:, 2] ** 2))[:, None] * ARM
+
+
+def off(normals: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Angles (n,) [degrees] between unit vectors."""
+    return np.degrees(np.arccos(np.clip((normals * others).sum(axis=1), -1.0, 1.0)))
+
+
+def test_a_ball_faces_outward_from_its_centre():
+    assert off(vertex_normals(BALL.vertices, BALL.faces), ARM).max() < 0.2
+    assert off(blurred_normals(BALL.vertices, BALL.faces, BALL.vertices, 6e-3), ARM).max() < 0.2
+
+
+def test_of_folds_narrower_than_the_blur_little_is_left():
+    """Waves of 18 mm and 1.5 mm height on a radius of 70 mm: Gaussian blurs of 6 mm take 90 % of them and more."""
+    nodes = folded(1.5e-3, 24)
+    belt = np.abs(ARM[:, 2]) < 0.3
+    assert off(vertex_normals(nodes, BALL.faces), ARM)[belt].max() > 20.0
+    assert off(blurred_normals(nodes, BALL.faces, nodes, 6e-3), ARM)[belt].max() < 4.0
+
+
+def test_what_is_wider_than_the_blur_stays():
+    nodes = folded(4e-3, 3)
+    found = blurred_normals(nodes, BALL.faces, nodes, 2.5e-3)
+    assert off(found, ARM).max() > 8.0
+    assert off(found, vertex_normals(nodes, BALL.faces)).max() < 1.0
+
+
+@pytest.mark.parametrize("blur", [3e-3, 6e-3])
+def test_a_finer_mesh_of_the_same_body_has_the_same_normals(blur):
+    """Every triangle in four without moving anything: only the quadrature changes."""
+    coarse = trimesh.creation.box((0.06, 0.05, 0.04))
+    for _ in range(4):
+        coarse = coarse.subdivide()
+    fine = coarse.subdivide()
+    points = np.asarray(coarse.vertices)
+    one = blurred_normals(points, coarse.faces, points, blur)
+    other = blurred_normals(fine.vertices, fine.faces, points, blur)
+    assert off(one, other).max() < 2.0
+
+
+def test_more_points_than_are_summed_at_once(monkeypatch):
+    whole = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3)
+    monkeypatch.setattr("sim.normals.TOGETHER", 7)
+    np.testing.assert_array_equal(blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3), whole)
