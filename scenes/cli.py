@@ -17,6 +17,7 @@ COMMANDS = {
     "simulate": "draw loads of a tool and answer them by finite elements, into a data set",
     "train": "fit the surrogates to a data set and say who wins",
     "judge": "hold models to loads that they have never seen: errors, and whether their bounds hold",
+    "export": "write a learnt model as an ONNX file, for programs in other languages",
     "patient": "from a label volume to a brain ready for the scenes: anatomy, simulate, train",
     "demo": "play a scene on a page in the browser",
     "render": "write the frames of a scene as pictures, without display",

@@ -1,0 +1,53 @@
+"""`sulcus export`: a learnt model as an ONNX file, for programs in other languages."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sim.errors import InputError
+from sim.files import check_output
+from sim.meshfile import read_anatomy
+from surrogate.exchange import write_onnx
+from surrogate.store import load
+
+ENDING = ".model.npz"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("model", type=Path, metavar="MODEL.npz", help="from `sulcus train`")
+    parser.add_argument("--out", required=True, metavar="MODEL.onnx", help="its inputs and outputs say what they are")
+    parser.add_argument("--learner", help="which of its models (default: the one of the tightest error bound)")
+    parser.add_argument(
+        "--anatomy", type=Path, help=f".vtu that it was trained on (default: MESH.vtu beside MESH{ENDING})"
+    )
+    parser.add_argument(
+        "--cortex",
+        action="store_true",
+        help="the open cortex too, not the tumour alone: then the graph wants the footprint's weights at its nodes",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Returns 0 when the file is written.
+
+    Raises
+    ------
+    InputError
+        A model or a mesh that is not there, or a learner that is not in the file.
+    """
+    out = check_output(args.out, ".onnx")
+    mesh = args.anatomy or args.model.with_name(args.model.name.removesuffix(ENDING) + ".vtu")
+    missing = [path for path in (args.model, mesh) if not path.is_file()]
+    if missing:
+        raise InputError(
+            f"{missing[0]}: no such file; give a model of `sulcus train`, its mesh beside it or --anatomy."
+        )
+    models = load(args.model, read_anatomy(mesh))
+    name = args.learner or min(models, key=lambda each: models[each].bound)
+    if name not in models:
+        raise InputError(f"{args.model}: no learner is called {name} in it: choose from {', '.join(models)}.")
+    write_onnx(out, name, models[name], args.cortex)
+    print(f"{name}, the tumour{' and the open cortex' if args.cortex else ''}, written: {out}")
+    return 0

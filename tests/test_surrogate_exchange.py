@@ -1,0 +1,205 @@
+"""Exported models: ONNX Runtime answers as they do."""
+
+import json
+import sys
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from conftest import make_box
+
+from scenes.cli import main
+from scenes.shipped import template_path
+from sim.accuracy import TRAIN
+from sim.deformation import Outcome
+from sim.effects import NodalForce, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.footprint import footprint_weights
+from sim.loads import Pushed, push, stacked
+from sim.material import Material, tissue_to_json
+from sim.meshfile import read_anatomy, write_anatomy
+from surrogate.ann import Ann
+from surrogate.bayesian import Bayesian
+from surrogate.bound import LEVELS
+from surrogate.dataset import read_dataset
+from surrogate.exchange import onnx_model
+from surrogate.parts import LEARNT, Expansion
+from surrogate.patch import open_patch
+from surrogate.sampling import draw
+from surrogate.series import Series
+from surrogate.simulate import simulate
+from surrogate.store import load, save
+from surrogate.train import LEARNERS, train
+
+TISSUE = Material("neo-hookean", 3000.0, 0.45)
+# Shares of a load's largest motion and of its bound. Numbers of 24 bits are off by 6e-8, and sums of some hundred terms
+# of both signs by some ten times that; a bound is the exponential of such a sum, which reaches ten.
+MOTION, BOUND = 5e-6, 2e-5
+
+
+@pytest.fixture(scope="module")
+def block():
+    return make_box((9, 9, 5), opening=20e-3, depth=18e-3)
+
+
+@pytest.fixture(scope="module")
+def models(block, tmp_path_factory):
+    path = tmp_path_factory.mktemp("exchange") / "data.h5"
+    fem = Fem(block, (*pushed_effects(block, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
+    provenance = {"tissue": tissue_to_json(TISSUE), "element": "p1"}
+    simulate(path, fem, draw("palpation", block, 200, 3), provenance)
+    data = read_dataset(path)
+    hasty = {name: ("tool", partial(Ann, steps=30)) for name in ("ann", "residual")}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("surrogate.parts.LEARNT", LEARNT | hasty)
+        return train(data, expansion=Expansion(data, "cpu")).models
+
+
+@pytest.fixture(scope="module")
+def loads(block, models):
+    """Five as they were taught, at corners and edges of triangles, of no force and outside what was taught."""
+    taught, patch = models["linear"].envelope, open_patch(block)
+    corner = patch.points[np.argsort(np.linalg.norm(patch.points, axis=1))[:2]]
+    at, down = taught.points[0], np.array([0.0, 0.0, -0.2])
+    return stacked(
+        [
+            draw("palpation", block, 5, 99),
+            push(np.vstack([corner, corner.mean(axis=0)]), down, 6e-3),
+            push(at, np.array([[0.0, 0.0, 0.0], [0.0, 1e-9, -1e-9], [0.0, 0.0, -0.01]]), 6e-3),
+            push(at, np.array([[0.0, 0.0, -0.9], [0.2, 0.0, -0.05], [0.0, 0.1, 0.2]]), 6e-3),
+            push(at, np.vstack([down, down]), np.array([3e-3, 12e-3])),
+            push(np.array([[20.7e-3, 4.1e-3, 0.0], [4.2e-3, -5.3e-3, 3e-3]]), down, 6e-3),
+        ]
+    )
+
+
+def opened(graph):
+    onnx.checker.check_model(graph, full_check=True)
+    return onnxruntime.InferenceSession(graph.SerializeToString(), providers=["CPUExecutionProvider"])
+
+
+def asked(session, loads, patch):
+    """The answer of a graph, and the loads as they were asked: in single precision."""
+    pushed = loads.of(Pushed)
+    given = {name: getattr(pushed, name).astype(np.float32) for name in ("point", "force", "footprint")}
+    heard = push(given["point"], given["force"], given["footprint"])
+    if "weight" in {port.name for port in session.get_inputs()}:
+        weight = footprint_weights(patch.points, patch.triangles, heard.of(Pushed).point, heard.of(Pushed).footprint)
+        given["weight"] = weight.toarray().astype(np.float32)
+    names = [port.name for port in session.get_outputs()]
+    return dict(zip(names, session.run(names, given), strict=True)), heard
+
+
+def assert_alike(answer, wanted):
+    """A graph's answer, and a `Deformation`."""
+    size = np.abs(wanted.displacement).max(axis=(1, 2))
+    assert (np.abs(answer["displacement"] - wanted.displacement).max(axis=(1, 2)) <= MOTION * size).all()
+    assert np.allclose(answer["bound"].T, wanted.bound, rtol=BOUND, atol=0.0, equal_nan=True)
+    assert [bool(far) for far in answer["extrapolated"]] == [told is Outcome.EXTRAPOLATED for told in wanted.outcome]
+    assert np.array_equal(answer["extrapolated"], answer["excess"] > 0.0)
+
+
+@pytest.mark.parametrize("cortex", [False, True])
+@pytest.mark.parametrize("name", LEARNERS)
+def test_runtime_answers_as_the_model(models, block, loads, name, cortex):
+    model, patch = models[name], open_patch(block)
+    session = opened(onnx_model(name, model, cortex))
+    answer, heard = asked(session, loads, patch)
+    wanted = model.deform(heard, at=None if cortex else block.tumour_nodes)
+    assert np.array_equal(answer["nodes"], wanted.nodes)
+    assert np.array_equal(answer["rest"], block.mesh.nodes[wanted.nodes].astype(np.float32))
+    assert_alike(answer, wanted)
+    assert answer["extrapolated"].sum() >= 6 and not answer["extrapolated"].all()
+    assert not answer["displacement"][8].any() and not answer["bound"][8].any()  # no force
+    # The cortex and three learners of the tumour stand on tables of forces at nodes.
+    tables = cortex or name in ("linear", "pcr", "residual")
+    assert {"point", "force", "footprint", *(["weight"] if tables else [])} == {p.name for p in session.get_inputs()}
+    assert ("pressed" in answer) == tables and (not tables or np.array_equal(answer["pressed"], patch.nodes))
+    for row in (0, 12):
+        alone, _ = asked(session, loads.rows(slice(row, row + 1)), patch)
+        assert alone["displacement"].shape == (1, len(wanted.nodes), 3) and alone["bound"].shape == (1, 2)
+        assert_alike(alone, wanted.rows(np.array([row])))
+
+
+def test_a_curved_cortex_and_the_model_that_ships():
+    anatomy = read_anatomy(template_path())
+    for name, model in load(template_path().with_suffix(".model.npz"), anatomy).items():
+        answer, heard = asked(opened(onnx_model(name, model)), draw("palpation", anatomy, 40, 7), open_patch(anatomy))
+        assert_alike(answer, model.deform(heard, at=anatomy.tumour_nodes))
+
+
+def test_bounds_have_classes_of_force_or_are_none(models, block, loads):
+    model, patch = models["svr"], open_patch(block)
+    classes = replace(model.bounds, edges=np.array([0.11, 0.21]), quantile=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
+    for bounds in (classes, None):
+        other = replace(model, bounds=bounds)
+        answer, heard = asked(opened(onnx_model("svr", other)), loads, patch)
+        assert_alike(answer, other.deform(heard, at=block.tumour_nodes))
+        assert np.isnan(answer["bound"]).all() == (bounds is None)
+
+
+def test_tools_of_one_radius_have_a_series_too(models, block, loads):
+    model = models["series"]
+    series = model.parts[0].regressor
+    narrow = Series(series.corners, series.triangles, series.radii[1:2], series.table[:, 1:2])
+    narrow = Series.restored(narrow.state())
+    other = replace(model, parts=(replace(model.parts[0], regressor=narrow),))
+    answer, heard = asked(opened(onnx_model("series", other)), loads, open_patch(block))
+    assert_alike(answer, other.deform(heard, at=block.tumour_nodes))
+
+
+@pytest.fixture
+def folder(models, block, tmp_path):
+    write_anatomy(tmp_path / "block.vtu", block)
+    save(tmp_path / "block.model.npz", {name: models[name] for name in ("linear", "ann")})
+    return tmp_path
+
+
+def test_a_file_says_what_it_holds(folder, models, block, loads, capsys):
+    out = folder / "model.onnx"
+    assert main(["export", str(folder / "block.model.npz"), "--out", str(out), "--learner", "ann"]) == 0
+    assert str(out) in capsys.readouterr().out
+    graph = onnx.load(out)
+    notes = {note.key: note.value for note in graph.metadata_props}
+    assert notes["anatomy"] == block.digest and notes["learner"] == "ann" and notes["frame"] == "RAS"
+    assert notes["format"] == "sulcus onnx 1"
+    assert (notes["length_unit"], notes["force_unit"], notes["element"]) == ("m", "N", "p1")
+    assert json.loads(notes["tissue"])["law"] == "neo-hookean" and graph.producer_version
+    assert [float(level) for level in notes["levels"].split(",")] == list(LEVELS)
+    assert all(port.doc_string for port in (*graph.graph.input, *graph.graph.output))
+    answer, heard = asked(opened(graph), loads, open_patch(block))
+    assert_alike(answer, models["ann"].deform(heard, at=block.tumour_nodes))
+
+
+def test_the_mesh_may_lie_elsewhere_and_the_best_is_taken(folder, models, block):
+    best = min(("linear", "ann"), key=lambda name: models[name].bound)
+    (folder / "block.model.npz").rename(folder / "other.npz")
+    words = ["export", str(folder / "other.npz"), "--out", str(folder / "model.onnx"), "--cortex"]
+    assert main([*words, "--anatomy", str(folder / "block.vtu")]) == 0
+    graph = onnx.load(folder / "model.onnx")
+    assert graph.graph.name == best
+    assert next(port for port in graph.graph.output if port.name == "nodes").type.tensor_type.shape.dim[
+        0
+    ].dim_value == (len(models[best].nodes))
+
+
+def test_what_cannot_be_exported_is_a_sentence(folder, models, capsys, monkeypatch):
+    model, out = str(folder / "block.model.npz"), str(folder / "model.onnx")
+    for words, said in (
+        ([str(folder / "none.model.npz"), "--out", out], "none.model.npz: no such file"),
+        ([model, "--out", out, "--anatomy", str(folder / "none.vtu")], "none.vtu: no such file"),
+        ([model, "--out", out, "--learner", "svr"], "no learner is called svr in it: choose from linear, ann"),
+        ([model, "--out", str(folder / "model.pb")], "written as .onnx"),
+    ):
+        assert main(["export", *words]) == 2
+        assert said in capsys.readouterr().err
+    strange = replace(models["ann"].parts[0], regressor=Bayesian())
+    with pytest.raises(InputError, match="Bayesian, which has no ONNX graph"):
+        onnx_model("ann", replace(models["ann"], parts=(strange,)))
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    assert main(["export", model, "--out", out]) == 2
+    assert "pip install onnx" in capsys.readouterr().err and not (folder / "model.onnx").exists()
