@@ -16,6 +16,7 @@ from surrogate.sectors import leave_sectors_out
 from surrogate.split import Split
 from surrogate.train import train
 
+from .report_adapt import debulked_study, simulating_seconds
 from .report_reference import beyond_of
 from .report_row import Figures, Row, against_reference, figures_between, of_times
 from .report_study import Study
@@ -70,6 +71,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         "beyond": _held(model, outside, beyond.displacement[beyond.good][:, known], nodes),
     }
     field = model.deform(study.played, at=nodes).displacement
+    adapt, adapted = _adapted(study, spec)
     row = Row(
         spec.name,
         "learnt",
@@ -79,6 +81,8 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         taught=len(order),
         units=len(study.dataset.unit_good),
         learning=learning,
+        adapt=adapt,
+        adapted=adapted,
         curve=tuple((count, each) for count, each in [*curve, (len(order), of_discs[0])] if each is not None),
         **of_times(single_seconds(model, study.converged.rows(np.flatnonzero(discs.test)), nodes, study.timed)),
     )
@@ -88,6 +92,21 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
 def counts(most: int) -> list[int]:
     """64, 128, 256, ... below `most`."""
     return [FEWEST_TAUGHT << k for k in range(20) if FEWEST_TAUGHT << k < most]
+
+
+def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]:
+    """Seconds of simulating and learning the debulked body, and figures there; nothing where it was not simulated."""
+    seconds = simulating_seconds(study)
+    if seconds is None:
+        return None, None
+    after = debulked_study(study)
+    nodes = spec.vertices(after.anatomy)
+    truth = after.answers[:, np.isin(after.anatomy.tumour_nodes, nodes)]
+    begun = clock.perf_counter()
+    model = _taught(after, spec, after.discs, truth)
+    seconds += clock.perf_counter() - begun
+    rows = np.flatnonzero(after.discs.test)
+    return seconds, _held(model, after.converged.rows(rows), truth[rows], nodes)[0]
 
 
 def _taught(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> Deformer:

@@ -133,7 +133,9 @@ class Row:
     learning
         Seconds of fitting; the solves' are not among them.
     adapt
-        Seconds until it answers within its error when the tumour is debulked by a fifth.
+        Seconds until it answers again when the tumour is debulked by a fifth: set-up, or solves and fitting, anew.
+    adapted
+        Distances from the teacher of the debulked body then, on discs left out; None of finite elements.
     curve
         Distances from the teacher on the discs, by number of loads taught.
     picture
@@ -158,6 +160,7 @@ class Row:
     units: int | None = None
     learning: float | None = None
     adapt: float | None = None
+    adapted: Figures | None = None
     curve: tuple[tuple[int, Figures], ...] = ()
     picture: str | None = None
 
@@ -170,7 +173,8 @@ def row_to_json(row: Row) -> str:
 def row_from_json(text: str) -> Row:
     """The row that `row_to_json` wrote."""
     stored: dict[str, Any] = json.loads(text)
-    stored["reference"] = _figures(stored["reference"])
+    for name in ("reference", "adapted"):
+        stored[name] = _figures(stored[name])
     stored["teacher"] = {name: _figures(each) for name, each in stored["teacher"].items()}
     stored["curve"] = tuple((taught, _figures(each)) for taught, each in stored["curve"])
     return Row(**stored)

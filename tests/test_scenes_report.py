@@ -14,6 +14,7 @@ from scenes import report, report_reference
 from scenes.cli import main
 from scenes.commands import report as command
 from scenes.report import UNBUILT, every, learners, left_out, rows, star
+from scenes.report_adapt import debulked, debulked_study, simulate_debulked, simulating_seconds
 from scenes.report_elements import OWN, Elements
 from scenes.report_learner import Learner, counts
 from scenes.report_page import Section, write_report
@@ -118,7 +119,7 @@ def test_rows_say_what_they_are(found, box):
     assert (fem.timed, fem.p99, learner.timed) == (2, None, 30) and fem.median > learner.median > 0.0
     assert published.reference.values == 2 * len(published_nodes(box)) and published.picture is None
     assert {row.state for row in empty} == {"not built yet"} and all(row.reference is None for row in empty)
-    assert all(row.adapt is None for row in found) and learner.curve[-1] == (learner.taught, learner.teacher["discs"])
+    assert learner.adapt is None and fem.adapt > 0.0 and learner.curve[-1] == (learner.taught, learner.teacher["discs"])
     assert row_from_json(row_to_json(learner)) == learner
     assert 0.05 < peak_memory() < 50.0
 
@@ -289,3 +290,53 @@ def test_a_command_without_data_makes_its_own(box, tmp_path, monkeypatch, capsys
     assert "30 palpation loads" in section["about"][0] and section["minutes"] > 0.0
     data = read_dataset(tmp_path / "palpation.h5")
     assert data.provenance["element"] == "smoothed" and "neo-hookean" in data.provenance["tissue"]
+
+
+class TestAdapting:
+    def test_a_debulked_body_lacks_a_fifth_of_its_tumour_and_nothing_else(self, box):
+        after = debulked(box)
+        volume = [body.mesh.volumes[body.mesh.region == 2].sum() for body in (after, box)]
+        element = box.mesh.volumes[box.mesh.region == 2].max()
+        assert 0.8 * volume[1] <= volume[0] <= 0.8 * volume[1] + element
+        assert after.mesh.volumes.sum() == pytest.approx(box.mesh.volumes.sum() - volume[1] + volume[0])
+        assert len(np.unique(after.mesh.tets)) == len(after.mesh.nodes)
+        for name in ("held", "slide_normal"):
+            known = {
+                tuple(place): tuple(value) for place, value in zip(box.mesh.nodes, getattr(box, name), strict=True)
+            }
+            ours = zip(after.mesh.nodes, getattr(after, name), strict=True)
+            assert all(known[tuple(place)] == tuple(value) for place, value in ours)
+        np.testing.assert_array_equal(
+            after.mesh.nodes[after.craniotomy], box.mesh.nodes[box.craniotomy]
+        )  # the cavity is inside
+
+    def test_elements_are_set_up_and_learners_taught_anew(self, study, found):
+        told = []
+        simulate_debulked(study, told.append)
+        simulate_debulked(study, told.append)
+        rows_in_all = len(study.dataset.loads) + len(study.dataset.unit_good)
+        assert sum(told) == 2 * rows_in_all
+        row = measured(study, Learner("linear"), study.folder / "adapted.png")
+        after = debulked_study(study)
+        model = train(after.dataset, ["linear"], split=after.discs).models["linear"]
+        test = np.flatnonzero(after.discs.test)
+        guess = model.deform(after.converged.rows(test), at=after.anatomy.tumour_nodes).displacement
+        wanted = 1e3 * np.linalg.norm(guess - after.answers[test], axis=2).mean()
+        assert row.adapted.mm.mean == pytest.approx(wanted, rel=1e-6)
+        assert row.adapt > simulating_seconds(study) > 0.0
+        assert found[0].adapt > 0.0 and found[0].adapted is None
+        assert found[2].adapt is None  # no data of the debulked body yet
+
+    def test_a_run_that_was_stopped_has_no_time(self, study, monkeypatch):
+        path = debulked_study(study).data
+        path.unlink(missing_ok=True)
+        path.with_suffix(".json").unlink(missing_ok=True)
+
+        def stopped(done):
+            if done:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            simulate_debulked(study, stopped)
+        simulate_debulked(study, nothing)
+        assert path.exists() and simulating_seconds(study) is None

@@ -67,6 +67,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
 
     from ..bench import machine
     from ..report import UNBUILT, every, learners, left_out, rows, star
+    from ..report_adapt import simulate_debulked
     from ..report_page import Section, write_report
     from ..report_reference import solve_beyond, solve_reference
     from ..report_study import Study
@@ -89,11 +90,14 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     sections = []
     for study in studies:
         specs = (*(every(study) if args.full else star(study, not args.quick)), *learners(args.quick))
-        total = len(study.played) + len(study.outside) + len(specs) + len(UNBUILT)
+        after = 0 if args.quick else len(study.dataset.loads) + len(study.dataset.unit_good)
+        total = len(study.played) + len(study.outside) + after + len(specs) + len(UNBUILT)
         found = []
         with tqdm(total=total, desc=study.data.stem, unit="step", file=sys.stderr) as bar:
             solve_reference(study, bar.update)
             solve_beyond(study, bar.update)
+            if not args.quick:
+                simulate_debulked(study, bar.update)
             for row in rows(study, specs):
                 found.append(row)
                 bar.update()
