@@ -142,12 +142,13 @@ def test_bounds_have_classes_of_force_or_are_none(models, block, loads):
         assert np.isnan(answer["bound"]).all() == (bounds is None)
 
 
-def test_tools_of_one_radius_have_a_series_too(models, block, loads):
+@pytest.mark.parametrize("taken", [[1], [0, 2, 1, 0, 2]])
+def test_a_series_has_one_radius_or_many(models, block, loads, taken):
     model = models["series"]
-    series = model.parts[0].regressor
-    narrow = Series(series.corners, series.triangles, series.radii[1:2], series.table[:, 1:2])
-    narrow = Series.restored(narrow.state())
-    other = replace(model, parts=(replace(model.parts[0], regressor=narrow),))
+    series, radii = model.parts[0].regressor, np.linspace(5e-3, 8e-3, len(taken))
+    drawn = Series(series.corners, series.triangles, radii, series.table[:, taken])
+    kept = Series.restored(drawn.state())  # in half precision, as all that is stored
+    other = replace(model, parts=(replace(model.parts[0], regressor=kept),))
     answer, heard = asked(opened(onnx_model("series", other)), loads, open_patch(block))
     assert_alike(answer, other.deform(heard, at=block.tumour_nodes))
 
