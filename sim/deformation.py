@@ -11,7 +11,7 @@ import numpy as np
 
 from .anatomy import Anatomy
 from .errors import InputError
-from .loads import Loads
+from .loads import Loads, all_finite
 
 
 class Outcome(Enum):
@@ -99,12 +99,12 @@ class Deformation:
     bound: np.ndarray = field(default_factory=lambda: np.array(np.nan))
 
     def __post_init__(self) -> None:
-        for name in ("reached", "inverted"):
-            if getattr(self, name).shape != (len(self),):
-                object.__setattr__(self, name, np.broadcast_to(getattr(self, name), len(self)))
-        if self.bound.shape != (2, len(self)):
-            object.__setattr__(self, "bound", np.broadcast_to(self.bound, (2, len(self))))
-        if not np.isfinite(self.displacement).all():
+        count = len(self.displacement)
+        for name, shape in (("reached", (count,)), ("inverted", (count,)), ("bound", (2, count))):
+            given = getattr(self, name)
+            if given.shape != shape:
+                object.__setattr__(self, name, np.broadcast_to(given, shape))
+        if not all_finite(self.displacement):
             raise AssertionError("a deformer let a displacement pass that is not finite: a defect of the deformer")
 
     def __len__(self) -> int:

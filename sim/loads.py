@@ -82,7 +82,7 @@ class Loads:
             names = ", ".join(kind.__name__ for kind in kinds) or "none"
             raise InputError(f"loads have the causes {names}: give at least one, and each kind once.")
         object.__setattr__(self, "causes", tuple(_checked(cause) for cause in self.causes))
-        rows = {len(getattr(cause, item.name)) for cause in self.causes for item in fields(cause)}
+        rows = {len(array) for cause in self.causes for array in vars(cause).values()}
         time = np.zeros(max(rows)) if self.time is None else np.asarray(self.time, np.float64)
         if rows != {len(time)}:
             raise InputError(f"load arrays have {sorted(rows | {len(time)})} rows: give one row per load case.")
@@ -149,17 +149,9 @@ def stacked(parts: Sequence[Loads]) -> Loads:
 
 def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) -> Loads:
     """Loads of one pushing tool: point (3,) or (B, 3) [m], force (3,) or (B, 3) [N], footprint radius [m]."""
-    point, force = np.atleast_2d(point), np.atleast_2d(force)
+    point, force = np.atleast_2d(point, force)
     rows = max(len(point), len(force))
-    return Loads(
-        (
-            Pushed(
-                np.broadcast_to(point, (rows, 3)),
-                np.broadcast_to(force, (rows, 3)),
-                np.broadcast_to(footprint, rows),
-            ),
-        )
-    )
+    return Loads((Pushed(_shaped(point, (rows, 3)), _shaped(force, (rows, 3)), _shaped(footprint, (rows,))),))
 
 
 def check_field(name: str, field: np.ndarray, vertices: int) -> None:
@@ -174,18 +166,29 @@ def check_field(name: str, field: np.ndarray, vertices: int) -> None:
         raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {vertices}.")
 
 
+def all_finite(array: np.ndarray) -> bool:
+    """Whether no number is infinite or NaN: in a third of the time that `.all()` takes of a few numbers."""
+    return np.count_nonzero(np.isfinite(array)) == array.size
+
+
+def _shaped(values: float | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Values of a shape, or broadcast to it, which takes longer than all the rest of a push."""
+    array = np.asarray(values)
+    return array if array.shape == shape else np.broadcast_to(array, shape)
+
+
 def _checked(cause: Cause) -> Cause:
     name = type(cause).__name__
-    arrays = {item.name: np.asarray(getattr(cause, item.name), np.float64) for item in fields(cause)}
+    arrays = {key: np.asarray(value, np.float64) for key, value in vars(cause).items()}
+    whole_field = isinstance(cause, Nodal | Prescribed)
     for key, array in arrays.items():
         scalar_rows = key == "footprint"
-        whole_field = isinstance(cause, Nodal | Prescribed)
         good = array.ndim == (1 if scalar_rows else 3 if whole_field else 2)
         if not good or (not scalar_rows and array.shape[-1] != 3):
             want = "(B,)" if scalar_rows else "(B, V, 3)" if whole_field else "(B, 3)"
             raise InputError(f"{name}.{key} has shape {array.shape}: give {want}.")
-        if not np.isfinite(array).all():
+        if not all_finite(array):
             raise InputError(f"{name}.{key} has a value that is not finite: every number must be finite.")
-        if scalar_rows and not (array > 0.0).all():
+        if scalar_rows and len(array) and not array.min() > 0.0:
             raise InputError(f"{name}.{key} has a radius of {array.min():g} m: give positive radii in metres.")
-    return replace(cause, **arrays)
+    return type(cause)(**arrays)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,11 @@ from .encode import ENCODERS, Basis, directions
 from .envelope import Envelope, measured
 from .patch import Patch, open_patch
 from .regressor import Fitted
+from .remainder import Remainder
+from .series import Series
+
+if TYPE_CHECKING:
+    from .swift import Swift
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +107,24 @@ class Learned:
         known[self.nodes] = True
         return known
 
+    @cached_property
+    def _swift(self) -> Swift | None:
+        """A shorter way for one load, where all that is known of the tumour is a series and what it leaves."""
+        tumour = self.anatomy.tumour_nodes
+        match [parts for parts, row in self._by_basis if (row[tumour] >= 0).any()]:
+            case [[Part("tool", Series() as series, basis)]]:
+                remainder = None
+            case [[Part("tool", Series() as series, basis), Part("tool", Remainder() as remainder)]]:
+                pass
+            case _:
+                return None
+        # Warp is loaded where a model is asked, not where it is read.
+        from .swift import LANES, Swift
+
+        if not np.array_equal(basis.nodes, tumour) or len(basis.modes) > LANES:
+            return None
+        return Swift(series, remainder, basis, self._patch, self.envelope, self.bounds)
+
     def _demand_known(self, nodes: np.ndarray) -> None:
         inside = (nodes >= 0) & (nodes < len(self._knows))
         strange = ~(inside & self._knows[np.where(inside, nodes, 0)])
@@ -126,6 +150,9 @@ class Learned:
         begun = time.perf_counter()
         pushed = only_pushed(loads)
         nodes = self.nodes if at is None else np.asarray(at)
+        if len(loads) == 1 and np.array_equal(nodes, self.anatomy.tumour_nodes) and self._swift is not None:
+            displacement, excess, promised = self._swift.answer(pushed)
+            return predicted(displacement, nodes, loads, (excess > 0.0,), begun, promised)
         self._demand_known(nodes)
         magnitude, direction = directions(pushed)
         # Beyond the taught forces the response stays what it was at the nearest of them.
@@ -168,22 +195,31 @@ class Learned:
 
 
 def predicted(
-    displacement: np.ndarray, nodes: np.ndarray, loads: Loads, outside: np.ndarray, begun: float, bound: np.ndarray
+    displacement: np.ndarray,
+    nodes: np.ndarray,
+    loads: Loads,
+    outside: Iterable[bool],
+    begun: float,
+    bound: np.ndarray,
 ) -> Deformation:
     """What a learnt model, asked at `begun` [s], answers pushes with; `outside` (B,) of what it was taught or not.
 
     displacement (B, n, 3) [m] of `nodes` (n,); bound as in `Deformation`.
     """
-    force = only_pushed(loads).force
+    count = len(loads)
+    unknown, reaction = np.full(count, np.nan), np.zeros((count, 1, 6))
+    reaction[:, 0, :3] = only_pushed(loads).force
     return Deformation(
         displacement,
         nodes,
-        tuple(Outcome.EXTRAPOLATED if far else Outcome.PREDICTED for far in outside),
-        np.zeros(len(loads), int),
-        np.full(len(loads), np.nan),
+        tuple([Outcome.EXTRAPOLATED if far else Outcome.PREDICTED for far in outside]),
+        np.zeros(count, int),
+        unknown,
         loads.times,
-        np.concatenate([force, np.zeros_like(force)], axis=1)[:, None],
+        reaction,
         cost=Cost({"predict": time.perf_counter() - begun}),
+        reached=unknown,
+        inverted=np.full(count, -1),
         bound=bound,
     )
 

@@ -12,6 +12,8 @@ from .series import ORDERS
 
 # Of the largest taught force: below it the remainder is smaller than the table's own errors, which must not be learnt.
 FAINT = 0.4
+# Those of `tool_features`, and force over radius.
+FEATURES = 9
 
 
 class Remainder:

@@ -92,7 +92,7 @@ class Series:
         return type(self)(self.corners, self.triangles, self.radii, table)
 
     @cached_property
-    def _frames(self) -> np.ndarray:
+    def frames(self) -> np.ndarray:
         """(4 S, 4): from (point, 1) to the shares of a triangle's three corners and the height over it [m]."""
         a, b, c = (self.corners[self.triangles[:, corner]] for corner in range(3))
         normal = np.cross(b - a, c - a)
@@ -105,7 +105,7 @@ class Series:
     def _located(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Six places (B, 6) of the triangle nearest to each point (B, 3) [m], and their shares of it (B, 6)."""
         count = len(self.triangles)
-        local = (self._frames @ np.column_stack([point, np.ones(len(point))]).T).reshape(count, 4, -1)
+        local = (self.frames @ np.column_stack([point, np.ones(len(point))]).T).reshape(count, 4, -1)
         miss = np.abs(local[:, 3]) - BESIDE * np.minimum(local[:, :3].min(axis=1), 0.0)
         best, rows = miss.argmin(axis=0), np.arange(len(point))
         corner = local[best, :3, rows].clip(min=0.0)

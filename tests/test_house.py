@@ -152,7 +152,9 @@ def test_each_library_does_its_job(library):
 
 def test_rooms_without_pictures_or_networks_import_none():
     assert all(name.startswith("ar/") or name == "scenes/collect.py" for name in importers("cv2"))
-    assert not any(name.startswith("surrogate/") for name in importers("warp"))
+    # A learnt model is arrays: Warp answers single loads alone, and is loaded with the first of them.
+    ours = {name for name in importers("warp") if name.startswith("surrogate/")}
+    assert ours == {"surrogate/swift.py", "surrogate/swift_kernel.py"}
 
 
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported():

@@ -1,0 +1,149 @@
+"""One load at the tumour, which has a way of its own, is answered as it is among others."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim.deformation import Outcome
+from sim.loads import Loads, Pushed, push, stacked
+from surrogate.bound import features_of, fitted_bound
+from surrogate.encode import Basis, tool_features
+from surrogate.envelope import envelope_of, measured
+from surrogate.learned import Learned, Part
+from surrogate.patch import open_patch
+from surrogate.remainder import Remainder
+from surrogate.sampling import draw
+from surrogate.series import Series
+from surrogate.tabulate import radii_between, with_middles
+
+MODES, RADII = 13, radii_between(5e-3, 7.5e-3)
+
+
+@pytest.fixture(scope="module")
+def taught(box):
+    return draw("palpation", box, 150, 0).of(Pushed)
+
+
+@pytest.fixture(scope="module")
+def inside(box):
+    return draw("palpation", box, 40, 9)
+
+
+@pytest.fixture(scope="module")
+def made(box, taught, inside):
+    """A model of random numbers, in the proportions of what is learnt; by radii and modes."""
+
+    def model(radii=RADII, modes=MODES):
+        random = np.random.default_rng(4)
+        patch, nodes = open_patch(box), box.tumour_nodes
+        triangles, places = with_middles(patch)
+        directions = np.linalg.qr(random.normal(size=(3 * len(nodes), modes)))[0].T.astype(np.float32)
+        basis = Basis(nodes, directions)
+        size = 1e-2 * np.repeat([1.0, 3.0, 9.0], [3, 6, 10])[:, None] / np.arange(1, modes + 1)
+        table = size * random.normal(size=(len(places), len(radii), 19, modes))
+        series = Series(patch.points, triangles, radii, table.astype(np.float32))
+        X = tool_features(patch, taught)
+        known = {
+            "mean": np.append(X.mean(axis=0), 30.0),
+            "deviation": np.array([*[1e-2] * 3, *[0.3] * 3, 0.1, 1e-3, 15.0]),
+            "length": random.uniform(0.5, 3.0, 9),
+            "offset": 1e-3 * random.normal(size=modes),
+            "noise": np.array(1e-6),
+            "seen": random.normal(size=(len(X), 9)),
+            "dual": random.normal(size=(len(X), modes)),
+            "faint": np.array(0.1),
+        }
+        learnt = Remainder.restored(known)
+        told = features_of(taught, measured(patch, taught))
+        error = np.abs(random.normal(1e-5, 1e-5, (len(told), len(nodes))))
+        bounds = fitted_bound((told, error.max(axis=1)), told, X[:, 6], error)
+        parts = (Part("tool", series, basis), Part("tool", learnt, basis))
+        return Learned(box, parts, envelope_of(patch, taught, inside.of(Pushed)), bounds=bounds)
+
+    return model
+
+
+@pytest.fixture(scope="module")
+def model(made):
+    return made()
+
+
+@pytest.fixture(scope="module")
+def asked(inside, box):
+    """Forty each: as taught, off the cortex, too strong, aslant, of other widths, weak, of no force; and on the rim."""
+    random = np.random.default_rng(2)
+    cause, rim = inside.of(Pushed), open_patch(box).rim.mean(axis=1)
+    other = [
+        replace(cause, point=cause.point + random.normal(0.0, 6e-3, cause.point.shape)),
+        replace(cause, force=10.0 * cause.force),
+        replace(cause, force=cause.force * random.normal(size=cause.force.shape)),
+        replace(cause, footprint=np.geomspace(1e-3, 2e-2, len(cause.footprint))),
+        replace(cause, force=1e-3 * cause.force),
+        replace(cause, force=0.0 * cause.force),
+    ]
+    return stacked([inside, *[Loads((each,)) for each in other], push(rim, [0.01, 0.0, -0.1], 6e-3)])
+
+
+def compared(model, loads):
+    """The answers one by one, after they were held to those of the batch."""
+    nodes = model.anatomy.tumour_nodes
+    batch = model.deform(loads, at=nodes)
+    single = [model.deform(loads.rows(slice(k, k + 1)), at=nodes) for k in range(len(loads))]
+    for k, answer in enumerate(single):
+        size = np.abs(batch.displacement[k]).max()
+        assert np.abs(answer.displacement[0] - batch.displacement[k]).max() <= 3e-6 * size
+        assert answer.outcome == batch.outcome[k : k + 1] and answer.nodes is nodes
+        assert np.allclose(answer.bound[:, 0], batch.bound[:, k], rtol=1e-9, atol=0.0, equal_nan=True)
+        for name in ("iterations", "residual", "time", "reaction", "reached", "inverted"):
+            ours, theirs = getattr(answer, name), getattr(batch, name)[k : k + 1]
+            assert ours.dtype == theirs.dtype and np.array_equal(ours, theirs, equal_nan=True), name
+    return single
+
+
+def test_alone_or_among_others_the_answer_is_the_same(model, asked):
+    single = compared(model, asked)
+    assert vars(model)["_swift"] is not None
+    kinds = [{answer.outcome[0] for answer in single[first : first + 40]} for first in range(0, 280, 40)]
+    inside, outside = {Outcome.PREDICTED}, {Outcome.EXTRAPOLATED}
+    assert kinds == [inside, inside | outside, outside, inside | outside, inside | outside, inside, inside]
+    for still in single[240:280]:
+        assert (still.displacement == 0.0).all() and (still.bound == 0.0).all()
+
+
+@pytest.mark.parametrize("radii", [np.array([7e-3]), np.geomspace(4e-3, 9e-3, 5)], ids=["one", "five"])
+def test_any_number_of_radii(made, asked, radii):
+    compared(made(radii), asked)
+
+
+def test_as_many_modes_as_lie_side_by_side_and_more(made, asked):
+    full, wider = made(modes=64), made(modes=65)
+    compared(full, asked)
+    compared(wider, asked)
+    assert vars(full)["_swift"] is not None and vars(wider)["_swift"] is None
+
+
+def test_a_series_alone_without_bounds_or_with_boundless_ones(model, asked):
+    alone = replace(model, parts=model.parts[:1], bounds=None)
+    compared(alone, asked)
+    assert vars(alone)["_swift"] is not None
+    endless = replace(model, bounds=replace(model.bounds, quantile=model.bounds.quantile * [[1.0], [np.inf]]))
+    compared(endless, asked)
+
+
+def test_classes_of_force_have_their_own_quantiles(model, asked):
+    edges = np.quantile(np.linalg.norm(asked.of(Pushed).force[:40], axis=1), [0.3, 0.6])
+    quantile = np.array([[1.0, 2.0, 4.0], [2.0, 3.0, 5.0]])
+    compared(replace(model, bounds=replace(model.bounds, edges=edges, quantile=quantile)), asked)
+
+
+def test_answers_are_their_own_when_two_threads_ask(model, asked):
+    nodes = model.anatomy.tumour_nodes
+    wanted = model.deform(asked, at=nodes).displacement
+    single = [asked.rows(slice(k, k + 1)) for k in range(len(asked))]
+    with ThreadPoolExecutor(2) as pool:
+        answers = list(pool.map(lambda one: model.deform(one, at=nodes), single * 4, chunksize=1))
+    for k, answer in enumerate(answers):
+        truth = wanted[k % len(single)]
+        assert np.abs(answer.displacement[0] - truth).max() <= 3e-6 * np.abs(truth).max()
