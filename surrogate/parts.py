@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from sim.accuracy import REFERENCE
 from sim.effects import pushed_effects
@@ -27,7 +28,7 @@ from .regressor import Regressor
 from .remainder import Remainder
 from .series import Series
 from .svr import Svr
-from .tabulate import radii_between, series_of, tabulated
+from .tabulate import radii_between, tabulated, with_middles
 
 # Encoder and regressor of each but the table itself; principal components are those of the forces at the nodes.
 LEARNT: dict[str, tuple[str, Callable[[], Regressor]]] = {
@@ -40,9 +41,11 @@ LEARNT: dict[str, tuple[str, Callable[[], Regressor]]] = {
 # Those that ask the finite elements for their series, of which the second learns what it leaves.
 EXPANDED = ("series", "series-gp")
 # Share of the responses that a learner's basis may lose, and its most modes; the same of the tables, and of the series.
-TOLERANCE, MODES = 1e-3, 60
+COARSE = (1e-3, 60)
 TABLE_TOLERANCE = 1e-4
-FINE_TOLERANCE, FINE_MODES = 2e-4, 64
+FINE = (2e-4, 64)
+# The same of the bases that series are tabulated in: 192 modes keep all but 1e-4 of the tumour's motion.
+WIDE = (1e-5, 192)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +67,10 @@ class Lesson:
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """The power series of a data set's finite elements, made once, when it is first asked for.
+    """What a data set's finite elements say without learning: compliance, and power series; made once, when asked for.
+
+    The series is tabulated in wide bases, of what all loads do, that the basis of any lesson nearly lies in: what a
+    table holds does not depend on the lesson, and grows neither with the tumour nor with the cortex.
 
     Parameters
     ----------
@@ -80,64 +86,10 @@ class Expansion:
     device: str = "auto"
     progress: Callable[[int, int], object] = lambda done, total: None
 
-    def on(self, basis: Basis) -> Series:
-        """The series as coefficients of a basis of tumour or open cortex.
-
-        Raises
-        ------
-        InputError
-            Data that do not say what tissue they are of.
-        """
-        return series_of(self._table, self._nodes, self._patch, self._radii, basis)
-
     @cached_property
-    def _patch(self) -> Patch:
+    def patch(self) -> Patch:
+        """The open cortex."""
         return open_patch(self.data.anatomy)
-
-    @cached_property
-    def _nodes(self) -> np.ndarray:
-        return np.union1d(self._patch.nodes, self.data.anatomy.tumour_nodes)
-
-    @cached_property
-    def _radii(self) -> np.ndarray:
-        footprint = only_pushed(self.data.loads).footprint
-        return radii_between(float(footprint.min()), float(footprint.max()))
-
-    @cached_property
-    def _table(self) -> np.ndarray:
-        return tabulated(self._fem(), self._patch, self._radii, self._nodes, self.progress)
-
-    def _fem(self) -> Fem:
-        said = self.data.provenance
-        if "tissue" not in said:
-            raise InputError(
-                f"{self.data.path}: does not say what tissue it is of, so no series can be had of it: choose other "
-                "learners, or simulate anew."
-            )
-        effects = pushed_effects(self.data.anatomy, tissue_from_json(said["tissue"]))
-        return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=said.get("element"))
-
-
-@dataclass(frozen=True, eq=False)
-class Classroom:
-    """What every learner of a data set is given, made when it is asked for.
-
-    Parameters
-    ----------
-    data
-        Its anatomy and its unit responses.
-    patch
-        Its open cortex.
-    basis_from
-        The lesson whose responses the series' bases span.
-    expansion
-        Of the same data.
-    """
-
-    data: Dataset
-    patch: Patch
-    basis_from: Lesson
-    expansion: Expansion
 
     @cached_property
     def tumour(self) -> np.ndarray:
@@ -159,19 +111,35 @@ class Classroom:
         """The cortex's compliance, if there is more than the tumour."""
         return (self._compliance(self.cortex),) if len(self.cortex) else ()
 
-    @cached_property
-    def series(self) -> tuple[Part, Part | None]:
-        """The finite elements' series at the tumour, and at the cortex what it adds to the compliance there."""
-        taught = self.basis_from
-        size = directions(taught.loads)[0][:, None, None]
-        bases = [reduce(self.tumour, taught.tumour / size, FINE_TOLERANCE, FINE_MODES)]
-        if len(self.cortex):
-            # A dent as small as its tool is no sum of a few modes, but what nonlinearity adds to it is.
-            linear = sum(part.response(ENCODERS[part.encoder](self.patch, taught.loads)) for part in self.cortex_table)
-            bases.append(reduce(self.cortex, taught.cortex / size - linear, TOLERANCE, MODES))
-        found = [self.expansion.on(basis) for basis in bases]
-        at_cortex = Part("tool", found[1].from_second_order(), bases[1]) if len(self.cortex) else None
-        return Part("tool", found[0], bases[0]), at_cortex
+    def bases(self, lesson: Lesson, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
+        """What a lesson's loads do to the tumour, and to the cortex, if there is more, beyond its compliance.
+
+        `tumour` and `cortex` are what may be left of it, as a share, and the most modes.
+        """
+        size = directions(lesson.loads)[0][:, None, None]
+        at_tumour = reduce(self.tumour, lesson.tumour / size, *tumour)
+        if not len(self.cortex):
+            return [at_tumour]
+        # A dent as small as its tool is no sum of a few modes, but what nonlinearity adds to it is.
+        linear = sum(part.response(ENCODERS[part.encoder](self.patch, lesson.loads)) for part in self.cortex_table)
+        return [at_tumour, reduce(self.cortex, lesson.cortex / size - linear, *cortex)]
+
+    def on(self, bases: list[Basis]) -> list[Series]:
+        """The series as coefficients of the `bases` of a lesson.
+
+        Raises
+        ------
+        InputError
+            Data that do not say what tissue they are of.
+        """
+        cuts = np.cumsum([len(wide.modes) for wide in self._wide])
+        tables = np.split(self._table, cuts[:-1], axis=-1)
+        triangles = with_middles(self.patch)[0]
+        found = []
+        for table, wide, basis in zip(tables, self._wide, bases, strict=True):
+            exact = Series(self.patch.points, triangles, self._radii, table @ (wide.modes @ basis.modes.T))
+            found.append(Series.restored(exact.state()))  # what is used is what can be stored
+        return found
 
     def _compliance(self, nodes: np.ndarray) -> Part:
         """The compliance table of some vertices, from the unit responses, in as many modes as it needs."""
@@ -179,24 +147,78 @@ class Classroom:
         basis = reduce(nodes, response, TABLE_TOLERANCE, len(response))
         return Part("nodal", Linear().fit(np.eye(len(response)), basis.encode(response)), basis)
 
+    @cached_property
+    def _wide(self) -> list[Basis]:
+        good = self.data.good
+        loads = only_pushed(self.data.loads.rows(np.flatnonzero(good)))
+        tumour, cortex = (self.data.displacement(nodes)[good] for nodes in (self.tumour, self.cortex))
+        return self.bases(Lesson(loads, tumour, cortex), WIDE, WIDE)
+
+    @cached_property
+    def _radii(self) -> np.ndarray:
+        footprint = only_pushed(self.data.loads).footprint
+        return radii_between(float(footprint.min()), float(footprint.max()))
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        fem = self._fem()
+        nodes = np.concatenate([basis.nodes for basis in self._wide])
+        modes = np.asarray(block_diag(*(basis.modes for basis in self._wide))).reshape(-1, len(nodes), 3)
+        return tabulated(fem, self.patch, self._radii, fem.reading(nodes, modes), self.progress)
+
+    def _fem(self) -> Fem:
+        said = self.data.provenance
+        if "tissue" not in said:
+            raise InputError(
+                f"{self.data.path}: does not say what tissue it is of, so no series can be had of it: choose other "
+                "learners, or simulate anew."
+            )
+        effects = pushed_effects(self.data.anatomy, tissue_from_json(said["tissue"]))
+        return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=said.get("element"))
+
+
+@dataclass(frozen=True, eq=False)
+class Classroom:
+    """What every learner of a data set is given, made when it is asked for.
+
+    Parameters
+    ----------
+    basis_from
+        The lesson whose responses the series' bases span.
+    expansion
+        Of the same data.
+    """
+
+    basis_from: Lesson
+    expansion: Expansion
+
+    @cached_property
+    def series(self) -> tuple[Part, Part | None]:
+        """The finite elements' series at the tumour, and at the cortex what it adds to the compliance there."""
+        bases = self.expansion.bases(self.basis_from, FINE, COARSE)
+        found = self.expansion.on(bases)
+        at_cortex = Part("tool", found[1].from_second_order(), bases[1]) if len(bases) > 1 else None
+        return Part("tool", found[0], bases[0]), at_cortex
+
 
 def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
     """The summands of one learner, taught with a lesson: for the tumour, and for the cortex beside it."""
+    known = room.expansion
     if name in EXPANDED:
         tumour, more = room.series
-        cortex = () if more is None else (*room.cortex_table, more)
+        cortex = () if more is None else (*known.cortex_table, more)
         if name == "series":
             return (tumour, *cortex)
-        learnt = _taught(("tool", Remainder), (tumour,), tumour.basis, room.patch, lesson.loads, lesson.tumour)
+        learnt = _taught(("tool", Remainder), (tumour,), tumour.basis, known.patch, lesson.loads, lesson.tumour)
         if more is None:
             return (tumour, learnt)
-        left = _taught(("tool", Remainder), cortex, more.basis, room.patch, lesson.loads, lesson.cortex)
+        left = _taught(("tool", Remainder), cortex, more.basis, known.patch, lesson.loads, lesson.cortex)
         return (tumour, learnt, *cortex, left)
     if name == "linear":
-        return (room.table, *room.cortex_table)
-    before = (room.table,) if name == "residual" else ()
-    learnt = _taught(LEARNT[name], before, room.tumour, room.patch, lesson.loads, lesson.tumour)
-    return (*before, learnt, *room.cortex_table)
+        return (known.table, *known.cortex_table)
+    before = (known.table,) if name == "residual" else ()
+    learnt = _taught(LEARNT[name], before, known.tumour, known.patch, lesson.loads, lesson.tumour)
+    return (*before, learnt, *known.cortex_table)
 
 
 def _taught(
@@ -211,6 +233,6 @@ def _taught(
     response = truth / directions(loads)[0][:, None, None]
     for part in before:
         response = response - part.response(ENCODERS[part.encoder](patch, loads))
-    basis = on if isinstance(on, Basis) else reduce(on, response, TOLERANCE, MODES)
+    basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE)
     encoder, regressor = kind
     return Part(encoder, regressor().fit(ENCODERS[encoder](patch, loads), basis.encode(response)), basis)

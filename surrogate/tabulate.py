@@ -1,4 +1,4 @@
-"""Tabulating the finite elements' series: where, how wide and in which directions they are asked."""
+"""Tabulating the finite elements' series: where and how wide they are asked."""
 
 from __future__ import annotations
 
@@ -8,21 +8,11 @@ import numpy as np
 
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
+from sim.series import Reading
 
-from .encode import Basis
 from .patch import Patch
-from .series import ORDERS, SPANS, STENCIL, TERMS, Series, forms
+from .series import FACTORS, ORDERS, STENCIL, TERMS
 
-# The ten axes of a dodecahedron tell any form of the third degree.
-GOLDEN = 0.5 * (1.0 + np.sqrt(5.0))
-AXES = np.array(
-    [(1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)]
-    + [
-        axis
-        for sign in (1.0, -1.0)
-        for axis in ((0, 1 / GOLDEN, sign * GOLDEN), (sign * GOLDEN, 0, 1 / GOLDEN), (1 / GOLDEN, sign * GOLDEN, 0))
-    ]
-)
 # Neighbouring radii differ by this factor at most.
 RATIO = 1.5
 
@@ -39,38 +29,24 @@ def tabulated(
     fem: Fem,
     patch: Patch,
     radii: np.ndarray,
-    nodes: np.ndarray,
+    reading: Reading,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> np.ndarray:
-    """What `forms` are multiplied by at each place of `with_middles` and each radius: (P, R, 19, n, 3) float32.
+    """What `forms` are multiplied by at each place of `with_middles` and each radius: (P, R, 19, r) float32.
 
-    For the responses of vertices `nodes` (n,); `progress` hears places done and all.
+    Of the r shares that a `reading` takes of the answers; `progress` hears places done and all.
     """
     places = with_middles(patch)[1]
-    directions = AXES / np.linalg.norm(AXES, axis=1, keepdims=True)
-    solver = [np.linalg.pinv(forms(directions, np.ones(len(directions)))[:, rows]) for rows in SPANS]
-    table = np.zeros((len(places), len(radii), TERMS, len(nodes), 3), np.float32)
-    some = max(1, fem.batch // (len(radii) * len(directions)))
+    table = np.empty((len(places), len(radii), TERMS, reading.count), np.float32)
+    some = max(1, fem.batch // (len(radii) * FACTORS[-1].shape[1]))
     for first in range(0, len(places), some):
         here = places[first : first + some]
-        shape = (len(here), len(radii), len(directions))
-        point = np.broadcast_to(here[:, None, None], (*shape, 3)).reshape(-1, 3)
-        force = np.broadcast_to(directions, (*shape, 3)).reshape(-1, 3)
-        radius = np.broadcast_to(radii[:, None], shape).reshape(-1)
-        found = fem.series(Loads((Pushed(point, force, radius),)), ORDERS, nodes).astype(np.float32)
-        for order, span in enumerate(SPANS):
-            answers = found[order].reshape(*shape, len(nodes), 3)
-            table[first : first + some, :, span] = np.einsum("td,prdnk->prtnk", solver[order], answers)
-        progress(min(first + some, len(places)), len(places))
+        point = np.repeat(here, 3 * len(radii), axis=0)
+        force = np.tile(np.eye(3), (len(here) * len(radii), 1))
+        loads = Loads((Pushed(point, force, np.tile(np.repeat(radii, 3), len(here))),))
+        table[first : first + some] = fem.series(loads, ORDERS, reading, 3).reshape(len(here), *table.shape[1:])
+        progress(first + len(here), len(places))
     return table
-
-
-def series_of(table: np.ndarray, nodes: np.ndarray, patch: Patch, radii: np.ndarray, basis: Basis) -> Series:
-    """A table of `tabulated` for sorted vertices `nodes` (n,), as coefficients of a basis of some of them."""
-    known = table[:, :, :, np.searchsorted(nodes, basis.nodes)]
-    coefficients = known.reshape(*table.shape[:3], -1) @ basis.modes.T
-    exact = Series(patch.points, with_middles(patch)[0], radii, coefficients)
-    return Series.restored(exact.state())  # what is used is what can be stored
 
 
 def with_middles(patch: Patch) -> tuple[np.ndarray, np.ndarray]:

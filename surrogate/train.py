@@ -109,7 +109,7 @@ def train(
 
     shared = expansion or Expansion(data)
     lessons = [lesson(_first(split.taught, most)), *([lesson(_first(~apart, most))] if apart.any() else [])]
-    rooms = [Classroom(data, patch, each, shared) for each in lessons]
+    rooms = [Classroom(each, shared) for each in lessons]
     test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
     envelopes = [envelope_of(patch, lessons[0].loads, _pushed(test))]
     features = [features_of(each, measured(patch, each)) for each in (_pushed(test), _pushed(fresh))]

@@ -7,8 +7,10 @@ from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Displaced, Loads, Pushed
+from sim.footprint import footprint_weights
+from sim.loads import Displaced, Loads, Nodal, Pushed
 from sim.material import LAWS, Material
+from sim.series import products, telling, terms_of
 
 EFFECTS = (Held(), Slide(), ToolForce(), NodalForce())
 POINT, RADIUS = np.array([[2e-3, 1e-3, 0.0], [-8e-3, 4e-3, 0.0]]), np.array([6e-3, 9e-3])
@@ -19,12 +21,19 @@ def pushes(share):
     return Loads((Pushed(POINT, share * FORCE, RADIUS),))
 
 
+def series(fem, loads, orders, nodes, sizes=1):
+    """(terms, G, n, 3)."""
+    reading = fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
+    found = fem.series(loads, orders, reading, sizes)
+    return np.moveaxis(found.reshape(*found.shape[:2], len(nodes), 3), 1, 0)
+
+
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
 @pytest.mark.parametrize("law", [law for law in LAWS if law != "linear"])
 def test_what_is_left_falls_with_the_fourth_power(box, law, element):
     fem = Fem(box, (Elasticity(Material(law, 3000.0, 0.45)), *EFFECTS), REFERENCE, "cpu", element=element)
     nodes = box.tumour_nodes
-    terms = fem.series(pushes(1.0), 3, nodes)
+    terms = series(fem, pushes(1.0), 3, nodes)
     assert terms.shape == (3, 2, len(nodes), 3)
     left = []
     for share in (0.2, 0.1):
@@ -36,7 +45,7 @@ def test_what_is_left_falls_with_the_fourth_power(box, law, element):
 def test_a_linear_body_has_one_order_only(box):
     fem = Fem(box, (Elasticity(Material("linear", 3000.0, 0.45)), *EFFECTS), REFERENCE, "cpu", element="p1")
     nodes = np.arange(len(box.mesh.nodes))
-    first, second, third = fem.series(pushes(1.0), 3, nodes)
+    first, second, third = series(fem, pushes(1.0), 3, nodes)
     assert np.allclose(first, fem.deform(pushes(1.0)).displacement, atol=1e-7 * np.abs(first).max())
     assert max(np.abs(second).max(), np.abs(third).max()) < 1e-6 * np.abs(first).max()
 
@@ -47,21 +56,74 @@ def test_without_an_inverse_of_the_rest_stiffness_it_is_the_same(box):
     iterated = Fem(box, effects, REFERENCE, "cpu", element="smoothed")
     iterated.__dict__["_exact"] = None
     nodes = box.tumour_nodes
-    one, other = direct.series(pushes(1.0), 3, nodes), iterated.series(pushes(1.0), 3, nodes)
+    one, other = (series(fem, pushes(1.0), 3, nodes) for fem in (direct, iterated))
     for order in range(3):
         assert np.allclose(one[order], other[order], atol=1e-5 * np.abs(one[order]).max())
 
 
 def test_no_load_has_a_series_of_nothing(box):
     fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1")
-    assert not fem.series(pushes(0.0), 3, box.tumour_nodes).any()
+    assert not series(fem, pushes(0.0), 3, box.tumour_nodes).any()
+
+
+def test_several_loads_at_once_have_forms_in_their_sizes(box):
+    fem = Fem(box, (Elasticity(Material("neo-hookean", 3000.0, 0.45)), *EFFECTS), REFERENCE, "cpu", element="p1")
+    nodes = box.tumour_nodes
+    point, radius = np.repeat(POINT[:1], 3, axis=0) + [[0, 0, 0], [0, 0, 0], [4e-3, 0, 0]], np.full(3, 7e-3)
+    force = 0.15 * np.eye(3)[[2, 0, 1]]
+    terms = series(fem, Loads((Pushed(point, force, radius),)), 3, nodes, 3)
+    assert terms.shape == (19, 1, len(nodes), 3) and terms_of(3, 3) == 19
+    sizes, left = np.array([[-0.9, 0.3, -0.5], [-0.5, -0.8, 0.2]]), []
+    for share in (0.4, 0.2):
+        factor = np.concatenate([products(share * sizes, order) for order in (1, 2, 3)])
+        told = np.einsum("tb,tnk->bnk", factor, terms[:, 0])
+        shares = share * sizes
+        nodal = np.einsum("bs,snk->bnk", shares, _nodal(box, point, force, radius))
+        left.append(np.linalg.norm(told - fem.deform(Loads((Nodal(nodal),)), at=nodes).displacement, axis=(1, 2)))
+    assert (np.log2(left[0] / left[1]) > 3.7).all() and (np.log2(left[0] / left[1]) < 4.6).all()
+
+
+def _nodal(box, point, force, radius):
+    """The forces (B, V, 3) at every vertex."""
+    weights = footprint_weights(box.mesh.nodes, box.mesh.surface, point, radius).toarray()
+    return weights[:, :, None] * force[:, None, :]
+
+
+def test_in_its_own_direction_a_form_is_the_series_of_one_load(box):
+    fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="smoothed")
+    nodes, direction = box.tumour_nodes, np.array([[0.5, -0.4, -0.7]])
+    three = Pushed(np.repeat(POINT[:1], 3, axis=0), np.eye(3), np.repeat(RADIUS[:1], 3))
+    terms = series(fem, Loads((three,)), 3, nodes, 3)[:, 0]
+    single = series(fem, Loads((Pushed(POINT[:1], direction, RADIUS[:1]),)), 3, nodes)[:, 0]
+    for order, (rows, wanted) in enumerate(zip(np.split(terms, [3, 9]), single, strict=True), start=1):
+        told = np.einsum("tb,tnk->nk", products(direction, order), rows)
+        assert np.linalg.norm(told - wanted) < 2e-3 * np.linalg.norm(wanted)
+
+
+@pytest.mark.parametrize("sizes", [1, 2, 3])
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_directions_tell_every_form(sizes, order):
+    values = products(telling(sizes, order), order)
+    assert values.shape[0] == values.shape[1] and np.linalg.cond(values) < 14.0
+
+
+def test_what_is_read_and_how_many_at_a_time_do_not_matter(box):
+    whole = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1")
+    some = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1", batch=1)
+    nodes, modes = box.tumour_nodes, np.random.default_rng(0).normal(size=(4, len(box.tumour_nodes), 3))
+    wanted = np.einsum("tgnk,rnk->gtr", series(whole, pushes(1.0), 3, nodes), modes)
+    for fem in (whole, some):
+        found = fem.series(pushes(1.0), 3, fem.reading(nodes, modes))
+        assert np.allclose(found, wanted, atol=1e-6 * np.abs(wanted).max(axis=(0, 2))[None, :, None])
 
 
 def test_what_has_no_series_is_refused(box):
     with pytest.raises(InputError, match="float64"):
-        Fem(box, (Elasticity(), *EFFECTS), TRAIN, "cpu").series(pushes(1.0), 3, box.tumour_nodes)
+        series(Fem(box, (Elasticity(), *EFFECTS), TRAIN, "cpu"), pushes(1.0), 3, box.tumour_nodes)
     fem = Fem(box, (Elasticity(), *EFFECTS, ToolDisplacement()), REFERENCE, "cpu")
     with pytest.raises(InputError, match="Displaced is no force"):
-        fem.series(Loads((Displaced(POINT, 0.01 * FORCE, RADIUS),)), 3, box.tumour_nodes)
+        series(fem, Loads((Displaced(POINT, 0.01 * FORCE, RADIUS),)), 3, box.tumour_nodes)
     with pytest.raises(InputError, match="no vertex 99999"):
-        fem.series(pushes(1.0), 3, np.array([99999]))
+        fem.reading(np.array([99999]), np.ones((1, 1, 3)))
+    with pytest.raises(InputError, match="2 loads are no groups of 3"):
+        series(fem, pushes(1.0), 3, box.tumour_nodes, 3)

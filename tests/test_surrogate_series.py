@@ -12,13 +12,13 @@ from sim.fem import Fem
 from sim.loads import Loads, Pushed
 from sim.material import Material, tissue_to_json
 from surrogate.dataset import read_dataset
-from surrogate.encode import Basis, directions, tool_features
-from surrogate.parts import EXPANDED, Expansion
+from surrogate.encode import directions, tool_features
+from surrogate.parts import COARSE, EXPANDED, FINE, Expansion, Lesson
 from surrogate.patch import open_patch
 from surrogate.series import ORDERS, SPANS, Series, forms
 from surrogate.simulate import simulate
 from surrogate.store import load, save
-from surrogate.tabulate import AXES, radii_between, series_of, tabulated, with_middles
+from surrogate.tabulate import radii_between, tabulated, with_middles
 from surrogate.train import learners_for, train
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
@@ -74,29 +74,27 @@ def test_forms_are_those_of_their_degree():
         assert np.allclose(values[:, columns] @ found, wanted)
 
 
-def test_the_axes_tell_every_form():
-    values = forms(AXES / np.linalg.norm(AXES, axis=1, keepdims=True), np.ones(len(AXES)))
-    for columns in SPANS:
-        assert np.linalg.cond(values[:, columns]) < 6.0
+def every_motion(fem, nodes):
+    return fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
 
 
 def test_the_table_is_the_finite_elements_series(box, patch):
     fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", batch=200, element="p1")
     nodes = box.tumour_nodes
     loads = pushes(patch, 30, 3, (7e-3, 7e-3))
-    exact = fem.series(Loads((loads,)), ORDERS, nodes)
-    basis = Basis(nodes[5:], np.eye(3 * len(nodes) - 15, dtype=np.float32))
-    places, radii = with_middles(patch)[1], np.array([7e-3])
+    reading = every_motion(fem, nodes)
+    exact = fem.series(Loads((loads,)), ORDERS, reading)
+    (triangles, places), radii = with_middles(patch), np.array([7e-3])
     heard = []
-    table = tabulated(fem, patch, radii, nodes, lambda done, total: heard.append((done, total)))
-    series = series_of(table, nodes, patch, radii, basis)
+    table = tabulated(fem, patch, radii, reading, lambda done, total: heard.append((done, total)))
+    series = Series(patch.points, triangles, radii, table)
     assert heard[-1] == (len(places), len(places))
     size, _ = directions(loads)
     told = series.predict(tool_features(patch, loads)) * size[:, None]
-    wanted = exact.sum(axis=0)[:, 5:].reshape(len(size), -1)
+    wanted = exact.sum(axis=1)
     # The box's triangles are as long as the tool is wide.
     assert np.linalg.norm(told - wanted) < 0.02 * np.linalg.norm(wanted)
-    linear = exact[0, :, 5:].reshape(len(size), -1)
+    linear = exact[:, 0]
     assert np.linalg.norm(told - wanted) < 0.25 * np.linalg.norm(linear - wanted)
     more = series.from_second_order().predict(tool_features(patch, loads)) * size[:, None]
     assert np.allclose(more, told - _first_order(series, loads, patch), atol=1e-4 * np.abs(told).max())
@@ -121,6 +119,23 @@ def data(box, tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(data):
     return train(data, ["linear", *EXPANDED], expansion=Expansion(data, "cpu"))
+
+
+def test_the_basis_of_a_lesson_lies_in_that_of_the_table(data, box, patch):
+    expansion, pushed = Expansion(data, "cpu"), data.loads.of(Pushed)
+    some = np.flatnonzero(data.good)[:90]
+    loads = Pushed(pushed.point[some], pushed.force[some], pushed.footprint[some])
+    nodes = (expansion.tumour, expansion.cortex)
+    bases = expansion.bases(Lesson(loads, *(data.displacement(at)[some] for at in nodes)), FINE, COARSE)
+    fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
+    places = np.array([0, 17, 60, 120, 198])
+    point = np.repeat(with_middles(patch)[1][places], 3, axis=0)
+    units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
+    for at, basis, found in zip(nodes, bases, expansion.on(bases), strict=True):
+        wanted = fem.series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
+        for terms in SPANS:
+            miss = np.linalg.norm((found.table[places, 0] - wanted)[:, terms])
+            assert miss < 1e-3 * np.linalg.norm(wanted[:, terms])  # half precision has eleven bits
 
 
 def test_a_series_beats_the_table_of_first_order(trained):
