@@ -56,9 +56,10 @@ def _remainder(X: Wire, state: State) -> Wire:
 
 
 def _series(X: Wire, state: State) -> Wire:
-    place, share = _located(X.columns(0, 1, 2), state["corners"], state["triangles"])
-    radius, weight = _between_radii(X.columns(7), state["radii"])
-    row = place.shaped(0, -1, 1) * len(state["radii"]) + radius.shaped(0, 1, -1)
+    series = Series.restored(state)
+    place, share = _located(X.columns(0, 1, 2), series.frames, series.triangles)
+    radius, weight = _between_radii(X.columns(7), series.radii)
+    row = place.shaped(0, -1, 1) * len(series.radii) + radius.shaped(0, 1, -1)
     factor = share.shaped(0, -1, 1) * weight.shaped(0, 1, -1)
     # As it is stored, in half precision.
     table = state["share"].reshape(-1, TERMS * state["unit"].shape[-1])
@@ -78,16 +79,10 @@ def _forms(direction: Wire, force: Wire) -> Wire:
     return direction.sheet.joined(*found)
 
 
-def _located(point: Wire, corners: np.ndarray, triangles: np.ndarray) -> tuple[Wire, Wire]:
+def _located(point: Wire, frames: np.ndarray, triangles: np.ndarray) -> tuple[Wire, Wire]:
     """Six places (B, 6) of the triangle nearest to each point (B, 3) [m], and their shares (B, 6), as `Series` has."""
-    a, b, c = (corners[triangles[:, corner]] for corner in range(3))
-    normal = np.cross(b - a, c - a)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    frame = np.stack([a, b, c, normal], axis=2)
-    frame = np.concatenate([frame, np.broadcast_to([1.0, 1.0, 1.0, 0.0], (len(a), 1, 4))], axis=1)
-    local = np.linalg.inv(frame).reshape(-1, 4)
     # (B, S, 4): the shares of the corners, and the height [m].
-    found = (point.of(np.float64) @ local[:, :3].T + local[:, 3]).shaped(0, -1, 4)
+    found = (point.of(np.float64) @ frames[:, :3].T + frames[:, 3]).shaped(0, -1, 4)
     beside = found.columns(0, 1, 2).least().clip(-np.inf, 0.0)
     miss = found.columns(3).through("Abs") - BESIDE * beside
     best = miss.shaped(0, -1).argmin()
