@@ -16,7 +16,8 @@ from .envelope import Envelope
 from .patch import Patch
 from .remainder import Remainder
 from .series import ORDERS, Series
-from .swift_kernel import LANES, Limits, Process, Table, answer, features, telling, wide, wide_double
+from .swift_kernel import LANES, Process, Table, answer, features, wide, wide_double
+from .swift_limits import Limits, telling
 
 
 class Swift:

@@ -6,13 +6,17 @@ time goes into calls. Coefficients lie side by side in vectors, over which the c
 
 import warp as wp
 
-from .bound import FARTHEST, GROWTH
-from .envelope import SLACK
 from .remainder import FEATURES
 from .series import BESIDE, STENCIL, TERMS
+from .swift_limits import ONE, ZERO, Limits, Load, angle_of, double, excess_of, overhang_of, promised
 
-# So many coefficients, or taught loads, lie side by side; so many places interpolate on a triangle; what tells a bound.
-LANES, PLACES, TOLD = 64, 6, 7
+# So many coefficients, or taught loads, lie side by side; so many places interpolate on a triangle.
+LANES, PLACES = 64, 6
+# exp(-s) = exp(-s / 2^6)^(2^6): Taylor's series to the ninth order; where s is greater than 2^6 nothing is left.
+TAYLOR, SQUARINGS = 9, 6
+VANISHED = double(2.0**SQUARINGS)
+TWO, THREE, FOUR = double(2.0), double(3.0), double(4.0)
+ROOT_5, BESIDE_ = double(5.0**0.5), double(BESIDE)
 
 wide = wp.types.vector(length=LANES, dtype=wp.float32)
 wide_double = wp.types.vector(length=LANES, dtype=wp.float64)
@@ -20,31 +24,6 @@ shares = wp.types.vector(length=PLACES, dtype=wp.float64)
 weights = wp.types.vector(length=STENCIL, dtype=wp.float64)
 products = wp.types.vector(length=TERMS, dtype=wp.float64)
 features = wp.types.vector(length=FEATURES, dtype=wp.float64)
-telling = wp.types.vector(length=TOLD, dtype=wp.float64)
-
-
-def double(number: float) -> wp.constant:
-    """A constant of double precision: what stands in a kernel without a type is single."""
-    return wp.constant(wp.float64(number))
-
-
-ZERO, ONE, TWO, THREE, FOUR = (double(number) for number in range(5))
-MILLI, ROOT_5 = double(1e3), double(5.0**0.5)
-BESIDE_, SLACK_, FARTHEST_, GROWTH_ = (double(number) for number in (BESIDE, SLACK, FARTHEST, GROWTH))
-# exp(-s) = exp(-s / 2^6)^(2^6): Taylor's series of so many orders; where s is greater than 2^6 nothing is left.
-ORDERS, SQUARINGS = 9, 6
-VANISHED = double(2.0**SQUARINGS)
-
-
-@wp.struct
-class Load:
-    """Point [m], force [N], its size and direction, footprint radius [m]; and the size, brought within the taught."""
-
-    point: wp.vec3d
-    size: wp.float64
-    direction: wp.vec3d
-    radius: wp.float64
-    within: wp.float64
 
 
 @wp.struct
@@ -63,9 +42,9 @@ class Table:
 
 @wp.struct
 class Process:
-    """`Remainder`: rows seen (blocks, 9) in lengths, dual coefficients (blocks, `LANES`), offset; units of features.
+    """`Remainder`: rows seen (blocks, 9), `LANES` of them side by side, and dual coefficients (blocks, `LANES`).
 
-    A block of rows holds `LANES` of them side by side.
+    Offset, mean and unit (deviation times length) of the features, and faint^3 [N^3].
     """
 
     seen: wp.array2d(dtype=wide_double)
@@ -74,28 +53,6 @@ class Process:
     mean: features
     unit: features
     faint: wp.float64
-
-
-@wp.struct
-class Limits:
-    """`Envelope`, the `Patch` that it is measured on (nodes, inward normals, rim as start and way), and `Bound`."""
-
-    taught: wp.array(dtype=wp.vec3d)
-    node: wp.array(dtype=wp.vec3d)
-    inward: wp.array(dtype=wp.vec3d)
-    start: wp.array(dtype=wp.vec3d)
-    along: wp.array(dtype=wp.vec3d)
-    reach: wp.float64
-    overhang: wp.float64
-    angle: wp.float64
-    line_force: wp.float64
-    force: wp.vec2d
-    footprint: wp.vec2d
-    mean: telling
-    deviation: telling
-    weight: wp.array(dtype=wp.float64)
-    edge: wp.array(dtype=wp.float64)
-    quantile: wp.array(dtype=wp.vec2d)
 
 
 @wp.func
@@ -188,8 +145,8 @@ def matern(square: wp.float64) -> wp.float64:
     s = ROOT_5 * wp.sqrt(square)
     x = -wp.min(s, VANISHED) / VANISHED
     power = ONE
-    for k in range(ORDERS):
-        power = ONE + x * power / wp.float64(ORDERS - k)
+    for k in range(TAYLOR):
+        power = ONE + x * power / wp.float64(TAYLOR - k)
     for _ in range(SQUARINGS):
         power *= power
     return (ONE + s + s * s / THREE) * power
@@ -217,81 +174,6 @@ def left_over(process: Process, load: Load) -> wide_double:
         for lane in range(LANES):
             total += near[lane] * process.dual[block, lane]
     return (load.within * load.within * load.within + process.faint) * total
-
-
-@wp.func
-def angle_of(limits: Limits, load: Load) -> wp.float64:
-    """Between force and inward normal at the nearest node [rad]: `envelope.measured`."""
-    least = wp.float64(wp.inf)
-    cosine = ZERO
-    for j in range(limits.node.shape[0]):
-        square = wp.length_sq(limits.node[j] - load.point)
-        if square < least:
-            least = square
-            cosine = wp.dot(limits.inward[j], load.direction)
-    return wp.acos(wp.clamp(cosine, -ONE, ONE))
-
-
-@wp.func
-def overhang_of(limits: Limits, load: Load) -> wp.float64:
-    """Footprint beyond the rim [m]: `Patch.rim_distance`."""
-    least = wp.float64(wp.inf)
-    for j in range(limits.start.shape[0]):
-        offset, along = load.point - limits.start[j], limits.along[j]
-        share = wp.clamp(wp.dot(offset, along) / wp.dot(along, along), ZERO, ONE)
-        least = wp.min(least, wp.length_sq(offset - share * along))
-    return load.radius - wp.sqrt(least)
-
-
-@wp.func
-def excess_of(limits: Limits, load: Load, angle: wp.float64, overhang: wp.float64) -> wp.float64:
-    """How far outside of what was taught: `Envelope.excess`."""
-    least = wp.float64(wp.inf)
-    for j in range(limits.taught.shape[0]):
-        least = wp.min(least, wp.length_sq(limits.taught[j] - load.point))
-        if least <= limits.reach * limits.reach:
-            break  # whichever is nearest, it is near enough
-    excess = wp.max(ZERO, MILLI * (wp.sqrt(least) - limits.reach - SLACK_))
-    excess = wp.max(excess, MILLI * (overhang - limits.overhang - SLACK_))
-    if load.size > ZERO:
-        excess = wp.max(excess, angle - limits.angle - SLACK_)
-    excess = wp.max(excess, load.size / limits.force[1] - ONE - SLACK_)
-    excess = wp.max(excess, load.size / (limits.line_force * load.radius) - ONE - SLACK_)
-    excess = wp.max(excess, limits.footprint[0] / load.radius - ONE - SLACK_)
-    return wp.max(excess, load.radius / limits.footprint[1] - ONE - SLACK_)
-
-
-@wp.func
-def promised(limits: Limits, load: Load, angle: wp.float64, overhang: wp.float64, excess: wp.float64) -> wp.vec2d:
-    """Bounds [m] at 0.95 and 0.99: `Bound.of` and what `Learned.deform` makes of it for weak forces."""
-    if limits.quantile.shape[0] == 0:
-        return wp.vec2d(wp.float64(wp.nan), wp.float64(wp.nan))
-    if load.size == ZERO:
-        return wp.vec2d()
-    weaker = wp.min(load.size / limits.force[0], ONE)
-    x = telling(
-        wp.log(load.within),
-        wp.log(load.radius),
-        angle,
-        MILLI * overhang,
-        MILLI * load.point[0],
-        MILLI * load.point[1],
-        MILLI * load.point[2],
-    )
-    x = wp.cw_div(x - limits.mean, limits.deviation)
-    for i in range(TOLD):
-        x[i] = wp.clamp(x[i], -FARTHEST_, FARTHEST_)
-    total = limits.weight[0]
-    pair = wp.int32(1 + TOLD)
-    for i in range(TOLD):
-        total += limits.weight[1 + i] * x[i]
-        for j in range(i, TOLD):
-            total += limits.weight[pair] * x[i] * x[j]
-            pair += 1
-    member = wp.int32(0)
-    while member < limits.edge.shape[0] and limits.edge[member] < load.size:
-        member += 1
-    return weaker * wp.exp(total) * (ONE + GROWTH_ * excess) * limits.quantile[member]
 
 
 @wp.kernel(module="unique", module_options={"max_unroll": 0})
