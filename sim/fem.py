@@ -10,6 +10,7 @@ from functools import cache, cached_property, partial
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
+from threadpoolctl import ThreadpoolController
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
@@ -254,12 +255,14 @@ class Fem:
         check_fits(self.problem.rows, columns, columns, self.problem.device, self._ladder.held)
         edge = float(np.cbrt(self._anatomy.mesh.volumes.mean() * 6.0))
         found = np.empty((len(loads) // sizes, terms_of(sizes, orders), reading.count))
-        for first in range(0, len(found), max(groups, 1)):
-            some = loads.rows(slice(first * sizes, (first + groups) * sizes))
-            self.problem.begin(Cases(some, np.zeros(len(some))))
-            forces = taylor(self.problem, self._at_rest, len(some), sizes, edge, orders)
-            told = [reading.of(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
-            found[first : first + groups] = np.concatenate(told, axis=1)
+        # Threads of BLAS wait for one another, ages where something else runs on their cores.
+        with ThreadpoolController().limit(limits=1, user_api="blas"):
+            for first in range(0, len(found), max(groups, 1)):
+                some = loads.rows(slice(first * sizes, (first + groups) * sizes))
+                self.problem.begin(Cases(some, np.zeros(len(some))))
+                forces = taylor(self.problem, self._at_rest, len(some), sizes, edge, orders)
+                told = [reading.of(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
+                found[first : first + groups] = np.concatenate(told, axis=1)
         return found
 
     @cached_property

@@ -19,7 +19,7 @@ from .device import Device
 from .problem import Problem
 from .product import product_with
 
-# The largest displacement in a difference, in edges: its square is the error, at worst 3 parts in 10,000 of the third
+# The largest displacement in a difference, in edges: its square is the error, at worst 3 parts in 100,000 of the third
 # order here. What round-off and linear solves leave grows with its inverse square.
 STEP = 0.003
 

@@ -127,3 +127,13 @@ def test_what_has_no_series_is_refused(box):
         fem.reading(np.array([99999]), np.ones((1, 1, 3)))
     with pytest.raises(InputError, match="2 loads are no groups of 3"):
         series(fem, pushes(1.0), 3, box.tumour_nodes, 3)
+
+
+def test_what_does_not_fit_into_memory_is_refused(box, monkeypatch):
+    fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1")
+    reading = fem.reading(box.tumour_nodes, np.ones((1, len(box.tumour_nodes), 3)))
+    monkeypatch.setattr("sim.memory.host_bytes", lambda: 2_000_000)
+    with pytest.raises(InputError, match="free"):
+        fem.series(pushes(1.0), 3, reading)
+    with pytest.raises(InputError, match="free"):
+        fem.reading(box.tumour_nodes, np.ones((50, len(box.tumour_nodes), 3)))
