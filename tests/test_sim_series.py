@@ -2,15 +2,17 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 from sim.accuracy import REFERENCE, TRAIN
+from sim.device import find_device
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.footprint import footprint_weights
 from sim.loads import Displaced, Loads, Nodal, Pushed
 from sim.material import LAWS, Material
-from sim.series import products, telling, terms_of
+from sim.series import mixed, mixing_kernel, products, telling, terms_of
 
 EFFECTS = (Held(), Slide(), ToolForce(), NodalForce())
 POINT, RADIUS = np.array([[2e-3, 1e-3, 0.0], [-8e-3, 4e-3, 0.0]]), np.array([6e-3, 9e-3])
@@ -105,6 +107,29 @@ def test_in_its_own_direction_a_form_is_the_series_of_one_load(box):
 def test_directions_tell_every_form(sizes, order):
     values = products(telling(sizes, order), order)
     assert values.shape[0] == values.shape[1] and np.linalg.cond(values) < 14.0
+
+
+def test_columns_are_mixed_alike_by_warp_and_by_numpy():
+    device = find_device("cpu", "float64")
+    random = np.random.default_rng(0)
+    x, weight = device.array(random.normal(size=(7, 12))), random.normal(size=(3, 5))
+    by_warp = device.zeros(7, 20)
+    device.launch(mixing_kernel(device), (7, 4), [x, device.array(weight)], [by_warp])
+    wanted = np.einsum("rgt,tj->rgj", x.numpy().reshape(7, 4, 3), weight).reshape(7, 20)
+    assert np.allclose(by_warp.numpy(), wanted) and np.allclose(mixed(device, x, weight).numpy(), wanted)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
+def test_cuda_finds_the_same_series(box):
+    force = Pushed(np.repeat(POINT, 3, axis=0), np.tile(np.eye(3), (2, 1)), np.repeat(RADIUS, 3))
+    one, other = (
+        series(Fem(box, (Elasticity(), *EFFECTS), REFERENCE, name, element="smoothed"), Loads((force,)), 3,
+               box.tumour_nodes, 3)
+        for name in ("cpu", "cuda")
+    )  # fmt: skip
+    for rows in (slice(0, 3), slice(3, 9), slice(9, 19)):
+        assert np.allclose(one[rows], other[rows], atol=1e-4 * np.abs(one[rows]).max())
 
 
 def test_what_is_read_and_how_many_at_a_time_do_not_matter(box):
