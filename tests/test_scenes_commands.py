@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from balls import ball
+from balls import EGG, ball
 from boxes import base_held
 from boxes import box as cube
 from theatres import put, theatre_of
@@ -18,10 +18,10 @@ from surrogate.store import load
 
 
 def test_a_patient_in_one_go(tmp_path, capsys):
-    ball(tmp_path)
+    ball(tmp_path, EGG)
     out = tmp_path / "me" / "brain.vtu"
     volumes = [str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--t1", str(tmp_path / "t1.nii.gz")]
-    size = ["--nodes", "2000", "--count", "40", "--device", "cpu", "--element", "p1", "--learners", "linear,residual"]
+    size = ["--nodes", "2000", "--count", "80", "--device", "cpu", "--element", "p1", "--learners", "linear,residual"]
     assert main(["patient", *volumes, *size, "--out", str(out)]) == 0
     text = capsys.readouterr().out
     for step in ("sulcus anatomy --labels", "sulcus simulate", "sulcus train", "wins", "ready: sulcus demo --anatomy"):
