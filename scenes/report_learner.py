@@ -10,6 +10,7 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
+from surrogate.coverage import TENTHS, coverage
 from surrogate.published import MACHINES, published_nodes, taught
 from surrogate.score import single_seconds
 from surrogate.sectors import leave_sectors_out
@@ -71,6 +72,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         "beyond": _held(model, outside, beyond.displacement[beyond.good][:, known], nodes),
     }
     field = model.deform(study.played, at=nodes).displacement
+    covered = _covered(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _adapted(study, spec)
     row = Row(
         spec.name,
@@ -78,6 +80,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         reference=against_reference(study, field, np.ones(len(field), bool), nodes),
         teacher={name: figures for name, (figures, _) in sets.items() if figures is not None},
         flagged={name: share for name, (_, share) in sets.items()},
+        covered=covered,
         taught=len(order),
         units=len(study.dataset.unit_good),
         learning=learning,
@@ -92,6 +95,18 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
 def counts(most: int) -> list[int]:
     """64, 128, 256, ... below `most`."""
     return [FEWEST_TAUGHT << k for k in range(20) if FEWEST_TAUGHT << k < most]
+
+
+def _covered(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) -> dict[str, float]:
+    """How often bounds at 0.95 hold where nothing is promised; `truth` (B, n, 3) [m] of the loads `outside`."""
+    if spec.name in MACHINES:
+        return {}
+    trained = train(study.dataset, [spec.name], expansion=study.expansion)
+    model, found = trained.models[spec.name], trained.left_out.get(spec.name)
+    covered = {} if found is None else {"discs": found.held[0]}
+    if model.bounds is not None and len(outside) >= TENTHS:
+        covered["beyond"] = coverage(model, outside, truth).held[0]
+    return covered
 
 
 def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]:

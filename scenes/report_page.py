@@ -41,6 +41,8 @@ NOTES = (
     "Time: one load at a time, from rest, learners on one core; median, and p99 where at least 1,000 were timed. "
     "Set-up, compiling and warm-up are not in it. Memory: the largest resident size of the process that made and "
     "played the row alone; card: what it took of the graphics card.",
+    "Bounds are promised for loads like those that were taught; how often they hold in discs of cortex and beyond the "
+    "range that were not is told, and promised by nobody.",
     "Adapting: wall time until the row answers again after a fifth of the tumour is taken out of its middle: for "
     "finite elements set-up and the first load, for what is learnt its solves and fitting, all anew; in brackets the "
     "mean error then [mm], on discs left out, from the debulked body's own teacher.",
@@ -140,17 +142,27 @@ def _count(row: Row) -> str:
 def _against_teacher(rows: Sequence[Row]) -> str:
     heads = (
         "row", "loads of", "loads", "mean mm", "p95", "p99.9", "largest", "mean %", "p95", "p99.9", "largest",
-        "called extrapolated",
+        "called extrapolated", "within 95 % bound",
     )  # fmt: skip
     return _table(
         heads,
         (
-            ("", (row.name, words, str(figures.loads), *_spread(figures), f"{100.0 * row.flagged[name]:.0f} %"))
+            (
+                "",
+                (
+                    *(row.name, words, str(figures.loads), *_spread(figures)),
+                    *(_share(shares.get(name)) for shares in (row.flagged, row.covered)),
+                ),
+            )
             for row in rows
             for name, words in SETS.items()
             if (figures := row.teacher.get(name)) is not None
         ),
     )
+
+
+def _share(share: float | None) -> str:
+    return "" if share is None else f"{100.0 * share:.0f} %"
 
 
 def _by_force(measured: Sequence[Row], learnt: Sequence[Row]) -> str:

@@ -118,6 +118,8 @@ class Row:
         Distances from its own teacher, by set of loads: "discs", "sectors", "beyond".
     flagged
         Share of each set that it calls extrapolated by itself.
+    covered
+        Share of the loads of "discs" and "beyond" whose largest error is within the bound at 0.95.
     failed
         Played loads that it found no answer to; they are in none of the figures.
     median, p99
@@ -149,6 +151,7 @@ class Row:
     reference: Figures | None = None
     teacher: Mapping[str, Figures] = field(default_factory=dict)
     flagged: Mapping[str, float] = field(default_factory=dict)
+    covered: Mapping[str, float] = field(default_factory=dict)
     failed: int = 0
     median: float | None = None
     p99: float | None = None

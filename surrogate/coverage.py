@@ -10,6 +10,7 @@ from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads
 
+from .bound import LEVELS
 from .encode import directions
 from .learned import Learned, only_pushed
 
@@ -40,6 +41,16 @@ class Coverage:
     bound_mm: float
     error_mm: float
     extrapolated: int
+
+    def __str__(self) -> str:
+        held = ", ".join(
+            f"{100 * share:.1f} % at {100 * level:g} %" for share, level in zip(self.held, LEVELS, strict=True)
+        )
+        tenths = " ".join(f"{100 * share:.0f}" for share in self.tenths)
+        return (
+            f"{held}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median of the largest error "
+            f"{self.error_mm:.4f} mm; {self.extrapolated} loads outside what was taught"
+        )
 
 
 def coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:

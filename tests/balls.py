@@ -3,7 +3,6 @@
 import nibabel
 import numpy as np
 
-
 # Of a head: a ball would turn in a smooth skull.
 EGG = np.array([0.86, 1.1, 1.0])
 

@@ -52,12 +52,12 @@ def box():
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory, box):
-    """100 palpation loads on a small box; two of them are played."""
+    """160 palpation loads on a small box; two of them are played."""
     folder = tmp_path_factory.mktemp("report")
     fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu")
     said = {"tissue": tissue_to_json(TISSUE), "element": "p1", "preset": "palpation"}
-    simulate(folder / "data.h5", fem, draw("palpation", box, 100, 0), said)
-    study = Study(folder / "data.h5", folder, "cpu", loads=2, beyond=6, timed=30)
+    simulate(folder / "data.h5", fem, draw("palpation", box, 160, 0), said)
+    study = Study(folder / "data.h5", folder, "cpu", loads=2, beyond=12, timed=30)
     solve_reference(study, nothing)
     solve_beyond(study, nothing)
     return study
@@ -115,6 +115,7 @@ def test_rows_say_what_they_are(found, box):
     assert (fem.against, law.against, learner.against) == ("error", "model difference", "error")
     assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.teacher
     assert set(learner.teacher) == {"discs", "sectors", "beyond"} and learner.flagged["beyond"] == 1.0
+    assert set(learner.covered) == {"discs", "beyond"} and max(learner.covered.values()) <= 1.0 and not published.covered
     assert learner.teacher["beyond"].percent.mean > learner.teacher["discs"].percent.mean
     assert (fem.timed, fem.p99, learner.timed) == (2, None, 30) and fem.median > learner.median > 0.0
     assert published.reference.values == 2 * len(published_nodes(box)) and published.picture is None
@@ -224,7 +225,7 @@ def test_what_lies_beyond_is_outside_the_envelope(study):
     size = np.linalg.norm(outside.force, axis=1)
     assert (size[::3] > 1.19 * np.linalg.norm(taught.force, axis=1).max()).all()
     assert (study.patch.rim_distance(outside.point[2::3]) < outside.footprint[2::3]).all()
-    assert beyond_of(study).displacement.shape == (6, len(study.anatomy.tumour_nodes), 3)
+    assert beyond_of(study).displacement.shape == (12, len(study.anatomy.tumour_nodes), 3)
 
 
 def test_plans(study):

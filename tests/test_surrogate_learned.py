@@ -11,7 +11,9 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
 from sim.errors import InputError
 from sim.loads import Displaced, Loads, Nodal, Pushed, push
+from surrogate.bound import features_of, fitted_bound
 from surrogate.dataset import read_dataset
+from surrogate.envelope import measured
 from surrogate.learned import Learned
 from surrogate.parts import EXPANDED
 from surrogate.patch import open_patch
@@ -119,6 +121,33 @@ def test_bounds_are_calibrated_on_loads_that_nothing_was_taught(trained, data, f
         field = model.margin(answer)
         assert field.shape == worst.shape + (len(model.anatomy.tumour_nodes),)
         assert np.allclose(field.max(axis=1), answer.bound[0] * model.bounds.profile.max())
+
+
+def test_how_bounds_hold_in_the_discs_left_out_is_told_of_a_model_that_knows_neither(trained, scored, data):
+    """Recomputed: the scored model, bounds from loads that are apart and outside every disc, held to the discs."""
+    good = data.loads.rows(np.flatnonzero(data.good))
+    truth = data.displacement(data.anatomy.tumour_nodes)[data.good]
+    place = np.linalg.norm(good.of(Pushed).point[:, None] - trained.split.centres, axis=2).min(axis=1)
+    apart = np.arange(len(good)) >= len(good) - trained.calibrated
+    rows = {"discs": trained.split.test, "beside": apart & (place > trained.split.radius)}
+    assert 19 <= rows["beside"].sum() < trained.calibrated
+    for name in ("linear", "svr"):
+        model, error, features, size = scored.models[name], {}, {}, {}
+        for which, chosen in rows.items():
+            loads = good.rows(np.flatnonzero(chosen))
+            error[which] = np.linalg.norm(
+                model.deform(loads, at=data.anatomy.tumour_nodes).displacement - truth[chosen], axis=2
+            )
+            known = measured(open_patch(data.anatomy), loads.of(Pushed))
+            size[which] = known.magnitude
+            within = known._replace(magnitude=np.clip(known.magnitude, *model.envelope.force))
+            features[which] = features_of(loads.of(Pushed), within)
+        worst = error["discs"].max(axis=1)
+        bounds = fitted_bound((features["discs"], worst), features["beside"], size["beside"], error["beside"])
+        held = worst <= replace(model, bounds=bounds).deform(good.rows(np.flatnonzero(rows["discs"]))).bound
+        found = trained.left_out[name]
+        assert found.loads == rows["discs"].sum() and found.held == pytest.approx(held.mean(axis=1))
+    assert scored.left_out == {}
 
 
 def test_outside_the_taught_range_bounds_grow(trained):

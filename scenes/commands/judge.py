@@ -9,8 +9,7 @@ from dataclasses import asdict
 import numpy as np
 
 from sim.errors import InputError
-from surrogate.bound import LEVELS
-from surrogate.coverage import Coverage, coverage
+from surrogate.coverage import coverage
 from surrogate.dataset import read_dataset
 from surrogate.learned import only_pushed
 from surrogate.score import score, table
@@ -59,16 +58,5 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({"scores": [asdict(row) for row in scores], "coverage": told, "motion_mm": motion}))
     else:
         print(f"{len(loads)} loads, against the finite elements that answered them:\n{table(scores, motion)}")
-        print("\n".join(f"{name}: {_told(found)}" for name, found in promised.items()))
+        print("\n".join(f"{name}: bounds held for {found}" for name, found in promised.items()))
     return 0
-
-
-def _told(found: Coverage) -> str:
-    held = ", ".join(
-        f"{100 * share:.1f} % at {100 * level:g} %" for share, level in zip(found.held, LEVELS, strict=True)
-    )
-    tenths = " ".join(f"{100 * share:.0f}" for share in found.tenths)
-    return (
-        f"bounds held for {held}; by tenths of force {tenths}; median bound {found.bound_mm:.4f} mm, median of the "
-        f"largest error {found.error_mm:.4f} mm; {found.extrapolated} loads outside what was taught"
-    )

@@ -63,6 +63,10 @@ def _for_people(trained: Trained, out: str, failed: int) -> str:
             "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
             table(trained.scores, 1e3 * trained.motion),
             f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}",
+            *(
+                f"on those discs, where nothing is promised, bounds of {name} held for {found}"
+                for name, found in trained.left_out.items()
+            ),
             f"the models written were taught {trained.taught} loads; {trained.calibrated} others calibrated bounds",
             f"written: {out}",
         ]
@@ -83,6 +87,7 @@ def _for_machines(trained: Trained, out: str, failed: int) -> str:
             "taught": int(split.taught.sum()),
             "held_out": int(split.test.sum()),
             "calibrated": trained.calibrated,
+            "left_out": {name: asdict(found) for name, found in trained.left_out.items()},
             "not_converged": failed,
         }
     )
