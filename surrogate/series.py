@@ -66,11 +66,11 @@ class Series:
     def _predicted(self, X: np.ndarray) -> np.ndarray:
         place, share = self._located(X[:, :3])
         radius, weight = self._between_radii(X[:, 7])
-        row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(len(X), -1)
-        factor = (share[:, :, None] * weight[:, None]).reshape(len(X), 1, -1).astype(np.float32)
+        row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(len(X), place.shape[1] * radius.shape[1])
+        factor = (share[:, :, None] * weight[:, None]).reshape(len(X), 1, row.shape[1]).astype(np.float32)
         products = forms(X[:, 3:6], X[:, 6]).astype(np.float32)
         flat = self.table.reshape(len(self.table) * len(self.radii), -1)
-        mixed = (factor @ flat[row]).reshape(len(X), TERMS, -1)
+        mixed = (factor @ flat[row]).reshape(len(X), TERMS, self.table.shape[-1])
         return (products[:, None] @ mixed)[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:

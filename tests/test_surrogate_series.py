@@ -59,6 +59,13 @@ def test_fields_of_second_degree_are_met_between_the_places(patch):
     assert np.allclose(alone, told[:5], rtol=1e-5, atol=1e-7)
 
 
+def test_of_no_loads_there_are_no_responses(patch):
+    (triangles, places), radii = with_middles(patch), radii_between(5e-3, 8e-3)
+    series = Series(patch.points, triangles, radii, np.ones((len(places), len(radii), 19, 2), np.float32))
+    none = tool_features(patch, Pushed(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))
+    assert series.predict(none).shape == (0, 2)
+
+
 def _row(loads, k):
     return Pushed(loads.point[k : k + 1], loads.force[k : k + 1], loads.footprint[k : k + 1])
 
