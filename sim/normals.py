@@ -7,6 +7,8 @@ from scipy.spatial import KDTree
 
 # Blurs, beyond which nothing counts; points whose surroundings are summed at once.
 REACH, TOGETHER = 3.5, 2_000
+# Of the longest edge, the narrowest blur: every corner has the middle of a triangle within two thirds of that edge.
+NARROWEST = 0.25
 
 
 def blurred_normals(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, blur: float) -> np.ndarray:
@@ -14,9 +16,12 @@ def blurred_normals(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray
 
     The gradient of a body's indicator after a Gaussian of standard deviation `blur` [m] is, by the divergence theorem,
     the integral over its surface of the Gaussian times the inward normal: of folds narrower than the blur nothing is
-    left, and the finer the mesh, the less the normals depend on it.
+    left, and the finer the mesh, the less the normals depend on it. Triangles that are so wide that none of their
+    middles need be in sight of a corner are seen through a wider blur, a quarter of their longest edge.
     """
     a, b, c = np.moveaxis(nodes[triangles], 1, 0)
+    longest = np.linalg.norm([b - a, c - b, a - c], axis=2).max()
+    blur = max(blur, NARROWEST * longest)
     twice, middle = np.cross(b - a, c - a), KDTree((a + b + c) / 3.0)
     out = np.zeros_like(points)
     for first in range(0, len(points), TOGETHER):

@@ -56,6 +56,12 @@ def test_a_finer_mesh_of_the_same_body_has_the_same_normals(blur):
     assert off(one, other).max() < 2.0
 
 
+def test_a_mesh_far_coarser_than_the_blur_faces_outward_too():
+    """Edges of 40 mm: no triangle's middle is in sight of a corner through a blur of 6 mm."""
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.07)
+    assert off(blurred_normals(ball.vertices, ball.faces, ball.vertices, 6e-3), unit(ball.vertices)).max() < 0.2
+
+
 def test_more_points_than_are_summed_at_once(monkeypatch):
     whole = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3)
     monkeypatch.setattr("sim.normals.TOGETHER", 7)
