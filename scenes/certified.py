@@ -41,7 +41,7 @@ class Certified:
     sound: bool
 
     def __str__(self) -> str:
-        doubt = "" if self.sound else "; not certain, for too much is left after two steps"
+        doubt = "" if self.sound else "; not certain, for too much is left after three steps"
         return (
             f"frame {self.frame}: off by {self.estimate_mm:.4f} mm as estimated ({self.error_mm:.4f} if solved to the "
             f"end), by {self.left_mm:.4f} ({self.corrected_mm:.4f}) when corrected; {self.predict_ms:.1f} ms to "
