@@ -3,7 +3,8 @@
 The state where one step of the finite elements leads (`sim/correction.py`) is so much nearer to equilibrium than the
 prediction that their distance is the prediction's error: Ainsworth, Oden 1997, "A posteriori error estimation in finite
 element analysis", Comput. Methods Appl. Mech. Eng. 142:1-88, call the ratio of the two the effectivity. What is left
-after the step, as the rest stiffness has it, says how far that holds; where too much is left, a second step follows, and a third.
+after the step, as the rest stiffness has it, says how far that holds; where too much is left, up to two more steps
+follow.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class Certificate:
 
 
 def certify(fem: Fem, loads: Loads, prediction: Deformation) -> Certificate:
-    """Estimate the error of predictions at the tumour, and correct them by one step, or up to three where too much is left.
+    """Estimate the error of predictions at the tumour, and correct them by one step, or up to three.
 
     A prediction at every vertex is itself where the steps begin. One that knows the tumour and less than all leaves
     that to the answer of the rest stiffness, which the step from rest finds first.
