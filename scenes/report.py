@@ -17,7 +17,6 @@ from sim.accuracy import FLOOR, Precision
 from sim.files import written_whole
 from sim.material import LAWS
 from sim.mesh import digest_of
-from surrogate.parts import EXPANDED
 from surrogate.published import MACHINES
 from surrogate.train import LEARNERS
 
@@ -27,8 +26,8 @@ from .report_row import Row, row_from_json, row_to_json
 from .report_rows import FAMILY, Spec, measured
 from .report_study import Study
 
-# States of rows that nothing is wrong with.
-LATER, SKIPPED = "not built yet", "left out of --quick"
+# The state of rows that nothing is wrong with.
+LATER = "not built yet"
 UNBUILT = ("mass-spring", "meshless", "boundary element", "geometry-based")
 ELEMENTS = ("p1", "smoothed", "p2")
 MESHES = {"2.5k": "2500", "17k": "17000"}
@@ -62,14 +61,9 @@ def every(study: Study) -> tuple[Elements, ...]:
     )
 
 
-def left_out() -> tuple[Row, ...]:
-    """Those that a quick report has no time for."""
-    return tuple(Row(name, FAMILY[Learner], state=SKIPPED) for name in EXPANDED)
-
-
-def learners(quick: bool = False) -> tuple[Learner, ...]:
-    """Whatever `surrogate` knows, the published ones last; a quick report does not wait for series."""
-    return tuple(Learner(name) for name in (*LEARNERS, *MACHINES) if not (quick and name in EXPANDED))
+def learners() -> tuple[Learner, ...]:
+    """Whatever `surrogate` knows, the published ones last."""
+    return tuple(Learner(name) for name in (*LEARNERS, *MACHINES))
 
 
 def apart(study: Study, spec: Spec, picture: Path) -> Row:

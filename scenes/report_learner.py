@@ -20,6 +20,7 @@ from surrogate.train import train
 from .report_adapt import debulked_study, simulating_seconds
 from .report_reference import beyond_of
 from .report_row import Figures, Row, against_reference, figures_between, of_times
+from .report_series import series_seconds
 from .report_study import Study
 
 FEWEST_TAUGHT = 64
@@ -56,7 +57,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
     discs, sectors = study.discs, leave_sectors_out(study.pushed, study.patch)
     begun = clock.perf_counter()
     model = _taught(study, spec, discs, truth)
-    learning = clock.perf_counter() - begun
+    learning = clock.perf_counter() - begun + series_seconds(study, spec.name)
     order = np.flatnonzero(discs.taught)
     curve = []
     for count in counts(len(order)):
@@ -119,7 +120,7 @@ def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]
     truth = after.answers[:, np.isin(after.anatomy.tumour_nodes, nodes)]
     begun = clock.perf_counter()
     model = _taught(after, spec, after.discs, truth)
-    seconds += clock.perf_counter() - begun
+    seconds += clock.perf_counter() - begun + series_seconds(after, spec.name)
     rows = np.flatnonzero(after.discs.test)
     return seconds, _held(model, after.converged.rows(rows), truth[rows], nodes)[0]
 

@@ -59,7 +59,7 @@ class Study:
     @cached_property
     def expansion(self) -> Expansion:
         """The series of its finite elements, which every training on the data shares."""
-        return Expansion(self.dataset, self.device)
+        return Expansion(self.dataset, self.device, kept=self.folder / "answers" / f"series-{self.digest}.npz")
 
     @property
     def anatomy(self) -> Anatomy:

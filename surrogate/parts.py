@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -13,6 +14,7 @@ from sim.accuracy import REFERENCE
 from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.files import written_whole
 from sim.loads import Pushed
 from sim.material import tissue_from_json
 
@@ -80,11 +82,14 @@ class Expansion:
         Where the finite elements work.
     progress
         Hears which place is done, and of how many.
+    kept
+        Where the series' table is read from, and written to where there is none: of these data, as the caller knows.
     """
 
     data: Dataset
     device: str = "auto"
     progress: Callable[[int, int], object] = lambda done, total: None
+    kept: Path | None = None
 
     @cached_property
     def patch(self) -> Patch:
@@ -132,11 +137,12 @@ class Expansion:
         InputError
             Data that do not say what tissue they are of.
         """
-        cuts = np.cumsum([len(wide.modes) for wide in self._wide])
-        tables = np.split(self._table, cuts[:-1], axis=-1)
+        bases_of_all, table_of_all = self.coefficients
+        cuts = np.cumsum([len(wide.modes) for wide in bases_of_all])
+        tables = np.split(table_of_all, cuts[:-1], axis=-1)
         triangles = with_middles(self.patch)[0]
         found = []
-        for table, wide, basis in zip(tables, self._wide, bases, strict=True):
+        for table, wide, basis in zip(tables, bases_of_all, bases, strict=True):
             exact = Series(self.patch.points, triangles, self._radii, table @ (wide.modes @ basis.modes.T))
             found.append(Series.restored(exact.state()))  # what is used is what can be stored
         return found
@@ -148,6 +154,27 @@ class Expansion:
         return Part("nodal", Linear().fit(np.eye(len(response)), basis.encode(response)), basis)
 
     @cached_property
+    def coefficients(self) -> tuple[list[Basis], np.ndarray]:
+        """The wide bases of tumour and cortex, and coefficients (places, radii, 19, r) float32 of all their modes.
+
+        Raises
+        ------
+        InputError
+            Data that do not say what tissue they are of.
+        """
+        nodes = [some for some in (self.tumour, self.cortex) if len(some)]
+        if self.kept is not None and self.kept.exists():
+            with np.load(self.kept) as file:
+                return [Basis(some, file[f"modes {k}"]) for k, some in enumerate(nodes)], file["table"]
+        fem, wide = self._fem(), self._wide()
+        modes = np.asarray(block_diag(*(basis.modes for basis in wide))).reshape(-1, sum(map(len, nodes)), 3)
+        reading = fem.reading(np.concatenate(nodes), modes)
+        table = tabulated(fem, self.patch, self._radii, reading, self.progress)
+        if self.kept is not None:
+            with written_whole(self.kept, ".npz") as partial:
+                np.savez(partial, table=table, **{f"modes {k}": basis.modes for k, basis in enumerate(wide)})
+        return wide, table
+
     def _wide(self) -> list[Basis]:
         good = self.data.good
         loads = only_pushed(self.data.loads.rows(np.flatnonzero(good)))
@@ -158,13 +185,6 @@ class Expansion:
     def _radii(self) -> np.ndarray:
         footprint = only_pushed(self.data.loads).footprint
         return radii_between(float(footprint.min()), float(footprint.max()))
-
-    @cached_property
-    def _table(self) -> np.ndarray:
-        fem = self._fem()
-        nodes = np.concatenate([basis.nodes for basis in self._wide])
-        modes = np.asarray(block_diag(*(basis.modes for basis in self._wide))).reshape(-1, len(nodes), 3)
-        return tabulated(fem, self.patch, self._radii, fem.reading(nodes, modes), self.progress)
 
     def _fem(self) -> Fem:
         said = self.data.provenance

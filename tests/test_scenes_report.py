@@ -13,7 +13,7 @@ from ar.screen import read_png
 from scenes import report, report_reference
 from scenes.cli import main
 from scenes.commands import report as command
-from scenes.report import UNBUILT, every, learners, left_out, rows, star
+from scenes.report import UNBUILT, every, learners, rows, star
 from scenes.report_adapt import debulked, debulked_study, simulate_debulked, simulating_seconds
 from scenes.report_elements import OWN, Elements
 from scenes.report_learner import Learner, counts
@@ -22,6 +22,7 @@ from scenes.report_plots import against_time, front
 from scenes.report_reference import beyond_of, reference_of, solve_beyond, solve_reference
 from scenes.report_row import Row, figures_of, row_from_json, row_to_json
 from scenes.report_rows import measured, peak_memory
+from scenes.report_series import series_seconds, tabulate_series
 from scenes.report_study import Study
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import NodalForce, pushed_effects
@@ -115,7 +116,9 @@ def test_rows_say_what_they_are(found, box):
     assert (fem.against, law.against, learner.against) == ("error", "model difference", "error")
     assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.teacher
     assert set(learner.teacher) == {"discs", "sectors", "beyond"} and learner.flagged["beyond"] == 1.0
-    assert set(learner.covered) == {"discs", "beyond"} and max(learner.covered.values()) <= 1.0 and not published.covered
+    assert (
+        set(learner.covered) == {"discs", "beyond"} and max(learner.covered.values()) <= 1.0 and not published.covered
+    )
     assert learner.teacher["beyond"].percent.mean > learner.teacher["discs"].percent.mean
     assert (fem.timed, fem.p99, learner.timed) == (2, None, 30) and fem.median > learner.median > 0.0
     assert published.reference.values == 2 * len(published_nodes(box)) and published.picture is None
@@ -125,10 +128,19 @@ def test_rows_say_what_they_are(found, box):
     assert 0.05 < peak_memory() < 50.0
 
 
-def test_a_quick_report_says_what_it_leaves_out():
-    quick, whole = ({spec.name for spec in learners(quick)} for quick in (True, False))
-    assert whole - quick == set(EXPANDED) == {row.name for row in left_out()}
-    assert {row.state for row in left_out()} == {"left out of --quick"}
+def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatch):
+    """Made of what is kept, a row has no finite elements to ask; the table's seconds are its own all the same."""
+    told = []
+    tabulate_series(study, lambda done, total: told.append((done, total)))
+    assert told and told[-1][0] == told[-1][1]
+    monkeypatch.setattr("surrogate.parts.Expansion._fem", None)
+    tabulate_series(study, lambda done, total: told.append(None))
+    assert None not in told
+    row = measured(replace(study), Learner("series"), tmp_path / "series.png")
+    assert row.state == "measured" and row.learning > series_seconds(study, "series") > 0.0
+    assert series_seconds(study, "linear") == 0.0
+    assert row.teacher["discs"].mm.mean < 0.5 * measured(study, SPECS[2], tmp_path / "l.png").teacher["discs"].mm.mean
+    assert {spec.name for spec in learners()} > set(EXPANDED)
 
 
 def test_tenths_of_the_force_and_of_no_load_nothing():
@@ -266,7 +278,7 @@ def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, found
     monkeypatch.setattr(report, "rows", lambda study, specs: iter(found))
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert [row["name"] for row in said["sections"][0]["rows"]] == [row.name for row in (*found, *left_out())]
+    assert [row["name"] for row in said["sections"][0]["rows"]] == [row.name for row in found]
     assert "quadratic tetrahedra (p2) on the same mesh" in (study.folder / "index.html").read_text()
     monkeypatch.setattr(report, "rows", lambda study, specs: iter([Row("odd", "f", state="no memory")]))
     assert main(words) == 1

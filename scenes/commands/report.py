@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a row could not be measured."""
-    from ..report import LATER, SKIPPED
+    from ..report import LATER
 
     try:
         sections = _measured(args)
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"stopped; the same command goes on from {args.out}", file=sys.stderr)
         return INTERRUPTED
     _say(args, sections)
-    return 0 if all(row.state in ("measured", LATER, SKIPPED) for part in sections for row in part.rows) else 1
+    return 0 if all(row.state in ("measured", LATER) for part in sections for row in part.rows) else 1
 
 
 def _measured(args: argparse.Namespace) -> list[Section]:
@@ -66,8 +66,8 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     from sim.device import find_device
 
     from ..bench import machine
-    from ..report import UNBUILT, every, learners, left_out, rows, star
-    from ..report_adapt import simulate_debulked
+    from ..report import UNBUILT, every, learners, rows, star
+    from ..report_adapt import debulked_study, simulate_debulked
     from ..report_page import Section, write_report
     from ..report_reference import solve_beyond, solve_reference
     from ..report_study import Study
@@ -89,22 +89,30 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     studies = [Study(path, args.out, args.device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
     sections = []
     for study in studies:
-        specs = (*(every(study) if args.full else star(study, not args.quick)), *learners(args.quick))
+        specs = (*(every(study) if args.full else star(study, not args.quick)), *learners())
         after = 0 if args.quick else len(study.dataset.loads) + len(study.dataset.unit_good)
         total = len(study.played) + len(study.outside) + after + len(specs) + len(UNBUILT)
         found = []
         with tqdm(total=total, desc=study.data.stem, unit="step", file=sys.stderr) as bar:
             solve_reference(study, bar.update)
             solve_beyond(study, bar.update)
+            _tabulate(study, bar)
             if not args.quick:
                 simulate_debulked(study, bar.update)
+                _tabulate(debulked_study(study), bar)
             for row in rows(study, specs):
                 found.append(row)
                 bar.update()
-        found += left_out() if args.quick else ()
         sections.append(Section(study.data.stem, _about(study), tuple(found), minutes.get(study.data)))
         write_report(args.out, machine(args.device), sections)
     return sections
+
+
+def _tabulate(study: Study, bar: tqdm) -> None:
+    from ..report_series import tabulate_series
+
+    tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"))
+    bar.set_postfix_str("")
 
 
 def _simulated(path: Path, args: argparse.Namespace, count: int) -> float | None:
