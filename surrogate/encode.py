@@ -17,7 +17,8 @@ Encoder = Callable[[Patch, Pushed], np.ndarray]
 def directions(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
     """Force magnitudes (B,) [N] and unit directions (B, 3); the direction of no force is zero."""
     magnitude = np.sqrt(np.einsum("bi,bi->b", pushed.force, pushed.force))
-    return magnitude, pushed.force / np.maximum(magnitude, np.finfo(float).tiny)[:, None]
+    # The root of the smallest number: squares of smaller forces are none.
+    return magnitude, pushed.force / np.maximum(magnitude, np.sqrt(np.finfo(float).tiny))[:, None]
 
 
 def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:

@@ -120,6 +120,12 @@ def test_alone_or_among_others_the_answer_is_the_same(model, asked):
         assert (still.displacement == 0.0).all() and (still.bound == 0.0).all()
 
 
+def test_a_force_whose_square_is_none_moves_nothing(model, inside):
+    cause = inside.of(Pushed)
+    for answer in compared(model, Loads((replace(cause, force=1e-200 * cause.force),))):
+        assert (answer.displacement == 0.0).all() and (answer.bound == 0.0).all()
+
+
 @pytest.mark.parametrize("radii", [np.array([7e-3]), np.geomspace(4e-3, 9e-3, 5)], ids=["one", "five"])
 def test_any_number_of_radii(made, asked, radii):
     compared(made(radii), asked)
