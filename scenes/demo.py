@@ -15,6 +15,7 @@ from .play import Frame, Player
 from .referee import Referee, Truth
 from .scene import Scene
 from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR, Stage
+from .tally import Tally
 from .theatre import Theatre
 
 SCRIPT, HAND = "script", "hand"
@@ -79,6 +80,7 @@ class Demo:
             size=(scene.viewpoint.width, scene.viewpoint.height),
         )
         self.referee = Referee(theatre, scene)
+        self.tally = Tally()
 
     def run(self, seconds: float = float("inf")) -> int:
         """Play until the time is over; returns the frames drawn."""
@@ -98,6 +100,7 @@ class Demo:
                 last = frame.deformation if frame is not None else None
                 frame = self._player(name).draw(number, time, touch, last if name == previous else None)
                 previous, shown = name, asked
+                self.tally.took(name, frame.deformation.cost.total)
                 self.referee.ask(number, frame.loads)
                 self._show(frame, name)
                 drawn += 1
@@ -177,6 +180,7 @@ class Demo:
         if name != "fem":
             guess = player.deformer.deform(truth.loads, at=nodes).displacement[0]
             error = 1e3 * np.linalg.norm(guess - right, axis=1)
+            self.tally.missed(name, 1e-3 * float(error.mean()))
             said = f"error against FEM: mean {error.mean():.3f}, largest {error.max():.3f} mm"
         motion = 1e3 * float(np.linalg.norm(right, axis=1).mean())
         return (
@@ -196,4 +200,4 @@ class Demo:
         bound = frame.deformation.bound[0, 0]
         if np.isfinite(bound):
             lines.insert(1, f"in 95 of 100 loads no vertex of the tumour is off by more than {1e3 * bound:.2f} mm")
-        return "\n\n".join(lines)
+        return "\n\n".join([*lines, str(self.tally)])

@@ -8,6 +8,7 @@ import numpy as np
 
 from ar.chart import Curve, Dot, Panel, drawn
 
+from .pareto import unbeaten
 from .report_row import ERROR, TOLERANCE_ALONE, Figures, Row
 
 SIZE = (880, 560)
@@ -21,7 +22,7 @@ def front(rows: Sequence[Row]) -> frozenset[str]:
 
     Only errors count: another law is none, and the reference's own elements have none of their mesh.
     """
-    return _unbeaten(_places((row, row.reference) for row in rows if row.against == ERROR))
+    return unbeaten(_places((row, row.reference) for row in rows if row.against == ERROR))
 
 
 def against_time(rows: Sequence[Row]) -> np.ndarray | None:
@@ -40,7 +41,7 @@ def learners_against_time(rows: Sequence[Row]) -> np.ndarray | None:
     places = _places((row, row.teacher.get("discs")) for row in rows)
     title = "What learning lost, against time: distance from the teacher on left-out discs"
     group = {row.name: row.family for row in rows}
-    return _scatter(title, "mean distance from the teacher at the tumour [mm]", places, group, _unbeaten(places))
+    return _scatter(title, "mean distance from the teacher at the tumour [mm]", places, group, unbeaten(places))
 
 
 def against_solves(rows: Sequence[Row]) -> np.ndarray | None:
@@ -59,14 +60,6 @@ def _places(found: Iterable[tuple[Row, Figures | None]]) -> dict[str, Place]:
         for row, figures in found
         if row.median is not None and figures is not None and figures.mm.mean > 0.0
     }
-
-
-def _unbeaten(places: Mapping[str, Place]) -> frozenset[str]:
-    return frozenset(
-        name
-        for name, (time, error) in places.items()
-        if not any(t <= time and e <= error and (t, e) != (time, error) for t, e in places.values())
-    )
 
 
 def _scatter(

@@ -16,11 +16,15 @@ from .report_study import Study
 def tabulate_series(study: Study, progress: Callable[[int, int], object]) -> None:
     """Make the table, if the data says of what tissue; `progress` hears the places that are done, and their number."""
     path = study.expansion.kept
-    if path is None or path.exists() or "tissue" not in study.dataset.provenance:
+    if path is None or "tissue" not in study.dataset.provenance:
         return
+    told = path.with_suffix(".json")
+    if path.exists() and told.exists():
+        return
+    path.unlink(missing_ok=True)  # of a run that was stopped before it said what the table took
     begun = clock.perf_counter()
     replace(study.expansion, progress=progress).coefficients  # noqa: B018 (asking makes it)
-    with written_whole(path.with_suffix(".json"), ".json") as partial:
+    with written_whole(told, ".json") as partial:
         partial.write_text(json.dumps({"seconds": clock.perf_counter() - begun}))
 
 

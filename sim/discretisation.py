@@ -21,7 +21,8 @@ ELEMENTS = {
 }
 
 
-# The least cosine between a wall's triangles and a slide normal that is theirs; less than 45 degrees.
+# The least cosine between slide normals that agree, and between a wall's triangles and one that is theirs: less than
+# the 45 degrees of a box's edge.
 FACING = 0.75
 
 
@@ -110,8 +111,8 @@ class Discretisation:
         """Slide normals (N, 3) from the mesh's own (V, 3); held (V, 3) bool.
 
         An added node slides where its edge lies on a surface triangle whose corners all slide or are held. Its normal
-        is the mean of its ends', of which one that does not face as these triangles do (the edge of a box, say, has
-        another plane's too) does not count beside one that does.
+        is the mean of its ends'. Where these disagree, one that does not face as those triangles do (the edge of a box,
+        say, has another plane's too) does not count beside one that does.
         """
         out = np.zeros((self.count, 3))
         out[: len(normal)] = normal
@@ -126,7 +127,8 @@ class Discretisation:
         facing = unit(facing[len(normal) :])
         ends = normal[self.edges]
         counts = np.einsum("nei,ni->ne", ends, facing) > FACING
-        counts |= ~counts.any(axis=1, keepdims=True)
+        agreed = np.einsum("ni,ni->n", ends[:, 0], ends[:, 1]) > FACING
+        counts |= (agreed | ~counts.any(axis=1))[:, None]
         mean = np.einsum("ne,nei->ni", counts, ends)
         # Between ends that are both held it slides along its triangles.
         mean = np.where((mean != 0.0).any(axis=1, keepdims=True), mean, facing)

@@ -165,14 +165,15 @@ class Expansion:
         nodes = [some for some in (self.tumour, self.cortex) if len(some)]
         if self.kept is not None and self.kept.exists():
             with np.load(self.kept) as file:
-                return [Basis(some, file[f"modes {k}"]) for k, some in enumerate(nodes)], file["table"]
+                modes = [file[f"arr_{k}"] for k in range(1, len(nodes) + 1)]
+                return [Basis(*each) for each in zip(nodes, modes, strict=True)], file["arr_0"]
         fem, wide = self._fem(), self._wide()
         modes = np.asarray(block_diag(*(basis.modes for basis in wide))).reshape(-1, sum(map(len, nodes)), 3)
         reading = fem.reading(np.concatenate(nodes), modes)
         table = tabulated(fem, self.patch, self._radii, reading, self.progress)
         if self.kept is not None:
             with written_whole(self.kept, ".npz") as partial:
-                np.savez(partial, table=table, **{f"modes {k}": basis.modes for k, basis in enumerate(wide)})
+                np.savez(partial, table, *(basis.modes for basis in wide))
         return wide, table
 
     def _wide(self) -> list[Basis]:

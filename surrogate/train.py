@@ -34,7 +34,7 @@ class Trained:
     `motion` is the mean displacement [m] of the tumour over the held-out loads, `calibrated` the number of loads by
     which the models' bounds were calibrated, `taught` that of those which the models were taught. `left_out` says by
     learner how often bounds held on the discs left out, where nothing is promised: those of the scored model,
-    calibrated on loads outside the discs.
+    of which loads outside the discs tell all, half of them the scale and half of them how much of it.
     """
 
     models: dict[str, Learned]
@@ -115,10 +115,10 @@ def train(
     lessons = [lesson(_first(split.taught, most)), *([lesson(_first(~apart, most))] if apart.any() else [])]
     rooms = [Classroom(each, shared) for each in lessons]
     test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
-    beside = np.zeros(0, bool)
+    beside = np.zeros(0, int)
     envelopes = [envelope_of(patch, lessons[0].loads, _pushed(test))]
     if apart.any():
-        beside = nearest(_pushed(fresh).point, split.centres)[1] > split.radius
+        beside = np.flatnonzero(nearest(_pushed(fresh).point, split.centres)[1] > split.radius)
         envelopes.append(envelope_of(patch, lessons[1].loads, _pushed(fresh)))
     models, scores, left_out = {}, [], {}
     for name in wanted:
@@ -134,10 +134,12 @@ def train(
             held_out = errors(model, test, truth[split.test], nodes).max(axis=1)
         seen = _features(patch, _pushed(test), envelopes[0]), held_out
         models[name] = replace(model, bound=min(conformal(held_out, LEVELS[0]), float(held_out.max())))
-        if beside.sum() >= FEWEST_APART and len(test) >= TENTHS:
+        if len(beside) >= 2 * FEWEST_APART and len(test) >= TENTHS:
             with stage("calibrate"):
-                known = fresh.rows(np.flatnonzero(beside))
-                bounded = _calibrated(model, patch, seen, known, truth[apart][beside], nodes)
+                scale, share = fresh.rows(beside[::2]), fresh.rows(beside[1::2])
+                error = errors(model, scale, truth[apart][beside[::2]], nodes).max(axis=1)
+                told = _features(patch, _pushed(scale), model.envelope), error
+                bounded = _calibrated(model, patch, told, share, truth[apart][beside[1::2]], nodes)
                 left_out[name] = coverage(bounded, test, truth[split.test])
         if apart.any():
             with stage(f"learn {name}"):

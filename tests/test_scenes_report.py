@@ -53,11 +53,11 @@ def box():
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory, box):
-    """160 palpation loads on a small box; two of them are played."""
+    """280 palpation loads on a small box; two of them are played."""
     folder = tmp_path_factory.mktemp("report")
     fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu")
     said = {"tissue": tissue_to_json(TISSUE), "element": "p1", "preset": "palpation"}
-    simulate(folder / "data.h5", fem, draw("palpation", box, 160, 0), said)
+    simulate(folder / "data.h5", fem, draw("palpation", box, 280, 0), said)
     study = Study(folder / "data.h5", folder, "cpu", loads=2, beyond=12, timed=30)
     solve_reference(study, nothing)
     solve_beyond(study, nothing)
