@@ -136,11 +136,8 @@ def train(
         models[name] = replace(model, bound=min(conformal(held_out, LEVELS[0]), float(held_out.max())))
         if len(beside) >= 2 * FEWEST_APART and len(test) >= TENTHS:
             with stage("calibrate"):
-                scale, share = fresh.rows(beside[::2]), fresh.rows(beside[1::2])
-                error = errors(model, scale, truth[apart][beside[::2]], nodes).max(axis=1)
-                told = _features(patch, _pushed(scale), model.envelope), error
-                bounded = _calibrated(model, patch, told, share, truth[apart][beside[1::2]], nodes)
-                left_out[name] = coverage(bounded, test, truth[split.test])
+                known = fresh.rows(beside), truth[apart][beside]
+                left_out[name] = coverage(_bounded(model, patch, *known, nodes), test, truth[split.test])
         if apart.any():
             with stage(f"learn {name}"):
                 parts = parts_of(name, rooms[1], lessons[1])
@@ -151,6 +148,15 @@ def train(
         progress(name)
     motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
     return Trained(models, tuple(scores), split, motion, int(apart.sum()), len(lessons[-1].loads.point), left_out)
+
+
+def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> Learned:
+    """With bounds that nothing but these loads tell: one half the scale, the other how much of it."""
+    scale, share = loads.rows(slice(None, None, 2)), loads.rows(slice(1, None, 2))
+    error = errors(model, scale, truth[::2], nodes).max(axis=1)
+    return _calibrated(
+        model, patch, (_features(patch, _pushed(scale), model.envelope), error), share, truth[1::2], nodes
+    )
 
 
 def _calibrated(
