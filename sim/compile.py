@@ -16,16 +16,16 @@ from .anatomy import Anatomy
 from .constraint import Constraint
 from .device import Device
 from .discretisation import Discretisation, discretise
-from .effects import Effect, Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
+from .effects import Effect, Elasticity, Gravity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
 from .errors import InputError
 from .footprint import Skin
 from .holding import check_held
-from .loads import Displaced, Loads, Nodal, Prescribed, Pushed, check_field
+from .loads import Displaced, Loads, Nodal, Posture, Prescribed, Pushed, check_field
 from .material import Tissue, coefficients_of, portion
 from .problem import Imposed, Problem
 from .term import Curved, Term
 
-CAUSES = {ToolForce: Pushed, ToolDisplacement: Displaced, NodalForce: Nodal, Held: Prescribed}
+CAUSES = {ToolForce: Pushed, ToolDisplacement: Displaced, NodalForce: Nodal, Held: Prescribed, Gravity: Posture}
 """The cause that each effect answers; other effects act by themselves."""
 
 
@@ -73,6 +73,10 @@ def compile_problem(
                 from .terms.dead_force import DeadForce, nodal_forces
 
                 terms.append(DeadForce("nodal force", partial(nodal_forces, len(anatomy.mesh.nodes), device), device))
+            case Gravity():
+                from .terms.gravity import change_of_weight
+
+                terms.append(change_of_weight(effect, space, device))
             case ToolDisplacement():
                 pass  # a constraint: `_impose` reads the loads
             case _:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from .anatomy import Anatomy
+from .errors import InputError
 from .material import BRAIN, Tissue
 
 
@@ -45,7 +47,52 @@ class NodalForce:
     """Dead forces at the mesh's own nodes: `Nodal` loads."""
 
 
-Effect = Elasticity | Held | Slide | ToolForce | ToolDisplacement | NodalForce
+@dataclass(frozen=True)
+class Gravity:
+    """Tissue weighs less under the cerebrospinal fluid than above it; `Posture` loads say how the head lies now.
+
+    The scan shows a body in equilibrium with its weight then, so that only the change since acts: the weight as a
+    `Posture` has it less the weight in the scan, as dead forces in the rest configuration. Tissue above the level
+    weighs density x g, under it (density - csf_density) x g: Archimedes' body force, which is the fluid's pressure on
+    the tissue but for how much that squeezes it.
+
+    Left out: tissue that moves through the level, densities of tumour and oedema, fluid that does not surround the
+    tissue (ventricles, cysts), tissue that loses water or is cut out, and the gap that opens where the brain sinks away
+    from the skull: with `Slide` it stays on it.
+
+    Parameters
+    ----------
+    direction
+        Which way gravity pulled in the scan (3,), of any length but none, in the mesh's frame; supine in RAS.
+    csf_level
+        How high the fluid stood in the scan [m] above the origin, against `direction`: what has
+        -direction . x < csf_level is under it. Infinite: the skull was closed and full.
+    density, csf_density
+        Of tissue and fluid [kg/m^3]; customary values.
+
+    Raises
+    ------
+    InputError
+        A direction of no length, a level that is no number, a density that is not positive.
+    """
+
+    direction: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    csf_level: float = math.inf
+    density: float = 1040.0
+    csf_density: float = 1007.0
+
+    def __post_init__(self) -> None:
+        given = all(map(math.isfinite, self.direction)) and any(self.direction)
+        if len(self.direction) != 3 or not given:
+            raise InputError(f"Gravity.direction is {self.direction}: give three finite numbers, not all zero.")
+        if math.isnan(self.csf_level):
+            raise InputError("Gravity.csf_level is no number: give a height [m], or infinity for a full skull.")
+        for name, value in (("density", self.density), ("csf_density", self.csf_density)):
+            if not 0.0 < value < math.inf:
+                raise InputError(f"Gravity.{name} is {value} kg/m^3: give a positive number.")
+
+
+Effect = Elasticity | Held | Slide | ToolForce | ToolDisplacement | NodalForce | Gravity
 """Everything that a scene may ask for."""
 
 

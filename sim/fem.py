@@ -31,7 +31,7 @@ from .inversion import Inversion
 from .ladder import FEWEST, LEARNT_KEY, Answer, Ladder, shortfall
 from .lbfgs import TAUGHT
 from .linear import Preconditioner, conjugate_gradients
-from .loads import MAGNITUDE, Displaced, Loads, Nodal, Pushed
+from .loads import Displaced, Loads, Nodal, Pushed
 from .memory import check_fits, fitting_batch
 from .patching import patching
 from .precondition import choose_preconditioner, is_exact, name_of, rest_solver
@@ -291,20 +291,17 @@ class Fem:
         return found.x
 
     def _guess(self, loads: Loads, start: Deformation) -> np.ndarray:
-        """First guesses (3N, B). A case without any load starts at rest: its answer is exactly zero."""
+        """First guesses (3N, B) [m]."""
         vertices = len(self._anatomy.mesh.nodes)
         if start.displacement.shape != (len(loads), vertices, 3):
             raise InputError(
                 f"the start has displacements of shape {start.displacement.shape}: give every vertex of "
                 f"{len(loads)} load cases, ({len(loads)}, {vertices}, 3)."
             )
-        loaded = np.zeros(len(loads), bool)
-        for cause in loads.causes:
-            loaded |= (getattr(cause, MAGNITUDE[type(cause)]) != 0.0).reshape(len(loads), -1).any(axis=1)
         full = self.space.interpolated(start.at(np.arange(vertices)).displacement)
         if len(self.space.edges) and MIDDLES in start.history:
             full[:, vertices:] += start.history[MIDDLES]
-        return np.where(loaded, full.reshape(len(loads), self.problem.rows).T, 0.0)
+        return full.reshape(len(loads), self.problem.rows).T
 
     def _solve(self, cases: Cases, last: np.ndarray | None, at: np.ndarray | None) -> Deformation:
         clock = time.perf_counter()

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from .accuracy import Accuracy
+from .balance import constants_of
 from .columns import gathered, scattered
 from .deformation import Outcome
 from .device import Device
@@ -112,13 +113,15 @@ class Ladder:
 
         A start that lies inside out is left alone, and so is a state that does to which a start led: a body turned
         over or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing.
+        Where nothing acts it stays at rest: the answer is exactly zero.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
         if not guesses:
             answer, astray = self._whole(cases), np.zeros(count, bool)
         else:
-            guess, astray = self._upright(guesses)
+            acts = self._acts(count)
+            guess, astray = self._upright([np.where(acts, one, 0.0) for one in guesses])
             started = guess.any(axis=0)
             learnt = NOTHING if astray.any() else learnt_from(cases, problem.rows)
             answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
@@ -134,6 +137,13 @@ class Ladder:
         if len(lost):
             answer.put(lost, self._in_steps(cases.rows(lost), answer, lost), device)
         return answer
+
+    def _acts(self, count: int) -> np.ndarray:
+        """Which cases (b,) of the batch that has begun any force or imposed motion acts on at rest."""
+        rest = self.problem.device.zeros(self.problem.rows, count)
+        _, loud = constants_of(self.problem, rest)
+        acts = (loud.numpy() != 0.0).any(axis=0)
+        return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
 
     def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The first of some guesses (3N, B) [m] of each case that is not inside out; which cases (B,) have none."""

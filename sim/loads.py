@@ -50,10 +50,32 @@ class Prescribed:
     displacement: np.ndarray
 
 
-Cause = Pushed | Displaced | Nodal | Prescribed
-C = TypeVar("C", Pushed, Displaced, Nodal, Prescribed)
+@dataclass(frozen=True, eq=False)
+class Posture:
+    """How the head lies and how high its fluid stands now; the effect `Gravity` knows how they were in the scan.
+
+    direction (B, 3), which way gravity pulls in the mesh's frame, of any length but none; csf_level (B,) [m] above the
+    origin, against the direction; share (B,) of the change of weight since the scan that acts. In the scan's own
+    posture no force acts, and half a load is half of the change, which no posture between the two would be.
+    """
+
+    direction: np.ndarray
+    csf_level: np.ndarray
+    share: np.ndarray
+
+
+Cause = Pushed | Displaced | Nodal | Prescribed | Posture
+C = TypeVar("C", Pushed, Displaced, Nodal, Prescribed, Posture)
 # The array of each cause that grows with the load; the others say where it acts.
-MAGNITUDE = {Pushed: "force", Displaced: "displacement", Nodal: "force", Prescribed: "displacement"}
+MAGNITUDE = {
+    Pushed: "force",
+    Displaced: "displacement",
+    Nodal: "force",
+    Prescribed: "displacement",
+    Posture: "share",
+}
+# Arrays of one number a load case.
+SCALARS = ("footprint", "csf_level", "share")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +85,7 @@ class Loads:
     Parameters
     ----------
     causes
-        `Pushed`, `Displaced`, `Nodal`, `Prescribed`.
+        `Pushed`, `Displaced`, `Nodal`, `Prescribed`, `Posture`.
     time
         (B,) [s]; the time at which the answer is wanted. Zero where nothing depends on time.
 
@@ -154,6 +176,13 @@ def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) ->
     return Loads((Pushed(_shaped(point, (rows, 3)), _shaped(force, (rows, 3)), _shaped(footprint, (rows,))),))
 
 
+def posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads:
+    """Loads of the whole change of weight since the scan: direction (3,) or (B, 3), csf_level scalar or (B,) [m]."""
+    direction, level = np.atleast_2d(direction), np.atleast_1d(csf_level)
+    rows = max(len(direction), len(level))
+    return Loads((Posture(_shaped(direction, (rows, 3)), _shaped(level, (rows,)), np.ones(rows)),))
+
+
 def check_field(name: str, field: np.ndarray, vertices: int) -> None:
     """Refuse a whole field (B, V, 3) of another mesh.
 
@@ -182,13 +211,15 @@ def _checked(cause: Cause) -> Cause:
     arrays = {key: np.asarray(value, np.float64) for key, value in vars(cause).items()}
     whole_field = isinstance(cause, Nodal | Prescribed)
     for key, array in arrays.items():
-        scalar_rows = key == "footprint"
+        scalar_rows = key in SCALARS
         good = array.ndim == (1 if scalar_rows else 3 if whole_field else 2)
         if not good or (not scalar_rows and array.shape[-1] != 3):
             want = "(B,)" if scalar_rows else "(B, V, 3)" if whole_field else "(B, 3)"
             raise InputError(f"{name}.{key} has shape {array.shape}: give {want}.")
         if not all_finite(array):
             raise InputError(f"{name}.{key} has a value that is not finite: every number must be finite.")
-        if scalar_rows and len(array) and not array.min() > 0.0:
+        if key == "footprint" and len(array) and not array.min() > 0.0:
             raise InputError(f"{name}.{key} has a radius of {array.min():g} m: give positive radii in metres.")
+        if key == "direction" and not array.any(axis=1).all():
+            raise InputError(f"{name}.{key} has a row of zeros: give every load case the way that gravity pulls.")
     return type(cause)(**arrays)

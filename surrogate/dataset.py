@@ -17,10 +17,10 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.deformation import Outcome
 from sim.errors import InputError
-from sim.loads import Cause, Displaced, Loads, Nodal, Prescribed, Pushed
+from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed
 from sim.mesh import TetMesh
 
-CAUSES: dict[str, type[Cause]] = {kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed)}
+CAUSES: dict[str, type[Cause]] = {kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture)}
 FORMAT = "sulcus data 1"
 # The arrays of a mesh; linear ones have no `middles`.
 MESH = ("nodes", "tets", "region", "middles")

@@ -10,11 +10,11 @@ from oracle import EVERY_LAW, tissue
 from scenes.shipped import template_path
 from sim.accuracy import LIVE, TRAIN, Accuracy
 from sim.discretisation import ELEMENTS
-from sim.effects import Elasticity, Held, Slide, ToolDisplacement, ToolForce
+from sim.effects import Elasticity, Gravity, Held, Slide, ToolDisplacement, ToolForce
 from sim.fem import Fem
 from sim.following import Kept
 from sim.linear import BlockJacobi
-from sim.loads import Displaced, Loads, push
+from sim.loads import Displaced, Loads, posture, push
 from sim.meshfile import read_anatomy
 from sim.symmetric import add_product, tiles_of
 from surrogate.sampling import draw
@@ -55,6 +55,24 @@ def test_a_moved_footprint_and_its_reaction(box, element):
         Fem(box, effects, Accuracy(1e-8), name, element=element).deform(loads) for name in ("cpu", "cuda")
     )
     np.testing.assert_allclose(on_cuda.reaction, on_cpu.reaction, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_a_batch_of_postures(box, element, precision):
+    """Levels between those of the box's nodes, and a tool beside them; the scan's posture among them."""
+    accuracy = Accuracy(1e-8) if precision == "float64" else TRAIN
+    down, top = np.array([0.3, 0.0, -1.0]), float(box.mesh.nodes[:, 2].max())
+    drained = posture(down, top - np.linspace(0.001, 0.04, 7))
+    loads = Loads((*pushes().causes, *drained.causes))
+    effects = (Elasticity(), Held(), ToolForce(), Gravity())
+    on_cpu, on_cuda = (Fem(box, effects, accuracy, name, element=element) for name in ("cpu", "cuda"))
+    expected, found = on_cpu.deform(loads), on_cuda.deform(loads)
+    assert all(outcome.good for outcome in found.outcome)
+    off = np.abs(expected.displacement - found.displacement).max()
+    assert off <= BOUND[precision] * np.abs(expected.displacement).max()
+    scan = posture(np.array(Gravity().direction), np.full(7, 1.0))
+    assert not on_cuda.deform(scan, found).displacement.any()
 
 
 def test_block_jacobi_reaches_what_the_inverse_reaches(box):

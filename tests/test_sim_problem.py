@@ -75,7 +75,7 @@ def test_only_what_is_asked_for_is_imported() -> None:
         "import sys; sys.path.insert(0, 'tests')\n"
         "import numpy as np\n"
         "from boxes import base_held, box, top_forces\n"
-        "from sim.effects import Elasticity, Held, NodalForce\n"
+        "from sim.effects import Elasticity, Gravity, Held, NodalForce\n"
         "from sim.fem import Fem\n"
         "from sim.loads import Loads, Nodal\n"
         "from sim.material import Material\n"
@@ -102,6 +102,7 @@ def test_only_what_is_asked_for_is_imported() -> None:
 
     assert imported("") == ["elasticity", "invariants", "law", "linear"]
     assert imported(", NodalForce()") == ["dead_force", "elasticity", "invariants", "law", "linear"]
+    assert imported(", Gravity()") == ["dead_force", "elasticity", "gravity", "invariants", "law", "linear"]
 
 
 def test_an_effect_that_is_not_asked_for_is_not_launched(launches: list[str]) -> None:

@@ -17,8 +17,8 @@ from tiny_terms import Spring, Wall
 from sim.compile import compile_problem
 from sim.device import Device, find_device
 from sim.discretisation import discretise
-from sim.effects import Elasticity, Held, NodalForce, ToolForce
-from sim.loads import Loads, Nodal, Pushed
+from sim.effects import Elasticity, Gravity, Held, NodalForce, ToolForce
+from sim.loads import Loads, Nodal, Posture, Pushed
 from sim.mesh import signed_volumes
 from sim.term import Cases, Term
 from sim.terms.elasticity import VOLUME_KEPT
@@ -79,6 +79,12 @@ def cases() -> Cases:
     return Cases(Loads((forces, pushes), np.array([1.0, 2.0, 3.0])), np.array([0.5, 0.0, 2.9]), history)
 
 
+def postures() -> Cases:
+    directions = np.array([[0.6, -0.3, 0.5], [0.0, 0.0, -1.0], [-1.0, 2.0, 0.1]])
+    lying = Posture(directions, np.array([-0.05, 0.03, -0.01]), np.array([0.5, -1.0, 2.0]))
+    return Cases(Loads((lying,)), np.zeros(3))
+
+
 LOGARITHMIC = ("neo-hookean", "ogden")
 PARTS = ("shape", "volume")
 
@@ -100,6 +106,7 @@ EXAMPLES = (
     | {
         "nodal force": Example(of_effects(NodalForce()), cases()),
         "tool force": Example(of_effects(ToolForce()), cases()),
+        "gravity": Example(of_effects(Gravity()), postures()),
         "spring": Example(lambda device: Spring(device, ROWS, 7.0), cases()),
         "wall": Example(lambda device: Wall(device, MESH.nodes, 0.12, 0.03, 500.0), cases(), bounded=True),
     }

@@ -13,8 +13,8 @@ from boxes import box as cube
 
 from sim.deformation import Outcome
 from sim.errors import InputError
-from sim.loads import Pushed
-from surrogate.dataset import read_dataset, read_embedded, write_embedded
+from sim.loads import Loads, Posture, Pushed, posture, push
+from surrogate.dataset import read_dataset, read_embedded, read_loads, write_embedded, write_loads
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
 
@@ -42,6 +42,16 @@ def test_what_is_written_is_read(tmp_path, box, pretender, loads):
     assert np.array_equal(data.displacement(box.tumour_nodes), data.displacement(slice(None))[:, box.tumour_nodes])
     assert data.displacement(box.tumour_nodes).dtype == np.float32
     assert data.good.all() and (data.iterations == 4).all() and (data.residual == 1e-5).all()
+
+
+def test_postures_are_stored(tmp_path):
+    both = Loads((*push(np.zeros(3), np.ones((2, 3)), 0.01).causes, *posture([[0.0, -1.0, 0.0]], [0.01, 0.02]).causes))
+    with h5py.File(tmp_path / "data.h5", "w") as file:
+        write_loads(file, both)
+        read = read_loads(file)
+    assert [type(cause) for cause in read.causes] == [Pushed, Posture]
+    for name, array in vars(both.of(Posture)).items():
+        assert np.array_equal(getattr(read.of(Posture), name), array)
 
 
 @pytest.mark.parametrize("mesh", [cube((2, 2, 2)), quadratic(cube((2, 2, 2)), curved=0.05)], ids=["p1", "p2"])

@@ -10,7 +10,7 @@ import pytest
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
 from sim.errors import InputError
-from sim.loads import Displaced, Loads, Nodal, Pushed, push
+from sim.loads import Displaced, Loads, Nodal, Posture, Pushed, push
 from surrogate.bound import features_of, fitted_bound
 from surrogate.dataset import read_dataset
 from surrogate.envelope import measured
@@ -231,7 +231,8 @@ def test_held_out_loads_lie_inside_the_envelope(trained, data):
 
 def test_other_loads_and_other_vertices_are_refused(model, box):
     point = np.zeros((1, 3))
-    for cause in (Displaced(point, point, np.ones(1)), Nodal(np.zeros((1, len(box.mesh.nodes), 3)))):
+    lying = Posture(np.ones((1, 3)), np.zeros(1), np.ones(1))
+    for cause in (Displaced(point, point, np.ones(1)), Nodal(np.zeros((1, len(box.mesh.nodes), 3))), lying):
         with pytest.raises(InputError, match=f"{type(cause).__name__}.*taught pushing forces only"):
             model.deform(Loads((cause,)))
     deep = np.setdiff1d(np.arange(len(box.mesh.nodes)), model.nodes)[:1]

@@ -1,0 +1,90 @@
+"""The change of weight since the scan: other posture, other level of the fluid round the brain."""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import warp as wp
+
+from ..device import Device
+from ..discretisation import Discretisation
+from ..effects import Gravity
+from ..element import EIGHT_POINTS, EIGHT_WEIGHTS, quadratic_shapes, quadratic_slopes
+from ..immersion import parts_under
+from ..loads import Loads, Posture
+from ..mesh import QUADRATIC_EDGES
+from ..normals import unit
+from .dead_force import DeadForce, Forces
+
+STANDARD_GRAVITY = 9.80665  # [m/s^2]
+# So many postures are weighed once and kept: a solver takes the same loads several times.
+KEPT = 64
+
+
+def change_of_weight(effect: Gravity, space: Discretisation, device: Device) -> DeadForce:
+    """The term of `Gravity` on the nodes of `space`: dead forces, the weight now less the weight in the scan."""
+    return DeadForce("gravity", changes(effect, space, device), device)
+
+
+def changes(effect: Gravity, space: Discretisation, device: Device) -> Callable[[Loads], Forces | None]:
+    """Loads -> the nodal forces f_a = s (w_a(now) - w_a(scan)), or None without a `Posture`.
+
+    w_a = g d integral of (rho - rho_csf [x is under the level]) N_a(x) dV in the rest configuration, N_a the elements'
+    own shape functions. The part of an element under the level is cut out exactly, so that the total is
+    g d (rho V - rho_csf V_under) and a level that moves changes the forces continuously. (A curved element is cut where
+    the plane meets it before it is bent.)
+    """
+    table, count = space.table, space.count
+    ones = np.broadcast_to(np.eye(4), (len(table), 4, 4))
+    whole = nodal_volumes(space, np.arange(len(table)), ones)
+    volume = summed(table, whole, count)
+
+    @lru_cache(KEPT)
+    def weights(*posture: float) -> np.ndarray:
+        """How much each node weighs (N, 3) [N] in a posture: direction, then level [m]."""
+        direction, level = np.array(posture[:3]), posture[3]
+        height = (-space.nodes @ direction - level)[table[:, :4]]
+        corners_under = (height < 0.0).sum(axis=1)
+        full, cut = corners_under == 4, np.flatnonzero((corners_under > 0) & (corners_under < 4))
+        owner, parts = parts_under(height[cut])
+        volumes = np.concatenate([whole[full], nodal_volumes(space, cut[owner], parts)])
+        under = summed(np.concatenate([table[full], table[cut[owner]]]), volumes, count)
+        mass = effect.density * volume - effect.csf_density * under
+        return STANDARD_GRAVITY * mass[:, None] * direction
+
+    def forces(loads: Loads) -> Forces | None:
+        cause = loads.of(Posture)
+        if cause is None:
+            return None
+        scan = weights(*downwards(np.array([effect.direction]))[0], effect.csf_level)
+        now = [weights(*row) for row in np.column_stack([downwards(cause.direction), cause.csf_level]).tolist()]
+        change = cause.share[:, None, None] * (np.reshape(now, (-1, count, 3)) - scan)
+        return Forces(device.array(np.arange(count), wp.int32), device.array(change.reshape(-1, 3 * count).T))
+
+    return forces
+
+
+def downwards(direction: np.ndarray) -> np.ndarray:
+    """Directions (B, 3) of any length but none, at unit length."""
+    return unit(direction / np.abs(direction).max(axis=1, keepdims=True))
+
+
+def nodal_volumes(space: Discretisation, owner: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """Integrals (m, n) [m^3] of the shape functions of tetrahedra `owner` (m,) over a part of each.
+
+    parts (m, 4, 4): corner coordinates of the part's own corners. Eight points of degree 3: exact for straight
+    elements, and for the volume of curved ones.
+    """
+    points = EIGHT_POINTS @ parts
+    weight = np.abs(np.linalg.det(parts))[:, None] * EIGHT_WEIGHTS
+    if space.table.shape[1] == 4:
+        return space.mesh.volumes[owner, None] * np.einsum("mq,mqa->ma", weight, points)
+    shape = quadratic_shapes(points, QUADRATIC_EDGES)
+    slope = quadratic_slopes(points.reshape(-1, 4)).reshape(*shape.shape, 3)
+    jacobian = np.einsum("mai,mqaj->mqij", space.nodes[space.table[owner]], slope)
+    return np.einsum("mq,mqa->ma", weight * np.linalg.det(jacobian) / 6.0, shape)
+
+
+def summed(table: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Values (m, n) of the nodes in `table` (m, n), summed by node (N,)."""
+    return np.bincount(table.ravel(), values.ravel(), count)
