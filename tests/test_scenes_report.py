@@ -106,7 +106,7 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
     guess = model.deform(data.loads.rows(np.flatnonzero(test)), at=box.tumour_nodes).displacement
     wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
     discs = stored[2]["teacher"]["discs"]
-    assert np.allclose([*discs["mm"].values(), *discs["percent"].values()], wanted, rtol=1e-6)
+    assert np.allclose([*discs["mm"].values(), *discs["percent"].values()], wanted, rtol=1e-5)
     assert discs["loads"] == test.sum() and discs["values"] == test.sum() * len(box.tumour_nodes)
     assert stored[2]["taught"] == study.discs.taught.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
 
