@@ -17,14 +17,16 @@ from surrogate.sampling import across
 
 @dataclass(frozen=True)
 class Body:
-    """What is pressed: the tissue, how many times as stiff the tumour is, whether the skull side is held, the element.
+    """What is pressed: the tissue, how many times as stiff the tumour is, the skull, the element.
 
-    Linear tetrahedra lock as nu nears 0.5, which would pass for an influence of nu: hence smoothed ones.
+    The skull side is `held`, or slides: as the anatomy has it, or along normals seen through another `blur` [m]. Linear
+    tetrahedra lock as nu nears 0.5, which would pass for an influence of nu: hence smoothed ones.
     """
 
     tissue: Material = BRAIN
     tumour: float = 1.0
     held: bool = False
+    blur: float | None = None
     element: str = "smoothed"
 
 
@@ -76,6 +78,10 @@ def variants(anatomy: Anatomy, body: Body, elements: Sequence[str] = ()) -> list
     ]
     if anatomy.slide_normal.any():
         changed.append(Variant("skull side", "slides", "held", replace(body, held=True)))
+        changed += [
+            Variant("skull's smoothness", "as meshed", f"{1e3 * blur:g} mm", replace(body, blur=blur))
+            for blur in (3e-3, 10e-3)
+        ]
     changed += [Variant("element", body.element, element, replace(body, element=element)) for element in elements]
     return [variant for variant in changed if variant.body != body or variant.aim != Aim()]
 

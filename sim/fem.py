@@ -246,7 +246,7 @@ class Fem:
             raise InputError("a series of differences needs float64: ask for an Accuracy of that precision.")
         for cause in loads.causes:
             if not isinstance(cause, Pushed | Nodal):
-                raise InputError(f"{type(cause).__name__} is no force: a series is had of `Pushed` and `Nodal` loads.")
+                raise InputError(f"a series is had of `Pushed` and `Nodal` loads, not of `{type(cause).__name__}`.")
         if len(loads) % sizes:
             raise InputError(f"{len(loads)} loads are no groups of {sizes}: give a multiple of that.")
         widest = len(factors(sizes, orders))

@@ -11,7 +11,7 @@ import pytest
 from conftest import make_box
 
 from scenes.cli import main
-from scenes.sensitivity import Study, change, moved_alike, rows, skull_held
+from scenes.sensitivity import Study, change, moved_alike, rows, with_skull
 from scenes.variant import Aim, Body, aimed, variants
 from sim.accuracy import Accuracy
 from sim.deformation import Outcome
@@ -58,14 +58,15 @@ def test_every_thing_has_its_row(found):
         ("motion itself", ""), ("force or motion", "5 % off"), ("its direction", "2 deg off"),
         ("its position", "1 mm off"), ("E", "-20%"), ("E", "+20%"), ("nu", "0.49"), ("nu", "0.495"),
         ("tumour's stiffness", "0.5 x"), ("tumour's stiffness", "2 x"), ("tumour's stiffness", "3 x"),
-        ("skull side", "held"), ("element", "smoothed"),
+        ("skull side", "held"), ("skull's smoothness", "3 mm"), ("skull's smoothness", "10 mm"),
+        ("element", "smoothed"),
     ]  # fmt: skip
     for row in found.values():
         for one in (row.force, row.motion):
             assert one.failed == 0
             assert max(one.mean_mm, one.p95_mm, one.worst95_mm) <= one.largest_mm
     ways = [row.force.solves // 4 for row in found.values()]
-    assert ways == [1, 2, 2, 4] + [1] * 9
+    assert ways == [1, 2, 2, 4] + [1] * 11
 
 
 @pytest.mark.parametrize(("now", "factor"), [("-20%", 1.0 / 0.8), ("+20%", 1.0 / 1.2)])
@@ -152,9 +153,19 @@ def test_a_known_motion_is_the_footprints_mean(box, pretender):
 
 
 def test_a_held_skull_holds_what_slid(anatomy):
-    held = skull_held(anatomy)
+    held = with_skull(anatomy, Body(held=True))
     assert not held.slide_normal.any()
     np.testing.assert_array_equal(held.held, anatomy.held | anatomy.slide_normal.any(axis=1)[:, None])
+
+
+def test_a_skull_is_as_smooth_as_asked_where_the_body_slides(anatomy):
+    assert with_skull(anatomy, Body()) is anatomy
+    slides = anatomy.slide_normal.any(axis=1)
+    sharp, smooth = (with_skull(anatomy, Body(blur=blur)).slide_normal for blur in (1e-3, 20e-3))
+    np.testing.assert_array_equal(smooth.any(axis=1), slides)
+    # Through a wide blur the flat sides of a box face outwards, and somewhat to the edges that are near.
+    turned = [1.0 - np.abs((one * anatomy.slide_normal).sum(axis=1))[slides] for one in (sharp, smooth)]
+    assert 0.05 < turned[1].mean() != pytest.approx(turned[0].mean(), rel=0.1)
 
 
 def test_a_body_without_tumour_is_refused(anatomy):
