@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time as clock
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,11 +13,11 @@ from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
-from sim.files import written_whole
 from sim.mesh import TetMesh
 from surrogate.simulate import simulate
 
 from .report_study import Study
+from .report_took import note_seconds, noted_seconds
 
 # Of the tumour's volume.
 SHARE = 0.2
@@ -64,14 +63,12 @@ def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
 
     simulate(path, fem, data.loads, data.provenance, fem.batch, tell)
     if whole:
-        with written_whole(path.with_suffix(".json"), ".json") as partial:
-            partial.write_text(json.dumps({"seconds": clock.perf_counter() - begun}))
+        note_seconds(path, clock.perf_counter() - begun)
 
 
 def simulating_seconds(study: Study) -> float | None:
     """What `simulate_debulked` took; None where it was not done, or not in one run."""
-    kept = _path(study).with_suffix(".json")
-    return json.loads(kept.read_text())["seconds"] if kept.exists() else None
+    return noted_seconds(_path(study))
 
 
 def _path(study: Study) -> Path:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import time as clock
 from collections.abc import Callable
 from dataclasses import replace
 
-from sim.files import written_whole
 from surrogate.parts import EXPANDED
 
 from .report_study import Study
+from .report_took import note_seconds, noted_seconds
 
 
 def tabulate_series(study: Study, progress: Callable[[int, int], object]) -> None:
@@ -18,19 +17,15 @@ def tabulate_series(study: Study, progress: Callable[[int, int], object]) -> Non
     path = study.expansion.kept
     if path is None or "tissue" not in study.dataset.provenance:
         return
-    told = path.with_suffix(".json")
-    if path.exists() and told.exists():
+    if path.exists() and noted_seconds(path) is not None:
         return
     path.unlink(missing_ok=True)  # of a run that was stopped before it said what the table took
     begun = clock.perf_counter()
     replace(study.expansion, progress=progress).coefficients  # noqa: B018 (asking makes it)
-    with written_whole(told, ".json") as partial:
-        partial.write_text(json.dumps({"seconds": clock.perf_counter() - begun}))
+    note_seconds(path, clock.perf_counter() - begun)
 
 
 def series_seconds(study: Study, learner: str) -> float:
     """What the table took, if this learner is made of it [s]."""
     path = study.expansion.kept
-    if learner not in EXPANDED or path is None or not path.with_suffix(".json").exists():
-        return 0.0
-    return json.loads(path.with_suffix(".json").read_text())["seconds"]
+    return (noted_seconds(path) or 0.0) if learner in EXPANDED and path is not None else 0.0

@@ -18,7 +18,7 @@ from .encode import directions
 from .envelope import Envelope, envelope_of, measured
 from .learned import Learned
 from .parts import EXPANDED, LEARNT, Classroom, Expansion, Lesson, parts_of
-from .patch import Patch, nearest, open_patch
+from .patch import Patch, nearest
 from .score import Score, errors, score
 from .split import APART, MOST_APART, Split, leave_discs_out
 
@@ -97,7 +97,8 @@ def train(
         )
     loads = data.loads.rows(np.flatnonzero(data.good))
     pushed = _pushed(loads)
-    patch, nodes = open_patch(data.anatomy), data.anatomy.tumour_nodes
+    shared = expansion or Expansion(data)
+    patch, nodes = shared.patch, shared.tumour
     if not len(nodes):
         raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
     apart = np.zeros(len(loads), bool)
@@ -106,12 +107,11 @@ def train(
         split = _without(leave_discs_out(pushed.point[~apart], patch), apart)
     with stage("read"):
         truth = data.displacement(nodes)[data.good]
-        cortex = data.displacement(np.setdiff1d(patch.nodes, nodes))[data.good]
+        cortex = data.displacement(shared.cortex)[data.good]
 
     def lesson(rows: np.ndarray) -> Lesson:
         return Lesson(_pushed(loads.rows(np.flatnonzero(rows))), truth[rows], cortex[rows])
 
-    shared = expansion or Expansion(data)
     lessons = [lesson(_first(split.taught, most)), *([lesson(_first(~apart, most))] if apart.any() else [])]
     rooms = [Classroom(each, shared) for each in lessons]
     test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))

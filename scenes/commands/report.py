@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from sim.errors import InputError
-from sim.files import check_output, written_whole
+from sim.files import check_output
 
 if TYPE_CHECKING:
     from ..report_page import Section
@@ -117,9 +117,9 @@ def _tabulate(study: Study, bar: tqdm) -> None:
 
 def _simulated(path: Path, args: argparse.Namespace, count: int) -> float | None:
     """Make a data set; the minutes that it took, or None where an earlier run did some of it."""
+    from ..report_took import note_seconds, noted_seconds
     from . import simulate
 
-    kept = path.with_suffix(".json")
     whole = not path.with_name(path.name + ".partial").exists() and not path.exists()
     parser = argparse.ArgumentParser()
     simulate.add_arguments(parser)
@@ -130,9 +130,9 @@ def _simulated(path: Path, args: argparse.Namespace, count: int) -> float | None
         if simulate.run(asked) != 0:
             raise KeyboardInterrupt
     if whole:
-        with written_whole(kept, ".json") as partial:
-            partial.write_text(json.dumps({"minutes": (clock.perf_counter() - begun) / 60.0}))
-    return json.loads(kept.read_text())["minutes"] if kept.exists() else None
+        note_seconds(path, clock.perf_counter() - begun)
+    seconds = noted_seconds(path)
+    return None if seconds is None else seconds / 60.0
 
 
 def _about(study: Study) -> tuple[str, ...]:
