@@ -94,13 +94,15 @@ class Fem:
         problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
         preconditioner = choose_preconditioner(problem, self.space, self._unsmoothed)
         self.preconditioner = name_of(preconditioner)
-        near = cache(partial(eliminating, problem, preconditioner, self.effects, self.space))
+        plain = problem.plain  # what shortcuts solve apart is elastic, and nothing else
+        near = cache(partial(eliminating, problem, preconditioner, self.effects, self.space) if plain else lambda: None)
         if problem.device.on_cuda:
             near()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
-        vicinity = vicinity_of(problem, preconditioner, self.effects, self.space)
+        vicinity = vicinity_of(problem, preconditioner, self.effects, self.space) if plain else None
         fitting = fitting_batch(problem.rows, problem.device) if batch is None else batch
         self.batch = fitting if vicinity is None else 1  # each load has a vicinity of its own
-        patch = patching(problem, preconditioner, self.effects, self.space) if live and vicinity is None else None
+        patching_pays = live and plain and vicinity is None
+        patch = patching(problem, preconditioner, self.effects, self.space) if patching_pays else None
         inversion = Inversion(self.space, problem.device)
         self._ladder = Ladder(problem, preconditioner, inversion, accuracy, near, vicinity or patch)
 
@@ -153,8 +155,8 @@ class Fem:
         return self._follower() if cuda and is_exact(self._ladder.preconditioner) else None
 
     def _follower(self) -> Following | None:
-        """None where nodes are not the mesh's own vertices, or a budget is too small to be spent elsewhere."""
-        if len(self.space.edges) or self.accuracy.outer < FEWEST:
+        """None where nodes are not the mesh's own, a budget is too small to be spent elsewhere, or more acts."""
+        if len(self.space.edges) or self.accuracy.outer < FEWEST or not self.problem.plain:
             return None
         ladder = self._ladder
         frame = Frame(self.problem, ladder.preconditioner, ladder.inversion, self._skin, self.accuracy.tolerance)
@@ -242,6 +244,8 @@ class Fem:
             a solver in float32, whose round-off would be taken for the higher orders.
         """
         check_causes(self.effects, loads)
+        if not self.problem.plain:
+            raise InputError("a series is had of elastic bodies under forces alone: leave the other effects out.")
         if self.problem.device.precision != "float64":
             raise InputError("a series of differences needs float64: ask for an Accuracy of that precision.")
         for cause in loads.causes:

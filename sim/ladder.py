@@ -141,7 +141,10 @@ class Ladder:
     def _acts(self, count: int) -> np.ndarray:
         """Which cases (b,) of the batch that has begun any force or imposed motion acts on at rest."""
         rest = self.problem.device.zeros(self.problem.rows, count)
-        _, loud = constants_of(self.problem, rest)
+        if self.problem.plain:
+            _, loud = constants_of(self.problem, rest)
+        else:
+            loud = self.problem.gradient(rest)
         acts = (loud.numpy() != 0.0).any(axis=0)
         return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
 
@@ -166,14 +169,14 @@ class Ladder:
 
         From rest without a start; `learnt` on the way to it, if anything was.
 
-        Motions that are imposed are left to Newton: it knows how the free nodes follow them.
+        Motions that are imposed are left to Newton: it knows how the free nodes follow them. So are steep terms.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         most = QUICK_ON_CUDA if device.on_cuda else QUICK
         # Rest satisfies whatever the batch does not move.
         imposed = problem.constraint.imposes or (start is not None and problem.gap(start)[1].any())
         start = device.zeros(problem.rows, count) if start is None else start
-        if imposed or self.accuracy.outer < FEWEST:
+        if imposed or problem.steep or self.accuracy.outer < FEWEST:
             return self._thorough(start, self.accuracy.outer)
         descents: list[tuple[Elimination | Patching | Vicinity | Lbfgs, Mapping[str, np.ndarray] | None]] = [
             (self._lbfgs, learnt)

@@ -80,7 +80,7 @@ SCALARS = ("footprint", "csf_level", "share")
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """B load cases, each the sum of all causes; at most one cause of each kind.
+    """B load cases, each the sum of all causes; at most one cause of each kind. Without any, time alone goes on.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ class Loads:
     Raises
     ------
     InputError
-        No cause, a kind twice, rows that do not agree, or a number that is not finite.
+        Neither cause nor time, a kind twice, rows that do not agree, or a number that is not finite.
     """
 
     causes: tuple[Cause, ...]
@@ -100,13 +100,15 @@ class Loads:
 
     def __post_init__(self) -> None:
         kinds = [type(cause) for cause in self.causes]
-        if not kinds or len(set(kinds)) < len(kinds):
+        if len(set(kinds)) < len(kinds) or not (kinds or self.time is not None):
             names = ", ".join(kind.__name__ for kind in kinds) or "none"
-            raise InputError(f"loads have the causes {names}: give at least one, and each kind once.")
+            raise InputError(f"loads have the causes {names}: give at least one, or a time, and each kind once.")
         object.__setattr__(self, "causes", tuple(_checked(cause) for cause in self.causes))
         rows = {len(array) for cause in self.causes for array in vars(cause).values()}
         time = np.zeros(max(rows)) if self.time is None else np.asarray(self.time, np.float64)
-        if rows != {len(time)}:
+        if time.ndim != 1 or not all_finite(time):
+            raise InputError(f"the times of loads have shape {time.shape}: give (B,) finite numbers [s].")
+        if rows - {len(time)}:
             raise InputError(f"load arrays have {sorted(rows | {len(time)})} rows: give one row per load case.")
         object.__setattr__(self, "time", time)
 

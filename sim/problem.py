@@ -52,6 +52,16 @@ class Problem:
         """3N."""
         return self.constraint.held.size
 
+    @property
+    def plain(self) -> bool:
+        """Whether forces that stay as they are act on what only ever resists: what shortcuts are made for."""
+        return all(term.constant or term.passive for term in self.terms)
+
+    @property
+    def steep(self) -> bool:
+        """Whether a term is steep."""
+        return any(term.steep for term in self.terms)
+
     def begin(self, cases: Cases) -> None:
         """Take a batch of load cases."""
         imposed = self.impose(cases.loads)

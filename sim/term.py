@@ -47,6 +47,16 @@ class Term(Protocol):
         """Whether the gradient depends on the cases alone, not on where the nodes are."""
         ...
 
+    @property
+    def passive(self) -> bool:
+        """Whether it only ever resists, as elastic tissue does: no gradient at rest, whatever the cases."""
+        ...
+
+    @property
+    def steep(self) -> bool:
+        """Whether its curvature may be far from what the rest stiffness knows, as where bodies touch."""
+        ...
+
     def begin(self, cases: Cases) -> None:
         """Take the loads, times and history of every column."""
         ...

@@ -12,7 +12,7 @@ from sim.accuracy import TRAIN
 from sim.effects import Elasticity, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Loads, Nodal, Prescribed, Pushed, push
+from sim.loads import Loads, Nodal, Prescribed, Pushed, push, stacked
 
 COUNT = 27
 FORCE = np.array([[0.0, 0.0, -0.05], [0.02, -0.03, -0.3], [0.1, 0.0, -0.6], [0.0, 0.1, 0.2], [0.0, 0.0, -0.9]])
@@ -37,6 +37,9 @@ def test_no_cause_or_one_twice_is_refused() -> None:
         (lambda: Loads((Pushed(POINT[:, :2], FORCE, np.full(5, 0.01)),)), r"point has shape \(5, 2\)"),
         (lambda: Loads((Nodal(np.zeros((COUNT, 3))),)), r"Nodal\.force has shape"),
         (lambda: Loads((Nodal(np.zeros((5, COUNT, 3))),), np.zeros(4)), r"\[4, 5\] rows"),
+        (lambda: Loads(()), "at least one, or a time"),
+        (lambda: Loads((), np.array([0.1, np.nan])), "times of loads"),
+        (lambda: Loads((), np.array(0.1)), r"times of loads have shape \(\)"),
     ],
 )
 def test_bad_numbers_are_refused(build: Callable[[], Loads], sentence: str) -> None:
@@ -50,6 +53,14 @@ def test_a_whole_field_of_another_mesh_is_refused() -> None:
         body.deform(Loads((Nodal(np.zeros((1, 8, 3))),)))
     with pytest.raises(InputError, match=r"Prescribed\.displacement has 8 vertices"):
         body.deform(Loads((Prescribed(np.zeros((1, 8, 3))),)))
+
+
+def test_time_alone_is_a_load() -> None:
+    later = Loads((), np.array([0.1, 0.2]))
+    both = stacked([later, later.rows(np.array([1])).scaled(0.5)])
+    np.testing.assert_array_equal(both.times, [0.1, 0.2, 0.2])
+    body = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), NodalForce()], TRAIN, "cpu")
+    np.testing.assert_array_equal(body.deform(both).displacement, 0.0)
 
 
 def test_scaling_and_rows() -> None:

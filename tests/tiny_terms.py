@@ -17,7 +17,7 @@ class Spring:
     E = k/2 |u - a|^2; over a step dt the anchor moves to a + (1 - exp(-dt / tau)) (u - a). History: a (B, N, 3) [m].
     """
 
-    constant = False
+    constant, passive, steep = False, False, False
 
     def __init__(self, device: Device, rows: int, stiffness: float, tau: float = 1.0):
         self.name = "spring"
@@ -69,7 +69,7 @@ class Wall:
     Li et al. 2020, "Incremental Potential Contact", eq. 6. No rest curvature: the wall is far away at rest.
     """
 
-    constant = False
+    constant, passive, steep = False, False, False
 
     def __init__(self, device: Device, nodes: np.ndarray, height: float, reach: float, stiffness: float):
         self.name = "wall"

@@ -129,7 +129,7 @@ class DeadForce:
         Where its arrays live.
     """
 
-    constant = True
+    constant, passive, steep = True, False, False
 
     def __init__(self, name: str, assemble: Callable[[Loads], Forces | None], device: Device):
         self.name = name

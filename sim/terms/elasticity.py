@@ -264,7 +264,7 @@ class Elasticity:
         Where its arrays live.
     """
 
-    constant = False
+    constant, passive, steep = False, True, False
 
     def __init__(
         self, name: str, law: Law, elements: Elements, coefficients: np.ndarray, lame: np.ndarray, device: Device

@@ -29,7 +29,7 @@ class Exterior:
     """
 
     name = "exterior"
-    constant = False
+    constant, passive, steep = False, True, False
 
     def __init__(self, rows: np.ndarray, stiffness: np.ndarray, count: int, device: Device):
         self._device = device
