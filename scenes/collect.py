@@ -16,7 +16,9 @@ import numpy as np
 
 from ar.overlay import silhouette
 from sim.deformation import Deformation
+from sim.errors import InputError
 from sim.files import written_whole
+from sim.loads import Loads, Posture, Pushed
 
 from .play import STAGES, Frame, Player
 from .stage import NAMES
@@ -29,6 +31,7 @@ DEPTH_SCALE = 1e-5
 JPEG_QUALITY = 95
 UNITS = {
     "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
+    "direction": "1", "csf_level": "m", "share": "1",
     "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "bound": "m", "seconds": "s",
     "depth": f"{DEPTH_SCALE:g} m (PNG, 16 bit)",
 }  # fmt: skip
@@ -84,15 +87,27 @@ def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
     return {
         "time": frame.time,
         "T_camera_world": frame.camera.T_camera_world,
-        "T_world_tool": frame.pose,
-        "tip": frame.tip,
-        "force": frame.touch.force * player.site.direction(frame.touch),
-        "contact": player.scene.contact(player.site, frame.touch).point,
+        **({} if frame.pose is None or frame.tip is None else {"T_world_tool": frame.pose, "tip": frame.tip}),
+        **caused(frame.loads),
         "tumour_predicted": player.positions(frame.deformation)[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],
         "seconds": np.array([frame.seconds[stage] for stage in STAGES]),
     }
+
+
+def caused(loads: Loads) -> dict[str, np.ndarray]:
+    """What each cause of one load case is, by name."""
+    found: dict[str, np.ndarray] = {}
+    for cause in loads.causes:
+        match cause:
+            case Pushed():
+                found |= {"force": cause.force[0], "contact": cause.point[0]}
+            case Posture():
+                found |= {name: array[0] for name, array in vars(cause).items()}
+            case _:
+                raise InputError(f"episodes hold no {type(cause).__name__}: collect a scene without it.")
+    return found
 
 
 def write_motion(file: h5py.File, player: Player, rows: list[dict], truth: Deformation) -> dict[str, int]:
@@ -114,7 +129,9 @@ def write_motion(file: h5py.File, player: Player, rows: list[dict], truth: Defor
 def describe(file: h5py.File, player: Player, deformer: str) -> None:
     """Units, frames and provenance as attributes."""
     for name, unit in UNITS.items():
-        file[name if name in file else f"pictures/{name}"].attrs["unit"] = unit
+        for place in (name, f"pictures/{name}"):
+            if place in file:  # what no frame has is not written
+                file[place].attrs["unit"] = unit
     scene, camera = player.scene, player.camera
     file.create_dataset("K", data=camera.K)
     file.attrs.update(

@@ -17,11 +17,13 @@ from .scene import Scene
 from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR, Stage
 from .tally import Tally
 from .theatre import Theatre
+from .told import told
 
 SCRIPT, HAND = "script", "hand"
 FEM_COLOUR = (0.95, 0.35, 0.75)
 CAPTION = """Left: the camera picture with the predicted tumour in register. Right: the same in 3-D, the tumour of the
-finite elements as a pink wire. Moving a slider takes the tool over; **tool: script** gives it back. Research only."""
+finite elements as a pink wire. Research only."""
+HANDS = "Moving a slider takes the tool over; **tool: script** gives it back."
 
 
 @dataclass
@@ -74,7 +76,7 @@ class Demo:
             ),
             self._controls(),
             title=f"sulcus: {scene.name}",
-            caption=CAPTION,
+            caption=CAPTION if scene.tool is None else f"{CAPTION} {HANDS}",
             host=host,
             port=port,
             size=(scene.viewpoint.width, scene.viewpoint.height),
@@ -124,9 +126,16 @@ class Demo:
         return self.players[name]
 
     def _controls(self) -> list[Slider | Choice]:
+        wish, names = self.wish, self.theatre.names(self.stage.scene)
+        return [
+            Choice("deformer", names, wish.deformer, lambda name: wish.set(deformer=name)),
+            *(self._hand() if self.stage.scene.tool is not None else []),
+        ]
+
+    def _hand(self) -> list[Slider | Choice]:
+        """Who has the tool, and where."""
         wish = self.wish
         return [
-            Choice("deformer", self.theatre.names, wish.deformer, lambda name: wish.set(deformer=name)),
             Choice("tool", (SCRIPT, HAND), SCRIPT, self._give),
             Slider("force [N]", 0.0, 0.4, 0.01, wish.touch.force, lambda value: self._take(force=value)),
             Slider("direction right [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(right=np.radians(value))),
@@ -138,7 +147,8 @@ class Demo:
     def _give(self, tool: str, **wishes: int) -> None:
         """The menu, or the frame slider, gave the tool away; the menu says so after whatever is on its way to it."""
         self.wish.set(tool=tool, **wishes)
-        self.browser.put("tool", tool)
+        if self.stage.scene.tool is not None:
+            self.browser.put("tool", tool)
 
     def _take(self, **values: float) -> None:
         """A slider was moved: the tool is in the visitor's hand."""
@@ -147,14 +157,14 @@ class Demo:
 
     def _bodies(self) -> list[Body]:
         positions = self.stage.site.anatomy.mesh.nodes
-        tool = self.stage.scene.tool.mesh
+        tool = self.stage.scene.tool
         brain, cortex, tumour = self.stage.brain, self.stage.cortex(positions), self.stage.tumour(positions)
         return [
             Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.14),
             Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
             Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
             Body("finite elements", tumour.vertices, tumour.triangles, FEM_COLOUR, wireframe=True),
-            Body("tool", tool.vertices, tool.faces, TOOL_COLOUR),
+            *([] if tool is None else [Body("tool", tool.mesh.vertices, tool.mesh.faces, TOOL_COLOUR)]),
         ]
 
     def _viewpoint(self) -> Viewpoint:
@@ -167,8 +177,9 @@ class Demo:
         self.browser.show(frame.number, frame.shown)
         self.browser.move("cortex", self.stage.cortex(positions).vertices)
         self.browser.move("tumour", self.stage.tumour(positions).vertices)
-        tool = self.stage.scene.tool.mesh
-        self.browser.move("tool", tool.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
+        tool = self.stage.scene.tool
+        if tool is not None and frame.pose is not None:
+            self.browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
 
     def _judge(self, truth: Truth, name: str) -> str:
         """Show what the finite elements answered, and say how far off a deformer is under the same loads."""
@@ -190,10 +201,12 @@ class Demo:
 
     def _report(self, frame: Frame, name: str, verdict: str) -> str:
         """The outcome, milliseconds a stage, and the verdict on the frame that the finite elements answered last."""
+        acts = [told(frame.loads)] if frame.loads.causes else [f"time {frame.time:.2f} s"]
+        acts += [] if frame.distance is None else [f"tip to tumour {1e3 * frame.distance:.1f} mm"]
         stages = " · ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
         lines = [
             f"**{name}**: {frame.deformation.outcome[0].value}",
-            f"frame {frame.number}: force {frame.touch.force:.2f} N, tip to tumour {1e3 * frame.distance:.1f} mm",
+            f"frame {frame.number}: {', '.join(acts)}",
             f"ms a stage: {stages}",
             verdict,
         ]

@@ -22,7 +22,7 @@ def offers(theatre: Theatre, scene: Scene) -> list[Offer]:
     made = []
     times = scene.times[np.linspace(0, len(scene.times) - 1, TIMED + 1).astype(int)]
     loads = [scene.loads(theatre.site, scene.path(float(time)), float(time)) for time in times]
-    for name in theatre.names:
+    for name in theatre.names(scene):
         deformer = theatre.deformer(name, scene)
         learnt, seconds, last = isinstance(deformer, Learned), [], None
         error_mm = 1e3 * deformer.bound if isinstance(deformer, Learned) else 1e3 * PROMISED

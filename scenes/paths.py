@@ -41,6 +41,11 @@ def smooth(t: float) -> float:
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
 
 
+def idle(time: float) -> Touch:
+    """Nobody touches anything at any time [s]."""
+    return Touch()
+
+
 def press(force: float, rise: float = 1.5, hold: float = 1.0, at: tuple[float, float] = (0.0, 0.0)) -> Path:
     """Press on one place up to `force` [N] within `rise` [s], hold [s], and let go as slowly."""
 

@@ -12,6 +12,7 @@ import trimesh
 
 from ar.camera import Camera
 from ar.hud import panel
+from ar.layer import Layer
 from ar.overlay import Gauge, Style, composite
 from ar.view import Picture, render
 from sim.deformation import Deformation, Deformer
@@ -22,6 +23,8 @@ from .paths import Touch
 from .scene import Scene
 from .site import Site
 from .stage import TOOL, Stage
+from .told import told
+from .tool import Probe
 
 STAGES = ("deform", "render", "overlay")
 """What the time of a frame is spent on."""
@@ -42,13 +45,13 @@ class Frame:
     camera
         The camera that the picture was drawn with.
     pose, tip
-        T_world_tool (4, 4), and where the tool touches (3,) [m].
+        T_world_tool (4, 4), and where the tool touches (3,) [m]; None where the scene has no tool.
     picture
         What the camera sees, without overlay.
     shown
         The picture with the predicted tumour in it (H, W, 3) uint8.
     distance
-        From the tool's tip to the tumour's predicted surface [m].
+        From the tool's tip to the tumour's predicted surface [m]; None without a tool.
     seconds
         Wall time by stage, see `STAGES`.
     """
@@ -59,11 +62,11 @@ class Frame:
     loads: Loads
     deformation: Deformation
     camera: Camera
-    pose: np.ndarray
-    tip: np.ndarray
+    pose: np.ndarray | None
+    tip: np.ndarray | None
     picture: Picture
     shown: np.ndarray
-    distance: float
+    distance: float | None
     seconds: Mapping[str, float]
 
 
@@ -102,16 +105,15 @@ class Player:
             margin, deformation = 0.0, self.deformer.deform(loads, start=last)
         solved = clock.perf_counter()
         positions = self.positions(deformation)
-        tip, pose = self.tool(touch, positions)
+        tip, pose = (None, None) if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
         picture = render(self.camera, self.stage.layers(positions, pose), self.stage.lamp)
         rendered = clock.perf_counter()
         tumour = self.stage.tumour(positions)
-        surface = trimesh.Trimesh(tumour.vertices, tumour.triangles, process=False)
-        nearest = trimesh.proximity.closest_point_naive(surface, tip[None])[0][0]
-        gauge = Gauge(tip, nearest)
+        gauge = None if tip is None else gauged(tip, tumour)
         over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin=margin, gauge=gauge)
         return Frame(
-            number, time, touch, loads, deformation, self.camera, pose, tip, picture, over.colour, gauge.distance,
+            number, time, touch, loads, deformation, self.camera, pose, tip, picture, over.colour,
+            None if gauge is None else gauge.distance,
             dict(zip(STAGES, np.diff([begun, solved, rendered, clock.perf_counter()]).tolist(), strict=True)),
         )  # fmt: skip
 
@@ -136,22 +138,29 @@ class Player:
         positions[deformation.nodes] += deformation.displacement[row]
         return positions
 
-    def tool(self, touch: Touch, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def tool(self, tool: Probe, touch: Touch, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Tip (3,) [m] and pose T_world_tool (4, 4): resting on the deformed surface, lifted off where it is idle."""
         contact = self.scene.contact(self.site, touch)
         inward = self.site.direction(replace(touch, tilt=(0.0, 0.0)))
         lift = 4e-3 * max(0.0, 1.0 - touch.force / 0.02)
         tip = contact.carried(positions) - lift * inward
-        return tip, self.scene.tool.pose(tip, inward, self.site.right)
+        return tip, tool.pose(tip, inward, self.site.right)
+
+
+def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
+    """From a tip (3,) [m] to the nearest point of a hidden surface."""
+    surface = trimesh.Trimesh(hidden.vertices, hidden.triangles, process=False)
+    return Gauge(tip, trimesh.proximity.closest_point_naive(surface, tip[None])[0][0])
 
 
 def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:
-    """The shown picture (H, W, 3) with a panel: deformer, milliseconds by stage, force, and error [m] if known.
+    """The shown picture (H, W, 3) with a panel: deformer, what acts, milliseconds by stage, and error [m] if known.
 
     An answer that may not be relied on looks like any other, so the panel says it.
     """
     stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-    lines = [f"{name}   {frame.touch.force:.2f} N   t {frame.time:.2f} s", f"ms: {stages}"]
+    acts = told(frame.loads)
+    lines = [f"{name}   t {frame.time:.2f} s", *([acts] if acts else []), f"ms: {stages}"]
     if error is not None:
         lines.append(f"error against FEM: {1e3 * error:.3f} mm (frame {frame.number})")
     outcome = frame.deformation.outcome[0]

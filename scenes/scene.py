@@ -9,11 +9,12 @@ import numpy as np
 
 from ar.camera import Camera, look_at
 from sim.accuracy import LIVE, Accuracy
-from sim.effects import Effect, Elasticity, Held, Slide, ToolForce
+from sim.effects import Effect, Elasticity, Gravity, Held, Slide, ToolForce
 from sim.errors import InputError
-from sim.loads import Loads, Pushed
+from sim.loads import Cause, Loads, Pushed
 
-from .paths import Path, Touch
+from .lying import Lie, supine
+from .paths import Path, Touch, idle
 from .site import Contact, Site
 from .tool import Probe
 
@@ -62,23 +63,42 @@ PALPATION = Probe()
 
 @dataclass(frozen=True)
 class Scene:
-    """One scripted scene. Times in seconds.
+    """One scripted scene. Times in seconds; what acts at a time follows from its effects.
 
-    `element` is one of `sim.discretisation.ELEMENTS`; None: p1, or p2 on a mesh that brings mid-edge nodes. Learnt
-    models are played and judged with the tissue and the element that they were taught, whatever the scene says.
+    Parameters
+    ----------
+    path, tool
+        What the hand does, and with what; without a tool none is in view.
+    lying
+        How the head lies, where `Gravity` is asked for.
+    element
+        One of `sim.discretisation.ELEMENTS`; None: p1, or p2 on a mesh that brings mid-edge nodes. Learnt models are
+        played and judged with the tissue and the element that they were taught, whatever the scene says.
+
+    Raises
+    ------
+    InputError
+        A tool's force without a tool.
     """
 
     name: str
     title: str
-    path: Path
-    duration: float
+    path: Path = idle
+    duration: float = 4.0
     effects: tuple[Effect, ...] = (Elasticity(), Held(), Slide(), ToolForce())
-    tool: Probe = PALPATION
+    tool: Probe | None = PALPATION
+    lying: Lie = supine
     viewpoint: Viewpoint = Viewpoint()
     element: str | None = None
     accuracy: Accuracy = LIVE
     bounds: Bounds = Bounds()
     frames_per_second: float = 30.0
+
+    def __post_init__(self) -> None:
+        if self.tool is None and ToolForce() in self.effects:
+            raise InputError(
+                f"the scene {self.name} asks for ToolForce, but has no tool: give it one, or leave it out."
+            )
 
     @property
     def times(self) -> np.ndarray:
@@ -87,13 +107,28 @@ class Scene:
 
     def contact(self, site: Site, touch: Touch) -> Contact:
         """The material point that the tool touches."""
+        assert self.tool is not None
         return site.contact(touch.x, touch.y, self.tool.radius)
 
     def loads(self, site: Site, touch: Touch, time: float) -> Loads:
-        """One load case: the tool at a place of the site."""
-        contact = self.contact(site, touch)
+        """One load case: the cause of every effect that has one; where none has, time alone goes on."""
+        causes = (self._cause(effect, site, touch, time) for effect in self.effects)
+        return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
+
+    def _cause(self, effect: Effect, site: Site, touch: Touch, time: float) -> Cause | None:
+        """What an effect of the scene is told at a moment."""
+        match effect:
+            case ToolForce():
+                return self._pushed(site, touch)
+            case Gravity():
+                return self.lying(time).posture(site.anatomy.mesh.nodes)
+            case _:
+                return None
+
+    def _pushed(self, site: Site, touch: Touch) -> Pushed:
+        assert self.tool is not None
         force = touch.force * site.direction(touch)
-        return Loads((Pushed(contact.point[None], force[None], np.array([self.tool.radius])),), np.array([time]))
+        return Pushed(self.contact(site, touch).point[None], force[None], np.array([self.tool.radius]))
 
 
 SCENES = ("press", "slide", "retract")

@@ -63,8 +63,10 @@ class Stage:
         vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
         return Layer("brain", CORTEX, mesh.nodes[vertices], triangles.reshape(-1, 3), CORTEX_COLOUR)
 
-    def layers(self, positions: np.ndarray, pose: np.ndarray) -> list[Layer]:
-        """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4)."""
+    def layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
+        """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
+        if self.scene.tool is None or pose is None:
+            return [self.cortex(positions), self._drape]
         tool = self.scene.tool.mesh
         at = np.asarray(tool.vertices) @ pose[:3, :3].T + pose[:3, 3]
         probe = Layer("tool", TOOL, at, tool.faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)

@@ -19,6 +19,7 @@ from sim.material import tissue_from_json
 from sim.meshfile import read_anatomy
 from surrogate.learned import Learned
 from surrogate.store import load
+from surrogate.taught import refusal
 
 from .play import Player
 from .scene import Scene
@@ -41,22 +42,25 @@ class Theatre:
         """The open cortex."""
         return site_of(self.anatomy)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Every deformer that can be asked for: the learnt ones, then the finite elements."""
-        return (*self.models, "fem")
+    def knowing(self, scene: Scene) -> dict[str, Learned]:
+        """The learnt models that were taught under a scene's effects, by name."""
+        return {name: model for name, model in self.models.items() if refusal(model, scene.effects) is None}
 
-    @property
-    def best(self) -> str:
-        """The learnt model of the tightest error bound; the finite elements where nothing was learnt."""
-        return min(self.models, key=lambda name: self.models[name].bound, default="fem")
+    def names(self, scene: Scene) -> tuple[str, ...]:
+        """Every deformer that can be asked for a scene: the learnt ones that know it, then the finite elements."""
+        return (*self.knowing(scene), "fem")
+
+    def best(self, scene: Scene) -> str:
+        """The learnt model of the tightest error bound; the finite elements where none knows the scene."""
+        knowing = self.knowing(scene)
+        return min(knowing, key=lambda name: knowing[name].bound, default="fem")
 
     def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem:
         """Finite elements for a scene's effects, with the tissue and the element that the models here were taught.
 
-        Where nothing was learnt, or the models do not say, tissue and element are the scene's; `live` as `Fem` has it.
+        Where no model knows the scene, or none says, tissue and element are the scene's; `live` as `Fem` has it.
         """
-        taught = next((model.training for model in self.models.values()), {})
+        taught = next((model.training for model in self.knowing(scene).values()), {})
         effects = scene.effects
         if "tissue" in taught:
             elasticity = Elasticity(tissue_from_json(taught["tissue"]))
@@ -70,15 +74,18 @@ class Theatre:
         Raises
         ------
         InputError
-            A name that this theatre does not know.
+            A name that this theatre does not know; a model that was not taught under the scene's effects.
         """
         if name == "fem":
             return self.fem(scene, scene.accuracy, live=True)
+        allowed = ", ".join(self.names(scene))
         if name not in self.models:
             raise InputError(
-                f"no deformer is called {name!r} here: choose one of {', '.join(self.names)}; "
-                "`sulcus train` makes the learnt ones."
+                f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the learnt ones."
             )
+        why = refusal(self.models[name], scene.effects)
+        if why is not None:
+            raise InputError(f"{name} does not know the scene {scene.name}: {why}. Choose one of {allowed}.")
         return self.models[name]
 
     def player(self, name: str, scene: Scene) -> Player:

@@ -234,7 +234,7 @@ def only_pushed(loads: Loads) -> Pushed:
     """
     pushed = loads.only(Pushed)
     if pushed is None:
-        names = ", ".join(type(cause).__name__ for cause in loads.causes)
+        names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
         raise InputError(
             f"the loads have the causes {names}, but this model was taught pushing forces only: give `Pushed` alone, "
             "or ask the finite elements."

@@ -199,17 +199,17 @@ def _blank():
 def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
 
     again = open_theatre(put(theatre, tmp_path / "box.vtu"), device="cpu")
-    assert again.anatomy.digest == theatre.anatomy.digest and again.names == ("linear", "svr", "fem")
+    assert again.anatomy.digest == theatre.anatomy.digest and again.names(short()) == ("linear", "svr", "fem")
     assert again.intensity is not None and theatre.intensity is not None
     assert np.array_equal(again.intensity.values, theatre.intensity.values)
-    assert again.best == min(theatre.models, key=lambda name: theatre.models[name].bound)
+    assert again.best(short()) == min(theatre.models, key=lambda name: theatre.models[name].bound)
     touch = Touch(force=0.2)
     pictures = [player(each, short(), "linear").draw(0, 0.0, touch).shown for each in (theatre, again)]
     assert np.array_equal(pictures[0], pictures[1])
     sidecar(tmp_path / "box.vtu").unlink()
     model_path(tmp_path / "box.vtu").unlink()
     bare = open_theatre(tmp_path / "box.vtu", device="cpu")
-    assert bare.intensity is None and bare.names == ("fem",) and bare.best == "fem"
+    assert bare.intensity is None and bare.names(short()) == ("fem",) and bare.best(short()) == "fem"
     with pytest.raises(InputError, match=r"'linear'.*fem; `sulcus train`"):
         bare.deformer("linear", short())
 
@@ -230,7 +230,7 @@ def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
     assert model_path(template_path()).stat().st_size <= 15_000_000 and sidecar(template_path()).is_file()
     theatre = open_theatre(device="cpu")
     assert {"linear", "ann", "svr"} <= set(theatre.models) and theatre.intensity is not None
-    assert all(model.bound < 1e-3 for model in theatre.models.values()) and theatre.best != "fem"
+    assert all(model.bound < 1e-3 for model in theatre.models.values()) and theatre.best(find_scene("press")) != "fem"
     assert main(["check", "--every", "40", "--device", "cpu", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["passed"] and len(report["scenes"]) == len(SCENES)

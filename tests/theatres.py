@@ -9,7 +9,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from scenes.paths import press
+from scenes.lying import drained_then_turned
+from scenes.paths import idle, press
 from scenes.play import Player
 from scenes.scene import Scene, Viewpoint, find_scene
 from scenes.shipped import template_path
@@ -17,7 +18,7 @@ from scenes.stage import Stage
 from scenes.theatre import Theatre, model_path
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
-from sim.effects import Elasticity, Held, NodalForce, Slide, ToolForce
+from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
 from sim.intensity import Intensity, read_intensity, sidecar, write_intensity
 from sim.meshfile import read_anatomy, write_anatomy
@@ -78,6 +79,13 @@ def small(name: str = "press", **values: object) -> Scene:
 def short() -> Scene:
     """Seven small frames: press and let go."""
     return small(path=press(0.25, rise=0.1, hold=0.0), duration=0.2)
+
+
+def sinking() -> Scene:
+    """Seven small frames without a tool: the fluid drains, and the head turns on its side."""
+    lying = drained_then_turned(0.1, 0.0, 0.1, np.radians(60.0))
+    effects = (Elasticity(), Held(), Slide(), Gravity())
+    return replace(small(path=idle, duration=0.2, effects=effects, tool=None, lying=lying), name="sinking")
 
 
 def player(theatre: Theatre, scene: Scene, deformer: str) -> Player:

@@ -44,27 +44,27 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--every {args.every}: give a whole number from 1 up.")
     scenes = [find_scene(name) for name in args.scenes or SCENES]
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    name = deformer_name(args, theatre, scenes[0])
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
+        name = deformer_name(args, theatre, scene)
         player = theatre.player(name, scene)
         frames = list(player.frames(args.every))
         truth = truth_of(theatre, scene, [frame.loads for frame in frames])
         figures = measure(player, player.camera, frames, truth)
         broken = figures.broken(scene.bounds)
-        rows.append({"scene": scene.name, "frames": len(frames), **figures.row(), "broken": broken})
+        rows.append({"scene": scene.name, "deformer": name, "frames": len(frames), **figures.row(), "broken": broken})
         print(
-            f"{scene.name:10s} {'FAILS' if broken else 'passes'}  overlap {figures.overlap:.4f}  "
+            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}  overlap {figures.overlap:.4f}  "
             f"error {figures.error_mm:.3f} mm of {figures.motion_mm:.2f} mm  projection {figures.pixels:.1e} px",
             file=table,
         )
         if args.certify:
             rows[-1]["certificates"] = _certificates(theatre, scene, frames, truth, table)
         for sentence in broken:
-            print(f"{'':10s} {sentence}", file=table)
+            print(f"{'':11s} {sentence}", file=table)
     passed = not any(row["broken"] for row in rows)
     if args.json:
-        print(json.dumps({"deformer": name, "passed": passed, "scenes": rows}))
+        print(json.dumps({"passed": passed, "scenes": rows}))
     return 0 if passed else 1
 
 
@@ -78,7 +78,7 @@ def _certificates(
 
     found = []
     for certificate in certified(theatre.fem(scene, TRAIN, live=True), frames, truth):
-        print(f"{'':10s} {certificate}", file=table, flush=True)
+        print(f"{'':11s} {certificate}", file=table, flush=True)
         found.append(asdict(certificate))
-    print(f"{'':10s} {SCOPE}", file=table)
+    print(f"{'':11s} {SCOPE}", file=table)
     return found

@@ -39,7 +39,7 @@ def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> s
     """
     budget = args.within_mm, args.within_ms
     if args.deformer != "auto" and budget == (None, None):
-        return args.deformer or theatre.best
+        return args.deformer or theatre.best(scene)
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
     from surrogate.choose import choose
@@ -81,6 +81,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
     if not theatre.models:
         print("no learnt model lies beside this anatomy: the finite elements play alone; see `sulcus train`")
+    elif not theatre.knowing(scene):
+        print("no learnt model here was taught under this scene's effects: the finite elements play alone")
     try:
         demo.run(args.seconds)
     except KeyboardInterrupt:

@@ -1,0 +1,31 @@
+"""What acts at a moment, in words: for panels and pages."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim.loads import Cause, Loads, Posture, Pushed
+
+# Sides of the body along the axes of RAS, and against them.
+SIDES = ("RL", "AP", "SI")
+# Components of a unit vector under this are not told.
+TOLD = 0.05
+
+
+def told(loads: Loads) -> str:
+    """What acts in the first load case, as one line; empty where time alone goes on."""
+    return ", ".join(words for words in map(_words, loads.causes) if words)
+
+
+def _words(cause: Cause) -> str:
+    match cause:
+        case Pushed():
+            return f"force {np.linalg.norm(cause.force[0]):.2f} N"
+        case Posture():
+            down = cause.direction[0] / np.linalg.norm(cause.direction[0])
+            ways = [
+                f"{sides[int(x < 0.0)]} {abs(x):.2f}" for sides, x in zip(SIDES, down, strict=True) if abs(x) > TOLD
+            ]
+            return f"gravity towards {' '.join(ways)}, fluid up to {1e3 * cause.csf_level[0]:.0f} mm"
+        case _:
+            return ""

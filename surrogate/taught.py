@@ -1,0 +1,40 @@
+"""Which scenes a learnt model may answer: those of the effects that it was taught under."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable
+
+from sim.effects import Effect, Elasticity, Gravity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
+
+from .learned import Learned
+
+# Effects that do nothing until a load calls for them: a model may have been taught under more of them than a scene has.
+ON_CALL = {kind.__name__ for kind in (ToolForce, ToolDisplacement, NodalForce, Gravity)}
+# What models were taught under whose file does not say.
+UNSAID = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
+
+
+def taught_effects(model: Learned) -> frozenset[str]:
+    """Names of the effects that a model was taught under, as its file states them."""
+    if "effects" not in model.training:
+        return UNSAID
+    match ast.parse(model.training["effects"], mode="eval").body:  # what `repr` of a tuple of effects gave
+        case ast.Tuple(elts):
+            return frozenset(ast.unparse(one.func) for one in elts if isinstance(one, ast.Call))
+    return frozenset()
+
+
+def refusal(model: Learned, effects: Iterable[Effect]) -> str | None:
+    """Why a model may not answer under these effects, or None if it may.
+
+    Where nothing slides in its anatomy it is all one whether `Slide` is asked for.
+    """
+    taught, asked = taught_effects(model), frozenset(type(effect).__name__ for effect in effects)
+    idle = set() if model.anatomy.slide_normal.any() else {"Slide"}
+    strange, missing = asked - taught - idle, taught - asked - ON_CALL - idle
+    if not strange and not missing:
+        return None
+    differences = [f"not under {', '.join(sorted(strange))}"] * bool(strange)
+    differences += [f"never without {', '.join(sorted(missing))}"] * bool(missing)
+    return f"it was taught under {', '.join(sorted(taught))}, {' and '.join(differences)}"

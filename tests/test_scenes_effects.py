@@ -1,0 +1,164 @@
+"""What acts in a scene follows from its effects, and a learnt model answers none that it was not taught."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+from theatres import player, short, sinking, theatre_of
+from visitor import free_port, wait_for
+
+from scenes.check import measure
+from scenes.collect import UNITS, collect
+from scenes.demo import Demo
+from scenes.lying import SUPINE, Lying, drained_then_turned, supine
+from scenes.paths import Touch
+from scenes.play import labelled
+from scenes.scene import Bounds
+from scenes.stage import TOOL
+from scenes.told import told
+from scenes.truth import truth_of
+from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
+from sim.errors import InputError
+from sim.loads import Loads, Posture, Pushed, posture
+from surrogate.taught import refusal, taught_effects
+
+EFFECTS = (Elasticity(), Held(), Slide())
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module")
+def frames(theatre):
+    return list(player(theatre, sinking(), "fem").frames(3))
+
+
+class TestCauses:
+    @pytest.mark.parametrize(
+        ("effects", "causes"),
+        [
+            (EFFECTS, []),
+            ((*EFFECTS, ToolForce()), [Pushed]),
+            ((*EFFECTS, Gravity()), [Posture]),
+            ((*EFFECTS, Gravity(), ToolForce()), [Posture, Pushed]),
+        ],
+    )
+    def test_they_follow_from_the_effects(self, theatre, effects, causes):
+        loads = replace(short(), effects=effects).loads(theatre.site, Touch(force=0.2), 0.5)
+        assert [type(cause) for cause in loads.causes] == causes and loads.times.tolist() == [0.5]
+
+    def test_a_force_without_a_tool_is_refused(self):
+        with pytest.raises(InputError, match="has no tool"):
+            replace(short(), tool=None)
+
+    def test_they_are_told_in_words(self, theatre):
+        both = replace(short(), effects=(*EFFECTS, Gravity(), ToolForce()))
+        words = told(both.loads(theatre.site, Touch(force=0.2), 0.0))
+        assert "force 0.20 N" in words and "gravity towards P 1.00, fluid up to" in words
+        assert told(Loads((), np.zeros(1))) == ""
+        assert "towards L 0.60 S 0.80, fluid up to -12 mm" in told(posture(np.array([-3.0, 0.0, 4.0]), -0.012))
+
+
+class TestLying:
+    def test_the_fluid_falls_wholly_and_then_the_head_turns(self):
+        lie, angle = drained_then_turned(2.0, 1.0, 3.0, 0.5), 0.5
+        assert lie(0.0) == Lying(SUPINE, 1.0) == supine(7.0)
+        assert lie(2.0) == Lying(SUPINE, 0.0) == lie(3.0) and 0.4 < lie(1.0).fluid < 0.6
+        for time in (6.0, 9.0):
+            assert lie(time).direction == pytest.approx((-np.sin(angle), -np.cos(angle), 0.0))
+        levels = [lie(time).fluid for time in np.linspace(0.0, 2.0, 50)]
+        assert (np.diff(levels) < 0.0).all()
+
+    @pytest.mark.parametrize("direction", [SUPINE, (0.0, 0.0, -3.0), (-1.0, -1.0, 0.2)])
+    def test_a_full_head_is_wet_and_a_drained_one_dry(self, box, direction):
+        nodes = box.mesh.nodes
+        for fluid, wet in ((1.0, len(nodes)), (0.0, 0)):
+            found = Lying(direction, fluid).posture(nodes)
+            assert np.linalg.norm(found.direction) == pytest.approx(1.0)
+            assert (-nodes @ found.direction[0] < found.csf_level[0]).sum() == wet
+
+    def test_a_head_that_lies_as_in_the_scan_is_at_rest(self, theatre):
+        frame = player(theatre, sinking(), "fem").draw(0, 0.0, Touch())
+        assert not frame.deformation.displacement.any()
+
+
+class TestLearnt:
+    def test_it_refuses_effects_that_it_was_not_taught(self, theatre):
+        model = theatre.models["linear"]
+        assert refusal(model, short().effects) is None
+        why = refusal(model, sinking().effects)
+        assert why is not None and "not under Gravity" in why
+        with pytest.raises(InputError, match=r"svr does not know the scene sinking.*not under Gravity.*one of fem"):
+            theatre.player("svr", sinking())
+        assert theatre.names(short()) == ("linear", "svr", "fem") and theatre.names(sinking()) == ("fem",)
+        assert theatre.best(sinking()) == "fem"
+
+    def test_it_refuses_causes_that_it_does_not_know(self, theatre):
+        model, scene = theatre.models["linear"], sinking()
+        with pytest.raises(InputError, match="causes Posture"):
+            model.deform(scene.loads(theatre.site, Touch(), 0.0))
+        with pytest.raises(InputError, match="causes none"):
+            model.deform(Loads((), np.zeros(2)))
+
+    def test_its_file_says_what_it_was_taught_under(self, theatre):
+        model = theatre.models["linear"]
+        assert taught_effects(model) == {"Elasticity", "Held", "Slide", "ToolForce"}  # its file does not say
+        effects = (Elasticity(regions={2: Elasticity().default}), Held(), ToolForce(), NodalForce())  # type: ignore
+        stated = replace(model, training={"effects": repr(effects)})
+        assert taught_effects(stated) == {"Elasticity", "Held", "ToolForce", "NodalForce"}
+        # Nothing slides in this body, and nodal forces act where loads hold some.
+        assert refusal(stated, short().effects) is None
+        why = refusal(stated, (Elasticity(), ToolForce()))
+        assert why is not None and "never without Held" in why
+
+    def test_where_the_skull_slides_it_matters(self, theatre, box):
+        normal = np.zeros_like(box.slide_normal)
+        normal[0, 0] = 1.0
+        model = replace(theatre.models["linear"], anatomy=replace(box, slide_normal=normal))
+        why = refusal(model, (Elasticity(), Held(), ToolForce()))
+        assert why is not None and "never without Slide" in why
+
+    def test_scenes_that_no_model_knows_keep_their_own_tissue(self, theatre):
+        other = replace(theatre, models={"linear": replace(theatre.models["linear"], training={"element": "smoothed"})})
+        scene = replace(sinking(), element="p1")
+        assert other.fem(scene, scene.accuracy).space.element == "p1"
+        assert other.fem(short(), scene.accuracy).space.element == "smoothed"
+
+
+class TestWithoutATool:
+    def test_none_is_drawn_or_measured(self, frames, monkeypatch):
+        for frame in frames:
+            assert frame.pose is frame.tip is frame.distance is None
+            assert not (frame.picture.segmentation == TOOL).any()
+            assert (frame.shown != frame.picture.colour).any()
+        lines = []
+        monkeypatch.setattr("scenes.play.panel", lambda colour, text: lines.extend(text) or colour)
+        labelled(frames[-1], "fem")
+        assert any("gravity towards L 0.87 P 0.50" in line for line in lines) and not any("0.00 N" in x for x in lines)
+
+    def test_it_can_be_checked(self, theatre, frames):
+        play = player(theatre, sinking(), "fem")
+        figures = measure(play, play.camera, frames, truth_of(theatre, play.scene, [frame.loads for frame in frames]))
+        assert not figures.broken(Bounds()) and figures.motion_mm > 0.01
+
+    def test_its_episode_tells_the_posture(self, theatre, tmp_path):
+        collect(tmp_path / "a.h5", theatre, player(theatre, sinking(), "fem"), "fem", iter)
+        with h5py.File(tmp_path / "a.h5") as file:
+            assert not {"force", "contact", "tip", "T_world_tool"} & set(file)
+            assert file["direction"].shape == (7, 3) and file["csf_level"].shape == (7,)
+            assert file["csf_level"].attrs["unit"] == UNITS["csf_level"] == "m"
+            assert np.diff(file["csf_level"][:4]).max() < 0.0
+
+    def test_the_page_offers_no_hand(self, theatre):
+        demo = Demo(theatre, sinking(), "fem", "127.0.0.1", free_port())
+        try:
+            assert set(demo.browser.inputs) == {"deformer"} and "tool" not in demo.browser.meshes
+            assert wait_for(lambda: demo.run(0.3) and "gravity towards" in demo.browser.text.content)
+            assert "tip to tumour" not in demo.browser.text.content
+        finally:
+            demo.close()
