@@ -1,5 +1,6 @@
 """Arithmetic on batches of columns: arrays (rows, b) on the device, one column per load case."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -136,6 +137,22 @@ def moving_kernels_of(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
 def is_kept(width: int) -> bool:
     """Whether a room may be so wide."""
     return width in WIDTHS or width % WIDTHS[-1] == 0
+
+
+class Rooms:
+    """Arrays of so many columns; of a width that rooms of L-BFGS may have always the same, as graphs want them."""
+
+    def __init__(self, make: Callable[[int], wp.array], device: Device):
+        self._make, self._device = make, device
+        self._arrays: dict[int, wp.array] = {}
+
+    def of(self, columns: int) -> wp.array:
+        """The array of this width: whoever asks writes it anew. On the CPU only the last one is kept."""
+        if columns not in self._arrays:
+            graphs = self._device.on_cuda
+            self._arrays = {width: array for width, array in self._arrays.items() if graphs and is_kept(width)}
+            self._arrays[columns] = self._make(columns)
+        return self._arrays[columns]
 
 
 def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:

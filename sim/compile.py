@@ -16,7 +16,7 @@ from .anatomy import Anatomy
 from .constraint import Constraint
 from .device import Device
 from .discretisation import Discretisation, discretise
-from .effects import Effect, Elasticity, Gravity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
+from .effects import Effect, Elasticity, Gravity, Held, Inertia, NodalForce, Slide, ToolDisplacement, ToolForce
 from .errors import InputError
 from .footprint import Skin
 from .holding import check_held
@@ -77,6 +77,11 @@ def compile_problem(
                 from .terms.gravity import change_of_weight
 
                 terms.append(change_of_weight(effect, space, device))
+            case Inertia():
+                from .terms.inertia import Inertia as InertiaTerm
+                from .terms.inertia import lumped_mass
+
+                terms.append(InertiaTerm(lumped_mass(effect.density, space), effect.damping, device))
             case ToolDisplacement():
                 pass  # a constraint: `_impose` reads the loads
             case _:

@@ -92,7 +92,38 @@ class Gravity:
                 raise InputError(f"Gravity.{name} is {value} kg/m^3: give a positive number.")
 
 
-Effect = Elasticity | Held | Slide | ToolForce | ToolDisplacement | NodalForce | Gravity
+@dataclass(frozen=True)
+class Inertia:
+    """Tissue keeps its velocity: answers follow one another in time, one step of backward Euler each.
+
+    The step is the time of the loads less the time of the start, at which the nodes stood where the start has them,
+    with the velocities of its history; at rest without one. Each step needs time to pass. Backward Euler is of first
+    order in the step and damps what swings faster than that: energy never grows, and one long step is statics.
+
+    Parameters
+    ----------
+    density
+        Of the tissue [kg/m^3].
+    damping
+        Force per mass and velocity [1/s], as of a body in a medium at rest: free motion decays with exp(-damping t).
+
+    Raises
+    ------
+    InputError
+        A density that is not positive, damping that is negative.
+    """
+
+    density: float = 1040.0
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.density < math.inf:
+            raise InputError(f"Inertia.density is {self.density} kg/m^3: give a positive number.")
+        if not 0.0 <= self.damping < math.inf:
+            raise InputError(f"Inertia.damping is {self.damping} 1/s: give a number that is not negative.")
+
+
+Effect = Elasticity | Held | Slide | ToolForce | ToolDisplacement | NodalForce | Gravity | Inertia
 """Everything that a scene may ask for."""
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, lru_cache, partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -33,6 +34,7 @@ from .lbfgs import TAUGHT
 from .linear import Preconditioner, conjugate_gradients
 from .loads import Displaced, Loads, Nodal, Pushed
 from .memory import check_fits, fitting_batch
+from .pace import KEPT, alike
 from .patching import patching
 from .precondition import choose_preconditioner, is_exact, name_of, rest_solver
 from .problem import Problem
@@ -50,7 +52,7 @@ LARGEST_SERIES_FACTOR = 60_000
 
 
 class Fem:
-    """A Deformer: static equilibrium by finite elements.
+    """A Deformer: static equilibrium by finite elements; a step in time where effects need it.
 
     Parameters
     ----------
@@ -105,6 +107,7 @@ class Fem:
         patch = patching(problem, preconditioner, self.effects, self.space) if patching_pays else None
         inversion = Inversion(self.space, problem.device)
         self._ladder = Ladder(problem, preconditioner, inversion, accuracy, near, vicinity or patch)
+        self._paced = lru_cache(KEPT)(self._ladder_at)
 
     @property
     def problem(self) -> Problem:
@@ -136,13 +139,25 @@ class Fem:
                 return answer if at is None else answer.at(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
         last = None if start is None else self._guess(loads, start)
-        cases = Cases(loads, np.zeros(len(loads))) if start is None else Cases(loads, start.time, start.history)
-        return _joined(
+        cases = Cases(loads, np.zeros(len(loads)))
+        if start is not None and last is not None:
+            cases = Cases(loads, start.time, start.history, last.T.reshape(len(loads), -1, 3))
+        some = alike(cases.steps, self.batch) if self.problem.paced else None
+        batches = some or [(math.inf, rows) for rows in self._batches(len(loads))]
+        answer = _joined(
             [
-                self._solve(cases.rows(rows), None if last is None else last[:, rows], at)
-                for rows in self._batches(len(loads))
+                self._solve(self._paced(step), cases.rows(rows), None if last is None else last[:, rows], at)
+                for step, rows in batches
             ]
         )
+        return answer.rows(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
+
+    def _ladder_at(self, step: float) -> Ladder:
+        """Whose preconditioner knows the step in time [s]; of an infinite one, the ladder of statics."""
+        if step == math.inf:
+            return self._ladder
+        preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed, step)
+        return Ladder(self.problem, preconditioner, self._ladder.inversion, self.accuracy)
 
     def _batches(self, count: int) -> Iterator[slice]:
         """The rows of each batch, at least one."""
@@ -168,10 +183,10 @@ class Fem:
         if len(beyond):
             raise InputError(f"the mesh has no vertex {beyond[0]}: ask for some of 0 to {count - 1}.")
 
-    def _unsmoothed(self) -> sp.csc_array:
-        """Rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh."""
+    def _unsmoothed(self, step: float) -> sp.csc_array:
+        """Rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh, over a step in time [s]."""
         linear = discretise(self._anatomy.mesh, "p1")
-        return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature()
+        return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature(step)
 
     def residual(self, loads: Loads, answer: Deformation) -> np.ndarray:
         """The relative residual (B,), in this solver's precision, of somebody's answers at every vertex.
@@ -307,10 +322,10 @@ class Fem:
             full[:, vertices:] += start.history[MIDDLES]
         return full.reshape(len(loads), self.problem.rows).T
 
-    def _solve(self, cases: Cases, last: np.ndarray | None, at: np.ndarray | None) -> Deformation:
+    def _solve(self, ladder: Ladder, cases: Cases, last: np.ndarray | None, at: np.ndarray | None) -> Deformation:
         clock = time.perf_counter()
         guesses = () if last is None else (moved_on(cases.loads, last, cases.history), last)
-        found = self._ladder.climb(cases, guesses)
+        found = ladder.climb(cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
         way = way_of(pushes_of(cases.loads), last, cases.history) if len(cases.loads) <= TAUGHT else {}
         return self._answered(cases, found, way, at, seconds)

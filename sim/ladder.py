@@ -178,6 +178,8 @@ class Ladder:
         start = device.zeros(problem.rows, count) if start is None else start
         if imposed or problem.steep or self.accuracy.outer < FEWEST:
             return self._thorough(start, self.accuracy.outer)
+        if problem.paced:  # the next frame's step may be another, and so its curvature
+            learnt = None
         descents: list[tuple[Elimination | Patching | Vicinity | Lbfgs, Mapping[str, np.ndarray] | None]] = [
             (self._lbfgs, learnt)
         ]

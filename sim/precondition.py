@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -26,12 +27,16 @@ LARGEST_SMOOTHED_FACTOR = 40_000
 
 
 def choose_preconditioner(
-    problem: Problem, space: Discretisation, unsmoothed: Callable[[], sp.csc_array]
+    problem: Problem,
+    space: Discretisation,
+    unsmoothed: Callable[[float], sp.csc_array],
+    step: float = math.inf,
 ) -> Preconditioner:
     """The rest stiffness, inverted (CUDA) or factorised where that pays; two levels where it has too many entries.
 
     Algebraic multigrid where even the coarse level does not fit; block Jacobi where nothing is free to move.
-    `unsmoothed` assembles the rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh.
+    `unsmoothed` assembles the rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh, over a step in time
+    [s], as `step` is what the stiffness is taken over.
 
     Raises
     ------
@@ -43,7 +48,7 @@ def choose_preconditioner(
         return BlockJacobi(device)
     try:
         if space.element == "p2":
-            stiffness = problem.rest_curvature()
+            stiffness = problem.rest_curvature(step)
             if device.on_cuda and _direct_pays(len(constraint.basis().indptr) - 1, device):
                 return _solver(stiffness, constraint, space.nodes, device)
             lifted = _on_corners(stiffness, space, constraint, device)
@@ -51,10 +56,10 @@ def choose_preconditioner(
             return TwoLevel(lifted, over_free(stiffness, constraint), device, name)
         if space.element == "smoothed" and problem.rows > LARGEST_SMOOTHED_FACTOR:
             # An average resists less than what is averaged, so that the coarse solver never overshoots.
-            coarse = _solver(unsmoothed(), constraint, space.nodes, device)
+            coarse = _solver(unsmoothed(step), constraint, space.nodes, device)
             name = f"two levels on {name_of(coarse)}"
-            return TwoLevel(coarse, over_free(problem.rest_curvature(), constraint), device, name)
-        return _solver(problem.rest_curvature(), constraint, space.nodes, device)
+            return TwoLevel(coarse, over_free(problem.rest_curvature(step), constraint), device, name)
+        return _solver(problem.rest_curvature(step), constraint, space.nodes, device)
     except RuntimeError as error:
         raise InputError(f"the stiffness at rest cannot be factorised ({error}): is every part held?") from error
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import reduce
@@ -15,7 +16,7 @@ from .columns import combined, norms
 from .constraint import Constraint
 from .device import Device
 from .loads import Loads
-from .term import Cases, Term
+from .term import Cases, Paced, Term
 
 # A gap of so many last digits of the largest displacement is closed.
 CLOSED = 100.0
@@ -61,6 +62,11 @@ class Problem:
     def steep(self) -> bool:
         """Whether a term is steep."""
         return any(term.steep for term in self.terms)
+
+    @property
+    def paced(self) -> bool:
+        """Whether the stiffness depends on the step in time."""
+        return any(isinstance(term, Paced) for term in self.terms)
 
     def begin(self, cases: Cases) -> None:
         """Take a batch of load cases."""
@@ -141,9 +147,11 @@ class Problem:
             term.add_diagonal(out)
         return out
 
-    def rest_curvature(self) -> sp.csc_array:
-        """Assembled curvature at rest (3N, 3N) [N/m] of the terms that offer one."""
+    def rest_curvature(self, step: float = math.inf) -> sp.csc_array:
+        """Assembled curvature at rest (3N, 3N) [N/m] of the terms that offer one, over a step in time [s]."""
         offered = [matrix for matrix in (term.rest_curvature() for term in self.terms) if matrix is not None]
+        if step < math.inf:
+            offered += [term.curvature_at_pace(step) for term in self.terms if isinstance(term, Paced)]
         return reduce(lambda a, b: a + b, offered, sp.csc_array((self.rows, self.rows)))
 
     def longest_step(self, u: wp.array, du: wp.array) -> np.ndarray:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from .errors import InputError
 from .loads import Loads
 
 
@@ -17,17 +18,55 @@ from .loads import Loads
 class Cases:
     """The load cases of a batch: what acts, since when, and what each term remembers of the past.
 
-    loads, B rows; start_time (B,) [s]; history, by term name: arrays with B rows, as `Term.end` returned them.
+    loads, B rows; start_time (B,) [s]; history, by term name: arrays with B rows, as `Term.end` returned them;
+    displacement (B, N, 3) [m] of the element's nodes at the start, or None: at rest.
     """
 
     loads: Loads
     start_time: np.ndarray
     history: Mapping[str, Any] = field(default_factory=dict)
+    displacement: np.ndarray | None = None
+
+    @property
+    def steps(self) -> np.ndarray:
+        """How much time (B,) [s] has passed since the start.
+
+        Raises
+        ------
+        InputError
+            Loads that lie before their start.
+        """
+        steps = self.loads.times - self.start_time
+        if (steps < 0.0).any():
+            row = int(steps.argmin())
+            raise InputError(
+                f"load case {row} is at {self.loads.times[row]:g} s, before its start at {self.start_time[row]:g} s: "
+                "to go back in time, start from an earlier deformation, or from rest."
+            )
+        return steps
 
     def rows(self, index: slice | np.ndarray) -> Cases:
         """Some of the cases."""
         history = {name: value[index] for name, value in self.history.items()}
-        return Cases(self.loads.rows(index), self.start_time[index], history)
+        displacement = None if self.displacement is None else self.displacement[index]
+        return Cases(self.loads.rows(index), self.start_time[index], history, displacement)
+
+    def past(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        """What the term `name` remembers, (B, *shape) float64; zeros if nothing.
+
+        Raises
+        ------
+        InputError
+            A history of another body or discretisation.
+        """
+        whole = (len(self.loads), *shape)
+        found = self.history.get(name)
+        if found is not None and found.shape != whole:
+            raise InputError(
+                f"the start's history of {name} has shape {found.shape}, not {whole}: start from an answer of the same "
+                "mesh and element, or from rest."
+            )
+        return np.zeros(whole) if found is None else np.asarray(found, np.float64)
 
 
 class Term(Protocol):
@@ -99,6 +138,15 @@ class Term(Protocol):
 
     def end(self, u: wp.array) -> Any:
         """What must travel to the next call, rows first (B, ...), or None."""
+        ...
+
+
+@runtime_checkable
+class Paced(Term, Protocol):
+    """A Term whose curvature grows as steps in time shrink, which preconditioners must know."""
+
+    def curvature_at_pace(self, step: float) -> sp.csc_array:
+        """What it adds to the curvature at rest (3N, 3N) [N/m] over a step in time [s]."""
         ...
 
 

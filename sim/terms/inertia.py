@@ -1,0 +1,200 @@
+"""Inertia with mass-proportional damping, one step of backward Euler as the minimum of an incremental potential."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..columns import CHUNK, Rooms
+from ..device import Device
+from ..discretisation import Discretisation
+from ..element import quadratic_elements
+from ..errors import InputError
+from ..term import Cases
+
+# Shares of a quadratic tetrahedron's mass: its consistent mass matrix' diagonal, scaled to the whole. Row sums would be
+# negative at corners.
+CORNER, MIDDLE = 1.0 / 36.0, 4.0 / 27.0
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Arithmetic of lumped masses in one scalar type."""
+
+    add_energy: wp.Kernel
+    add_force: wp.Kernel
+    add_blocks: wp.Kernel
+
+
+@cache
+def kernels_of(device: Device) -> Kernels:
+    """Kernels of a device's scalar type."""
+    scalar, mat = device.scalar, device.matrix
+    chunk = CHUNK
+
+    @wp.kernel(module="unique")
+    def add_energy(
+        mass: wp.array(dtype=scalar),
+        weight: wp.array(dtype=scalar),
+        aim: wp.array2d(dtype=scalar),
+        u: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array(dtype=wp.float64),
+    ):
+        """E_c += w_c / 2 sum over a chunk of nodes of m_i |u_i - a_i|^2, in double precision."""
+        block, c = wp.tid()
+        total = wp.float64(0.0)
+        for i in range(block * chunk, wp.min((block + 1) * chunk, mass.shape[0])):
+            for k in range(3):
+                away = wp.float64(u[3 * i + k, c]) - wp.float64(aim[3 * i + k, c])
+                total += wp.float64(mass[i]) * away * away
+        wp.atomic_add(out, c, wp.float64(0.5) * wp.float64(weight[c]) * total)
+
+    @wp.kernel(module="unique")
+    def add_force(
+        mass: wp.array(dtype=scalar),
+        weight: wp.array(dtype=scalar),
+        x: wp.array2d(dtype=scalar),
+        aim: wp.array2d(dtype=scalar),
+        aimed: scalar,
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """f_i += m_i w_c (x_i - a_i), where anything is aimed at."""
+        i, c = wp.tid()
+        for k in range(3):
+            out[3 * i + k, c] += mass[i] * weight[c] * (x[3 * i + k, c] - aimed * aim[3 * i + k, c])
+
+    @wp.kernel(module="unique")
+    def add_blocks(
+        mass: wp.array(dtype=scalar),
+        weight: wp.array(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=mat),
+    ):
+        """K_ii += m_i w_c I."""
+        i, c = wp.tid()
+        out[i, c] += mass[i] * weight[c] * wp.identity(n=3, dtype=scalar)
+
+    return Kernels(add_energy, add_force, add_blocks)
+
+
+def lumped_mass(density: float, space: Discretisation) -> np.ndarray:
+    """Mass of every node (N,) [kg], positive, in sum density x volume.
+
+    A quarter of each linear tetrahedron's; of a quadratic one's as Hinton, Rock, Zienkiewicz 1976, "A note on mass
+    lumping and related processes in the finite element method", Earthq. Eng. Struct. Dyn. 4:245-249.
+    """
+    every = np.ones(len(space.table), bool)
+    quadratic = space.table.shape[1] == 10
+    share = np.repeat([CORNER, MIDDLE], [4, 6]) if quadratic else np.full(4, 0.25)
+    volume = space.mesh.volumes
+    if quadratic:
+        volume = quadratic_elements(space.nodes, space.table, every).weight.sum(axis=1)
+    return density * np.bincount(space.table.ravel(), np.outer(volume, share).ravel(), space.count)
+
+
+class Inertia:
+    """A Term: E = w/2 |u - a|^2_M, M the lumped mass, w = (1/dt + damping) / dt, a = u_n + dt v_n / (1 + damping dt).
+
+    Its gradient is M ((v - v_n) / dt + damping v) with v = (u - u_n) / dt: backward Euler (Martin, Thomaszewski,
+    Grinspun, Gross 2011, "Example-Based Elastic Materials", ACM Trans. Graph. 30(4), section 4). History: velocities
+    (B, N, 3) [m/s].
+
+    Parameters
+    ----------
+    mass
+        (N,) [kg].
+    damping
+        [1/s].
+    device
+        Where its arrays live.
+    """
+
+    name = "inertia"
+    constant, passive, steep = False, False, False
+
+    def __init__(self, mass: np.ndarray, damping: float, device: Device):
+        self._device, self._kernels = device, kernels_of(device)
+        self._damping, self._masses = damping, mass
+        self._mass = device.array(mass)
+        self._weight = Rooms(lambda columns: device.zeros(columns), device)
+        self._aim = Rooms(lambda columns: device.zeros(3 * len(mass), columns), device)
+        self._cases: Cases | None = None
+
+    def begin(self, cases: Cases) -> None:
+        """Aim every column at where its motion would carry it.
+
+        Raises
+        ------
+        InputError
+            Loads whose time is that of their start, or before it; a history of another body.
+        """
+        steps, count = cases.steps, len(cases.loads)
+        if not (steps > 0.0).all():
+            raise InputError(
+                f"load case {int(steps.argmin())} is at its start's time, {cases.loads.times[steps.argmin()]:g} s: "
+                "Inertia needs time to pass; give loads a later `time`."
+            )
+        self._cases = cases
+        drift = steps / (1.0 + self._damping * steps)
+        aim = self._start(cases) + drift[:, None, None] * self._velocity(cases)
+        self._weight.of(count).assign((1.0 + self._damping * steps) / steps**2)
+        self._aim.of(count).assign(np.ascontiguousarray(aim.reshape(count, -1).T))
+
+    def keep(self, columns: np.ndarray) -> None:
+        """Keep the aims of these columns."""
+        assert self._cases is not None
+        self.begin(self._cases.rows(columns))
+
+    def energy(self, u: wp.array, out: wp.array) -> None:
+        """E += w/2 |u - a|^2_M."""
+        inputs = [self._mass, self._weight.of(u.shape[1]), self._aim.of(u.shape[1]), u]
+        self._device.launch(self._kernels.add_energy, (-(-len(self._mass) // CHUNK), u.shape[1]), inputs, [out])
+
+    def add_gradient(self, u: wp.array, out: wp.array) -> None:
+        """f += w M (u - a)."""
+        self._add_force(u, self._aim.of(u.shape[1]), 1.0, out)
+
+    def linearise(self, u: wp.array, definite: wp.array) -> None:
+        """The curvature is the same everywhere."""
+
+    def add_curvature(self, p: wp.array, out: wp.array) -> None:
+        """f += w M p."""
+        self._add_force(p, p, 0.0, out)
+
+    def add_diagonal(self, out: wp.array) -> None:
+        """Blocks += w M."""
+        self._device.launch(self._kernels.add_blocks, out.shape, [self._mass, self._weight.of(out.shape[1])], [out])
+
+    def rest_curvature(self) -> None:
+        """Of an infinite step, none; of a shorter one see `curvature_at_pace`."""
+
+    def curvature_at_pace(self, step: float) -> sp.csc_array:
+        """W M (3N, 3N) [N/m] over a step [s]."""
+        weight = (1.0 + self._damping * step) / step**2
+        return sp.csc_array(sp.diags_array(np.repeat(weight * self._masses, 3)))
+
+    def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
+        """Inertia allows every step."""
+
+    def end(self, u: wp.array) -> np.ndarray:
+        """Velocities (B, N, 3) [m/s] at the end of the step."""
+        assert self._cases is not None
+        now = u.numpy().astype(np.float64).T.reshape(u.shape[1], -1, 3)
+        return (now - self._start(self._cases)) / self._cases.steps[:, None, None]
+
+    def _start(self, cases: Cases) -> np.ndarray:
+        """Where the nodes were (B, N, 3) [m]."""
+        still = np.zeros((len(cases.loads), len(self._masses), 3))
+        return still if cases.displacement is None else cases.displacement
+
+    def _velocity(self, cases: Cases) -> np.ndarray:
+        """How fast they were (B, N, 3) [m/s]."""
+        return cases.past(self.name, (len(self._masses), 3))
+
+    def _add_force(self, x: wp.array, aim: wp.array, aimed: float, out: wp.array) -> None:
+        inputs = [self._mass, self._weight.of(x.shape[1]), x, aim, aimed]
+        self._device.launch(self._kernels.add_force, (len(self._mass), x.shape[1]), inputs, [out])
