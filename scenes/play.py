@@ -52,6 +52,8 @@ class Frame:
         The picture with the predicted tumour in it (H, W, 3) uint8.
     distance
         From the tool's tip to the tumour's predicted surface [m]; None without a tool.
+    moved
+        Mean distance of the tumour's predicted surface from where the scan has it [m].
     seconds
         Wall time by stage, see `STAGES`.
     """
@@ -67,6 +69,7 @@ class Frame:
     picture: Picture
     shown: np.ndarray
     distance: float | None
+    moved: float
     seconds: Mapping[str, float]
 
 
@@ -114,8 +117,13 @@ class Player:
         return Frame(
             number, time, touch, loads, deformation, self.camera, pose, tip, picture, over.colour,
             None if gauge is None else gauge.distance,
+            float(np.linalg.norm(tumour.vertices - self._rest, axis=1).mean()),
             dict(zip(STAGES, np.diff([begun, solved, rendered, clock.perf_counter()]).tolist(), strict=True)),
         )  # fmt: skip
+
+    @cached_property
+    def _rest(self) -> np.ndarray:
+        return self.stage.tumour(self.site.anatomy.mesh.nodes).vertices
 
     def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
         """How far each vertex of the drawn tumour may be off [m]: what the model promises of this load, if it does."""
@@ -160,7 +168,8 @@ def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:
     """
     stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
     acts = told(frame.loads)
-    lines = [f"{name}   t {frame.time:.2f} s", *([acts] if acts else []), f"ms: {stages}"]
+    lines = [f"{name}   t {frame.time:.2f} s   tumour moved {1e3 * frame.moved:.2f} mm"]
+    lines += [*([acts] if acts else []), f"ms: {stages}"]
     if error is not None:
         lines.append(f"error against FEM: {1e3 * error:.3f} mm (frame {frame.number})")
     outcome = frame.deformation.outcome[0]

@@ -131,7 +131,7 @@ class Scene:
         return Pushed(self.contact(site, touch).point[None], force[None], np.array([self.tool.radius]))
 
 
-SCENES = ("press", "slide", "retract")
+SCENES = ("press", "slide", "retract", "brain_shift")
 """The built-in scenes, each a module of this room that exports SCENE."""
 
 

@@ -25,9 +25,28 @@ TOOL_COLOUR = (0.78, 0.80, 0.83)
 TUMOUR_COLOUR = (0.30, 0.95, 0.55)
 # Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
 READ_BELOW = 2.0e-3
+# So far under the bone the cortex may come to light [m].
+RIM = 10e-3
 DRAPE_HEIGHT, DRAPE_DEPTH = 3.0e-3, 8.0e-3
 # Radius of the drape's hole over that of the largest circle of open cortex: its rim hides the mesh's ragged border.
 HOLE = 0.98
+
+
+@dataclass(frozen=True, eq=False)
+class Cortex:
+    """Part of the surface: mesh vertices (n,), triangles (m, 3) of them; the scan, and where it is read (n, 3) [m]."""
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    rest: np.ndarray
+    solid: Solid | None
+
+    def at(self, positions: np.ndarray) -> Layer:
+        """As it is seen at `positions` (V, 3) [m]."""
+        rest = None if self.solid is None else self.rest
+        return Layer(
+            "cortex", CORTEX, positions[self.vertices], self.triangles, CORTEX_COLOUR, 0.5, solid=self.solid, rest=rest
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +71,11 @@ class Stage:
 
     def cortex(self, positions: np.ndarray) -> Layer:
         """The open cortex at `positions` (V, 3) [m]."""
-        vertices, triangles, rest, solid = self._cortex
-        at = rest if solid is not None else None
-        return Layer("cortex", CORTEX, positions[vertices], triangles, CORTEX_COLOUR, gloss=0.5, solid=solid, rest=at)
+        return self._cortex.at(positions)
+
+    def visible(self, positions: np.ndarray) -> Layer:
+        """The open cortex, and what lies just under the edge of the bone: it comes to light where the brain shifts."""
+        return self._visible.at(positions)
 
     @cached_property
     def brain(self) -> Layer:
@@ -66,11 +87,11 @@ class Stage:
     def layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
         """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
         if self.scene.tool is None or pose is None:
-            return [self.cortex(positions), self._drape]
+            return [self.visible(positions), self._drape]
         tool = self.scene.tool.mesh
         at = np.asarray(tool.vertices) @ pose[:3, :3].T + pose[:3, 3]
         probe = Layer("tool", TOOL, at, tool.faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
-        return [self.cortex(positions), self._drape, probe]
+        return [self.visible(positions), self._drape, probe]
 
     def tumour(self, positions: np.ndarray) -> Layer:
         """The tumour's surface at `positions` (V, 3) [m]."""
@@ -88,18 +109,29 @@ class Stage:
         return vertices, triangles.reshape(-1, 3)
 
     @cached_property
-    def _cortex(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Solid | None]:
-        """Mesh vertices, triangles, the points where the scan is read, and the scan as a solid texture."""
-        anatomy = self.site.anatomy
-        vertices, triangles = np.unique(anatomy.open_surface, return_inverse=True)
+    def _cortex(self) -> Cortex:
+        return self._dressed(self.site.anatomy.open_surface)
+
+    @cached_property
+    def _visible(self) -> Cortex:
+        mesh = self.site.anatomy.mesh
+        away = np.linalg.norm(mesh.nodes[mesh.surface] - self.site.origin, axis=2).min(axis=1)
+        return self._dressed(mesh.surface[away < self.site.radius + RIM])
+
+    def _dressed(self, surface: np.ndarray) -> Cortex:
+        """Triangles (S, 3) of the mesh's surface that wear the scan."""
+        vertices, triangles = np.unique(surface, return_inverse=True)
         triangles = triangles.reshape(-1, 3)
-        at = anatomy.mesh.nodes[vertices]
-        rest = at - READ_BELOW * vertex_normals(at, triangles)
+        at = self.site.anatomy.mesh.nodes[vertices]
+        return Cortex(vertices, triangles, at - READ_BELOW * vertex_normals(at, triangles), self._solid)
+
+    @cached_property
+    def _solid(self) -> Solid | None:
+        """The scan as a solid texture."""
         if self.intensity is None:
-            return vertices, triangles, rest, None
+            return None
         values = self.intensity.values.astype(np.float32) / 255.0
-        solid = Solid(values, np.linalg.inv(self.intensity.affine), dark=(0.34, 0.10, 0.10), relief=1.5e-3)
-        return vertices, triangles, rest, solid
+        return Solid(values, np.linalg.inv(self.intensity.affine), dark=(0.34, 0.10, 0.10), relief=1.5e-3)
 
     @cached_property
     def _drape(self) -> Layer:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from theatres import player, short, sinking, theatre_of
+from theatres import player, short, sinking, small, template_theatre, theatre_of
 from visitor import free_port, wait_for
 
 from scenes.check import measure
@@ -16,13 +16,13 @@ from scenes.demo import Demo
 from scenes.lying import SUPINE, Lying, drained_then_turned, supine
 from scenes.paths import Touch
 from scenes.play import labelled
-from scenes.scene import Bounds
-from scenes.stage import TOOL
+from scenes.scene import Bounds, find_scene
+from scenes.stage import CORTEX, TOOL
 from scenes.told import told
 from scenes.truth import truth_of
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.errors import InputError
-from sim.loads import Loads, Posture, Pushed, posture
+from sim.loads import Loads, Posture, Pushed, posture, stacked
 from surrogate.taught import refusal, taught_effects
 
 EFFECTS = (Elasticity(), Held(), Slide())
@@ -162,3 +162,29 @@ class TestWithoutATool:
             assert "tip to tumour" not in demo.browser.text.content
         finally:
             demo.close()
+
+
+class TestBrainShift:
+    def test_the_brain_sinks_as_far_as_in_patients(self):
+        """Cortex 6.1 +- 3.4 mm in 61 patients; 5.1, and the tumour 3.5, over 1,000 computed cases."""
+        theatre, scene = template_theatre(), find_scene("brain_shift")
+        fem, cortex = theatre.fem(scene, scene.accuracy), np.unique(theatre.anatomy.open_surface)
+        times = [0.0, 1.2, 1.5, 3.0, 6.0]
+        loads = stacked([scene.loads(theatre.site, scene.path(time), time) for time in times])
+        answer = fem.deform(loads)
+        moved = 1e3 * np.linalg.norm(answer.displacement, axis=2)
+        shift, tumour = moved[:, cortex].mean(axis=1), moved[:, theatre.anatomy.tumour_nodes].mean(axis=1)
+        assert all(outcome.good for outcome in answer.outcome) and not answer.displacement[0].any()
+        assert (np.diff(shift[:4]) > 0.3).all() and 3.5 < shift[3] < 6.0
+        assert 1.2 < shift[3] / tumour[3] < 1.8
+        # It sinks along gravity where it can, and turns with the head.
+        way = answer.displacement[3:, cortex].mean(axis=1)
+        assert way[0, 1] < -0.8 * np.linalg.norm(way[0]) and way[1, 0] < way[0, 0] - 5e-4
+
+    def test_its_border_stays_hidden(self):
+        """The cortex that moves out from under the bone is drawn too: nothing is seen through the hole beside it."""
+        theatre, scene = template_theatre(), small("brain_shift")
+        still, sunk = (theatre.player("fem", scene).draw(0, time, Touch()) for time in (0.0, 3.0))
+        seen = still.picture.segmentation == CORTEX
+        inside = seen & ~(sunk.picture.segmentation == CORTEX)
+        assert seen.sum() > 5000 and inside.sum() < 0.015 * seen.sum()

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from theatres import on_template, player, put, short, small, template_theatre, theatre_of
+from theatres import PUSHING, on_template, player, put, short, small, template_theatre, theatre_of
 
 from ar.camera import project_cv2
 from scenes.cli import main
@@ -61,7 +61,7 @@ def test_a_lighter_touch_rests_higher_and_an_idle_tool_stands_off(play):
     assert depth[0] == pytest.approx(-4e-3) and 0.0 < depth[1] < depth[2]
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", PUSHING)
 def test_the_idle_tool_is_outside_the_tissue(template, name):
     play = on_template(name)
     tool = np.asarray(play.scene.tool.mesh.vertices)
@@ -114,7 +114,7 @@ def test_warm_starts_of_the_loop_change_nothing_that_is_seen(theatre):
         assert difference.max() < 5e-5
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", PUSHING)
 def test_the_tool_is_never_tinted(name):
     play = on_template(name)
     for number in (20, 50, 75):

@@ -12,7 +12,7 @@ import numpy as np
 from scenes.lying import drained_then_turned
 from scenes.paths import idle, press
 from scenes.play import Player
-from scenes.scene import Scene, Viewpoint, find_scene
+from scenes.scene import SCENES, Scene, Viewpoint, find_scene
 from scenes.shipped import template_path
 from scenes.stage import Stage
 from scenes.theatre import Theatre, model_path
@@ -27,6 +27,9 @@ from surrogate.sampling import draw
 from surrogate.simulate import simulate
 from surrogate.store import save
 from surrogate.train import train
+
+PUSHING = tuple(name for name in SCENES if ToolForce() in find_scene(name).effects)
+"""The built-in scenes in which a tool pushes."""
 
 
 @cache

@@ -1,0 +1,19 @@
+"""The dura is open and the fluid drains: the brain sinks, and sinks otherwise when the head is turned."""
+
+import numpy as np
+
+from sim.effects import Elasticity, Gravity, Held, Slide
+
+from .lying import drained_then_turned
+from .scene import Scene
+
+# On smoothed elements: linear ones lock under a weight that does little but squeeze.
+SCENE = Scene(
+    "brain_shift",
+    __doc__ or "",
+    duration=6.0,
+    effects=(Elasticity(), Held(), Slide(), Gravity()),
+    tool=None,
+    lying=drained_then_turned(drain=3.0, pause=0.5, turn=2.0, angle=np.radians(30.0)),
+    element="smoothed",
+)
