@@ -117,9 +117,9 @@ def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
         label, constants = text.split(":")
         if ogden:
             *terms, bulk = constants.split(";")
-            return int(label), Ogden(parse_terms(terms), float(bulk))
+            return int(label), Ogden(parse_terms(terms), float(bulk), tissue.prony)
         young, poisson = constants.split(",")
-        return int(label), Material(tissue.law, float(young), float(poisson))
+        return int(label), Material(tissue.law, float(young), float(poisson), tissue.prony)
     except InputError as error:
         raise InputError(f"--region {text}: {error}") from error
     except ValueError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from operator import add
@@ -17,6 +17,7 @@ from .constraint import Constraint
 from .device import Device
 from .discretisation import Discretisation, discretise
 from .effects import Effect, Elasticity, Gravity, Held, Inertia, NodalForce, Slide, ToolDisplacement, ToolForce
+from .element import Elements
 from .errors import InputError
 from .footprint import Skin
 from .holding import check_held
@@ -178,8 +179,6 @@ def _elasticity(
 
     `within` (T,) bool: of these tetrahedra alone, posed on their own nodes (n,).
     """
-    from .terms.elasticity import Elasticity as ElasticityTerm
-
     mesh = space.mesh
     labels = [int(label) for label in np.unique(mesh.region)]
     unknown = sorted(set(effect.regions) - set(labels))
@@ -192,19 +191,37 @@ def _elasticity(
             raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
         materials[label] = material
     terms: list[Curved] = []
-    for name in sorted({material.law for material in materials.values()}):
-        law = importlib.import_module(f".terms.{name.replace('-', '_')}", __package__).LAW
-        obeying = {label: material for label, material in materials.items() if material.law == name}
+    for name, relaxes in sorted({(material.law, bool(material.prony)) for material in materials.values()}):
+        obeying = {
+            label: material
+            for label, material in materials.items()
+            if (material.law, bool(material.prony)) == (name, relaxes)
+        }
         chosen = np.isin(mesh.region, list(obeying))
         if within is not None:
             chosen &= within
         if not chosen.any():
             continue
         for part in space.parts(chosen):
-            tissues, which = list(obeying.values()), np.searchsorted(list(obeying), mesh.region[part.elements.owner])
-            lame = np.array([portion(tissue, part.carries) for tissue in tissues])[which]
-            coefficients = coefficients_of(tissues, part.carries)[which]
-            term = f"elasticity {name}" if part.carries == "whole" else f"elasticity {name} of {part.carries}"
+            which = np.searchsorted(list(obeying), mesh.region[part.elements.owner])
             elements = part.elements if nodes is None else part.elements.on(nodes)
-            terms.append(ElasticityTerm(term, law, elements, coefficients, lame, device))
+            terms.append(_obeying(list(obeying.values()), which, elements, part.carries, device))
     return terms
+
+
+def _obeying(tissues: Sequence[Tissue], which: np.ndarray, elements: Elements, carries: str, device: Device) -> Curved:
+    """The term of elements of tissues that obey one law, `which` (T,) of them each; all of them relax, or none."""
+    from .terms.elasticity import Elasticity as ElasticityTerm
+
+    law = importlib.import_module(f".terms.{tissues[0].law.replace('-', '_')}", __package__).LAW
+    lame = np.array([portion(tissue, carries) for tissue in tissues])[which]
+    coefficients = coefficients_of(tissues, carries)[which]
+    name = f"elasticity {law.name}" if carries == "whole" else f"elasticity {law.name} of {carries}"
+    sources = []
+    if tissues[0].prony and carries != "volume":  # what resists a change of volume does not relax
+        from .terms.viscoelastic import Prony
+
+        name, points = f"visco{name}", elements.weight.shape[1]
+        pairs = [tissues[tissue].prony for tissue in which]
+        sources.append(Prony(name, law, coefficients, pairs, points, device))
+    return ElasticityTerm(name, law, elements, coefficients, lame, device, sources)

@@ -15,6 +15,12 @@ LAWS = ("linear", "corotational", "neo-hookean", "stable-neo-hookean")
 """The laws that E and nu determine; `Ogden` has constants of its own."""
 
 
+HYPERELASTIC = ("neo-hookean", "stable-neo-hookean", "ogden")
+"""The laws that a Prony series may relax: their energy knows shape from volume at finite strain."""
+Pairs = tuple[tuple[float, float], ...]
+"""A Prony series: pairs (g, tau [s]). Of a stress that is held in shape, sum g (1 - exp(-t / tau)) has gone after t."""
+
+
 @dataclass(frozen=True)
 class Material:
     """A tissue law by name with its engineering constants.
@@ -27,16 +33,19 @@ class Material:
         Young's modulus at small strain [Pa].
     poisson
         Poisson's ratio at small strain, -1 < nu < 0.5.
+    prony
+        How the resistance to a change of shape relaxes, if it does: E and nu are then instantaneous.
 
     Raises
     ------
     InputError
-        Unknown law, E <= 0, nu outside (-1, 0.5).
+        Unknown law, E <= 0, nu outside (-1, 0.5), a series that no tissue has or the law cannot have.
     """
 
     law: str
     young: float
     poisson: float
+    prony: Pairs = ()
 
     def __post_init__(self) -> None:
         if self.law == Ogden.law:
@@ -50,6 +59,7 @@ class Material:
                 f"Poisson's ratio is {self.poisson}: give a number in (-1, 0.5); "
                 "for nearly incompressible tissue, 0.49 or 0.4999."
             )
+        check_prony(self.prony, self.law)
 
     @property
     def lame(self) -> tuple[float, float]:
@@ -80,16 +90,20 @@ class Ogden:
         Pairs (c_i [Pa], m_i), as many as you like.
     bulk
         Bulk modulus K [Pa].
+    prony
+        How the resistance to a change of shape relaxes, if it does: the terms are then instantaneous.
 
     Raises
     ------
     InputError
-        No terms, numbers that are not finite, an exponent of zero, no stiffness in shear or in volume.
+        No terms, numbers that are not finite, an exponent of zero, no stiffness in shear or in volume, a series that no
+        tissue has.
     """
 
     law: ClassVar[str] = "ogden"
     terms: tuple[tuple[float, float], ...]
     bulk: float
+    prony: Pairs = ()
 
     def __post_init__(self) -> None:
         if not self.terms:
@@ -102,6 +116,7 @@ class Ogden:
             raise InputError(f"Ogden's c sum to {total} Pa, twice the shear modulus: let the sum be positive.")
         if not (np.isfinite(self.bulk) and self.bulk > 0.0):
             raise InputError(f"the bulk modulus is {self.bulk} Pa: give a positive number.")
+        check_prony(self.prony, self.law)
 
     @property
     def lame(self) -> tuple[float, float]:
@@ -124,9 +139,33 @@ Tissue = Material | Ogden
 """What a region may be made of: each has `law`, `lame` and `coefficients`."""
 
 
+def check_prony(prony: Pairs, law: str) -> None:
+    """Refuse a Prony series that no tissue has, or that a law cannot have.
+
+    Raises
+    ------
+    InputError
+        A law of small strains, g <= 0, tau <= 0, g that sum to 1 or more.
+    """
+    if prony and law not in HYPERELASTIC:
+        raise InputError(
+            f"the law {law} cannot relax: its energy does not part shape from volume; "
+            f"choose one of {', '.join(HYPERELASTIC)}."
+        )
+    for g, tau in prony:
+        if not (0.0 < g < 1.0 and 0.0 < tau < np.inf):
+            raise InputError(f"the Prony pair ({g}, {tau}) is none: give 0 < g < 1 and a positive tau [s].")
+    total = sum(g for g, _ in prony)
+    if total >= 1.0:
+        raise InputError(f"the Prony series' g sum to {total:g}: below 1, so that some stiffness is left in the end.")
+
+
 def tissue_to_json(tissue: Tissue) -> str:
     """One line that `tissue_from_json` reads."""
-    return json.dumps({"law": tissue.law, **asdict(tissue)})
+    constants = asdict(tissue)
+    if not tissue.prony:
+        del constants["prony"]  # as it was written before there were any
+    return json.dumps({"law": tissue.law, **constants})
 
 
 def tissue_from_json(text: str) -> Tissue:
@@ -139,9 +178,11 @@ def tissue_from_json(text: str) -> Tissue:
     """
     try:
         constants = json.loads(text)
+        prony = tuple((float(g), float(tau)) for g, tau in constants.pop("prony", ()))
         if constants["law"] == Ogden.law:
-            return Ogden(tuple((float(c), float(m)) for c, m in constants["terms"]), float(constants["bulk"]))
-        return Material(**constants)
+            terms = tuple((float(c), float(m)) for c, m in constants["terms"])
+            return Ogden(terms, float(constants["bulk"]), prony)
+        return Material(**constants, prony=prony)
     except (ValueError, LookupError, TypeError) as error:
         raise InputError(f"{text!r} is no tissue that this version knows ({error}): simulate anew.") from error
 
@@ -201,6 +242,12 @@ MATERIALS = {
         Ogden(((1340.0, -19.0),), 148e3),
         "minutes",
         "mu 670 Pa, alpha -19, K 148 kPa from brain shift between prone and supine in vivo, PMC9748497",
+    ),
+    # Incompressible in the paper; the bulk modulus is that of a Poisson's ratio of 0.49 at once.
+    "viscoelastic": MaterialSet(
+        Ogden(((2.0 * 842.0, -4.7),), 842.0 * 2.98 / 0.06, ((0.45, 0.5), (0.365, 50.0))),
+        "half a second to minutes, as loads say how much time goes by; else at once",
+        "mu 842 Pa, alpha -4.7, g 0.45 and 0.365, tau 0.5 and 50 s: Miller, Chinzei 2002, J. Biomech. 35:483-490",
     ),
 }
 """Named tissues."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,7 +21,7 @@ from sim.effects import Elasticity, Gravity, Held, Inertia, NodalForce, ToolForc
 from sim.loads import Loads, Nodal, Posture, Pushed
 from sim.mesh import signed_volumes
 from sim.term import Cases, Term
-from sim.terms.elasticity import VOLUME_KEPT
+from sim.terms.loops import VOLUME_KEPT
 
 MESH = box((2, 2, 2), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
@@ -100,10 +100,32 @@ def of_law(law: str, element: str = "p1", part: int = 0) -> Example:
     return Example(build, cases(), law in LOGARITHMIC, space.nodes, 1e-3 if element == "p2" else 4e-3)
 
 
+RELAXES = ("neo-hookean", "stable-neo-hookean", "ogden")
+SERIES = ((0.3, 0.4), (0.4, 3.0))
+
+
+def relaxing(law: str, element: str = "p1") -> Example:
+    """A viscoelastic law amid its history; the first case is a body at rest so far, at once."""
+    space = discretise(MESH, element)
+    tissues = replace(tissue(law), prony=SERIES)
+    part = space.parts(np.ones(len(MESH.tets), bool))[0]
+    points = part.elements.weight.size
+    name = f"viscoelasticity {law}" + ("" if part.carries == "whole" else f" of {part.carries}")
+    past = 50.0 * np.random.default_rng(14).normal(size=(3, points, 18)) * np.array([0.0, 1.0, 1.0])[:, None, None]
+
+    def build(device: Device) -> Term:
+        return compile_problem((Elasticity(tissues), Held()), ANATOMY, device, space).terms[0]
+
+    cases = Cases(Loads((), np.array([0.0, 1.7, 3.0])), np.array([0.0, 1.0, 2.999]), {name: past})
+    return Example(build, cases, True, space.nodes, 1e-3 if element == "p2" else 4e-3)
+
+
 EXAMPLES = (
     {law: of_law(law) for law in EVERY_LAW}
     | {f"{law} p2": of_law(law, "p2") for law in EVERY_LAW}
     | {f"{law} smoothed {part}": of_law(law, "smoothed", i) for law in EVERY_LAW for i, part in enumerate(PARTS)}
+    | {f"relaxing {law}": relaxing(law) for law in RELAXES}
+    | {f"relaxing neo-hookean {element}": relaxing("neo-hookean", element) for element in ("p2", "smoothed")}
     | {
         "nodal force": Example(of_effects(NodalForce()), cases()),
         "tool force": Example(of_effects(ToolForce()), cases()),

@@ -2,247 +2,32 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
+from ..columns import Rooms
 from ..device import Device
 from ..element import Elements, hooke_stiffness
 from ..term import Cases
 from ..together import cores, together
-from .invariants import cofactor
 from .law import Law
-
-# A step must leave every volume above this share of what it was: the logarithm and its curvature stay moderate.
-VOLUME_KEPT = 0.1
+from .loops import kernels_of, spreading_of
+from .source import Source
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Some of the elements: how many; sizes, node numbers and shape gradients; weights and coefficients."""
+    """Elements from the first on: how many; sizes, node numbers and shape gradients; weights; coefficients."""
 
+    first: int
     count: int
     shape: list[wp.array]
-    inside: list[wp.array]
-
-
-@dataclass(frozen=True)
-class Kernels:
-    """The compiled loops over elements of one law."""
-
-    add_energy: wp.Kernel
-    add_gradient: wp.Kernel
-    add_curvature: wp.Kernel
-    add_diagonal: wp.Kernel
-    bound_step: wp.Kernel | None
-
-
-@cache
-def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
-    """Kernels for elements of `size` nodes and laws of `count` coefficients.
-
-    Each launches over (element, column). Elements of `size` 0 have as many nodes as `sizes` says, each its own number.
-    """
-    scalar, mat, vec = device.scalar, device.matrix, device.vector
-    constants = wp.types.vector(length=count, dtype=scalar)
-    stress, stress_change, density = law.stress, law.stress_change, law.energy
-    kept = VOLUME_KEPT
-
-    # Loops over nodes are unrolled where `size` is a constant, a fifth less time on the CPU; over points too, they take
-    # thrice as long to compile. Shape gradients sum to zero: only how far nodes moved from node 0 counts.
-    @wp.func
-    def gradient_of(
-        u: wp.array2d(dtype=scalar),
-        sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        e: int,
-        q: int,
-        c: int,
-    ):
-        """H = sum over nodes of (u_a - u_0) (x) grad N_a."""
-        H = mat()
-        i = 3 * table[e, 0]
-        origin = vec(u[i, c], u[i + 1, c], u[i + 2, c])
-        for a in range(1, size if size else sizes[e]):
-            i = 3 * table[e, a]
-            H += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]) - origin, gradient[e, q, a])
-        return H
-
-    @wp.func
-    def spread(
-        P: mat,
-        sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        e: int,
-        q: int,
-        c: int,
-        out: wp.array2d(dtype=scalar),
-    ):
-        """f_a += P grad N_a; they sum to zero."""
-        total = vec()
-        for a in range(1, size if size else sizes[e]):
-            i = 3 * table[e, a]
-            f = P * gradient[e, q, a]
-            total += f
-            for k in range(3):
-                wp.atomic_add(out, i + k, c, f[k])
-        i = 3 * table[e, 0]
-        for k in range(3):
-            wp.atomic_sub(out, i + k, c, total[k])
-
-    @wp.kernel(module="unique")
-    def add_energy(
-        u: wp.array2d(dtype=scalar),
-        sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        weight: wp.array2d(dtype=scalar),
-        coefficients: wp.array(dtype=constants),
-        # outputs
-        out: wp.array(dtype=wp.float64),
-    ):
-        """E += sum over points of w psi(H)."""
-        e, c = wp.tid()
-        for q in range(gradient.shape[1]):
-            H = gradient_of(u, sizes, table, gradient, e, q, c)
-            wp.atomic_add(out, c, wp.float64(weight[e, q] * density(H, coefficients[e])))
-
-    @wp.kernel(module="unique")
-    def add_gradient(
-        u: wp.array2d(dtype=scalar),
-        sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        weight: wp.array2d(dtype=scalar),
-        coefficients: wp.array(dtype=constants),
-        # outputs
-        out: wp.array2d(dtype=scalar),
-    ):
-        """f_a += sum over points of w P(H) grad N_a."""
-        e, c = wp.tid()
-        for q in range(gradient.shape[1]):
-            P = weight[e, q] * stress(gradient_of(u, sizes, table, gradient, e, q, c), coefficients[e])
-            spread(P, sizes, table, gradient, e, q, c, out)
-
-    @wp.kernel(module="unique")
-    def add_curvature(
-        p: wp.array2d(dtype=scalar),
-        at: wp.array2d(dtype=scalar),
-        definite: wp.array(dtype=wp.int32),
-        sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        weight: wp.array2d(dtype=scalar),
-        coefficients: wp.array(dtype=constants),
-        # outputs
-        out: wp.array2d(dtype=scalar),
-    ):
-        """f_a += sum over points of w dP(H; D) grad N_a; `definite` columns take the curvature at rest."""
-        e, c = wp.tid()
-        for q in range(gradient.shape[1]):
-            H = mat()
-            if definite[c] == 0:
-                H = gradient_of(at, sizes, table, gradient, e, q, c)
-            D = gradient_of(p, sizes, table, gradient, e, q, c)
-            P = weight[e, q] * stress_change(H, D, coefficients[e])
-            spread(P, sizes, table, gradient, e, q, c, out)
-
-    @wp.func
-    def along(H: mat, of: constants, k: int, m: int):
-        """dP for dF = e_k (x) e_m."""
-        D = mat()
-        D[k, m] = scalar(1.0)
-        return stress_change(H, D, of)
-
-    # Unrolled, its many stress changes take ten seconds to compile.
-    @wp.kernel(module="unique", module_options={"max_unroll": 0})
-    def add_diagonal(
-        at: wp.array2d(dtype=scalar),
-        definite: wp.array(dtype=wp.int32),
-        sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        weight: wp.array2d(dtype=scalar),
-        coefficients: wp.array(dtype=constants),
-        # outputs
-        out: wp.array2d(dtype=mat),
-    ):
-        """K_aa += sum over points of w dP(H; e_k (x) grad N_a) grad N_a, column k of the block.
-
-        Nine stress changes serve all nodes of a point.
-        """
-        e, c = wp.tid()
-        for q in range(gradient.shape[1]):
-            H = mat()
-            if definite[c] == 0:
-                H = gradient_of(at, sizes, table, gradient, e, q, c)
-            for k in range(3):
-                X = along(H, coefficients[e], k, 0)
-                Y = along(H, coefficients[e], k, 1)
-                Z = along(H, coefficients[e], k, 2)
-                for a in range(size if size else sizes[e]):
-                    g = gradient[e, q, a]
-                    f = weight[e, q] * ((g[0] * X + g[1] * Y + g[2] * Z) * g)
-                    block = mat()
-                    for i in range(3):
-                        block[i, k] = f[i]
-                    wp.atomic_add(out, table[e, a], c, block)
-
-    @wp.kernel(module="unique")
-    def bound_step(
-        u: wp.array2d(dtype=scalar),
-        du: wp.array2d(dtype=scalar),
-        sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        # outputs
-        out: wp.array(dtype=scalar),
-    ):
-        """Halve t until J(t) = det(F + t D) >= kept J(0) on all of [0, t]; J is a cubic in t."""
-        e, c = wp.tid()
-        one = scalar(1.0)
-        for q in range(gradient.shape[1]):
-            H = gradient_of(u, sizes, table, gradient, e, q, c)
-            D = gradient_of(du, sizes, table, gradient, e, q, c)
-            F = wp.identity(n=3, dtype=scalar) + H
-            normal, normal_change = cofactor(F), cofactor(D)
-            a0 = wp.dot(F[0], normal[0])
-            a1 = wp.ddot(normal, D)
-            a2 = wp.ddot(F, normal_change)
-            a3 = wp.dot(D[0], normal_change[0])
-            floor = scalar(kept) * a0
-            t = out[c]
-            zero = scalar(0.0)
-            # Most steps are so short that nothing has to be looked at closely.
-            if a0 + t * (wp.min(a1, zero) + t * (wp.min(a2, zero) + t * wp.min(a3, zero))) >= floor:
-                continue
-            for _ in range(40):
-                low = a0 + t * (a1 + t * (a2 + t * a3))
-                # Stationary points of the cubic inside (0, t), by the root formula that does not cancel.
-                root = a2 * a2 - scalar(3.0) * a1 * a3
-                if root > scalar(0.0):
-                    s = -(a2 + wp.where(a2 >= scalar(0.0), one, -one) * wp.sqrt(root))
-                    if a3 != scalar(0.0):
-                        t1 = s / (scalar(3.0) * a3)
-                        if t1 > scalar(0.0) and t1 < t:
-                            low = wp.min(low, a0 + t1 * (a1 + t1 * (a2 + t1 * a3)))
-                    if s != scalar(0.0):
-                        t2 = a1 / s
-                        if t2 > scalar(0.0) and t2 < t:
-                            low = wp.min(low, a0 + t2 * (a1 + t2 * (a2 + t2 * a3)))
-                if low >= floor:
-                    break
-                t = t / scalar(2.0)
-            wp.atomic_min(out, c, t)
-
-    return Kernels(
-        add_energy, add_gradient, add_curvature, add_diagonal, bound_step if law.needs_positive_volume else None
-    )
+    weight: wp.array
+    coefficients: wp.array
 
 
 class Elasticity:
@@ -262,43 +47,76 @@ class Elasticity:
         (T, 2) Lamé's mu and lambda at small strain [Pa].
     device
         Where its arrays live.
+    sources
+        What the law takes at every point in every case beside its coefficients, from the inside of the law outwards. At
+        most one has a history.
     """
 
-    constant, passive, steep = False, True, False
+    constant, steep = False, False
 
     def __init__(
-        self, name: str, law: Law, elements: Elements, coefficients: np.ndarray, lame: np.ndarray, device: Device
+        self,
+        name: str,
+        law: Law,
+        elements: Elements,
+        coefficients: np.ndarray,
+        lame: np.ndarray,
+        device: Device,
+        sources: Sequence[Source] = (),
     ):
         self.name = name
+        self.passive = not sources
         self._device = device
-        count = coefficients.shape[1]
+        self._sources = sources
+        self._cases: Cases | None = None
+        count = own = coefficients.shape[1]
         size = elements.table.shape[1] if elements.size is None else 0
         sizes = np.zeros(0, np.int32) if elements.size is None else elements.size
-        self._kernels = kernels_of(law, device, size, count)
         self._rest, self._tissue = (elements, *lame.T), (law, coefficients)
+        for source in sources:
+            law, count = source.law(law, count), count + source.count
+        self._kernels = kernels_of(law, device, size, count)
         shape = [
             device.array(sizes, wp.int32),
             device.array(elements.table, wp.int32),
             device.array(elements.gradient, device.vector),
         ]
-        inside = [
-            device.array(elements.weight),
-            device.array(coefficients, wp.types.vector(length=count, dtype=device.scalar)),
-        ]
+        weight = device.array(elements.weight)
+        constants = device.array(coefficients, wp.types.vector(length=own, dtype=device.scalar))
+        self._constants = device.array(coefficients) if sources else constants
+        points = elements.weight.shape
+        self._numbers = Rooms(lambda columns: device.zeros(*points, count, columns), device)
+        self._strains = Rooms(lambda columns: wp.empty((*points, columns), device.matrix, device.name), device)
         every = len(elements.table)
         ends = np.linspace(0, every, (1 if device.on_cuda else cores(every)) + 1).astype(int).tolist()
         self._parts = [
-            _Part(stop - first, *([_rows(array, first, stop) for array in arrays] for arrays in (shape, inside)))
+            _Part(
+                first,
+                stop - first,
+                [_rows(array, first, stop) for array in shape],
+                _rows(weight, first, stop),
+                _rows(constants, first, stop),
+            )
             for first, stop in pairwise(ends)
         ]
         self._at: wp.array | None = None
         self._definite: wp.array | None = None
 
     def begin(self, cases: Cases) -> None:
-        """Elasticity remembers nothing."""
+        """Take what varies, if anything does."""
+        if self._sources:
+            self._cases, numbers = cases, self._numbers.of(len(cases.loads))
+            points, own = numbers.shape[:2], self._tissue[1].shape[1]
+            dim = (*points, own, len(cases.loads))
+            self._device.launch(spreading_of(self._device), dim, [self._constants], [numbers])
+            for source in self._sources:
+                source.fill(cases, own, numbers)
+                own += source.count
 
     def keep(self, columns: np.ndarray) -> None:
-        """Columns are all alike to elasticity."""
+        """Keep what varies of these columns."""
+        if self._cases is not None:
+            self.begin(self._cases.rows(columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """E += sum of w psi(H)."""
@@ -355,13 +173,26 @@ class Elasticity:
             for bound in bounds[1:]:
                 np.minimum(out.numpy(), bound.numpy(), out=out.numpy())
 
-    def end(self, u: wp.array) -> None:
-        """Elasticity remembers nothing."""
+    def end(self, u: wp.array) -> np.ndarray | None:
+        """What a source remembers; elasticity by itself remembers nothing."""
+        if self._cases is None:
+            return None
+        strains = self._strains.of(u.shape[1])
+        outputs = [strains[part.first : part.first + part.count] for part in self._parts]
+        self._each(self._kernels.measure, lambda part: [u, *part.shape], outputs, u.shape[1])
+        kept = [source.end(self._cases, strains) for source in self._sources]
+        return next((history for history in kept if history is not None), None)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:
         """Add to `out` whatever a kernel adds."""
         sums = [out, *(wp.zeros_like(out) for _ in self._parts[1:])]
-        self._each(kernel, lambda part: [*inputs, *part.shape, *part.inside], sums, columns)
+        numbers = self._numbers.of(columns) if self._sources else None
+
+        def all_inputs(part: _Part) -> list:
+            own = part.coefficients if numbers is None else numbers[part.first : part.first + part.count]
+            return [*inputs, *part.shape, part.weight, own]
+
+        self._each(kernel, all_inputs, sums, columns)
         for total in sums[1:]:
             np.add(out.numpy(), total.numpy(), out=out.numpy())
 

@@ -53,3 +53,16 @@ def cofactor_change(F: Any, D: Any):
         wp.cross(D[2], F[0]) + wp.cross(F[2], D[0]),
         wp.cross(D[0], F[1]) + wp.cross(F[0], D[1]),
     )
+
+
+@wp.func
+def green_strain(H: Any):
+    """E = (H + H^T + H^T H) / 2."""
+    return (H + wp.transpose(H) + wp.transpose(H) * H) / type(H[0, 0])(2.0)
+
+
+@wp.func
+def exp_less_one(t: Any):
+    """exp(t) - 1 = 2 sinh(t/2) exp(t/2)."""
+    half = t / type(t)(2.0)
+    return type(t)(2.0) * wp.sinh(half) * wp.exp(half)

@@ -11,15 +11,9 @@ from typing import Any
 
 import warp as wp
 
-from .invariants import log_one_plus, volume_change
+from .invariants import exp_less_one, green_strain, log_one_plus, volume_change
 from .law import Law
 from .spectral import principal_axes
-
-
-@wp.func
-def green_strain(H: Any):
-    """E = (H + H^T + H^T H) / 2."""
-    return (H + wp.transpose(H) + wp.transpose(H) * H) / type(H[0, 0])(2.0)
 
 
 @wp.func
@@ -61,13 +55,6 @@ def exp_excess(t: Any):
     for i in range(16):
         tail = one + t / type(t)(18 - i) * tail
     return t * t / type(t)(2.0) * tail
-
-
-@wp.func
-def exp_less_one(t: Any):
-    """exp(t) - 1 = 2 sinh(t/2) exp(t/2)."""
-    half = t / type(t)(2.0)
-    return type(t)(2.0) * wp.sinh(half) * wp.exp(half)
 
 
 @wp.func

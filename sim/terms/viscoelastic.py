@@ -1,0 +1,250 @@
+"""Viscoelasticity in shape: any law's isochoric stress relaxes in a Prony series, a step at a time.
+
+Simo 1987, "On a fully three-dimensional finite-strain viscoelastic damage model", Comput. Methods Appl. Mech. Eng.
+60:153-173; Simo, Hughes 1998, "Computational Inelasticity", section 10.3; Holzapfel 2000, "Nonlinear Solid Mechanics",
+section 6.10. The step is the derivative of an incremental potential: with Fb = J^(-1/3) F, Cb = Fb^T Fb,
+
+    psi(F) + (f - 1) psi(Fb) + Cb : A / 2,  f = 1 - sum_i g_i (1 - exp(-dt / (2 tau_i))),
+    A = sum_i (exp(-dt / tau_i) H_i - g_i exp(-dt / (2 tau_i)) S),
+
+S the isochoric stress of the law itself, pulled back by the last step's Fb, and H_i the parts of it that fade.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..device import Device
+from ..material import Pairs
+from ..term import Cases
+from .invariants import (
+    cofactor_change,
+    cofactor_excess,
+    exp_less_one,
+    green_strain,
+    log_one_plus,
+    volume_change,
+)
+from .law import Law
+
+# A symmetric tensor's components.
+SIX = 6
+
+
+@wp.func
+def isochoric(H: Any):
+    """Fb - I = J^(-1/3) (I + H) - I, exact at small strain."""
+    k = exp_less_one(-log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
+    return H + k * (wp.identity(n=3, dtype=type(k)) + H)
+
+
+@wp.func
+def inverse_transpose(H: Any):
+    """(I + H)^-T."""
+    J = type(H[0, 0])(1.0) + volume_change(H)
+    return (wp.identity(n=3, dtype=type(J)) + cofactor_excess(H)) / J
+
+
+@cache
+def relaxing(law: Law, device: Device, count: int) -> Law:
+    """The law on `count` numbers that also takes f - 1 and the components xx, yy, zz, yz, zx, xy of A [Pa]."""
+    scalar, mat = device.scalar, device.matrix
+    inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1 + SIX))
+    own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
+
+    @wp.func
+    def of_law(c: whole):
+        """What the law itself takes."""
+        k = inner()
+        for i in range(count):
+            k[i] = c[i]
+        return k
+
+    @wp.func
+    def pull(c: whole):
+        """A."""
+        xx, yy, zz, yz, zx, xy = (
+            c[count + 1],
+            c[count + 2],
+            c[count + 3],
+            c[count + 4],
+            c[count + 5],
+            c[count + 6],
+        )
+        return mat(xx, xy, zx, xy, yy, yz, zx, yz, zz)
+
+    @wp.func
+    def energy(H: mat, c: whole):
+        """psi(F) + (f - 1) psi(Fb) + (Cb - I) : A / 2 [Pa]; +inf where J <= 0."""
+        if volume_change(H) <= scalar(-1.0):
+            return scalar(wp.inf)
+        Hb, k = isochoric(H), of_law(c)
+        return own_energy(H, k) + c[count] * own_energy(Hb, k) + wp.ddot(green_strain(Hb), pull(c))
+
+    @wp.func
+    def stress(H: mat, c: whole):
+        """P(F) + J^(-1/3) (Q - (Q : F) F^-T / 3), with Q = (f - 1) P(Fb) + Fb A."""
+        F, Hb, k, A = wp.identity(n=3, dtype=scalar) + H, isochoric(H), of_law(c), pull(c)
+        Q = c[count] * own_stress(Hb, k) + A + Hb * A
+        shrink = wp.exp(-log_one_plus(volume_change(H)) / scalar(3.0))
+        return own_stress(H, k) + shrink * (Q - wp.ddot(Q, F) / scalar(3.0) * inverse_transpose(H))
+
+    @wp.func
+    def stress_change(H: mat, D: mat, c: whole):
+        """dP for dF = D: the derivative of `stress`, factor by factor."""
+        three = scalar(3.0)
+        identity = wp.identity(n=3, dtype=scalar)
+        F, Hb, k, A = identity + H, isochoric(H), of_law(c), pull(c)
+        J = scalar(1.0) + volume_change(H)
+        shrink = wp.exp(-log_one_plus(volume_change(H)) / three)
+        G = inverse_transpose(H)
+        swelling = wp.ddot(G, D)
+        dG = cofactor_change(F, D) / J - swelling * G
+        dF = shrink * (D - swelling / three * F)
+        Q = c[count] * own_stress(Hb, k) + A + Hb * A
+        dQ = c[count] * own_change(Hb, dF, k) + dF * A
+        level = wp.ddot(Q, F)
+        turned = dQ - (wp.ddot(dQ, F) + wp.ddot(Q, D)) / three * G - level / three * dG
+        return own_change(H, D, k) + shrink * (turned - swelling / three * (Q - level / three * G))
+
+    @wp.func
+    def at_rest(c: whole):
+        """Nothing has faded, nothing pulls."""
+        k = c
+        for i in range(count, count + 1 + SIX):
+            k[i] = scalar(0.0)
+        return k
+
+    return Law(f"viscoelastic {law.name}", energy, stress, stress_change, needs_positive_volume=True, at_rest=at_rest)
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """A step of the Prony series at every point."""
+
+    fade: wp.Kernel
+    advance: wp.Kernel
+
+
+@cache
+def kernels_of(law: Law, device: Device, count: int) -> Kernels:
+    """Kernels for a law of `count` coefficients; each launches over (element, point, column)."""
+    scalar, mat, vec = device.scalar, device.matrix, device.vector
+    constants = wp.types.vector(length=count, dtype=scalar)
+    own_stress = law.stress
+    six = SIX
+
+    @wp.kernel(module="unique")
+    def fade(
+        share: wp.array2d(dtype=scalar),
+        tau: wp.array2d(dtype=scalar),
+        step: wp.array(dtype=scalar),
+        past: wp.array3d(dtype=scalar),
+        first: int,
+        # outputs
+        out: wp.array4d(dtype=scalar),
+    ):
+        """f - 1, and A; past (b, points, 6 (n + 1)): S, then each H_i."""
+        e, q, c = wp.tid()
+        p = e * out.shape[1] + q
+        less = scalar(0.0)
+        for i in range(share.shape[1]):
+            less += share[e, i] * exp_less_one(-step[c] / (scalar(2.0) * tau[e, i]))
+        out[e, q, first, c] = less
+        for k in range(six):
+            pull = scalar(0.0)
+            for i in range(share.shape[1]):
+                half = wp.exp(-step[c] / (scalar(2.0) * tau[e, i]))
+                pull += half * (half * past[c, p, six * (i + 1) + k] - share[e, i] * past[c, p, k])
+            out[e, q, first + 1 + k, c] = pull
+
+    @wp.func
+    def pulled_back(H: mat, k: constants):
+        """S = Fb^-1 dev(P(Fb) Fb^T) Fb^-T."""
+        Hb = isochoric(H)
+        P, G = own_stress(Hb, k), wp.identity(n=3, dtype=scalar) + cofactor_excess(Hb)
+        level = wp.ddot(P, wp.identity(n=3, dtype=scalar) + Hb) / scalar(3.0)
+        return wp.transpose(G) * (P - level * G)
+
+    @wp.kernel(module="unique")
+    def advance(
+        share: wp.array2d(dtype=scalar),
+        tau: wp.array2d(dtype=scalar),
+        step: wp.array(dtype=scalar),
+        past: wp.array3d(dtype=scalar),
+        coefficients: wp.array(dtype=constants),
+        strain: wp.array3d(dtype=mat),
+        # outputs
+        out: wp.array3d(dtype=scalar),
+    ):
+        """S at H, and H_i <- exp(-dt / tau) H_i + g exp(-dt / (2 tau)) (S - its last value)."""
+        e, q, c = wp.tid()
+        p = e * strain.shape[1] + q
+        S = pulled_back(strain[e, q, c], coefficients[e])
+        low, high = vec(S[0, 0], S[1, 1], S[2, 2]), vec(S[1, 2], S[2, 0], S[0, 1])
+        for k in range(six):
+            now = wp.where(k < 3, low[k % 3], high[k % 3])
+            out[c, p, k] = now
+            for i in range(share.shape[1]):
+                half, row = wp.exp(-step[c] / (scalar(2.0) * tau[e, i])), six * (i + 1) + k
+                out[c, p, row] = half * (half * past[c, p, row] + share[e, i] * (now - past[c, p, k]))
+
+    return Kernels(fade, advance)
+
+
+class Prony:
+    """A Source: what is left of the stress of earlier steps. History: S, then each H_i, (B, points, 6 (n + 1)) [Pa].
+
+    Parameters
+    ----------
+    name
+        Key of its history.
+    law
+        The law itself, of `coefficients` (T, k).
+    pairs
+        The series (g, tau [s]) of each of T elements' tissues, of any lengths.
+    points
+        How many points an element has.
+    device
+        Where its arrays live.
+    """
+
+    count = 1 + SIX
+
+    def __init__(
+        self, name: str, law: Law, coefficients: np.ndarray, pairs: Sequence[Pairs], points: int, device: Device
+    ):
+        self._name, self._device = name, device
+        self._kernels = kernels_of(law, device, coefficients.shape[1])
+        self._coefficients = device.array(
+            coefficients, wp.types.vector(length=coefficients.shape[1], dtype=device.scalar)
+        )
+        most = max(map(len, pairs))
+        filled = np.array([(*row, *[(0.0, 1.0)] * (most - len(row))) for row in pairs]).reshape(-1, most, 2)
+        self._series = [device.array(filled[:, :, 0]), device.array(filled[:, :, 1])]
+        self._points, self._shape = points, (len(coefficients) * points, SIX * (most + 1))
+
+    def law(self, inner: Law, count: int) -> Law:
+        """The law, and its isochoric part again, which relaxes."""
+        return relaxing(inner, self._device, count)
+
+    def fill(self, cases: Cases, first: int, out: wp.array) -> None:
+        """f - 1 and A."""
+        self._device.launch(
+            self._kernels.fade, (*out.shape[:2], out.shape[3]), [*self._series, *self._since(cases), first], [out]
+        )
+
+    def end(self, cases: Cases, strains: wp.array) -> np.ndarray:
+        """S and H_i now."""
+        out = self._device.zeros(len(cases.loads), *self._shape)
+        inputs = [*self._series, *self._since(cases), self._coefficients, strains]
+        self._device.launch(self._kernels.advance, strains.shape, inputs, [out])
+        return out.numpy()
+
+    def _since(self, cases: Cases) -> list[wp.array]:
+        """Steps (b,) [s] and what there was before them (b, points, 6 (n + 1))."""
+        return [self._device.array(cases.steps), self._device.array(cases.past(self._name, self._shape))]

@@ -1,0 +1,186 @@
+"""Tissue that relaxes: the curves of a Prony series, what does not relax, rotations, and a past that travels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boxes import base_held, box, hold, top_forces
+from oracle import tissue
+
+from sim.accuracy import Accuracy
+from sim.compile import compile_problem
+from sim.device import find_device
+from sim.discretisation import ELEMENTS, discretise
+from sim.effects import Elasticity, Held, NodalForce
+from sim.fem import Fem
+from sim.loads import Loads, Nodal
+from sim.material import HYPERELASTIC, Material, Ogden, Tissue
+from sim.mesh import TetMesh
+from sim.problem import Problem
+from sim.term import Cases
+
+SERIES = ((0.45, 0.5), (0.365, 5.0))
+MESH = box((1, 1, 1), 0.1)
+TIGHT = Accuracy(tolerance=1e-11)
+TINY = 1e-6
+SHEAR = TINY * np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+STRETCH = TINY * np.diag([1.0, 0.0, 0.0])
+
+
+def relaxing(law: str, series: tuple[tuple[float, float], ...] = SERIES) -> Tissue:
+    return replace(tissue(law), prony=series)
+
+
+def modulus(time: np.ndarray | float) -> np.ndarray:
+    """What is left of the shear modulus, as a share of what it was at once."""
+    return 1.0 - sum(g * (1.0 - np.exp(-np.asarray(time) / tau)) for g, tau in SERIES)
+
+
+def posed(made_of: Tissue, element: str = "p1", mesh: TetMesh = MESH) -> tuple[Problem, np.ndarray]:
+    """A box without anything that acts on it, and its nodes (N, 3) [m]."""
+    space = discretise(mesh, element)
+    effects = (Elasticity(made_of), Held())
+    return compile_problem(effects, base_held(mesh), find_device("cpu", "float64"), space), space.nodes
+
+
+def stresses(problem: Problem, nodes: np.ndarray, path: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Mean first Piola-Kirchhoff stress (n, 3, 3) [Pa] along displacement gradients (n, 3, 3), the same everywhere."""
+    found, history, before = [], {}, 0.0
+    for H, time in zip(path, times, strict=True):
+        u = problem.device.array((nodes @ H.T).reshape(-1, 1))
+        problem.begin(Cases(Loads((), np.array([time])), np.array([before]), history))
+        found.append(problem.gradient(u).numpy().reshape(-1, 3).T @ nodes / MESH.volumes.sum())
+        history, before = problem.end(u), time
+    return np.array(found)
+
+
+@pytest.mark.parametrize("law", HYPERELASTIC)
+def test_held_shape_relaxes_by_the_series_and_volume_never(law: str) -> None:
+    """Exactly at every step, however long: what is held is convolved with a step."""
+    problem, nodes = posed(relaxing(law))
+    times = np.array([0.0, 0.01, 0.3, 1.0, 4.0, 50.0])
+    mu, lam = tissue(law).lame
+    for strain in (SHEAR, STRETCH, TINY * np.eye(3)):
+        found = stresses(problem, nodes, np.repeat(strain[None], len(times), axis=0), times)
+        mean = np.trace(strain) / 3.0 * np.eye(3)
+        expected = 2.0 * mu * modulus(times)[:, None, None] * (strain - mean) + (3.0 * lam + 2.0 * mu) * mean
+        np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("strain", [SHEAR, STRETCH - np.trace(STRETCH) / 3.0 * np.eye(3)])
+def test_a_ramp_is_of_second_order_in_the_step(strain: np.ndarray) -> None:
+    """Strain that grows with t: sigma = 2 mu (t - sum g (t - tau (1 - exp(-t / tau))))."""
+    problem, nodes = posed(relaxing("neo-hookean"))
+    left = 1.0 - sum(g * (1.0 - tau * (1.0 - np.exp(-1.0 / tau))) for g, tau in SERIES)
+    exact = 2.0 * tissue("neo-hookean").lame[0] * left * strain
+    errors = []
+    for count in (4, 8, 16):
+        times = np.linspace(0.0, 1.0, count + 1)[1:]
+        found = stresses(problem, nodes, times[:, None, None] * strain, times)[-1]
+        errors.append(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+    assert errors[-1] < 2e-3
+    assert np.log2(errors[0] / errors[1]) > 1.9
+    assert np.log2(errors[1] / errors[2]) > 1.9
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize("law", HYPERELASTIC)
+def test_at_once_it_is_the_law_itself(law: str, element: str) -> None:
+    """At finite strain: forces and curvature."""
+    mesh = box((1, 1, 2), 0.1)
+    (plain, nodes), (viscous, _) = posed(tissue(law), element, mesh), posed(relaxing(law), element, mesh)
+    u, p = np.random.default_rng(1).normal(size=(2, nodes.size, 1))
+    found = []
+    for problem in (plain, viscous):
+        at = problem.device.array(2e-3 * u)
+        problem.begin(Cases(Loads((), np.zeros(1)), np.zeros(1)))
+        problem.linearise(at, np.zeros(1, bool))
+        bent = problem.device.zeros(*u.shape)
+        problem.add_curvature(problem.device.array(p), bent)
+        found.append((problem.gradient(at).numpy(), bent.numpy()))
+    assert plain.plain and not viscous.plain
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12 * np.abs(one).max())
+
+
+@pytest.mark.parametrize("law", HYPERELASTIC)
+def test_a_turned_history_turns_the_answer(law: str) -> None:
+    """Whether the body was turned from the start or in between."""
+    problem, nodes = posed(relaxing(law))
+    rng, times = np.random.default_rng(2), np.array([0.2, 0.5, 1.1, 3.0])
+    path = 0.2 * rng.normal(size=(4, 3, 3))
+    Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    Q *= np.linalg.det(Q)
+    still = stresses(problem, nodes, path, times)
+    for first in (0, 2):
+        turned = np.where(np.arange(4)[:, None, None] >= first, Q @ (np.eye(3) + path) - np.eye(3), path)
+        found = stresses(problem, nodes, turned, times)
+        np.testing.assert_allclose(found[first:], Q @ still[first:], atol=1e-9 * np.abs(still).max())
+    fresh = stresses(problem, nodes, path[-1:], times[-1:])
+    assert np.abs(fresh[-1] - still[-1]).max() > 0.01 * np.abs(still[-1]).max()
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_a_pulled_block_creeps_to_what_is_left_of_its_stiffness(element: str) -> None:
+    mesh = box((1, 1, 2), 0.1)
+    anatomy, effects = base_held(mesh), (Held(), NodalForce())
+    pull = (Nodal(top_forces(mesh, np.array([2e-4, 0.0, 2e-4]))),)
+    mu, lam = Material("neo-hookean", 3000.0, 0.45).lame
+    left = float(modulus(np.inf))
+    bulk = lam + 2.0 * mu / 3.0
+    soft = Material(
+        "neo-hookean",
+        9.0 * bulk * left * mu / (3.0 * bulk + left * mu),
+        (3.0 * bulk - 2.0 * left * mu) / (6.0 * bulk + 2.0 * left * mu),
+    )
+    ends = [
+        Fem(anatomy, [Elasticity(Material("neo-hookean", 3000.0, 0.45)), *effects], TIGHT, "cpu", element=element),
+        Fem(anatomy, [Elasticity(soft), *effects], TIGHT, "cpu", element=element),
+    ]
+    first, last = (fem.deform(Loads(pull)).displacement for fem in ends)
+    fem = Fem(anatomy, [Elasticity(relaxing("neo-hookean")), *effects], TIGHT, "cpu", element=element)
+    answer, track = None, []
+    for time in [0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 100.0, 200.0]:
+        answer = fem.deform(Loads(pull, np.array([time])), answer)
+        assert answer.outcome[0].good
+        track.append(answer.displacement[0, -1, 0])
+    assert answer is not None
+    if element != "smoothed":  # which parts stiffness by Lame's constants, and lends volume what shape has left
+        np.testing.assert_allclose(answer.displacement, last, atol=2e-3 * np.abs(last).max())
+    assert track[0] == pytest.approx(first[0, -1, 0], rel=1e-6)
+    assert (np.diff(track) > -1e-9 * track[-1]).all() and track[-1] > 2.0 * track[0]
+
+
+def test_a_run_may_be_cut_and_tissues_mixed() -> None:
+    """Another solver goes on as if it had been there from the start; regions that do not relax have no history."""
+    halves = TetMesh(MESH.nodes, MESH.tets, np.arange(len(MESH.tets)) % 2)
+    anatomy, force = base_held(halves), Nodal(top_forces(halves, np.array([[0.5, 0.0, 0.2], [0.0, 0.3, -0.2]])))
+    law = Ogden(((900.0, -4.7),), 2e4)
+    tissues = Elasticity(law, {1: replace(law, prony=SERIES)})
+
+    def run(fem: Fem, start: object, times: tuple[float, ...]) -> object:
+        for time in times:
+            start = fem.deform(Loads((force,), np.array([time, 2.0 * time])), start)  # pyright: ignore
+        return start
+
+    one, other = (Fem(anatomy, [tissues, Held(), NodalForce()], TIGHT, "cpu") for _ in range(2))
+    straight = run(one, None, (0.0, 0.1, 0.4, 2.0))
+    begun = run(one, None, (0.0, 0.1))
+    run(other, None, (0.7,))
+    cut = run(other, begun, (0.4, 2.0))
+    np.testing.assert_array_equal(cut.displacement, straight.displacement)  # pyright: ignore
+    name = "viscoelasticity ogden"
+    assert straight.history[name].shape == (2, 3, 18)  # pyright: ignore
+    np.testing.assert_array_equal(cut.history[name], straight.history[name])  # pyright: ignore
+    assert [term.name for term in one.problem.terms] == ["elasticity ogden", name, "nodal force"]
+
+
+def test_held_all_round_it_needs_no_solver() -> None:
+    """A series of one pair in a body that cannot move: nothing acts, nothing is remembered but zeros."""
+    anatomy = hold(MESH, np.ones(len(MESH.nodes), bool))
+    fem = Fem(anatomy, [Elasticity(relaxing("ogden", SERIES[:1])), Held()], TIGHT, "cpu")
+    answer = fem.deform(Loads((), np.array([3.0])))
+    assert not answer.displacement.any()
+    assert not answer.history["viscoelasticity ogden"].any()
