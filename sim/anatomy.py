@@ -53,6 +53,45 @@ class Anatomy:
             raise InputError("slide_normal has rows that are neither zero nor of unit length: normalise them.")
 
     @cached_property
+    def orphaned(self) -> np.ndarray:
+        """(V,) bool: vertices that belong to no tetrahedron, any more or from the start."""
+        orphaned = np.ones(len(self.mesh.nodes), bool)
+        orphaned[self.mesh.table] = False
+        return orphaned
+
+    def without(self, elements: np.ndarray) -> Anatomy:
+        """The body without some tetrahedra `elements` (n,), under the same vertex numbers; what they bared is free.
+
+        Vertices that lose their last tetrahedron are held, and neither slide nor may be touched.
+
+        Raises
+        ------
+        InputError
+            Tetrahedra that the mesh does not have, or all that it has.
+        """
+        mesh, taken = self.mesh, np.unique(elements)
+        count = len(mesh.tets)
+        beyond = taken[(taken < 0) | (taken >= count)]
+        if len(beyond):
+            raise InputError(f"the mesh has no tetrahedron {beyond[0]}: take some of 0 to {count - 1}.")
+        if len(taken) == count:
+            raise InputError(f"all {count} tetrahedra are taken: leave some of the body.")
+        left = np.ones(count, bool)
+        left[taken] = False
+        middles = None if mesh.middles is None else mesh.middles[left]
+        rest = Anatomy(
+            TetMesh(mesh.nodes, mesh.tets[left], mesh.region[left], middles),
+            self.held, self.slide_normal, self.craniotomy,
+        )  # fmt: skip
+        orphaned = rest.orphaned
+        return Anatomy(
+            rest.mesh,
+            self.held | orphaned[:, None],
+            np.where(orphaned[:, None], 0.0, self.slide_normal),
+            self.craniotomy & ~orphaned,
+        )
+
+    @cached_property
     def tumour_nodes(self) -> np.ndarray:
         """Sorted vertex numbers (n,) of the tumour."""
         return self.mesh.nodes_of(TUMOUR_LABEL)

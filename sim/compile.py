@@ -16,17 +16,35 @@ from .anatomy import Anatomy
 from .constraint import Constraint
 from .device import Device
 from .discretisation import Discretisation, discretise
-from .effects import Effect, Elasticity, Gravity, Held, Inertia, NodalForce, Slide, ToolDisplacement, ToolForce
+from .effects import (
+    Effect,
+    Elasticity,
+    Gravity,
+    Held,
+    Inertia,
+    NodalForce,
+    Resection,
+    Slide,
+    ToolDisplacement,
+    ToolForce,
+)
 from .element import Elements
 from .errors import InputError
 from .footprint import Skin
 from .holding import check_held
-from .loads import Displaced, Loads, Nodal, Posture, Prescribed, Pushed, check_field
+from .loads import Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Resected, check_field
 from .material import Tissue, coefficients_of, portion
 from .problem import Imposed, Problem
 from .term import Curved, Term
 
-CAUSES = {ToolForce: Pushed, ToolDisplacement: Displaced, NodalForce: Nodal, Held: Prescribed, Gravity: Posture}
+CAUSES = {
+    ToolForce: Pushed,
+    ToolDisplacement: Displaced,
+    NodalForce: Nodal,
+    Held: Prescribed,
+    Gravity: Posture,
+    Resection: Resected,
+}
 """The cause that each effect answers; other effects act by themselves."""
 
 
@@ -85,6 +103,8 @@ def compile_problem(
                 terms.append(InertiaTerm(lumped_mass(effect.density, space), effect.damping, device))
             case ToolDisplacement():
                 pass  # a constraint: `_impose` reads the loads
+            case Resection():
+                raise InputError("Resection changes the body: make its solver with `operated.finite_elements`.")
             case _:
                 allowed = ", ".join(kind.__name__ for kind in Effect.__args__)
                 raise InputError(f"no effect is called {type(effect).__name__}: choose from {allowed}.")

@@ -123,7 +123,47 @@ class Inertia:
             raise InputError(f"Inertia.damping is {self.damping} 1/s: give a number that is not negative.")
 
 
-Effect = Elasticity | Held | Slide | ToolForce | ToolDisplacement | NodalForce | Gravity | Inertia
+@dataclass(frozen=True)
+class Resection:
+    """Tissue is taken away, step after step; `Resected` loads say how many steps are done, without them all are.
+
+    The wall of the cavity is free surface. What a step loosens (a piece joined by no face to anything held) goes with
+    it. `operated.finite_elements` makes what solves it.
+
+    Left out: the stress that the scan's own equilibrium holds, so that without another load nothing moves; terms that
+    remember what elements went through forget it at a cut.
+
+    Parameters
+    ----------
+    steps
+        Of each step the numbers of the tetrahedra that it takes.
+
+    Raises
+    ------
+    InputError
+        No steps, a step that takes nothing, a tetrahedron that is taken twice.
+    """
+
+    steps: tuple[tuple[int, ...], ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "steps", tuple(tuple(int(number) for number in step) for step in self.steps))
+        if not self.steps:
+            raise InputError("Resection has no steps: give the tetrahedra of at least one, or leave it out.")
+        taken: dict[int, int] = {}
+        for number, step in enumerate(self.steps, start=1):
+            if not step:
+                raise InputError(f"step {number} of Resection takes nothing: leave it out.")
+            for element in step:
+                if element in taken:
+                    raise InputError(
+                        f"Resection takes tetrahedron {element} in step {taken[element]} and again in step {number}: "
+                        "name it once."
+                    )
+                taken[element] = number
+
+
+Effect = Elasticity | Held | Slide | ToolForce | ToolDisplacement | NodalForce | Gravity | Inertia | Resection
 """Everything that a scene may ask for."""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
+from .anatomy import Anatomy
 from .errors import InputError
 from .mesh import FACES, TetMesh, row_keys
 
@@ -49,6 +50,20 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray) -> None:
         raise InputError(
             f"{what} can move rigidly in {free} of 6 ways: hold at least three nodes of it that are not in line."
         )
+
+
+def loosened(anatomy: Anatomy) -> np.ndarray:
+    """Tetrahedra (n,) that can move rigidly: joined by faces to nothing held, and not borne by what slides."""
+    cluster, nodes = _clusters(anatomy.mesh.tets), anatomy.mesh.nodes
+    loose = []
+    for number in np.unique(cluster):
+        mine = np.flatnonzero(cluster == number)
+        node = np.unique(anatomy.mesh.table[mine])
+        if not anatomy.held[node].any():
+            one = np.zeros(len(node), np.int64)
+            if _free_motions(nodes, anatomy.held, anatomy.slide_normal, one, node)[0]:
+                loose.append(mine)
+    return np.concatenate(loose) if loose else np.zeros(0, np.int64)
 
 
 def _components(first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:

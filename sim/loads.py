@@ -64,8 +64,15 @@ class Posture:
     share: np.ndarray
 
 
-Cause = Pushed | Displaced | Nodal | Prescribed | Posture
-C = TypeVar("C", Pushed, Displaced, Nodal, Prescribed, Posture)
+@dataclass(frozen=True, eq=False)
+class Resected:
+    """How many steps of the effect `Resection` are done: done (B,) whole numbers. Of a share of a load, as many."""
+
+    done: np.ndarray
+
+
+Cause = Pushed | Displaced | Nodal | Prescribed | Posture | Resected
+C = TypeVar("C", Pushed, Displaced, Nodal, Prescribed, Posture, Resected)
 # The array of each cause that grows with the load; the others say where it acts.
 MAGNITUDE = {
     Pushed: "force",
@@ -75,7 +82,7 @@ MAGNITUDE = {
     Posture: "share",
 }
 # Arrays of one number a load case.
-SCALARS = ("footprint", "csf_level", "share")
+SCALARS = ("footprint", "csf_level", "share", "done")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +92,7 @@ class Loads:
     Parameters
     ----------
     causes
-        `Pushed`, `Displaced`, `Nodal`, `Prescribed`, `Posture`.
+        `Pushed`, `Displaced`, `Nodal`, `Prescribed`, `Posture`, `Resected`.
     time
         (B,) [s]; the time at which the answer is wanted. Zero where nothing depends on time.
 
@@ -125,6 +132,10 @@ class Loads:
         """The cause of one kind, or None."""
         return next((cause for cause in self.causes if isinstance(cause, kind)), None)
 
+    def but(self, kind: type[Cause]) -> Loads:
+        """The same loads without the cause of one kind."""
+        return Loads(tuple(cause for cause in self.causes if not isinstance(cause, kind)), self.times)
+
     def only(self, kind: type[C]) -> C | None:
         """The cause of one kind, or None where there is none, or another beside it."""
         return self.of(kind) if len(self.causes) == 1 else None
@@ -138,10 +149,12 @@ class Loads:
         return Loads(causes, self.times[index])
 
     def scaled(self, fraction: float | np.ndarray) -> Loads:
-        """The same causes with every magnitude times `fraction` (scalar or (B,))."""
+        """The same causes with every magnitude that they have times `fraction` (scalar or (B,))."""
 
         def grown(cause: Cause) -> Cause:
-            name = MAGNITUDE[type(cause)]
+            name = MAGNITUDE.get(type(cause))
+            if name is None:
+                return cause
             array = getattr(cause, name)
             factor = np.broadcast_to(fraction, len(array)).reshape(-1, *[1] * (array.ndim - 1))
             return replace(cause, **{name: factor * array})
@@ -222,6 +235,8 @@ def _checked(cause: Cause) -> Cause:
             raise InputError(f"{name}.{key} has a value that is not finite: every number must be finite.")
         if key == "footprint" and len(array) and not array.min() > 0.0:
             raise InputError(f"{name}.{key} has a radius of {array.min():g} m: give positive radii in metres.")
+        if key == "done" and ((array < 0.0) | (array % 1.0 != 0.0)).any():
+            raise InputError(f"{name}.{key} is {array}: give how many steps are done, as whole numbers from 0 up.")
         if key == "direction" and not array.any(axis=1).all():
             raise InputError(f"{name}.{key} has a row of zeros: give every load case the way that gravity pulls.")
     return type(cause)(**arrays)

@@ -32,6 +32,7 @@ TIERS = (
         "following",
     },
     {"fem"},
+    {"operated"},
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""
 OWNERS = {

@@ -1,0 +1,65 @@
+"""What is left of a body after each step of a resection, and what came loose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from .anatomy import Anatomy
+from .effects import Resection
+from .errors import InputError
+from .holding import loosened
+
+
+@dataclass(frozen=True, eq=False)
+class Remains:
+    """A body after so many steps.
+
+    Parameters
+    ----------
+    done
+        Steps.
+    anatomy
+        What is left, under the whole body's vertex numbers.
+    loose
+        (n,) the whole body's tetrahedra that no step took: nothing held them any more, and they went too.
+    """
+
+    done: int
+    anatomy: Anatomy
+    loose: np.ndarray
+
+    def __str__(self) -> str:
+        """The sentence that a user reads."""
+        said = f"{self.done} step{'' if self.done == 1 else 's'} done"
+        if not len(self.loose):
+            return said
+        return f"{said}; {len(self.loose)} tetrahedra that nothing held any more went too"
+
+
+def remains(anatomy: Anatomy, effect: Resection) -> tuple[Remains, ...]:
+    """What is left after 0, 1, ... all steps.
+
+    Raises
+    ------
+    InputError
+        A step that takes a tetrahedron that the mesh does not have, or the last of the body.
+    """
+    return tuple(_remains(anatomy, effect))
+
+
+def _remains(anatomy: Anatomy, effect: Resection) -> Iterator[Remains]:
+    yield Remains(0, anatomy, np.zeros(0, np.int64))
+    taken: set[int] = set()
+    for done, step in enumerate(effect.steps, start=1):
+        taken.update(step)
+        gone = np.array(sorted(taken))
+        try:
+            left = anatomy.without(gone)
+            kept = np.setdiff1d(np.arange(len(anatomy.mesh.tets)), gone)
+            loose = kept[loosened(left)]
+            yield Remains(done, anatomy.without(np.concatenate([gone, loose])) if len(loose) else left, loose)
+        except InputError as error:
+            raise InputError(f"step {done} of Resection cannot be done: {error}") from error

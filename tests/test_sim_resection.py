@@ -1,0 +1,314 @@
+"""Tissue that is taken away: what is left answers as if it had always been so, and what came loose goes and is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boxes import base_held, box, hold, quadratic
+
+from sim.accuracy import Accuracy
+from sim.anatomy import Anatomy
+from sim.compile import compile_problem
+from sim.deformation import guess
+from sim.device import find_device
+from sim.discretisation import ELEMENTS
+from sim.effects import Effect, Elasticity, Gravity, Held, Inertia, NodalForce, Resection, Slide, ToolForce
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Nodal, Posture, Resected, posture, push
+from sim.material import Material
+from sim.mesh import TetMesh
+from sim.operated import Operated, finite_elements
+from sim.resection import remains
+
+TIGHT = Accuracy(tolerance=1e-11)
+SOFT = Material("neo-hookean", 3000.0, 0.4)
+MESH = box((3, 3, 3), 0.06, distortion=0.15)
+BODY = base_held(MESH)
+MIDDLE = MESH.nodes[MESH.tets].mean(axis=1)
+DOWN = np.array([0.0, 0.3, -1.0])
+
+
+def within(low: tuple[float, float, float], high: tuple[float, float, float], mesh: TetMesh = MESH) -> tuple[int, ...]:
+    """Tetrahedra whose middles lie in a box, in cubes' sides."""
+    at = mesh.nodes[mesh.tets].mean(axis=1) / 0.02
+    return tuple(np.flatnonzero(((at > low) & (at < high)).all(axis=1)).tolist())
+
+
+TOP, NEXT = within((1, 1, 2), (2, 2, 4)), within((1, 1, 1), (2, 2, 2))
+STEPS = Resection((TOP, NEXT))
+EFFECTS: tuple[Effect, ...] = (Elasticity(SOFT), Held(), Gravity(direction=(0.0, 0.0, -1.0)), ToolForce())
+
+
+def lying(done: np.ndarray | list[int], level: float = -1.0) -> Loads:
+    """The head turned a little and drained, after so many steps."""
+    rows = len(done)
+    turned = Posture(np.tile(DOWN, (rows, 1)), np.full(rows, level), np.ones(rows))
+    return Loads((turned, Resected(np.asarray(done))))
+
+
+def compact(anatomy: Anatomy) -> tuple[Anatomy, np.ndarray]:
+    """The same body meshed without its orphans, and which vertices are left."""
+    mesh, used = anatomy.mesh, np.flatnonzero(~anatomy.orphaned)
+    tets = np.searchsorted(used, mesh.tets)
+    middles = None if mesh.middles is None else np.searchsorted(used, mesh.middles)
+    fresh = TetMesh(mesh.nodes[used], tets, mesh.region, middles)
+    return Anatomy(fresh, anatomy.held[used], anatomy.slide_normal[used], anatomy.craniotomy[used]), used
+
+
+def solver(steps: Resection = STEPS, element: str | None = "p1", **values: object) -> Operated:
+    made = finite_elements(BODY, (*EFFECTS, steps), TIGHT, "cpu", element=element, **values)  # type: ignore
+    assert isinstance(made, Operated)
+    return made
+
+
+@pytest.fixture(scope="module")
+def operated() -> Operated:
+    return solver()
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_what_is_left_answers_as_the_body_meshed_without_it(element: str) -> None:
+    made = solver(element=element)
+    loads = Loads((*lying([2, 1]).causes, *push([0.005, 0.05, 0.06], [0.0, 0.02, -0.1], 0.012).rows([0, 0]).causes))
+    answer = made.deform(loads)
+    for row, done in enumerate((2, 1)):
+        body, used = compact(made.remains(done).anatomy)
+        alone = Fem(body, EFFECTS, TIGHT, "cpu", element=element).deform(loads.but(Resected).rows(np.array([row])))
+        assert alone.outcome[0].good and answer.outcome[row].good
+        size = np.abs(alone.displacement).max()
+        assert size > 1e-4
+        np.testing.assert_allclose(answer.displacement[row, used], alone.displacement[0], atol=1e-9 * size)
+        assert not np.delete(answer.displacement[row], used, axis=0).any()
+        np.testing.assert_allclose(answer.reaction[row], alone.reaction[0], rtol=1e-9)
+
+
+def test_a_mesh_with_middles_of_its_own_loses_them_too() -> None:
+    curved = quadratic(box((2, 2, 2), 0.04, distortion=0.1), curved=0.05)
+    body, effects = base_held(curved), EFFECTS[:3]
+    made = finite_elements(body, (*effects, Resection((within((1, 1, 1), (2, 2, 2), curved),))), TIGHT, "cpu")
+    assert isinstance(made, Operated)
+    left, used = compact(made.remains(1).anatomy)
+    alone = Fem(left, effects, TIGHT, "cpu").deform(posture(DOWN, -1.0))
+    answer = made.deform(posture(DOWN, -1.0))
+    assert 0 < len(used) < len(curved.nodes)
+    np.testing.assert_allclose(
+        answer.displacement[0, used], alone.displacement[0], atol=1e-9 * np.abs(alone.displacement).max()
+    )
+
+
+def test_without_a_cause_all_steps_are_done(operated: Operated) -> None:
+    silent = operated.deform(posture(DOWN, -1.0))
+    said = operated.deform(lying([2]))
+    np.testing.assert_array_equal(silent.displacement, said.displacement)
+
+
+def test_no_step_is_the_whole_body(operated: Operated) -> None:
+    plain = Fem(BODY, EFFECTS, TIGHT, "cpu").deform(posture(DOWN, -1.0))
+    np.testing.assert_array_equal(operated.deform(lying([0])).displacement, plain.displacement)
+
+
+def test_each_row_has_its_own_body(operated: Operated) -> None:
+    done = [2, 0, 1, 0, 2]
+    together = operated.deform(lying(done))
+    for row, one in enumerate(done):
+        alone = operated.deform(lying([one]))
+        np.testing.assert_allclose(together.displacement[row], alone.displacement[0], atol=1e-12)
+    assert together.time.shape == (5,) and len(together.outcome) == 5
+
+
+def test_without_weight_nothing_moves(operated: Operated) -> None:
+    at_rest = Loads((Posture(np.array([[0.0, 0.0, -1.0]]), np.array([1.0]), np.ones(1)), Resected(np.array([1]))))
+    assert not operated.deform(at_rest).displacement.any()
+
+
+def test_a_wall_is_free(operated: Operated) -> None:
+    """Forces on the cavity's own wall are answered: it is no longer inside."""
+    wall = np.setdiff1d(np.unique(operated.remains(2).anatomy.mesh.surface), np.unique(MESH.surface))
+    force = np.zeros((1, len(MESH.nodes), 3))
+    force[0, wall, 2] = -0.01
+    effects = (Elasticity(SOFT), Held(), NodalForce(), STEPS)
+    answer = finite_elements(BODY, effects, TIGHT, "cpu", element="p1").deform(Loads((Nodal(force),)))
+    assert len(wall) and (answer.displacement[0, wall, 2] < 0.0).all()
+
+
+class TestAcrossCuts:
+    @pytest.mark.parametrize("element", ELEMENTS)
+    def test_an_answer_after_other_steps_is_a_start(self, element: str) -> None:
+        made = solver(element=element, live=True)
+        cold = {done: made.deform(lying([done])) for done in range(3)}
+        last = None
+        for done in (0, 0, 1, 2, 0, 2):
+            last = made.deform(lying([done]), last)
+            assert last.outcome[0].good
+            size = np.abs(cold[done].displacement).max()
+            np.testing.assert_allclose(last.displacement, cold[done].displacement, atol=1e-7 * size)
+
+    def test_answers_are_pure(self, operated: Operated) -> None:
+        start = operated.deform(lying([1]))
+        first = operated.deform(lying([2]), start)
+        operated.deform(lying([0]))
+        again = operated.deform(lying([2]), start)
+        np.testing.assert_array_equal(first.displacement, again.displacement)
+        np.testing.assert_array_equal(start.displacement, operated.deform(lying([1])).displacement)
+
+    def test_rows_start_from_their_own(self, operated: Operated) -> None:
+        start = operated.deform(lying([0, 1, 2]))
+        answer = operated.deform(lying([1, 1, 0]), start)
+        for row, done in enumerate((1, 1, 0)):
+            alone = operated.deform(lying([done]))
+            np.testing.assert_allclose(answer.displacement[row], alone.displacement[0], atol=1e-10)
+
+    def test_somebodys_guess_is_a_start(self, operated: Operated) -> None:
+        """It moves vertices of which nothing is left."""
+        wild = guess(1e-4 * np.random.default_rng(1).normal(size=(1, len(MESH.nodes), 3)))
+        answer = operated.deform(lying([2]), wild)
+        exact = operated.deform(lying([2])).displacement
+        np.testing.assert_allclose(answer.displacement, exact, atol=1e-8 * np.abs(exact).max())
+
+    def test_velocities_go_on(self) -> None:
+        effects = (*EFFECTS[:3], Inertia(), STEPS)
+        made = finite_elements(BODY, effects, Accuracy(tolerance=1e-9), "cpu", element="p1")
+        falling = lying([0])
+        first = made.deform(replace(falling, time=np.array([0.01])))
+        speeds = []
+        for start in (first, replace(first, history={})):
+            second = made.deform(replace(lying([1]), time=np.array([0.011])), start)
+            speeds.append(np.abs(second.displacement - first.displacement).max())
+        assert speeds[0] > 5.0 * speeds[1]
+
+
+class TestWhatComesLoose:
+    SLICE = within((0, 0, 1), (3, 3, 2))
+
+    def test_it_goes_too_and_is_told(self) -> None:
+        """A slice through the box leaves its upper third in the air."""
+        _, left = remains(BODY, Resection((self.SLICE,)))
+        above = within((0, 0, 2), (3, 3, 4))
+        assert tuple(left.loose.tolist()) == above
+        assert f"{len(above)} tetrahedra that nothing held any more went too" in str(left)
+        np.testing.assert_array_equal(left.anatomy.orphaned, MESH.nodes[:, 2] > 0.03)
+
+    def test_the_rest_answers_as_without_it(self) -> None:
+        made, both = solver(Resection((self.SLICE,))), solver(Resection((self.SLICE + within((0, 0, 2), (3, 3, 4)),)))
+        answers = [each.deform(lying([1])).displacement for each in (made, both)]
+        assert np.abs(answers[0]).max() > 1e-6
+        np.testing.assert_array_equal(answers[0], answers[1])
+
+    def test_it_may_be_taken_in_a_later_step(self) -> None:
+        left = remains(BODY, Resection((self.SLICE, within((0, 0, 2), (3, 3, 4)))))
+        assert len(left[1].loose) and not len(left[2].loose)
+        np.testing.assert_array_equal(left[1].anatomy.mesh.tets, left[2].anatomy.mesh.tets)
+
+    def test_what_hangs_by_a_corner_goes_as_well(self) -> None:
+        """Two cubes of the top layer that share an edge only with the rest."""
+        keep = set(within((0, 0, 1), (1, 1, 2)) + within((1, 1, 2), (2, 2, 4)))
+        above = [number for number in within((0, 0, 1), (3, 3, 4)) if number not in keep]
+        _, left = remains(BODY, Resection((tuple(above),)))
+        assert set(left.loose.tolist()) == set(within((1, 1, 2), (2, 2, 4)))
+
+    def test_what_slides_in_place_stays(self) -> None:
+        """A box that nothing holds but three planes that it slides on."""
+        normal = np.zeros_like(MESH.nodes)
+        for axis in range(3):
+            normal[(MESH.nodes[:, axis] < 1e-9) & ~normal.any(axis=1), axis] = -1.0
+        corner = hold(MESH, np.zeros(len(MESH.nodes), bool), normal)
+        assert [len(one.loose) for one in remains(corner, Resection((TOP,)))] == [0, 0]
+
+    def test_a_piece_on_the_skull_alone_goes(self) -> None:
+        """It slides, but nothing stops it."""
+        wall = np.where((MESH.nodes[:, :1] > 0.06 - 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)
+        sliding = hold(MESH, MESH.nodes[:, 2] < 1e-9, wall)
+        _, left = remains(sliding, Resection((self.SLICE,)))
+        assert tuple(left.loose.tolist()) == within((0, 0, 2), (3, 3, 4))
+
+
+class TestHardCases:
+    def test_the_rim_of_the_opening_and_what_holds(self) -> None:
+        """A resection down to the held floor through the opening's edge: held, sliding and open vertices go."""
+        normal = np.where((MESH.nodes[:, :1] < 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [-1.0, 0.0, 0.0], 0.0)
+        opened = MESH.nodes[:, 2] > 0.06 - 1e-9
+        body = replace(hold(MESH, MESH.nodes[:, 2] < 1e-9, normal), craniotomy=opened)
+        cut = Resection((within((0, 0, 0), (1, 1, 4)),))
+        effects = (Elasticity(SOFT), Held(), Slide(), Gravity(direction=(0.0, 0.0, -1.0)))
+        made = finite_elements(body, (*effects, cut), TIGHT, "cpu", element="p1")
+        assert isinstance(made, Operated)
+        left = made.remains(1).anatomy
+        gone = left.orphaned
+        assert (gone & BODY.held[:, 0]).any() and (gone & normal.any(axis=1)).any() and (gone & opened).any()
+        assert left.held[gone].all() and not left.slide_normal[gone].any() and not left.craniotomy[gone].any()
+        compacted, used = compact(left)
+        alone = Fem(compacted, effects, TIGHT, "cpu", element="p1").deform(posture(DOWN, 0.03))
+        answer = made.deform(posture(DOWN, 0.03))
+        np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-12)
+
+    def test_a_tissue_that_is_taken_altogether_needs_no_law(self) -> None:
+        region = np.zeros(len(MESH.tets), int)
+        region[list(TOP)] = 2
+        body = base_held(replace(MESH, region=region))
+        effects = (Elasticity(SOFT, {2: Material("linear", 9000.0, 0.3)}), *EFFECTS[1:])
+        answer = finite_elements(body, (*effects, Resection((TOP,))), TIGHT, "cpu", element="p1").deform(lying([1]))
+        np.testing.assert_allclose(answer.displacement, solver(Resection((TOP,))).deform(lying([1])).displacement)
+
+    @pytest.mark.parametrize(
+        ("steps", "sentence"),
+        [
+            ((), "no steps"),
+            (((1, 2), ()), "step 2 of Resection takes nothing"),
+            (((1, 2), (5, 2)), "tetrahedron 2 in step 1 and again in step 2: name it once"),
+            (((4, 4),), "tetrahedron 4 in step 1 and again in step 1"),
+        ],
+    )
+    def test_steps_that_are_none_are_sentences(self, steps: tuple[tuple[int, ...], ...], sentence: str) -> None:
+        with pytest.raises(InputError, match=sentence):
+            Resection(steps)
+
+    @pytest.mark.parametrize(
+        ("step", "sentence"),
+        [
+            ((162,), r"step 2 of Resection cannot be done: the mesh has no tetrahedron 162: take some of 0 to 161"),
+            ((-1,), "no tetrahedron -1"),
+            (tuple(set(range(162)) - set(TOP)), "step 2 of Resection cannot be done: all 162 tetrahedra are taken"),
+            (within((0, 0, 0), (3, 3, 1)), "step 2 of Resection cannot be done: all 162 tetrahedra are taken"),
+        ],
+    )
+    def test_steps_that_the_body_does_not_bear_are_sentences(self, step: tuple[int, ...], sentence: str) -> None:
+        with pytest.raises(InputError, match=sentence):
+            remains(BODY, Resection((TOP, step)))
+
+    def test_what_is_left_on_a_hinge_is_a_sentence(self) -> None:
+        """One held edge: the piece turns about it."""
+        floor = (MESH.nodes[:, 2] < 1e-9) & (MESH.nodes[:, 0] > 0.06 - 1e-9)
+        edge = replace(BODY, held=np.repeat(((MESH.nodes[:, 2] > 0.06 - 1e-9) | floor)[:, None], 3, axis=1))
+        made = finite_elements(edge, (*EFFECTS, Resection((self.MIDDLE_LAYER,))), TIGHT, "cpu", element="p1")
+        with pytest.raises(InputError, match="can move rigidly in 1 of 6 ways"):
+            made.deform(lying([1]))
+
+    MIDDLE_LAYER = within((0, 0, 1), (3, 3, 2))
+
+    @pytest.mark.parametrize("done", [-1.0, 0.5])
+    def test_steps_are_counted_in_whole_numbers(self, done: float) -> None:
+        with pytest.raises(InputError, match="whole numbers from 0 up"):
+            Loads((Resected(np.array([done])),))
+
+    def test_more_steps_than_there_are_is_a_sentence(self, operated: Operated) -> None:
+        with pytest.raises(InputError, match="done is 3, but Resection has 2 steps"):
+            operated.deform(lying([1, 3]))
+
+    def test_a_plain_solver_says_whose_work_it_is(self) -> None:
+        with pytest.raises(InputError, match=r"operated\.finite_elements"):
+            compile_problem((*EFFECTS, STEPS), BODY, find_device("cpu", "float64"))
+        with pytest.raises(InputError, match="asked for 2 times"):
+            finite_elements(BODY, (*EFFECTS, STEPS, STEPS))
+        with pytest.raises(InputError, match="Resected, which nothing answers: add the effect Resection"):
+            Fem(BODY, EFFECTS, TIGHT, "cpu").deform(lying([1]))
+
+    def test_without_a_resection_it_is_the_plain_solver(self) -> None:
+        assert isinstance(finite_elements(BODY, EFFECTS, TIGHT, "cpu"), Fem)
+
+
+def test_half_a_load_is_of_the_same_body() -> None:
+    half = lying([1]).scaled(0.5)
+    assert half.of(Resected).done.tolist() == [1.0] and half.of(Posture).share.tolist() == [0.5]  # type: ignore
