@@ -23,6 +23,7 @@ from .effects import (
     Held,
     Inertia,
     NodalForce,
+    Pulsation,
     Resection,
     Slide,
     ToolDisplacement,
@@ -76,10 +77,13 @@ def compile_problem(
     terms: list[Term] = []
     held = np.zeros_like(anatomy.held)
     normal = np.zeros_like(anatomy.slide_normal)
+    pulsation = next((effect for effect in effects if isinstance(effect, Pulsation)), None)
     for effect in effects:
         match effect:
             case Elasticity():
-                terms += _elasticity(effect, space, device)
+                terms += _elasticity(effect, space, device, pulsation=pulsation)
+            case Pulsation():
+                pass  # elasticity swells
             case Held():
                 held = anatomy.held
             case Slide():
@@ -194,6 +198,7 @@ def _elasticity(
     device: Device,
     within: np.ndarray | None = None,
     nodes: np.ndarray | None = None,
+    pulsation: Pulsation | None = None,
 ) -> list[Curved]:
     """One term for each law and kind of element, over the elements of all regions that obey it.
 
@@ -201,6 +206,10 @@ def _elasticity(
     """
     mesh = space.mesh
     labels = [int(label) for label in np.unique(mesh.region)]
+    swell = np.isin(mesh.region, labels if pulsation is None or pulsation.regions is None else pulsation.regions)
+    absent = set() if pulsation is None else set(pulsation.regions or ()) - set(labels)
+    if absent:
+        raise InputError(f"Pulsation is asked of region {min(absent)}, but the mesh has the regions {labels}.")
     unknown = sorted(set(effect.regions) - set(labels))
     if unknown:
         raise InputError(f"a law is given for region {unknown[0]}, but the mesh has the regions {labels}.")
@@ -225,12 +234,23 @@ def _elasticity(
         for part in space.parts(chosen):
             which = np.searchsorted(list(obeying), mesh.region[part.elements.owner])
             elements = part.elements if nodes is None else part.elements.on(nodes)
-            terms.append(_obeying(list(obeying.values()), which, elements, part.carries, device))
+            swelling = None if pulsation is None else (pulsation, swell[part.elements.owner])
+            terms.append(_obeying(list(obeying.values()), which, elements, part.carries, device, swelling))
     return terms
 
 
-def _obeying(tissues: Sequence[Tissue], which: np.ndarray, elements: Elements, carries: str, device: Device) -> Curved:
-    """The term of elements of tissues that obey one law, `which` (T,) of them each; all of them relax, or none."""
+def _obeying(
+    tissues: Sequence[Tissue],
+    which: np.ndarray,
+    elements: Elements,
+    carries: str,
+    device: Device,
+    swelling: tuple[Pulsation, np.ndarray] | None,
+) -> Curved:
+    """The term of elements of tissues that obey one law, `which` (T,) of them each; all of them relax, or none.
+
+    `swelling`: the effect, and which elements (T,) bool it swells.
+    """
     from .terms.elasticity import Elasticity as ElasticityTerm
 
     law = importlib.import_module(f".terms.{tissues[0].law.replace('-', '_')}", __package__).LAW
@@ -244,4 +264,8 @@ def _obeying(tissues: Sequence[Tissue], which: np.ndarray, elements: Elements, c
         name, points = f"visco{name}", elements.weight.shape[1]
         pairs = [tissues[tissue].prony for tissue in which]
         sources.append(Prony(name, law, coefficients, pairs, points, device))
+    if swelling is not None and swelling[1].any():
+        from .terms.swelling import Swelling
+
+        sources.append(Swelling(swelling[0].swelling, swelling[1], device))
     return ElasticityTerm(name, law, elements, coefficients, lame, device, sources)

@@ -11,7 +11,7 @@ import numpy as np
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
 from .deformation import Deformation, joined
-from .effects import Effect, Elasticity, Resection
+from .effects import Effect, Elasticity, Pulsation, Resection
 from .errors import InputError
 from .fem import Fem
 from .loads import Loads, Resected
@@ -119,10 +119,12 @@ def finite_elements(
 
 
 def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
-    """Effects without the laws of regions that are gone altogether."""
+    """Effects without what they say of regions that are gone altogether."""
     gone = set(whole.mesh.region.tolist()) - set(body.mesh.region.tolist())
 
     def kept(effect: Effect) -> Effect:
+        if isinstance(effect, Pulsation) and effect.regions is not None:
+            return replace(effect, regions=tuple(label for label in effect.regions if label not in gone))
         if not isinstance(effect, Elasticity):
             return effect
         return replace(effect, regions={label: law for label, law in effect.regions.items() if label not in gone})

@@ -17,7 +17,7 @@ from tiny_terms import Spring, Wall
 from sim.compile import compile_problem
 from sim.device import Device, find_device
 from sim.discretisation import discretise
-from sim.effects import Elasticity, Gravity, Held, Inertia, NodalForce, ToolForce
+from sim.effects import Elasticity, Gravity, Held, Inertia, NodalForce, Pulsation, ToolForce, Wave
 from sim.loads import Loads, Nodal, Posture, Pushed
 from sim.mesh import signed_volumes
 from sim.term import Cases, Term
@@ -102,9 +102,10 @@ def of_law(law: str, element: str = "p1", part: int = 0) -> Example:
 
 RELAXES = ("neo-hookean", "stable-neo-hookean", "ogden")
 SERIES = ((0.3, 0.4), (0.4, 3.0))
+STRONG = Pulsation(Wave(1.0, 0.2), Wave(0.2, 0.05))
 
 
-def relaxing(law: str, element: str = "p1") -> Example:
+def relaxing(law: str, element: str = "p1", *effects: object) -> Example:
     """A viscoelastic law amid its history; the first case is a body at rest so far, at once."""
     space = discretise(MESH, element)
     tissues = replace(tissue(law), prony=SERIES)
@@ -114,10 +115,21 @@ def relaxing(law: str, element: str = "p1") -> Example:
     past = 50.0 * np.random.default_rng(14).normal(size=(3, points, 18)) * np.array([0.0, 1.0, 1.0])[:, None, None]
 
     def build(device: Device) -> Term:
-        return compile_problem((Elasticity(tissues), Held()), ANATOMY, device, space).terms[0]
+        return compile_problem((Elasticity(tissues), Held(), *effects), ANATOMY, device, space).terms[0]  # pyright: ignore
 
-    cases = Cases(Loads((), np.array([0.0, 1.7, 3.0])), np.array([0.0, 1.0, 2.999]), {name: past})
+    cases = Cases(Loads((), np.array([0.0, 1.7, 3.1])), np.array([0.0, 1.0, 3.099]), {name: past})
     return Example(build, cases, True, space.nodes, 1e-3 if element == "p2" else 4e-3)
+
+
+def swelling(law: str, element: str = "p1", part: int = 0) -> Example:
+    """A law that swells and shrinks by a fifth; in the first case not yet."""
+    space, effects = discretise(MESH, element), (Elasticity(tissue(law)), Held(), STRONG)
+
+    def build(device: Device) -> Term:
+        return compile_problem(effects, ANATOMY, device, space).terms[part]
+
+    cases = Cases(Loads((), np.array([0.0, 0.2, 0.8])), np.zeros(3))
+    return Example(build, cases, law in LOGARITHMIC, space.nodes, 1e-3 if element == "p2" else 4e-3)
 
 
 EXAMPLES = (
@@ -126,6 +138,10 @@ EXAMPLES = (
     | {f"{law} smoothed {part}": of_law(law, "smoothed", i) for law in EVERY_LAW for i, part in enumerate(PARTS)}
     | {f"relaxing {law}": relaxing(law) for law in RELAXES}
     | {f"relaxing neo-hookean {element}": relaxing("neo-hookean", element) for element in ("p2", "smoothed")}
+    | {"relaxing and swelling ogden": relaxing("ogden", "p1", STRONG)}
+    | {f"swelling {law}": swelling(law) for law in EVERY_LAW}
+    | {"swelling linear p2": swelling("linear", "p2")}
+    | {f"swelling neo-hookean smoothed {part}": swelling("neo-hookean", "smoothed", i) for i, part in enumerate(PARTS)}
     | {
         "nodal force": Example(of_effects(NodalForce()), cases()),
         "tool force": Example(of_effects(ToolForce()), cases()),

@@ -1,0 +1,123 @@
+"""Tissue that swells with its blood: any law in F / (1 + theta)^(1/3), which is at rest where F only swells.
+
+Rodriguez, Hoger, McCulloch 1994, "Stress-dependent finite growth in soft elastic tissues", J. Biomech. 27:455-467, with
+growth of the same size in all directions: psi per volume before it is (1 + theta) psi(F_e), F = (1 + theta)^(1/3) F_e.
+"""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from ..device import Device
+from ..term import Cases
+from .law import Law
+
+
+@cache
+def swollen(law: Law, device: Device, count: int) -> Law:
+    """The law on `count` numbers that also takes r = (1 + theta)^(1/3) - 1."""
+    scalar, mat = device.scalar, device.matrix
+    inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1))
+    own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
+
+    @wp.func
+    def of_law(c: whole):
+        """What the law itself takes."""
+        k = inner()
+        for i in range(count):
+            k[i] = c[i]
+        return k
+
+    @wp.func
+    def elastic(H: mat, c: whole):
+        """F_e - I = (H - r I) / (1 + r)."""
+        return (H - c[count] * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + c[count])
+
+    @wp.func
+    def energy(H: mat, c: whole):
+        """(1 + r)^3 psi(F_e) [Pa]."""
+        s = scalar(1.0) + c[count]
+        return s * s * s * own_energy(elastic(H, c), of_law(c))
+
+    @wp.func
+    def stress(H: mat, c: whole):
+        """P = (1 + r)^2 P(F_e) [Pa]."""
+        s = scalar(1.0) + c[count]
+        return s * s * own_stress(elastic(H, c), of_law(c))
+
+    @wp.func
+    def stress_change(H: mat, D: mat, c: whole):
+        """dP [Pa] for dF = D: (1 + r) dP(F_e; D)."""
+        return (scalar(1.0) + c[count]) * own_change(elastic(H, c), D, of_law(c))
+
+    @wp.func
+    def same(k: inner):
+        """Of what does not vary."""
+        return k
+
+    own_rest = law.at_rest or same
+
+    @wp.func
+    def at_rest(c: whole):
+        """r = 0, and the law's own numbers at rest."""
+        k, own = whole(), own_rest(of_law(c))
+        for i in range(count):
+            k[i] = own[i]
+        return k
+
+    return Law(f"swelling {law.name}", energy, stress, stress_change, law.needs_positive_volume, at_rest)
+
+
+@cache
+def filling_of(device: Device) -> wp.Kernel:
+    """Kernel that tells every point how much its column's tissue has swollen, if it does."""
+    scalar = device.scalar
+
+    @wp.kernel(module="unique")
+    def fill(
+        swells: wp.array(dtype=scalar),
+        wider: wp.array(dtype=scalar),
+        place: int,
+        # outputs
+        out: wp.array4d(dtype=scalar),
+    ):
+        """r_eqc = s_e r_c."""
+        e, q, c = wp.tid()
+        out[e, q, place, c] = swells[e] * wider[c]
+
+    return fill
+
+
+class Swelling:
+    """A Source: how much wider tissue is than it would be by itself. It remembers nothing.
+
+    Parameters
+    ----------
+    theta
+        Times (B,) [s] -> shares of volume (B,) more than there are at rest.
+    swells
+        (T,) bool: elements that do.
+    device
+        Where its arrays live.
+    """
+
+    count = 1
+
+    def __init__(self, theta: Callable[[np.ndarray], np.ndarray], swells: np.ndarray, device: Device):
+        self._theta, self._device = theta, device
+        self._swells = device.array(swells.astype(np.float64))
+
+    def law(self, inner: Law, count: int) -> Law:
+        """The law of what is left of the motion beside the swelling."""
+        return swollen(inner, self._device, count)
+
+    def fill(self, cases: Cases, first: int, out: wp.array) -> None:
+        """r at every point: accurate for small theta too."""
+        wider = np.expm1(np.log1p(self._theta(cases.loads.times)) / 3.0)
+        inputs = [self._swells, self._device.array(wider), first]
+        self._device.launch(filling_of(self._device), (*out.shape[:2], out.shape[3]), inputs, [out])
+
+    def end(self, cases: Cases, strains: wp.array) -> None:
+        """Swelling depends on the time alone."""
