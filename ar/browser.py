@@ -148,10 +148,16 @@ class Browser:
 
         self.note("picture", send)
 
-    def move(self, name: str, vertices: np.ndarray) -> None:
-        """Put the vertices (V, 3) [m] of a body in the 3-D view elsewhere."""
+    def move(self, name: str, vertices: np.ndarray, triangles: np.ndarray | None = None) -> None:
+        """Put the vertices (V, 3) [m] of a body in the 3-D view elsewhere; triangles (F, 3) where they are others."""
         mesh = self.meshes[name]
-        self.note(f"body {name}", lambda: setattr(mesh, "vertices", np.asarray(vertices, np.float32)))
+
+        def send() -> None:
+            if triangles is not None and not np.array_equal(mesh.faces, triangles):
+                mesh.faces = np.asarray(triangles, np.uint32)
+            mesh.vertices = np.asarray(vertices, np.float32)
+
+        self.note(f"body {name}", send)
 
     def report(self, markdown: str) -> None:
         """Show Markdown text between playback and controls."""

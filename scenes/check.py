@@ -68,14 +68,17 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
 
     `camera` is the one that should have drawn them.
     """
-    motion = truth.at(player.site.anatomy.tumour_nodes).displacement
+    moved = [
+        np.linalg.norm(truth.at(player.stage.at(frame.loads).anatomy.tumour_nodes).displacement[row], axis=1).mean()
+        for row, frame in enumerate(frames)
+    ]
     finite = [_finite(frame) for frame in frames]
     misses = [_miss(player, camera, frame, truth, row) if finite[row] else NOWHERE for row, frame in enumerate(frames)]
     overlap, error, pixels = zip(*misses, strict=True)
     return Figures(
         overlap=min(overlap),
         error_mm=1e3 * max(error),
-        motion_mm=1e3 * float(np.linalg.norm(motion, axis=2).mean(axis=1).max()),
+        motion_mm=1e3 * float(max(moved)),
         pixels=max(pixels),
         finite=all(finite),
         answered=all(frame.deformation.outcome[0].good for frame in frames) and all(o.good for o in truth.outcome),
@@ -92,11 +95,12 @@ def _finite(frame: Frame) -> bool:
 
 def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, float, float]:
     """Overlap, mean distance [m] and largest distance in the picture [pixel] between a frame and the truth."""
-    shown = player.stage.tumour(player.positions(frame.deformation))
-    true = player.stage.tumour(player.positions(truth, row))
+    stage = player.stage.at(frame.loads)
+    shown = stage.tumour(player.positions(frame.deformation))
+    true = stage.tumour(player.positions(truth, row))
     drawn = silhouette(frame.camera, shown.vertices, shown.triangles)
     overlap = iou(drawn, silhouette(camera, true.vertices, true.triangles))
-    nodes = player.site.anatomy.tumour_nodes
+    nodes = stage.anatomy.tumour_nodes
     off = frame.deformation.at(nodes).displacement[0] - truth.at(nodes).displacement[row]
     ours = frame.camera.project(shown.vertices)[0]
     pixels = np.linalg.norm(ours - project_cv2(camera, shown.vertices), axis=1).max()

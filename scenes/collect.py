@@ -18,7 +18,7 @@ from ar.overlay import silhouette
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.files import written_whole
-from sim.loads import Loads, Posture, Pushed
+from sim.loads import Loads, Posture, Pushed, Resected
 
 from .play import STAGES, Frame, Player
 from .stage import NAMES
@@ -31,7 +31,7 @@ DEPTH_SCALE = 1e-5
 JPEG_QUALITY = 95
 UNITS = {
     "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
-    "direction": "1", "csf_level": "m", "share": "1",
+    "direction": "1", "csf_level": "m", "share": "1", "done": "1",
     "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "bound": "m", "seconds": "s",
     "depth": f"{DEPTH_SCALE:g} m (PNG, 16 bit)",
 }  # fmt: skip
@@ -68,7 +68,7 @@ def collect(
 def encoded(frame: Frame, player: Player) -> dict[str, np.ndarray]:
     """The frame's pictures as compressed bytes, by name."""
     picture = frame.picture
-    tumour = player.stage.tumour(player.positions(frame.deformation))
+    tumour = player.stage.at(frame.loads).tumour(player.positions(frame.deformation))
     mask = silhouette(frame.camera, tumour.vertices, tumour.triangles)
     depth = np.clip(np.rint(picture.depth / DEPTH_SCALE), 0, np.iinfo(np.uint16).max).astype(np.uint16)
     quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
@@ -90,6 +90,7 @@ def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
         **({} if frame.pose is None or frame.tip is None else {"T_world_tool": frame.pose, "tip": frame.tip}),
         **caused(frame.loads),
         "tumour_predicted": player.positions(frame.deformation)[nodes],
+        "tumour_left": ~player.stage.at(frame.loads).anatomy.orphaned[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],
         "seconds": np.array([frame.seconds[stage] for stage in STAGES]),
@@ -103,7 +104,7 @@ def caused(loads: Loads) -> dict[str, np.ndarray]:
         match cause:
             case Pushed():
                 found |= {"force": cause.force[0], "contact": cause.point[0]}
-            case Posture():
+            case Posture() | Resected():
                 found |= {name: array[0] for name, array in vars(cause).items()}
             case _:
                 raise InputError(f"episodes hold no {type(cause).__name__}: collect a scene without it.")
@@ -139,7 +140,7 @@ def describe(file: h5py.File, player: Player, deformer: str) -> None:
             "format": FORMAT,
             "scene": scene.name,
             "deformer": deformer,
-            "effects": repr(scene.effects),
+            "effects": repr(scene.effects_on(player.site.anatomy)),
             "anatomy": player.site.anatomy.digest,
             "world_frame": "RAS [m]",
             "camera_frame": "OpenCV: x right, y down, z forward; pixel centres at whole numbers",

@@ -175,8 +175,9 @@ class Demo:
     def _show(self, frame: Frame, name: str) -> None:
         positions = self._player(name).positions(frame.deformation)
         self.browser.show(frame.number, frame.shown)
-        self.browser.move("cortex", self.stage.cortex(positions).vertices)
-        self.browser.move("tumour", self.stage.tumour(positions).vertices)
+        stage = self.stage.at(frame.loads)
+        for layer in (stage.cortex(positions), stage.tumour(positions)):
+            self.browser.move(layer.name, layer.vertices, layer.triangles)
         tool = self.stage.scene.tool
         if tool is not None and frame.pose is not None:
             self.browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
@@ -184,8 +185,10 @@ class Demo:
     def _judge(self, truth: Truth, name: str) -> str:
         """Show what the finite elements answered, and say how far off a deformer is under the same loads."""
         player = self._player(name)
-        self.browser.move("finite elements", self.stage.tumour(player.positions(truth.deformation)).vertices)
-        nodes = self.stage.site.anatomy.tumour_nodes
+        stage = self.stage.at(truth.loads)
+        seen = stage.tumour(player.positions(truth.deformation))
+        self.browser.move("finite elements", seen.vertices, seen.triangles)
+        nodes = stage.anatomy.tumour_nodes
         right = truth.deformation.at(nodes).displacement[0]
         said = "this is the finite elements' own answer"
         if name != "fem":
@@ -201,12 +204,14 @@ class Demo:
 
     def _report(self, frame: Frame, name: str, verdict: str) -> str:
         """The outcome, milliseconds a stage, and the verdict on the frame that the finite elements answered last."""
+        left = self.stage.at(frame.loads).left
         acts = [told(frame.loads)] if frame.loads.causes else [f"time {frame.time:.2f} s"]
         acts += [] if frame.distance is None else [f"tip to tumour {1e3 * frame.distance:.1f} mm"]
         stages = " · ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
         lines = [
             f"**{name}**: {frame.deformation.outcome[0].value}",
             f"frame {frame.number}: {', '.join(acts)}",
+            *([] if left is None else [str(left)]),
             f"ms a stage: {stages}",
             verdict,
         ]

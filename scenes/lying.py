@@ -48,14 +48,20 @@ def supine(time: float) -> Lying:
     return Lying()
 
 
+def drained(seconds: float, to: float = 0.0) -> Lie:
+    """On the back while the fluid falls to a share of its height within so many seconds."""
+    return lambda time: Lying(fluid=1.0 - (1.0 - to) * smooth(time / seconds))
+
+
 def drained_then_turned(drain: float, pause: float, turn: float, angle: float) -> Lie:
     """On the back while the fluid drains wholly within `drain` [s]; `pause` [s]; then a turn by `angle` [rad].
 
     A positive angle brings the left side down; the turn takes `turn` [s].
     """
+    falling = drained(drain)
 
     def lie(time: float) -> Lying:
         turned = angle * smooth((time - drain - pause) / turn)
-        return Lying((-float(np.sin(turned)), -float(np.cos(turned)), 0.0), 1.0 - smooth(time / drain))
+        return Lying((-float(np.sin(turned)), -float(np.cos(turned)), 0.0), falling(time).fluid)
 
     return lie

@@ -109,21 +109,18 @@ class Player:
         solved = clock.perf_counter()
         positions = self.positions(deformation)
         tip, pose = (None, None) if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
-        picture = render(self.camera, self.stage.layers(positions, pose), self.stage.lamp)
+        stage = self.stage.at(loads)
+        picture = render(self.camera, stage.layers(positions, pose), stage.lamp)
         rendered = clock.perf_counter()
-        tumour = self.stage.tumour(positions)
+        tumour, rest = (stage.tumour(at) for at in (positions, self.site.anatomy.mesh.nodes))
         gauge = None if tip is None else gauged(tip, tumour)
         over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin=margin, gauge=gauge)
         return Frame(
             number, time, touch, loads, deformation, self.camera, pose, tip, picture, over.colour,
             None if gauge is None else gauge.distance,
-            float(np.linalg.norm(tumour.vertices - self._rest, axis=1).mean()),
+            float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()),
             dict(zip(STAGES, np.diff([begun, solved, rendered, clock.perf_counter()]).tolist(), strict=True)),
         )  # fmt: skip
-
-    @cached_property
-    def _rest(self) -> np.ndarray:
-        return self.stage.tumour(self.site.anatomy.mesh.nodes).vertices
 
     def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
         """How far each vertex of the drawn tumour may be off [m]: what the model promises of this load, if it does."""

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from ar.camera import Camera, look_at
 from sim.accuracy import LIVE, Accuracy
-from sim.effects import Effect, Elasticity, Gravity, Held, Slide, ToolForce
+from sim.anatomy import Anatomy
+from sim.effects import Effect, Elasticity, Gravity, Held, Resection, Slide, ToolForce
 from sim.errors import InputError
-from sim.loads import Cause, Loads, Pushed
+from sim.loads import Cause, Loads, Pushed, Resected
 
 from .lying import Lie, supine
 from .paths import Path, Touch, idle
 from .site import Contact, Site
+from .surgery import Debulking
 from .tool import Probe
 
 
@@ -71,6 +74,8 @@ class Scene:
         What the hand does, and with what; without a tool none is in view.
     lying
         How the head lies, where `Gravity` is asked for.
+    surgery
+        What is cut, if anything.
     element
         One of `sim.discretisation.ELEMENTS`; None: p1, or p2 on a mesh that brings mid-edge nodes. Learnt models are
         played and judged with the tissue and the element that they were taught, whatever the scene says.
@@ -88,6 +93,7 @@ class Scene:
     effects: tuple[Effect, ...] = (Elasticity(), Held(), Slide(), ToolForce())
     tool: Probe | None = PALPATION
     lying: Lie = supine
+    surgery: Debulking | None = None
     viewpoint: Viewpoint = Viewpoint()
     element: str | None = None
     accuracy: Accuracy = LIVE
@@ -105,6 +111,10 @@ class Scene:
         """Time of every frame (n,) [s]."""
         return np.arange(round(self.duration * self.frames_per_second) + 1) / self.frames_per_second
 
+    def effects_on(self, anatomy: Anatomy) -> tuple[Effect, ...]:
+        """Its effects, with those that depend on the body."""
+        return self.effects if self.surgery is None else (*self.effects, _resection(self.surgery, anatomy))
+
     def contact(self, site: Site, touch: Touch) -> Contact:
         """The material point that the tool touches."""
         assert self.tool is not None
@@ -112,7 +122,7 @@ class Scene:
 
     def loads(self, site: Site, touch: Touch, time: float) -> Loads:
         """One load case: the cause of every effect that has one; where none has, time alone goes on."""
-        causes = (self._cause(effect, site, touch, time) for effect in self.effects)
+        causes = (self._cause(effect, site, touch, time) for effect in self.effects_on(site.anatomy))
         return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
 
     def _cause(self, effect: Effect, site: Site, touch: Touch, time: float) -> Cause | None:
@@ -120,6 +130,9 @@ class Scene:
         match effect:
             case ToolForce():
                 return self._pushed(site, touch)
+            case Resection():
+                assert self.surgery is not None
+                return Resected(np.array([self.surgery.done(time)]))
             case Gravity():
                 return self.lying(time).posture(site.anatomy.mesh.nodes)
             case _:
@@ -131,7 +144,13 @@ class Scene:
         return Pushed(self.contact(site, touch).point[None], force[None], np.array([self.tool.radius]))
 
 
-SCENES = ("press", "slide", "retract", "brain_shift")
+@lru_cache(8)
+def _resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
+    """Each frame asks for it."""
+    return surgery.resection(anatomy)
+
+
+SCENES = ("press", "slide", "retract", "brain_shift", "resection")
 """The built-in scenes, each a module of this room that exports SCENE."""
 
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from ar.layer import Layer, Solid, vertex_normals
 from ar.view import Lamp, lamp_beside
+from sim.anatomy import Anatomy
+from sim.effects import Resection
 from sim.intensity import Intensity
+from sim.loads import Loads, Resected
+from sim.resection import Remains, remains
 
 from .scene import Scene
 from .site import Site
@@ -56,11 +60,29 @@ class Stage:
     scene: Scene
     site: Site
     intensity: Intensity | None = None
+    left: Remains | None = None
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The body, as far as it is left."""
+        return self.site.anatomy if self.left is None else self.left.anatomy
+
+    def at(self, loads: Loads) -> Stage:
+        """The stage as the first load case has it: after the steps of a resection that are done."""
+        cause = loads.of(Resected)
+        return self if cause is None else self._after[int(cause.done[0])]
+
+    @cached_property
+    def _after(self) -> tuple[Stage, ...]:
+        """The stage after 0, 1, ... steps."""
+        whole = self.site.anatomy
+        cut = next(effect for effect in self.scene.effects_on(whole) if isinstance(effect, Resection))
+        return tuple(replace(self, left=left) for left in remains(whole, cut))
 
     @cached_property
     def nodes(self) -> np.ndarray:
         """Sorted mesh vertices (n,) whose motion is drawn: open cortex and tumour."""
-        anatomy = self.site.anatomy
+        anatomy = self.anatomy
         return np.union1d(np.unique(anatomy.open_surface), anatomy.tumour_nodes)
 
     @cached_property
@@ -80,7 +102,7 @@ class Stage:
     @cached_property
     def brain(self) -> Layer:
         """The closed part of the brain's surface, at rest."""
-        mesh, craniotomy = self.site.anatomy.mesh, self.site.anatomy.craniotomy
+        mesh, craniotomy = self.anatomy.mesh, self.anatomy.craniotomy
         vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
         return Layer("brain", CORTEX, mesh.nodes[vertices], triangles.reshape(-1, 3), CORTEX_COLOUR)
 
@@ -105,16 +127,16 @@ class Stage:
 
     @cached_property
     def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
-        vertices, triangles = np.unique(self.site.anatomy.tumour_surface, return_inverse=True)
+        vertices, triangles = np.unique(self.anatomy.tumour_surface, return_inverse=True)
         return vertices, triangles.reshape(-1, 3)
 
     @cached_property
     def _cortex(self) -> Cortex:
-        return self._dressed(self.site.anatomy.open_surface)
+        return self._dressed(self.anatomy.open_surface)
 
     @cached_property
     def _visible(self) -> Cortex:
-        mesh = self.site.anatomy.mesh
+        mesh = self.anatomy.mesh
         away = np.linalg.norm(mesh.nodes[mesh.surface] - self.site.origin, axis=2).min(axis=1)
         return self._dressed(mesh.surface[away < self.site.radius + RIM])
 
@@ -122,7 +144,7 @@ class Stage:
         """Triangles (S, 3) of the mesh's surface that wear the scan."""
         vertices, triangles = np.unique(surface, return_inverse=True)
         triangles = triangles.reshape(-1, 3)
-        at = self.site.anatomy.mesh.nodes[vertices]
+        at = self.anatomy.mesh.nodes[vertices]
         return Cortex(vertices, triangles, at - READ_BELOW * vertex_normals(at, triangles), self._solid)
 
     @cached_property

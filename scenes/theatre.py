@@ -17,6 +17,7 @@ from sim.fem import Fem
 from sim.intensity import Intensity, read_intensity, sidecar
 from sim.material import tissue_from_json
 from sim.meshfile import read_anatomy
+from sim.operated import Operated, finite_elements
 from surrogate.learned import Learned
 from surrogate.store import load
 from surrogate.taught import refusal
@@ -44,7 +45,9 @@ class Theatre:
 
     def knowing(self, scene: Scene) -> dict[str, Learned]:
         """The learnt models that were taught under a scene's effects, by name."""
-        return {name: model for name, model in self.models.items() if refusal(model, scene.effects) is None}
+        return {
+            name: model for name, model in self.models.items() if refusal(model, scene.effects_on(self.anatomy)) is None
+        }
 
     def names(self, scene: Scene) -> tuple[str, ...]:
         """Every deformer that can be asked for a scene: the learnt ones that know it, then the finite elements."""
@@ -55,18 +58,18 @@ class Theatre:
         knowing = self.knowing(scene)
         return min(knowing, key=lambda name: knowing[name].bound, default="fem")
 
-    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem:
+    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
         """Finite elements for a scene's effects, with the tissue and the element that the models here were taught.
 
         Where no model knows the scene, or none says, tissue and element are the scene's; `live` as `Fem` has it.
         """
         taught = next((model.training for model in self.knowing(scene).values()), {})
-        effects = scene.effects
+        effects = scene.effects_on(self.anatomy)
         if "tissue" in taught:
             elasticity = Elasticity(tissue_from_json(taught["tissue"]))
             effects = tuple(elasticity if isinstance(effect, Elasticity) else effect for effect in effects)
         element = taught.get("element", scene.element)
-        return Fem(self.anatomy, effects, accuracy, self.device, batch, element, live)
+        return finite_elements(self.anatomy, effects, accuracy, self.device, batch, element, live)
 
     def deformer(self, name: str, scene: Scene) -> Deformer:
         """A deformer by name; "fem" is made for the scene's accuracy.
@@ -83,7 +86,7 @@ class Theatre:
             raise InputError(
                 f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the learnt ones."
             )
-        why = refusal(self.models[name], scene.effects)
+        why = refusal(self.models[name], scene.effects_on(self.anatomy))
         if why is not None:
             raise InputError(f"{name} does not know the scene {scene.name}: {why}. Choose one of {allowed}.")
         return self.models[name]

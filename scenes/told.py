@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.loads import Cause, Loads, Posture, Pushed
+from sim.loads import Cause, Loads, Posture, Pushed, Resected
 
 # Sides of the body along the axes of RAS, and against them.
 SIDES = ("RL", "AP", "SI")
@@ -27,5 +27,7 @@ def _words(cause: Cause) -> str:
                 f"{sides[int(x < 0.0)]} {abs(x):.2f}" for sides, x in zip(SIDES, down, strict=True) if abs(x) > TOLD
             ]
             return f"gravity towards {' '.join(ways)}, fluid up to {1e3 * cause.csf_level[0]:.0f} mm"
+        case Resected():
+            return f"resection: {cause.done[0]:.0f} steps done"
         case _:
             return ""

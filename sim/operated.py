@@ -33,12 +33,16 @@ class Operated:
     bodies
         After 0, 1, ... all steps.
     make
-        Makes the solver of one of them; made when it is first asked for.
+        Makes the solver of one of them.
+    ahead
+        All are made at once, and kept: no load waits for one. Else each when it is first asked for, and a few are kept.
     """
 
-    def __init__(self, bodies: tuple[Remains, ...], make: Callable[[Anatomy], Fem]):
+    def __init__(self, bodies: tuple[Remains, ...], make: Callable[[Anatomy], Fem], ahead: bool = False):
         self._bodies = bodies
-        self._solver = lru_cache(KEPT)(lambda done: make(bodies[done].anatomy))
+        self._solver = lru_cache(len(bodies) if ahead else KEPT)(lambda done: make(bodies[done].anatomy))
+        for done in range(len(bodies) if ahead else 0):
+            self._solver(done)
 
     @property
     def anatomy(self) -> Anatomy:
@@ -115,7 +119,7 @@ def finite_elements(
     def make(body: Anatomy) -> Fem:
         return Fem(body, _of(others, anatomy, body), accuracy, device, batch, element, live)
 
-    return Operated(remains(anatomy, cuts[0]), make)
+    return Operated(remains(anatomy, cuts[0]), make, ahead=live)
 
 
 def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:

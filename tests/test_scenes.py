@@ -99,7 +99,7 @@ def test_built_in_scenes_say_what_they_are_and_begin_as_the_scan(name, template)
     assert times[0] == 0.0 and times[-1] == pytest.approx(scene.duration) and np.allclose(np.diff(times), 1 / 30)
     assert scene.path(0.0).force == 0.0 and scene.lying(0.0) == Lying()
     loads = scene.loads(template.site, scene.path(0.0), 0.0)
-    check_causes(scene.effects, loads)
+    check_causes(scene.effects_on(template.anatomy), loads)
 
 
 @pytest.mark.parametrize("name", PUSHING)

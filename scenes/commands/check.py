@@ -72,12 +72,15 @@ def _certificates(
     theatre: Theatre, scene: Scene, frames: Sequence[Frame], truth: Deformation, table: TextIO
 ) -> list[dict[str, float | bool]]:
     """Every frame's certificate, printed as it comes."""
+    from sim.fem import Fem
     from surrogate.certify import SCOPE
 
     from ..certified import certified
 
-    found = []
-    for certificate in certified(theatre.fem(scene, TRAIN, live=True), frames, truth):
+    fem, found = theatre.fem(scene, TRAIN, live=True), []
+    if not isinstance(fem, Fem):
+        raise InputError(f"the scene {scene.name} cuts tissue away, which is not certified: leave --certify out.")
+    for certificate in certified(fem, frames, truth):
         print(f"{'':11s} {certificate}", file=table, flush=True)
         found.append(asdict(certificate))
     print(f"{'':11s} {SCOPE}", file=table)

@@ -1,0 +1,57 @@
+"""What is cut, and when: a corridor to the tumour, and the tumour in shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.effects import Resection
+from sim.errors import InputError
+
+from .site import site_of
+
+
+@dataclass(frozen=True)
+class Debulking:
+    """A corridor from the cortex to the tumour, then the tumour from the top down, in equal shares; one share is left.
+
+    Parameters
+    ----------
+    times
+        When each step is done [s], in turn: the corridor, then share after share.
+    corridor
+        Its radius [m].
+    """
+
+    times: tuple[float, ...]
+    corridor: float = 5e-3
+
+    def done(self, time: float) -> int:
+        """How many steps are done at a time [s]."""
+        return int(np.searchsorted(self.times, time, side="right"))
+
+    def resection(self, anatomy: Anatomy) -> Resection:
+        """The tetrahedra of each step.
+
+        Raises
+        ------
+        InputError
+            No open cortex, or no tumour of so many shares.
+        """
+        mesh, site = anatomy.mesh, site_of(anatomy)
+        tumour = np.flatnonzero(mesh.region == TUMOUR_LABEL)
+        shares = len(self.times)
+        if len(tumour) < shares:
+            raise InputError(f"the tumour has {len(tumour)} tetrahedra, and {shares} shares are asked for: mesh finer.")
+        middle = mesh.nodes[mesh.tets].mean(axis=1)
+        # Straight from the middle of the open cortex to that of the tumour.
+        way = middle[tumour].mean(axis=0) - site.origin
+        length = np.linalg.norm(way)
+        along = (middle - site.origin) @ way / length
+        across = np.linalg.norm(middle - site.origin - np.outer(along, way / length), axis=1)
+        on_the_way = (across < self.corridor) & (along < length) & (mesh.region != TUMOUR_LABEL)
+        from_the_top = tumour[np.argsort(along[tumour], kind="stable")]
+        *taken, _ = np.array_split(from_the_top, shares)
+        return Resection(tuple(tuple(step.tolist()) for step in (np.flatnonzero(on_the_way), *taken)))

@@ -1,0 +1,134 @@
+"""A tumour that is taken in steps: what is cut, what is drawn of the rest, and what an episode and a page say of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import h5py
+import numpy as np
+import pytest
+from theatres import player, put, small, theatre_of
+from visitor import free_port, wait_for
+
+from ar.overlay import silhouette
+from scenes.cli import main
+from scenes.collect import collect
+from scenes.demo import Demo
+from scenes.lying import drained
+from scenes.paths import Touch
+from scenes.surgery import Debulking
+from scenes.told import told
+from sim.anatomy import TUMOUR_LABEL
+from sim.effects import Resection
+from sim.errors import InputError
+from sim.loads import Posture, Resected
+
+SURGERY = Debulking(times=(0.05, 0.1, 0.15))
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Seven small frames: corridor, a share, another share; the fluid is gone before."""
+    return small("resection", duration=0.2, surgery=SURGERY, lying=drained(0.04))
+
+
+@pytest.fixture(scope="module")
+def play(theatre, scene):
+    return player(theatre, scene, "fem")
+
+
+@pytest.fixture(scope="module")
+def frames(play):
+    return list(play.frames())
+
+
+def test_the_steps_are_a_corridor_and_shares_from_the_top(box, theatre):
+    corridor, *shares = (np.array(step) for step in SURGERY.resection(box).steps)
+    middle = box.mesh.nodes[box.mesh.tets].mean(axis=1)
+    assert (np.linalg.norm(middle[corridor, :2], axis=1) < 5e-3).all() and middle[corridor, 2].max() > -4e-3
+    assert (box.mesh.region[corridor] != TUMOUR_LABEL).all()
+    tumour = np.flatnonzero(box.mesh.region == TUMOUR_LABEL)
+    left = np.setdiff1d(tumour, np.concatenate(shares))
+    assert [len(step) for step in (*shares, left)] == pytest.approx(3 * [len(tumour) / 3], abs=1.0)
+    depth = [-middle[step] @ [0.0, 0.0, 1.0] for step in (*shares, left)]
+    assert all(upper.max() <= lower.min() + 1e-4 for upper, lower in pairwise(depth))
+    assert [SURGERY.done(time) for time in (0.0, 0.0499, 0.05, 0.12, 9.0)] == [0, 0, 1, 2, 3]
+
+
+def test_a_tumour_of_fewer_elements_is_a_sentence(box):
+    with pytest.raises(InputError, match="mesh finer"):
+        Debulking(times=tuple(np.arange(5000.0))).resection(box)
+
+
+def test_its_effects_and_causes_are_the_body_s(theatre, scene):
+    assert [type(effect) for effect in scene.effects_on(theatre.anatomy)][-1] is Resection
+    loads = scene.loads(theatre.site, Touch(), 0.12)
+    assert [type(cause) for cause in loads.causes] == [Posture, Resected]
+    assert loads.of(Resected).done.tolist() == [2] and "resection: 2 steps done" in told(loads)
+    assert theatre.names(scene) == ("fem",)
+
+
+def test_the_rest_of_the_tumour_is_drawn(play, frames):
+    areas = []
+    for frame in frames:
+        stage = play.stage.at(frame.loads)
+        layer = stage.tumour(play.positions(frame.deformation))
+        areas.append(int(silhouette(frame.camera, layer.vertices, layer.triangles).sum()))
+        assert not stage.anatomy.orphaned[stage.tumour_vertices].any()
+        assert frame.deformation.outcome[0].good and frame.moved >= 0.0
+    done = [SURGERY.done(frame.time) for frame in frames]
+    assert done == sorted(done) and set(done) == {0, 1, 2, 3}
+    seen = [areas[done.index(step)] for step in range(4)]
+    assert seen[0] == pytest.approx(seen[1], rel=0.05) and seen[3] < 0.97 * seen[1]
+
+
+def test_the_corridor_is_seen_in_the_cortex(play, frames):
+    """Through the hole the camera sees deeper than the surface."""
+    before, after = frames[1].picture.depth, frames[2].picture.depth
+    assert (after - before).max() > 4e-3 and (np.abs(after - before) < 1e-3).mean() > 0.9
+
+
+def test_what_was_taken_stays_where_the_scan_has_it(play, frames):
+    gone = play.stage.at(frames[-1].loads).anatomy.orphaned
+    moved = np.linalg.norm(frames[-1].deformation.displacement[0], axis=1)
+    assert gone.any() and not moved[gone].any() and moved[~gone].max() > 1e-5
+
+
+def test_an_episode_says_what_is_left(theatre, play, scene, tmp_path):
+    collect(tmp_path / "a.h5", theatre, play, "fem", iter)
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["done"][:].tolist() == [SURGERY.done(time) for time in scene.times]
+        left = file["tumour_left"][:]
+        assert left.dtype == bool and left[0].all() and not left[-1].all()
+        taken = file["tumour_predicted"][-1][~left[-1]] - file["tumour_rest"][:][~left[-1]]
+        assert not taken.any() and "Resection(steps=" in file.attrs["effects"]
+
+
+def test_the_page_shows_the_rest(theatre, scene):
+    demo = Demo(theatre, replace(scene, frames_per_second=30.0), "fem", "127.0.0.1", free_port())
+    try:
+        demo.wish.set(plays=False, number=0)
+        whole = len(demo.browser.meshes["tumour"].faces)
+        demo.wish.set(number=6)
+        assert wait_for(lambda: demo.run(0.3) and "3 steps done" in demo.browser.text.content)
+        assert wait_for(lambda: len(demo.browser.meshes["tumour"].faces) < whole)
+        rest = demo.stage.at(scene.loads(theatre.site, Touch(), 0.2)).tumour(theatre.anatomy.mesh.nodes)
+        assert np.array_equal(demo.browser.meshes["tumour"].faces, rest.triangles)
+        assert wait_for(
+            lambda: demo.run(0.2) and np.array_equal(demo.browser.meshes["finite elements"].faces, rest.triangles)
+        )
+    finally:
+        demo.close()
+
+
+def test_it_is_checked_but_not_certified(theatre, tmp_path, capsys):
+    words = ["check", "resection", "--anatomy", str(put(theatre, tmp_path / "box.vtu")), "--every", "75"]
+    assert main([*words, "--device", "cpu"]) == 0
+    assert main([*words, "--device", "cpu", "--certify"]) == 2
+    assert "leave --certify out" in capsys.readouterr().err
