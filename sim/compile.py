@@ -25,7 +25,9 @@ from .effects import (
     NodalForce,
     Pulsation,
     Resection,
+    Retraction,
     Slide,
+    ToolContact,
     ToolDisplacement,
     ToolForce,
 )
@@ -33,10 +35,21 @@ from .element import Elements
 from .errors import InputError
 from .footprint import Skin
 from .holding import check_held
-from .loads import Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Resected, check_field
+from .loads import (
+    Displaced,
+    Loads,
+    Nodal,
+    Posture,
+    Prescribed,
+    Pushed,
+    Resected,
+    Retracted,
+    Touching,
+    check_field,
+)
 from .material import Tissue, coefficients_of, portion
 from .problem import Imposed, Problem
-from .term import Curved, Term
+from .term import Curved, Moving, Term
 
 CAUSES = {
     ToolForce: Pushed,
@@ -45,6 +58,8 @@ CAUSES = {
     Held: Prescribed,
     Gravity: Posture,
     Resection: Resected,
+    ToolContact: Touching,
+    Retraction: Retracted,
 }
 """The cause that each effect answers; other effects act by themselves."""
 
@@ -75,6 +90,7 @@ def compile_problem(
     space = space or discretise(anatomy.mesh, "p1")
     skin = skin or Skin(space.nodes, space.surface, device)
     terms: list[Term] = []
+    moving: list[Moving] = []
     held = np.zeros_like(anatomy.held)
     normal = np.zeros_like(anatomy.slide_normal)
     pulsation = next((effect for effect in effects if isinstance(effect, Pulsation)), None)
@@ -105,6 +121,10 @@ def compile_problem(
                 from .terms.inertia import lumped_mass
 
                 terms.append(InertiaTerm(lumped_mass(effect.density, space), effect.damping, device))
+            case ToolContact() | Retraction():
+                from .terms.contact import contact_of
+
+                moving.append(contact_of(effect, anatomy, space, _shear(effects), device))
             case ToolDisplacement():
                 pass  # a constraint: `_impose` reads the loads
             case Resection():
@@ -114,7 +134,13 @@ def compile_problem(
                 raise InputError(f"no effect is called {type(effect).__name__}: choose from {allowed}.")
     check_held(anatomy.mesh, held, normal)
     constraint = Constraint(space.held(held), space.sliding(normal, held), device)
-    return Problem(tuple(terms), constraint, device, partial(_impose, space, skin))
+    return Problem((*terms, *moving), constraint, device, partial(_impose, space, skin), tuple(moving))
+
+
+def _shear(effects: Iterable[Effect]) -> float:
+    """The shear modulus [Pa] of the softest tissue."""
+    effect = next(effect for effect in effects if isinstance(effect, Elasticity))
+    return min(tissue.lame[0] for tissue in (effect.default, *effect.regions.values()) if tissue is not None)
 
 
 def check_causes(effects: Iterable[Effect], loads: Loads) -> None:

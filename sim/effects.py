@@ -11,6 +11,7 @@ import numpy as np
 from .anatomy import Anatomy
 from .errors import InputError
 from .material import BRAIN, Tissue
+from .tools import Spatula, Tool
 
 # Of `Pulsation`: shares of the volume, by which the opened template moves as much as opened brains do.
 CARDIAC, RESPIRATORY = 1.5e-3, 1.5e-3
@@ -226,8 +227,65 @@ class Pulsation:
         return sum((wave.amplitude * np.sin(2.0 * np.pi * wave.frequency * times) for wave in waves), np.zeros(()))
 
 
+@dataclass(frozen=True)
+class ToolContact:
+    """Rigid tools, moved by pose, press and slide without friction on the tissue that they touch: `Touching` loads.
+
+    Tissue begins to feel a tool at a distance of `gap` [m], and is never nearer than a few hundredths of that. Only
+    what no bone covers is touched: surface that is neither held nor slides.
+
+    Raises
+    ------
+    InputError
+        No tool, or a gap that is not positive.
+    """
+
+    tools: tuple[Tool, ...]
+    gap: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if not self.tools:
+            raise InputError("ToolContact has no tool: give at least one, such as Ball(7e-3), or leave the effect out.")
+        _check_gap(self)
+
+
+@dataclass(frozen=True)
+class Retraction:
+    """A blade is laid on the tissue and held at a displacement: `Retracted` loads.
+
+    As `ToolContact`, whose `gap` [m] it has; what it takes to hold the blade comes out as its reaction.
+
+    Raises
+    ------
+    InputError
+        A gap that is not positive.
+    """
+
+    blade: Spatula
+    gap: float = 1e-4
+
+    def __post_init__(self) -> None:
+        _check_gap(self)
+
+
+def _check_gap(effect: ToolContact | Retraction) -> None:
+    if not 0.0 < effect.gap < math.inf:
+        raise InputError(f"{type(effect).__name__}.gap is {effect.gap} m: give a positive number.")
+
+
 Effect = (
-    Elasticity | Held | Slide | ToolForce | ToolDisplacement | NodalForce | Gravity | Inertia | Pulsation | Resection
+    Elasticity
+    | Held
+    | Slide
+    | ToolForce
+    | ToolDisplacement
+    | NodalForce
+    | Gravity
+    | Inertia
+    | Pulsation
+    | Resection
+    | ToolContact
+    | Retraction
 )
 """Everything that a scene may ask for."""
 

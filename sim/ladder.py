@@ -41,6 +41,9 @@ NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
 FIRST_STEP, LEAST_STEP, CUT = 1.0 / 4.0, 1.0 / 64.0, 1.0 / 4.0
 # The next load step is as long as lets expect so many outer steps; one that takes more than the most is too long.
 STEP_OUTER, MOST_STEP_OUTER = 8, 15
+# Tools that go farther than so many gaps at once begin with one that is wider by a power of the closing; until it is
+# their own they are settled to this tolerance.
+WIDE_ENOUGH, CLOSING, OPEN_TOLERANCE = 8.0, 4.0, 0.05
 # Load steps end when the batch has spent so many times the linear iterations that one outer step may take.
 PATIENCE = 4
 
@@ -129,7 +132,7 @@ class Ladder:
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
-                some = cases.rows(again)
+                some = replace(cases.rows(again), anew=True)
                 problem.begin(some)
                 answer.put(again, self._whole(some), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
@@ -176,6 +179,8 @@ class Ladder:
         # Rest satisfies whatever the batch does not move.
         imposed = problem.constraint.imposes or (start is not None and problem.gap(start)[1].any())
         start = device.zeros(problem.rows, count) if start is None else start
+        if problem.moving:
+            return self._moved(cases, start)
         if imposed or problem.steep or self.accuracy.outer < FEWEST:
             return self._thorough(start, self.accuracy.outer)
         if problem.paced:  # the next frame's step may be another, and so its curvature
@@ -208,10 +213,29 @@ class Ladder:
             answer.put(index, self._thorough(start, self.accuracy.outer), device)
         return replace(answer, learnt=taught)
 
-    def _thorough(self, start: wp.array, outer: int) -> Answer:
+    def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
+        """Newton, of cases whose tools have gone so many times their gap: it is opened first, and closed step by step.
+
+        In a narrow gap tissue would be thrown out of a tool, and caught again, node by node; a wide one leads it.
+        """
+        iterations, linear = np.zeros(start.shape[1], int), 0
+        widest = int(np.ceil(np.log(max(gaps / WIDE_ENOUGH, 1.0)) / np.log(CLOSING)))
+        for times in CLOSING ** np.arange(widest, 0.0, -1.0):
+            self.problem.begin(cases)
+            for term in self.problem.moving:
+                term.widen(float(times))
+            found = self._thorough(start, outer, max(OPEN_TOLERANCE, self.accuracy.tolerance))
+            start, iterations, linear = found.u, iterations + found.iterations, linear + found.linear_iterations
+        self.problem.begin(cases)
+        found = self._thorough(start, outer)
+        linear += found.linear_iterations
+        return replace(found, iterations=iterations + found.iterations, linear_iterations=linear)
+
+    def _thorough(self, start: wp.array, outer: int, tolerance: float | None = None) -> Answer:
         """Newton, in at most so many outer steps, of a batch that has begun."""
         newton = NewtonCG(self.preconditioner, self.accuracy.inner)
-        found = find_equilibrium(self.problem, newton, start, replace(self.accuracy, outer=outer))
+        accuracy = replace(self.accuracy, outer=outer, tolerance=tolerance or self.accuracy.tolerance)
+        found = find_equilibrium(self.problem, newton, start, accuracy)
         return self._answer(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
 
     def _answer(
@@ -225,26 +249,61 @@ class Ladder:
 
         Of cases that are the rows `index` (k,) of what failed; where no share is found that stands.
         """
-        problem, device, count = self.problem, self.problem.device, len(index)
-        u, step, spent = device.zeros(problem.rows, count), np.full(count, FIRST_STEP), 0
-        reached, iterations, residual = np.zeros(count), np.zeros(count, int), failed.residual[index]
-        for _ in range(self.accuracy.steps):
-            live = np.flatnonzero((reached < 1.0) & (step >= LEAST_STEP))
-            if len(live) == 0 or spent > PATIENCE * self.accuracy.inner:
+        problem, device, cases = self.problem, self.problem.device, replace(cases, anew=True)
+
+        def raised(part: Cases, share: np.ndarray) -> Cases:
+            return replace(part, loads=part.loads.scaled(share), share=share)
+
+        start = device.zeros(problem.rows, len(index))
+        found = self._by_steps(cases, start, raised, FIRST_STEP, self.accuracy.steps)
+        outcome = failed.outcome[index]
+        outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
+        none = np.flatnonzero(found.reached == 0.0)
+        scattered(device, gathered(device, failed.u, index[none]), none, found.u)
+        residual = np.where(found.reached == 0.0, failed.residual[index], found.residual)
+        return replace(found, outcome=outcome, residual=residual, inverted=self.inversion.count(found.u))
+
+    def _moved(self, cases: Cases, start: wp.array) -> Answer:
+        """From start (3N, b), where the tools were, as far as they may go at once again and again."""
+
+        def moved(part: Cases, share: np.ndarray) -> Cases:
+            return replace(part, share=share)
+
+        return self._by_steps(cases, start, moved, 1.0, self.accuracy.steps)
+
+    def _by_steps(
+        self, cases: Cases, start: wp.array, aimed: Callable[[Cases, np.ndarray], Cases], first: float, most: int
+    ) -> Answer:
+        """From start (3N, b), cases at growing shares: the equilibrium at the largest share found.
+
+        `aimed` makes cases at shares (b,); the `first` step is so long, and none longer than tools may go at once. Each
+        that these ask for is one more than the `most` steps. Outcomes are good where the share is 1.
+        """
+        problem, device, count = self.problem, self.problem.device, len(cases.loads)
+        longest = np.minimum.reduce([np.ones(count), *(term.stride(cases) for term in problem.moving)])
+        gaps = np.maximum.reduce([np.zeros(count), *(term.gaps(cases) for term in problem.moving)])
+        asked = int(np.ceil(1.0 / longest.min(initial=1.0)))
+        u, step, spent = wp.clone(start), np.minimum(first, longest), 0
+        least = LEAST_STEP * np.minimum(1.0, 4.0 * longest)
+        reached, iterations, residual = np.zeros(count), np.zeros(count, int), np.full(count, np.inf)
+        outcome = np.full(count, Outcome.BUDGET, object)
+        lets, outer = (STEP_OUTER, min(MOST_STEP_OUTER, self.accuracy.outer)) if first < 1.0 else 2 * (self.accuracy.outer,)
+        for _ in range(most + asked):
+            live = np.flatnonzero((reached < 1.0) & (step >= least))
+            if len(live) == 0 or spent > PATIENCE * self.accuracy.inner * asked:
                 break
             aim = np.minimum(reached[live] + step[live], 1.0)
-            part = cases.rows(live)
-            problem.begin(replace(part, loads=part.loads.scaled(aim)))
-            found = self._thorough(gathered(device, u, live), min(MOST_STEP_OUTER, self.accuracy.outer))
+            gone = float(((aim - reached[live]) * gaps[live]).max())
+            found = self._closed(aimed(cases.rows(live), aim), gathered(device, u, live), outer, gone)
             good, spent = found.good, spent + found.linear_iterations
             iterations[live] += found.iterations
-            step[live] *= np.where(good, np.clip(STEP_OUTER / np.maximum(found.iterations, 1), 0.5, 2.0), CUT)
+            step[live] *= np.where(good, np.clip(lets / np.maximum(found.iterations, 1), 0.5, 2.0), CUT)
+            step = np.minimum(step, longest)
             scattered(device, gathered(device, found.u, np.flatnonzero(good)), live[good], u)
             reached[live[good]], residual[live[good]] = aim[good], found.residual[good]
-        outcome = failed.outcome[index]
-        outcome[reached == 1.0] = Outcome.CONVERGED_IN_STEPS
-        none, short = np.flatnonzero(reached == 0.0), np.flatnonzero((reached > 0.0) & (reached < 1.0))
-        scattered(device, gathered(device, failed.u, index[none]), none, u)
+            outcome[live] = found.outcome
+        short = np.flatnonzero(reached < 1.0)
+        outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
         if len(short):
             problem.begin(cases.rows(short))
             residual[short] = shortfall(problem, gathered(device, u, short))

@@ -71,9 +71,27 @@ class Resected:
     done: np.ndarray
 
 
-Cause = Pushed | Displaced | Nodal | Prescribed | Posture | Resected
-C = TypeVar("C", Pushed, Displaced, Nodal, Prescribed, Posture, Resected)
-# The array of each cause that grows with the load; the others say where it acts.
+@dataclass(frozen=True, eq=False)
+class Touching:
+    """Where the tools of `ToolContact` are: T_world_tool pose (B, tools, 4, 4), in its order.
+
+    They come straight from where they were in the start; without one, along their shafts from clear of the body.
+    """
+
+    pose: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Retracted:
+    """A blade laid on at T_world_tool pose (B, 4, 4), clear of the tissue, and moved by displacement (B, 3) [m]."""
+
+    pose: np.ndarray
+    displacement: np.ndarray
+
+
+Cause = Pushed | Displaced | Nodal | Prescribed | Posture | Resected | Touching | Retracted
+C = TypeVar("C", Pushed, Displaced, Nodal, Prescribed, Posture, Resected, Touching, Retracted)
+# The array of each cause that grows with the load; the others say where it acts. Tools move on `Cases.share`.
 MAGNITUDE = {
     Pushed: "force",
     Displaced: "displacement",
@@ -83,6 +101,8 @@ MAGNITUDE = {
 }
 # Arrays of one number a load case.
 SCALARS = ("footprint", "csf_level", "share", "done")
+# How far from a rotation the upper left of a pose may be.
+RIGID = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,6 +246,9 @@ def _checked(cause: Cause) -> Cause:
     arrays = {key: np.asarray(value, np.float64) for key, value in vars(cause).items()}
     whole_field = isinstance(cause, Nodal | Prescribed)
     for key, array in arrays.items():
+        if key == "pose":
+            _check_poses(name, array, 4 if isinstance(cause, Touching) else 3)
+            continue
         scalar_rows = key in SCALARS
         good = array.ndim == (1 if scalar_rows else 3 if whole_field else 2)
         if not good or (not scalar_rows and array.shape[-1] != 3):
@@ -240,3 +263,18 @@ def _checked(cause: Cause) -> Cause:
         if key == "direction" and not array.any(axis=1).all():
             raise InputError(f"{name}.{key} has a row of zeros: give every load case the way that gravity pulls.")
     return type(cause)(**arrays)
+
+
+def _check_poses(name: str, pose: np.ndarray, axes: int) -> None:
+    """Refuse what does not move bodies rigidly."""
+    if pose.ndim != axes or pose.shape[-2:] != (4, 4):
+        raise InputError(f"{name}.pose has shape {pose.shape}: give {'(B, tools, 4, 4)' if axes == 4 else '(B, 4, 4)'}.")
+    if not all_finite(pose):
+        raise InputError(f"{name}.pose has a value that is not finite: every number must be finite.")
+    turn = pose[..., :3, :3]
+    off = np.abs(turn @ turn.swapaxes(-1, -2) - np.eye(3)).max(initial=0.0)
+    if off > RIGID or (np.linalg.det(turn) < 0.0).any() or (pose[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():
+        raise InputError(
+            f"{name}.pose has a matrix that is no rigid motion: give rotations of determinant 1, lengths in metres, and "
+            "0 0 0 1 as the last row."
+        )

@@ -16,7 +16,7 @@ from .columns import combined, norms
 from .constraint import Constraint
 from .device import Device
 from .loads import Loads
-from .term import Cases, Paced, Term
+from .term import Cases, Moving, Paced, Term
 
 # A gap of so many last digits of the largest displacement is closed.
 CLOSED = 100.0
@@ -40,13 +40,14 @@ def nothing_imposed(loads: Loads) -> Imposed:
 class Problem:
     """Terms, constraints, and how loads impose displacements; N nodes on one device.
 
-    Arrays are (3N, b): one column per live load case.
+    Arrays are (3N, b): one column per live load case. `moving` are those of the terms whose tools move.
     """
 
     terms: tuple[Term, ...]
     constraint: Constraint
     device: Device
     impose: Callable[[Loads], Imposed] = nothing_imposed
+    moving: tuple[Moving, ...] = ()
 
     @property
     def rows(self) -> int:

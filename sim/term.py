@@ -19,13 +19,16 @@ class Cases:
     """The load cases of a batch: what acts, since when, and what each term remembers of the past.
 
     loads, B rows; start_time (B,) [s]; history, by term name: arrays with B rows, as `Term.end` returned them;
-    displacement (B, N, 3) [m] of the element's nodes at the start, or None: at rest.
+    displacement (B, N, 3) [m] of the element's nodes at the start, or None: at rest; share (B,) of the way from where
+    they were that tools have gone, 1 if None; anew, whether the descent begins at rest, where nothing is touched yet.
     """
 
     loads: Loads
     start_time: np.ndarray
     history: Mapping[str, Any] = field(default_factory=dict)
     displacement: np.ndarray | None = None
+    share: np.ndarray | None = None
+    anew: bool = False
 
     @property
     def steps(self) -> np.ndarray:
@@ -49,7 +52,8 @@ class Cases:
         """Some of the cases."""
         history = {name: value[index] for name, value in self.history.items()}
         displacement = None if self.displacement is None else self.displacement[index]
-        return Cases(self.loads.rows(index), self.start_time[index], history, displacement)
+        share = None if self.share is None else self.share[index]
+        return Cases(self.loads.rows(index), self.start_time[index], history, displacement, share, self.anew)
 
     def past(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """What the term `name` remembers, (B, *shape) float64; zeros if nothing.
@@ -147,6 +151,26 @@ class Paced(Term, Protocol):
 
     def curvature_at_pace(self, step: float) -> sp.csc_array:
         """What it adds to the curvature at rest (3N, 3N) [N/m] over a step in time [s]."""
+        ...
+
+
+class Moving(Term, Protocol):
+    """A Term of tools that move from where they were, and of a gap that they keep, which a descent may open first."""
+
+    def stride(self, cases: Cases) -> np.ndarray:
+        """The longest share (B,), at most 1, of their way that the tools may go at once."""
+        ...
+
+    def gaps(self, cases: Cases) -> np.ndarray:
+        """How many times (B,) the gap the tools go on their whole way."""
+        ...
+
+    def widen(self, times: float) -> None:
+        """Until the next batch begins the gap is so many times as wide."""
+        ...
+
+    def reaction(self, u: wp.array) -> np.ndarray:
+        """(b, tools, 6): force [N] and moment about its origin [N m] that each tool exerts at u (3N, b) [m]."""
         ...
 
 

@@ -1,0 +1,65 @@
+"""How rigid tools get from one pose to another, and where one comes from that has not touched yet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .tools import Tool, core_of
+
+# A step moves no point of a tool farther than this share of its radius: tissue never comes out at its other side.
+STRIDE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """B load cases' tools on their way: T_world_tool (B, tools, 4, 4) at its beginning and at its end."""
+
+    begin: np.ndarray
+    end: np.ndarray
+
+    def at(self, share: np.ndarray) -> np.ndarray:
+        """Poses (B, tools, 4, 4) after shares (B,) of the way: straight, turning evenly (spherical interpolation)."""
+        count, tools = self.end.shape[:2]
+        share = np.repeat(share, tools)
+        before, after = self.begin.reshape(-1, 4, 4), self.end.reshape(-1, 4, 4)
+        turn = Rotation.from_matrix(before[:, :3, :3].swapaxes(1, 2) @ after[:, :3, :3]).as_rotvec()
+        out = after.copy()
+        on_the_way = share != 1.0  # the end is reached to the last digit
+        partly = Rotation.from_rotvec(share[:, None] * turn).as_matrix()
+        out[on_the_way, :3, :3] = (before[:, :3, :3] @ partly)[on_the_way]
+        moved = before[:, :3, 3] + share[:, None] * (after[:, :3, 3] - before[:, :3, 3])
+        out[on_the_way, :3, 3] = moved[on_the_way]
+        return out.reshape(count, tools, 4, 4)
+
+    def travel(self, tools: tuple[Tool, ...]) -> np.ndarray:
+        """How far (B, tools) [m] the points of each tool go, at most."""
+        before, after = self.begin[:, :, :3], self.end[:, :, :3]
+        turn = (before[..., :3].swapaxes(2, 3) @ after[..., :3]).reshape(-1, 3, 3)
+        angle = Rotation.from_matrix(turn).magnitude().reshape(self.end.shape[:2])
+        extent = np.array([core_of(tool).extent for tool in tools])
+        return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
+
+    def stride(self, tools: tuple[Tool, ...]) -> np.ndarray:
+        """The longest shares (B,), at most 1, of the way that the tools may go at once."""
+        most = STRIDE * np.array([core_of(tool).radius for tool in tools])
+        return (most / np.maximum(self.travel(tools), most)).min(axis=1)
+
+
+def approach(tools: tuple[Tool, ...], pose: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
+    """Where tools (B, tools, 4, 4) came from along their shafts, clear of a surface with vertices `points` (n, 3) [m].
+
+    `reach` [m] is how far a surface may go on beyond its vertices, as half an edge.
+    """
+    out = pose.copy()
+    for k, tool in enumerate(tools):
+        core = core_of(tool)
+        for case in range(len(pose)):
+            local = (points - pose[case, k, :3, 3]) @ pose[case, k, :3, :3]
+            aside = np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]
+            above = local[(aside <= core.radius + reach).all(axis=1), 2]
+            back = max(0.0, float(above.max(initial=0.0)) + reach)
+            out[case, k, :3, 3] += back * pose[case, k, :3, 2]
+    return out

@@ -1,0 +1,51 @@
+"""What keeps two surfaces apart: a pressure that grows without end as the gap between them closes.
+
+    b(d) = -k (d - g)^2 ln(d / g) for 0 < d < g, 0 beyond: Li et al. 2020, "Incremental Potential Contact", eq. 6.
+
+Below a hundredth of g it goes on as the parabola that meets it there (a relaxed barrier: Feller, Ebenbauer 2017, IEEE
+Trans. Autom. Control 62:1223-1238): a tool that has moved into tissue pushes it out again, and no start is forbidden.
+With k = mu / g, mu the tissue's shear modulus, the pressure there is 107 mu: tissue that bears less stays outside.
+"""
+
+from typing import Any
+
+import warp as wp
+
+# The share of the gap below which the barrier is a parabola.
+RELAXED = wp.constant(0.01)
+
+
+@wp.func
+def barrier(d: Any, g: Any):
+    """b(d) / k [m^2]."""
+    zero = type(d)(0.0)
+    if d >= g:
+        return zero
+    low = type(d)(RELAXED) * g
+    e = wp.max(d, low)
+    value = -(e - g) * (e - g) * wp.log(e / g)
+    if d < low:
+        value += (d - low) * (barrier_slope(low, g) + type(d)(0.5) * (d - low) * barrier_curvature(low, g))
+    return value
+
+
+@wp.func
+def barrier_slope(d: Any, g: Any):
+    """b'(d) / k [m]: never positive, so that nothing is ever pulled."""
+    if d >= g:
+        return type(d)(0.0)
+    low = type(d)(RELAXED) * g
+    e = wp.max(d, low)
+    slope = -(type(d)(2.0) * (e - g) * wp.log(e / g) + (e - g) * (e - g) / e)
+    if d < low:
+        slope += (d - low) * barrier_curvature(low, g)
+    return slope
+
+
+@wp.func
+def barrier_curvature(d: Any, g: Any):
+    """b''(d) / k: never negative."""
+    if d >= g:
+        return type(d)(0.0)
+    e = wp.max(d, type(d)(RELAXED) * g)
+    return -(type(d)(2.0) * wp.log(e / g) + type(d)(4.0) * (e - g) / e - (e - g) * (e - g) / (e * e))

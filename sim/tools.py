@@ -1,0 +1,113 @@
+"""Rigid tools that touch tissue: each is all that lies within a radius of a point, a line or a rectangle.
+
+In a tool's own frame its lowest point is the origin and its shaft goes along +z.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from .errors import InputError
+
+
+def _check(tool: object) -> None:
+    for item in fields(tool):  # pyright: ignore[reportArgumentType]
+        value = getattr(tool, item.name)
+        if not 0.0 < value < math.inf:
+            raise InputError(f"{type(tool).__name__}.{item.name} is {value} m: give a positive number.")
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball of `radius` [m], its centre that far up the shaft.
+
+    Raises
+    ------
+    InputError
+        A size that is not positive.
+    """
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A round rod along the shaft with round ends: `radius` [m] about a line of `length` [m].
+
+    Raises
+    ------
+    InputError
+        A size that is not positive.
+    """
+
+    radius: float
+    length: float
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+@dataclass(frozen=True)
+class Spatula:
+    """A flat blade across the shaft, `width` [m] along x and `length` [m] along y, twice its `edge` radius [m] thick.
+
+    The sizes include the round edge.
+
+    Raises
+    ------
+    InputError
+        A size that is not positive, or a blade narrower than its edges.
+    """
+
+    width: float
+    length: float
+    edge: float
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if 2.0 * self.edge > min(self.width, self.length):
+            raise InputError(
+                f"a Spatula of {1e3 * self.width:g} x {1e3 * self.length:g} mm has no room for round edges of "
+                f"{1e3 * self.edge:g} mm: make it wider, or them smaller."
+            )
+
+
+Tool = Ball | Capsule | Spatula
+
+
+@dataclass(frozen=True, eq=False)
+class Core:
+    """What a tool lies within `radius` [m] of: a box in its frame, centre (3,) and half sizes (3,) [m], some of them 0."""
+
+    centre: np.ndarray
+    half: np.ndarray
+    radius: float
+
+    @property
+    def extent(self) -> float:
+        """How far the tool's farthest point is from its origin [m], at most."""
+        return float(np.linalg.norm(np.abs(self.centre) + self.half)) + self.radius
+
+
+def core_of(tool: Tool) -> Core:
+    """What a tool is made of."""
+    match tool:
+        case Ball(radius):
+            return Core(np.array([0.0, 0.0, radius]), np.zeros(3), radius)
+        case Capsule(radius, length):
+            return Core(np.array([0.0, 0.0, radius + 0.5 * length]), np.array([0.0, 0.0, 0.5 * length]), radius)
+        case Spatula(width, length, edge):
+            return Core(np.array([0.0, 0.0, edge]), np.array([0.5 * width - edge, 0.5 * length - edge, 0.0]), edge)
+
+
+def distances_to(tool: Tool, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Signed distances (n,) [m] of points (n, 3) [m] from a tool at T_world_tool `pose` (4, 4); negative inside."""
+    core = core_of(tool)
+    local = (points - pose[:3, 3]) @ pose[:3, :3] - core.centre
+    return np.linalg.norm(local - np.clip(local, -core.half, core.half), axis=1) - core.radius
