@@ -287,7 +287,9 @@ class Ladder:
         least = LEAST_STEP * np.minimum(1.0, 4.0 * longest)
         reached, iterations, residual = np.zeros(count), np.zeros(count, int), np.full(count, np.inf)
         outcome = np.full(count, Outcome.BUDGET, object)
-        lets, outer = (STEP_OUTER, min(MOST_STEP_OUTER, self.accuracy.outer)) if first < 1.0 else 2 * (self.accuracy.outer,)
+        lets, outer = (
+            (STEP_OUTER, min(MOST_STEP_OUTER, self.accuracy.outer)) if first < 1.0 else 2 * (self.accuracy.outer,)
+        )
         for _ in range(most + asked):
             live = np.flatnonzero((reached < 1.0) & (step >= least))
             if len(live) == 0 or spent > PATIENCE * self.accuracy.inner * asked:

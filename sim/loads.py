@@ -268,13 +268,15 @@ def _checked(cause: Cause) -> Cause:
 def _check_poses(name: str, pose: np.ndarray, axes: int) -> None:
     """Refuse what does not move bodies rigidly."""
     if pose.ndim != axes or pose.shape[-2:] != (4, 4):
-        raise InputError(f"{name}.pose has shape {pose.shape}: give {'(B, tools, 4, 4)' if axes == 4 else '(B, 4, 4)'}.")
+        raise InputError(
+            f"{name}.pose has shape {pose.shape}: give {'(B, tools, 4, 4)' if axes == 4 else '(B, 4, 4)'}."
+        )
     if not all_finite(pose):
         raise InputError(f"{name}.pose has a value that is not finite: every number must be finite.")
     turn = pose[..., :3, :3]
     off = np.abs(turn @ turn.swapaxes(-1, -2) - np.eye(3)).max(initial=0.0)
     if off > RIGID or (np.linalg.det(turn) < 0.0).any() or (pose[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():
         raise InputError(
-            f"{name}.pose has a matrix that is no rigid motion: give rotations of determinant 1, lengths in metres, and "
-            "0 0 0 1 as the last row."
+            f"{name}.pose has a matrix that is no rigid motion: give rotations of determinant 1, lengths in metres, "
+            "and 0 0 0 1 as the last row."
         )

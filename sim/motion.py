@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .tools import Tool, core_of
+from .tools import Tool, core_of, distances_to
 
 # A step moves no point of a tool farther than this share of its radius: tissue never comes out at its other side.
 STRIDE = 0.5
+# Most steps of a tool's way through the air, each as far as nothing can be touched.
+MARCH = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,18 +50,22 @@ class Way:
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
 
 
-def approach(tools: tuple[Tool, ...], pose: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
-    """Where tools (B, tools, 4, 4) came from along their shafts, clear of a surface with vertices `points` (n, 3) [m].
+def approach(tools: tuple[Tool, ...], pose: np.ndarray, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Where tools (B, tools, 4, 4) came from along their shafts: just clear of a surface with vertices `points` (n, 3).
 
-    `reach` [m] is how far a surface may go on beyond its vertices, as half an edge.
+    `reach` (n,) [m] is how far the surface goes on round each vertex. A tool that is clear where it is came from there.
     """
     out = pose.copy()
     for k, tool in enumerate(tools):
         core = core_of(tool)
         for case in range(len(pose)):
+            shaft = pose[case, k, :3, 2]
             local = (points - pose[case, k, :3, 3]) @ pose[case, k, :3, :3]
-            aside = np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]
-            above = local[(aside <= core.radius + reach).all(axis=1), 2]
-            back = max(0.0, float(above.max(initial=0.0)) + reach)
-            out[case, k, :3, 3] += back * pose[case, k, :3, 2]
+            aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
+            above = (local[:, 2] + reach)[aside <= core.radius + reach]
+            back, room = max(0.0, float(above.max(initial=0.0))), 0.0
+            for _ in range(MARCH):
+                back = max(0.0, back - room)
+                out[case, k, :3, 3] = pose[case, k, :3, 3] + back * shaft
+                room = max(0.0, float((distances_to(tool, out[case, k], points) - reach).min()))
     return out

@@ -83,7 +83,7 @@ Tool = Ball | Capsule | Spatula
 
 @dataclass(frozen=True, eq=False)
 class Core:
-    """What a tool lies within `radius` [m] of: a box in its frame, centre (3,) and half sizes (3,) [m], some of them 0."""
+    """What a tool lies within `radius` [m] of: a box in its frame, centre (3,) and half sizes (3,) [m], some 0."""
 
     centre: np.ndarray
     half: np.ndarray
