@@ -161,7 +161,7 @@ def contact_of(
     """The term of an effect on tissue with a shear modulus [Pa]."""
     contact = isinstance(effect, ToolContact)
     name, tools = ("tool contact", effect.tools) if contact else ("retraction", (effect.blade,))
-    covered: np.ndarray = anatomy.held.any(axis=1) | anatomy.slide_normal.any(axis=1)
+    covered = np.logical_or(anatomy.held.any(axis=1), anatomy.slide_normal.any(axis=1))
     triangles = space.surface[~covered[space.mesh.surface].all(axis=1)]
     if not len(triangles):
         raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is held or slides.")
