@@ -22,7 +22,7 @@ class Debulking:
     times
         When each step is done [s], in turn: the corridor, then share after share.
     corridor
-        Its radius [m].
+        Its radius [m]; wider where the mesh is coarser.
     """
 
     times: tuple[float, ...]
@@ -51,7 +51,8 @@ class Debulking:
         length = np.linalg.norm(way)
         along = (middle - site.origin) @ way / length
         across = np.linalg.norm(middle - site.origin - np.outer(along, way / length), axis=1)
-        on_the_way = (across < self.corridor) & (along < length) & (mesh.region != TUMOUR_LABEL)
+        radius = max(self.corridor, float(np.cbrt(6.0 * mesh.volumes.mean())))
+        on_the_way = (across < radius) & (along < length) & (mesh.region != TUMOUR_LABEL)
         from_the_top = tumour[np.argsort(along[tumour], kind="stable")]
         *taken, _ = np.array_split(from_the_top, shares)
         return Resection(tuple(tuple(step.tolist()) for step in (np.flatnonzero(on_the_way), *taken)))

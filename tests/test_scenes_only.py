@@ -1,0 +1,146 @@
+"""Only what a scene asks for is imported, compiled, launched and kept: told by a fresh interpreter for each scene."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from scenes.scene import SCENES, find_scene
+from sim.effects import Effect, Elasticity
+from sim.material import LAWS
+
+TESTS = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What it takes to have an effect: modules of `sim.terms`, kernels of a frame, classes that keep arrays."""
+
+    modules: frozenset[str] = frozenset()
+    kernels: frozenset[str] = frozenset()
+    classes: frozenset[str] = frozenset()
+
+
+def cost(modules: str = "", kernels: str = "", classes: str = "") -> Cost:
+    """Of words."""
+    return Cost(frozenset(modules.split()), frozenset(kernels.split()), frozenset(classes.split()))
+
+
+# A new effect adds one line.
+OF_EFFECT = {
+    "Elasticity": cost("elasticity invariants law loops source", "loops:add_gradient", "Elasticity Kernels Law _Part"),
+    "Held": cost(),
+    "Slide": cost(),
+    "ToolForce": cost("dead_force", "dead_force:spread dead_force:subtract", "DeadForce Forces Kernels"),
+    "ToolDisplacement": cost(),
+    "NodalForce": cost("dead_force", "", "DeadForce"),
+    "Gravity": cost("dead_force gravity", "dead_force:subtract", "DeadForce Forces Kernels"),
+    "Inertia": cost("inertia", "inertia:add_force", "Inertia Kernels"),
+    "Pulsation": cost("swelling", "swelling:fill loops:measure loops:spread", "Swelling"),
+    "Resection": cost(),
+}
+OF_LAW = {
+    "linear": cost("linear"),
+    "corotational": cost("corotational"),
+    "neo-hookean": cost("neo_hookean"),
+    "stable-neo-hookean": cost("stable_neo_hookean"),
+    "ogden": cost("ogden spectral"),
+    "prony": cost(
+        "neo_hookean viscoelastic", "loops:measure loops:spread viscoelastic:advance viscoelastic:fade", "Prony Kernels"
+    ),
+}
+# What a solver may do of any energy, as the load needs it.
+ANY = {f"loops:{name}" for name in ("add_energy", "add_curvature", "add_diagonal", "bound_step")} | {
+    "dead_force:subtract_work",
+    "inertia:add_energy",
+    "inertia:add_blocks",
+}
+
+
+@cache
+def witnessed(scene: str, more: str = "", law: str = "", element: str = "") -> dict[str, set[str]]:
+    """What `witness.py` says, in an interpreter of its own."""
+    paths = os.pathsep.join([str(TESTS.parent), str(TESTS)])
+    words = [sys.executable, str(TESTS / "witness.py"), scene, more, law, element]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": paths})
+    assert done.returncode == 0, done.stderr
+    return {name: set(found) for name, found in json.loads(done.stdout).items()}
+
+
+def expected(effects: list[str], law: str) -> Cost:
+    """Of all effects and the law."""
+    costs = [*(OF_EFFECT[name] for name in effects), OF_LAW[law]]
+    return Cost(*(frozenset().union(*(getattr(one, name) for one in costs)) for name in Cost.__dataclass_fields__))
+
+
+def of_terms(kernels: set[str]) -> set[str]:
+    """Those kernels that are terms', without what any energy may need."""
+    return {name.removeprefix("sim.terms.") for name in kernels if name.startswith("sim.terms.")} - ANY
+
+
+def check(found: dict[str, set[str]], effects: list[str], law: str) -> None:
+    """Nothing less, and nothing more."""
+    want = expected(effects, law)
+    assert found["imported"] == want.modules
+    assert found["living"] == want.classes
+    assert (
+        of_terms(found["launched"]) >= want.kernels if law == "prony" else want.kernels == of_terms(found["launched"])
+    )
+    assert {name.split(":")[0] for name in of_terms(found["compiled"])} <= want.modules
+    assert not found["heavy"]
+
+
+def effects_of(name: str) -> list[str]:
+    """The effects of a built-in scene, by name."""
+    scene = find_scene(name)
+    return [*(type(effect).__name__ for effect in scene.effects), *(["Resection"] if scene.surgery else [])]
+
+
+def law_of(name: str) -> str:
+    """The law of a built-in scene's tissue."""
+    (tissue,) = (effect.default for effect in find_scene(name).effects if isinstance(effect, Elasticity))
+    assert tissue is not None
+    return tissue.law
+
+
+def test_every_effect_and_law_has_its_line():
+    assert set(OF_EFFECT) == {kind.__name__ for kind in Effect.__args__}
+    assert set(OF_LAW) == {*LAWS, "ogden", "prony"}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_scene_costs_its_effects_and_nothing_else(scene):
+    check(witnessed(scene), effects_of(scene), law_of(scene))
+
+
+@pytest.mark.parametrize("more", ["Inertia", "Pulsation", "NodalForce", "ToolDisplacement", "Inertia+Gravity"])
+def test_one_more_effect_costs_itself_alone(more):
+    check(witnessed("press", more), [*effects_of("press"), *more.split("+")], law_of("press"))
+
+
+@pytest.mark.parametrize("law", sorted(set(OF_LAW) - {"stable-neo-hookean"}))
+def test_a_scene_of_one_law_knows_no_other(law):
+    """A linear scene compiles no Ogden kernel: it does not even read what it is made of."""
+    check(witnessed("press", "", law), effects_of("press"), law)
+
+
+@pytest.mark.parametrize("element", ["p2", "smoothed"])
+def test_elements_need_no_term_of_their_own(element):
+    found = witnessed("press", "", "", element)
+    check(found, effects_of("press"), law_of("press"))
+    grids = {"sim.multigrid", "sim.sparse"}
+    assert (grids <= {name.split(":")[0] for name in found["launched"]}) == (element == "p2")
+
+
+def test_every_kernel_of_a_frame_was_compiled_and_the_plain_frame_is_short():
+    """The ear hears: what is launched is what was compiled, and a scene that lies still steers nothing."""
+    press, sinking = witnessed("press"), witnessed("brain_shift")
+    assert press["launched"] <= press["compiled"] and len(press["launched"]) > 10
+    assert not {name for name in sinking["compiled"] if "footprint" in name or name.endswith("dead_force:spread")}

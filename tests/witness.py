@@ -1,0 +1,84 @@
+"""What an interpreter that plays one scene holds: run as a program with a scene, more effects, a tissue and an element.
+
+Prints as JSON the modules of `sim.terms` that were imported; where the kernels come from that were compiled, and that
+were launched in a later frame; the classes of the terms that live; and modules that no scene needs on this machine.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import sys
+from dataclasses import replace
+
+import warp as wp
+from conftest import make_box
+
+from scenes.paths import Touch
+from scenes.play import Player
+from scenes.scene import Scene, find_scene
+from scenes.stage import Stage
+from scenes.theatre import Theatre
+from sim import effects as known
+from sim.effects import Elasticity
+from sim.material import Material, Ogden
+
+LAUNCHED: set[str] = set()
+TISSUES = {
+    "ogden": Ogden(((1340.0, -2.0),), 3e4),
+    "prony": Material("neo-hookean", 3000.0, 0.45, ((0.4, 0.5),)),
+}
+HEAVY = ("torch", "sim.dense", "pyamg", "sim.amg", "viser", "sklearn", "onnx")
+
+
+def told(kernel: wp.Kernel) -> str:
+    """The module whose source a kernel is, and its name."""
+    return f"{kernel.func.__module__}:{kernel.func.__name__}"
+
+
+def listened(launch):
+    """`wp.launch` that notes what it launches."""
+
+    def noting(kernel, *words, **more):
+        LAUNCHED.add(told(kernel))
+        return launch(kernel, *words, **more)
+
+    return noting
+
+
+def scene_of(name: str, more: str, law: str, element: str) -> Scene:
+    """A built-in scene with more effects, another law for all tissue, another element."""
+    scene = find_scene(name)
+    effects = tuple(getattr(known, kind)() for kind in more.split("+") if kind)
+    if law:
+        tissue = TISSUES[law] if law in TISSUES else Material(law, 3000.0, 0.45)
+        scene = replace(scene, effects=(Elasticity(tissue), *scene.effects[1:]))
+    return replace(scene, effects=(*scene.effects, *effects), element=element or scene.element)
+
+
+def played(scene: Scene) -> dict[str, list[str]]:
+    """Three frames of the scene's middle on a tiny box; the last is watched."""
+    theatre = Theatre(make_box((4, 4, 4), spacing=18e-3, tumour=16e-3, depth=30e-3, opening=26e-3), None, {}, "cpu")
+    player = Player(Stage(scene, theatre.site), theatre.deformer("fem", scene))
+    last = None
+    for number in range(3):
+        LAUNCHED.clear()
+        time = 0.35 * scene.duration + 0.4 * number
+        loads = scene.loads(theatre.site, scene.path(time) if scene.tool else Touch(), time)
+        last = player.deformer.deform(loads, start=last)
+        assert last.outcome[0].good, last.outcome
+    things = gc.get_objects()
+    compiled = [thing for thing in things if isinstance(thing, wp.Kernel) and thing.module.execs]
+    living = {type(thing).__name__ for thing in things if str(type(thing).__module__).startswith("sim.terms.")}
+    return {
+        "imported": sorted(name.split(".")[2] for name in sys.modules if name.startswith("sim.terms.")),
+        "compiled": sorted({told(kernel) for kernel in compiled}),
+        "launched": sorted(LAUNCHED),
+        "living": sorted(living),
+        "heavy": sorted(set(HEAVY) & set(sys.modules)),
+    }
+
+
+if __name__ == "__main__":
+    wp.launch = listened(wp.launch)
+    print(json.dumps(played(scene_of(*sys.argv[1:]))))
