@@ -45,6 +45,8 @@ OF_EFFECT = {
     "Inertia": cost("inertia", "inertia:add_force", "Inertia Kernels"),
     "Pulsation": cost("swelling", "swelling:fill loops:measure loops:spread", "Swelling"),
     "Resection": cost(),
+    "ToolContact": cost("barrier contact touch", "", "Contact"),  # no tool has a pose yet
+    "Retraction": cost("barrier contact touch", "", "Contact"),
 }
 OF_LAW = {
     "linear": cost("linear"),
@@ -120,7 +122,9 @@ def test_a_scene_costs_its_effects_and_nothing_else(scene):
     check(witnessed(scene), effects_of(scene), law_of(scene))
 
 
-@pytest.mark.parametrize("more", ["Inertia", "Pulsation", "NodalForce", "ToolDisplacement", "Inertia+Gravity"])
+@pytest.mark.parametrize(
+    "more", ["Inertia", "Pulsation", "NodalForce", "ToolDisplacement", "ToolContact", "Retraction", "Inertia+Gravity"]
+)
 def test_one_more_effect_costs_itself_alone(more):
     check(witnessed("press", more), [*effects_of("press"), *more.split("+")], law_of("press"))
 

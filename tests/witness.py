@@ -22,12 +22,14 @@ from scenes.theatre import Theatre
 from sim import effects as known
 from sim.effects import Elasticity
 from sim.material import Material, Ogden
+from sim.tools import Ball, Spatula
 
 LAUNCHED: set[str] = set()
 TISSUES = {
     "ogden": Ogden(((1340.0, -2.0),), 3e4),
     "prony": Material("neo-hookean", 3000.0, 0.45, ((0.4, 0.5),)),
 }
+MADE = {"ToolContact": known.ToolContact((Ball(7e-3),)), "Retraction": known.Retraction(Spatula(12e-3, 20e-3, 1e-3))}
 HEAVY = ("torch", "sim.dense", "pyamg", "sim.amg", "viser", "sklearn", "onnx")
 
 
@@ -49,7 +51,7 @@ def listened(launch):
 def scene_of(name: str, more: str, law: str, element: str) -> Scene:
     """A built-in scene with more effects, another law for all tissue, another element."""
     scene = find_scene(name)
-    effects = tuple(getattr(known, kind)() for kind in more.split("+") if kind)
+    effects = tuple(MADE[kind] if kind in MADE else getattr(known, kind)() for kind in more.split("+") if kind)
     if law:
         tissue = TISSUES[law] if law in TISSUES else Material(law, 3000.0, 0.45)
         scene = replace(scene, effects=(Elasticity(tissue), *scene.effects[1:]))
