@@ -39,6 +39,7 @@ from .patching import patching
 from .precondition import choose_preconditioner, is_exact, name_of, rest_solver
 from .problem import Problem
 from .series import Reading, factors, taylor, terms_of
+from .still import Still
 from .term import Cases
 from .vicinity import vicinity_of
 
@@ -152,10 +153,10 @@ class Fem:
         )
         return answer.rows(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
-    def _ladder_at(self, step: float) -> Ladder:
+    def _ladder_at(self, step: float) -> Ladder | Still:
         """Whose preconditioner knows the step in time [s]; of an infinite one, the ladder of statics."""
-        if step == math.inf:
-            return self._ladder
+        if step == 0.0 or step == math.inf:
+            return self._ladder if step else Still(self.problem, self._ladder.inversion)
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed, step)
         return Ladder(self.problem, preconditioner, self._ladder.inversion, self.accuracy)
 
@@ -322,7 +323,9 @@ class Fem:
             full[:, vertices:] += start.history[MIDDLES]
         return full.reshape(len(loads), self.problem.rows).T
 
-    def _solve(self, ladder: Ladder, cases: Cases, last: np.ndarray | None, at: np.ndarray | None) -> Deformation:
+    def _solve(
+        self, ladder: Ladder | Still, cases: Cases, last: np.ndarray | None, at: np.ndarray | None
+    ) -> Deformation:
         clock = time.perf_counter()
         guesses = () if last is None else (moved_on(cases.loads, last, cases.history), last)
         found = ladder.climb(cases, guesses)

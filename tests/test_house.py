@@ -27,6 +27,7 @@ TIERS = (
         "patching",
         "vicinity",
         "ladder",
+        "still",
         "correction",
         "frame",
         "following",

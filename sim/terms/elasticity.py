@@ -180,7 +180,7 @@ class Elasticity:
         strains = self._strains.of(u.shape[1])
         outputs = [strains[part.first : part.first + part.count] for part in self._parts]
         self._each(self._kernels.measure, lambda part: [u, *part.shape], outputs, u.shape[1])
-        kept = [source.end(self._cases, strains) for source in self._sources]
+        kept = [source.end(self._cases, strains) for source in reversed(self._sources)]
         return next((history for history in kept if history is not None), None)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:

@@ -11,7 +11,6 @@ from ..columns import CHUNK, Rooms
 from ..device import Device
 from ..discretisation import Discretisation
 from ..element import quadratic_elements
-from ..errors import InputError
 from ..term import Cases
 
 # Shares of a quadratic tetrahedron's mass: its consistent mass matrix' diagonal, scaled to the whole. Row sums would be
@@ -101,7 +100,7 @@ class Inertia:
 
     Its gradient is M ((v - v_n) / dt + damping v) with v = (u - u_n) / dt: backward Euler (Martin, Thomaszewski,
     Grinspun, Gross 2011, "Example-Based Elastic Materials", ACM Trans. Graph. 30(4), section 4). History: velocities
-    (B, N, 3) [m/s].
+    (B, N, 3) [m/s]. Where no time passes there is no motion to resist, and velocities stay: w = 0.
 
     Parameters
     ----------
@@ -130,18 +129,14 @@ class Inertia:
         Raises
         ------
         InputError
-            Loads whose time is that of their start, or before it; a history of another body.
+            Loads that lie before their start; a history of another body.
         """
         steps, count = cases.steps, len(cases.loads)
-        if not (steps > 0.0).all():
-            raise InputError(
-                f"load case {int(steps.argmin())} is at its start's time, {cases.loads.times[steps.argmin()]:g} s: "
-                "Inertia needs time to pass; give loads a later `time`."
-            )
         self._cases = cases
         drift = steps / (1.0 + self._damping * steps)
         aim = self._start(cases) + drift[:, None, None] * self._velocity(cases)
-        self._weight.of(count).assign((1.0 + self._damping * steps) / steps**2)
+        passes = np.where(steps > 0.0, steps, np.inf)
+        self._weight.of(count).assign(1.0 / passes**2 + self._damping / passes)
         self._aim.of(count).assign(np.ascontiguousarray(aim.reshape(count, -1).T))
 
     def keep(self, columns: np.ndarray) -> None:
@@ -184,7 +179,9 @@ class Inertia:
         """Velocities (B, N, 3) [m/s] at the end of the step."""
         assert self._cases is not None
         now = u.numpy().astype(np.float64).T.reshape(u.shape[1], -1, 3)
-        return (now - self._start(self._cases)) / self._cases.steps[:, None, None]
+        steps = self._cases.steps[:, None, None]
+        passes = np.where(steps > 0.0, steps, np.inf)
+        return np.where(steps > 0.0, (now - self._start(self._cases)) / passes, self._velocity(self._cases))
 
     def _start(self, cases: Cases) -> np.ndarray:
         """Where the nodes were (B, N, 3) [m]."""

@@ -31,5 +31,8 @@ class Source(Protocol):
         ...
 
     def end(self, cases: Cases, strains: wp.array) -> np.ndarray | None:
-        """What must travel to the next call (B, ...), or None; strains (T, q, b): the displacement gradients now."""
+        """What must travel to the next call (B, ...), or None; strains (T, q, b): the displacement gradients now.
+
+        A source that accounts for some of them leaves the rest there: those inside of it come after it.
+        """
         ...

@@ -5,6 +5,7 @@ growth of the same size in all directions: psi per volume before it is (1 + thet
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -70,10 +71,18 @@ def swollen(law: Law, device: Device, count: int) -> Law:
     return Law(f"swelling {law.name}", energy, stress, stress_change, law.needs_positive_volume, at_rest)
 
 
+@dataclass(frozen=True)
+class Kernels:
+    """How much wider every point is; each launches over (element, point, column)."""
+
+    fill: wp.Kernel
+    shrink: wp.Kernel
+
+
 @cache
-def filling_of(device: Device) -> wp.Kernel:
-    """Kernel that tells every point how much its column's tissue has swollen, if it does."""
-    scalar = device.scalar
+def kernels_of(device: Device) -> Kernels:
+    """Kernels of a device's scalar type."""
+    scalar, mat = device.scalar, device.matrix
 
     @wp.kernel(module="unique")
     def fill(
@@ -87,7 +96,19 @@ def filling_of(device: Device) -> wp.Kernel:
         e, q, c = wp.tid()
         out[e, q, place, c] = swells[e] * wider[c]
 
-    return fill
+    @wp.kernel(module="unique")
+    def shrink(
+        swells: wp.array(dtype=scalar),
+        wider: wp.array(dtype=scalar),
+        # outputs
+        strain: wp.array3d(dtype=mat),
+    ):
+        """H <- F_e - I = (H - r I) / (1 + r)."""
+        e, q, c = wp.tid()
+        r = swells[e] * wider[c]
+        strain[e, q, c] = (strain[e, q, c] - r * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + r)
+
+    return Kernels(fill, shrink)
 
 
 class Swelling:
@@ -114,10 +135,15 @@ class Swelling:
         return swollen(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
-        """r at every point: accurate for small theta too."""
-        wider = np.expm1(np.log1p(self._theta(cases.loads.times)) / 3.0)
-        inputs = [self._swells, self._device.array(wider), first]
-        self._device.launch(filling_of(self._device), (*out.shape[:2], out.shape[3]), inputs, [out])
+        """r at every point."""
+        inputs = [self._swells, self._wider(cases), first]
+        self._device.launch(kernels_of(self._device).fill, (*out.shape[:2], out.shape[3]), inputs, [out])
 
     def end(self, cases: Cases, strains: wp.array) -> None:
-        """Swelling depends on the time alone."""
+        """Swelling depends on the time alone; what is elastic of the strains is left to what remembers it."""
+        inputs = [self._swells, self._wider(cases)]
+        self._device.launch(kernels_of(self._device).shrink, strains.shape, inputs, [strains])
+
+    def _wider(self, cases: Cases) -> wp.array:
+        """R (b,), accurate for small theta too."""
+        return self._device.array(np.expm1(np.log1p(self._theta(cases.loads.times)) / 3.0))

@@ -4,10 +4,12 @@ Simo 1987, "On a fully three-dimensional finite-strain viscoelastic damage model
 60:153-173; Simo, Hughes 1998, "Computational Inelasticity", section 10.3; Holzapfel 2000, "Nonlinear Solid Mechanics",
 section 6.10. The step is the derivative of an incremental potential: with Fb = J^(-1/3) F, Cb = Fb^T Fb,
 
-    psi(F) + (f - 1) psi(Fb) + Cb : A / 2,  f = 1 - sum_i g_i (1 - exp(-dt / (2 tau_i))),
+    f psi(F) + (1 - f) psi(J^(1/3) I) + Cb : A / 2,  f = 1 - sum_i g_i (1 - exp(-dt / (2 tau_i))),
     A = sum_i (exp(-dt / tau_i) H_i - g_i exp(-dt / (2 tau_i)) S),
 
-S the isochoric stress of the law itself, pulled back by the last step's Fb, and H_i the parts of it that fade.
+S the deviatoric stress of the law itself, pulled back by the last step's Fb, and H_i the parts of it that fade. Where a
+law parts shape from volume, as Ogden's, psi(F) - psi(J^(1/3) I) is psi(Fb), and this is what the papers have. Of the
+others psi(Fb) must not be taken away from psi(F): it outgrows it where tissue is crushed, which then collapses.
 """
 
 from collections.abc import Sequence
@@ -40,6 +42,13 @@ def isochoric(H: Any):
     """Fb - I = J^(-1/3) (I + H) - I, exact at small strain."""
     k = exp_less_one(-log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
     return H + k * (wp.identity(n=3, dtype=type(k)) + H)
+
+
+@wp.func
+def dilated(H: Any):
+    """J^(1/3) I - I."""
+    k = exp_less_one(log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
+    return k * wp.identity(n=3, dtype=type(k))
 
 
 @wp.func
@@ -79,37 +88,45 @@ def relaxing(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def energy(H: mat, c: whole):
-        """psi(F) + (f - 1) psi(Fb) + (Cb - I) : A / 2 [Pa]; +inf where J <= 0."""
+        """f psi(F) + (1 - f) psi(J^(1/3) I) + (Cb - I) : A / 2 [Pa]; +inf where J <= 0."""
         if volume_change(H) <= scalar(-1.0):
             return scalar(wp.inf)
-        Hb, k = isochoric(H), of_law(c)
-        return own_energy(H, k) + c[count] * own_energy(Hb, k) + wp.ddot(green_strain(Hb), pull(c))
+        k, less = of_law(c), c[count]
+        own = own_energy(H, k) + less * (own_energy(H, k) - own_energy(dilated(H), k))
+        return own + wp.ddot(green_strain(isochoric(H)), pull(c))
 
     @wp.func
     def stress(H: mat, c: whole):
-        """P(F) + J^(-1/3) (Q - (Q : F) F^-T / 3), with Q = (f - 1) P(Fb) + Fb A."""
-        F, Hb, k, A = wp.identity(n=3, dtype=scalar) + H, isochoric(H), of_law(c), pull(c)
-        Q = c[count] * own_stress(Hb, k) + A + Hb * A
-        shrink = wp.exp(-log_one_plus(volume_change(H)) / scalar(3.0))
-        return own_stress(H, k) + shrink * (Q - wp.ddot(Q, F) / scalar(3.0) * inverse_transpose(H))
+        """f P(F) + (1 - f) p J^(1/3) F^-T + J^(-1/3) (Q - (Q : F) F^-T / 3), p I = P(J^(1/3) I), Q = Fb A."""
+        F, k, A, less = wp.identity(n=3, dtype=scalar) + H, of_law(c), pull(c), c[count]
+        Q, G = A + isochoric(H) * A, inverse_transpose(H)
+        V = dilated(H)
+        wide = scalar(1.0) + V[0, 0]
+        p = own_stress(V, k)[0, 0]
+        level = less * p * wide + wp.ddot(Q, F) / (scalar(3.0) * wide)
+        return (scalar(1.0) + less) * own_stress(H, k) + Q / wide - level * G
 
     @wp.func
     def stress_change(H: mat, D: mat, c: whole):
         """dP for dF = D: the derivative of `stress`, factor by factor."""
         three = scalar(3.0)
         identity = wp.identity(n=3, dtype=scalar)
-        F, Hb, k, A = identity + H, isochoric(H), of_law(c), pull(c)
+        F, k, A, less = identity + H, of_law(c), pull(c), c[count]
         J = scalar(1.0) + volume_change(H)
-        shrink = wp.exp(-log_one_plus(volume_change(H)) / three)
+        V = dilated(H)
+        wide = scalar(1.0) + V[0, 0]
         G = inverse_transpose(H)
         swelling = wp.ddot(G, D)
+        widening = wide * swelling / three
         dG = cofactor_change(F, D) / J - swelling * G
-        dF = shrink * (D - swelling / three * F)
-        Q = c[count] * own_stress(Hb, k) + A + Hb * A
-        dQ = c[count] * own_change(Hb, dF, k) + dF * A
-        level = wp.ddot(Q, F)
-        turned = dQ - (wp.ddot(dQ, F) + wp.ddot(Q, D)) / three * G - level / three * dG
-        return own_change(H, D, k) + shrink * (turned - swelling / three * (Q - level / three * G))
+        Q = A + isochoric(H) * A
+        dQ = (D - swelling / three * F) * A / wide
+        p, dp = own_stress(V, k)[0, 0], own_change(V, widening * identity, k)[0, 0]
+        level = less * p * wide + wp.ddot(Q, F) / (three * wide)
+        pulled = (wp.ddot(dQ, F) + wp.ddot(Q, D) - swelling / three * wp.ddot(Q, F)) / (three * wide)
+        rise = less * (dp * wide + p * widening) + pulled
+        own = (scalar(1.0) + less) * own_change(H, D, k)
+        return own + (dQ - swelling / three * Q) / wide - rise * G - level * dG
 
     @wp.func
     def at_rest(c: whole):
@@ -164,11 +181,11 @@ def kernels_of(law: Law, device: Device, count: int) -> Kernels:
 
     @wp.func
     def pulled_back(H: mat, k: constants):
-        """S = Fb^-1 dev(P(Fb) Fb^T) Fb^-T."""
-        Hb = isochoric(H)
-        P, G = own_stress(Hb, k), wp.identity(n=3, dtype=scalar) + cofactor_excess(Hb)
-        level = wp.ddot(P, wp.identity(n=3, dtype=scalar) + Hb) / scalar(3.0)
-        return wp.transpose(G) * (P - level * G)
+        """S = Fb^-1 dev(P F^T) Fb^-T = J^(1/3) Fb^-1 (P - (P : Fb) Fb^-T / 3)."""
+        Hb, P = isochoric(H), own_stress(H, k)
+        identity = wp.identity(n=3, dtype=scalar)
+        G, wide = identity + cofactor_excess(Hb), scalar(1.0) + dilated(H)[0, 0]
+        return wide * (wp.transpose(G) * (P - wp.ddot(P, identity + Hb) / scalar(3.0) * G))
 
     @wp.kernel(module="unique")
     def advance(
