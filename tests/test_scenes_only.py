@@ -43,7 +43,7 @@ OF_EFFECT = {
     "NodalForce": cost("dead_force", "", "DeadForce"),
     "Gravity": cost("dead_force gravity", "dead_force:subtract", "DeadForce Forces Kernels"),
     "Inertia": cost("inertia", "inertia:add_force", "Inertia Kernels"),
-    "Pulsation": cost("swelling", "swelling:fill loops:measure loops:spread", "Swelling"),
+    "Pulsation": cost("swelling", "swelling:fill loops:spread", "Swelling"),
     "Resection": cost(),
     "ToolContact": cost("barrier contact touch", "", "Contact"),  # no tool has a pose yet
     "Retraction": cost("barrier contact touch", "", "Contact"),

@@ -10,7 +10,7 @@ from oracle import EVERY_LAW, tissue
 from scenes.shipped import template_path
 from sim.accuracy import LIVE, TRAIN, Accuracy
 from sim.discretisation import ELEMENTS
-from sim.effects import Elasticity, Gravity, Held, Slide, ToolDisplacement, ToolForce
+from sim.effects import Elasticity, Gravity, Held, Inertia, Pulsation, Slide, ToolDisplacement, ToolForce
 from sim.fem import Fem
 from sim.following import Kept
 from sim.linear import BlockJacobi
@@ -73,6 +73,28 @@ def test_a_batch_of_postures(box, element, precision):
     assert off <= BOUND[precision] * np.abs(expected.displacement).max()
     scan = posture(np.array(Gravity().direction), np.full(7, 1.0))
     assert not on_cuda.deform(scan, found).displacement.any()
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("element", ["p1", "smoothed"])
+@pytest.mark.parametrize("moving", [(), (Inertia(damping=2.0),)])
+def test_steps_in_time(box, moving, element, precision):
+    """Tissue that relaxes and swells, with and without mass; steps of two lengths in one batch."""
+    accuracy = Accuracy(1e-8) if precision == "float64" else TRAIN
+    made_of = replace(tissue("ogden"), prony=((0.4, 0.5), (0.3, 5.0)))
+    effects = (Elasticity(made_of), Held(), ToolForce(), Pulsation(), *moving)
+    step = np.array([0.02, 0.02, 0.02, 0.02, 0.3, 0.3, 0.3])
+    answers = []
+    for name in ("cpu", "cuda"):
+        fem, answer = Fem(box, effects, accuracy, name, element=element), None
+        for number in range(1, 4):
+            answer = fem.deform(Loads(pushes().causes, number * step), answer)
+            assert all(outcome.good for outcome in answer.outcome)
+        answers.append(answer)
+    on_cpu, on_cuda = answers
+    off = np.abs(on_cpu.displacement - on_cuda.displacement).max()
+    assert off <= 3.0 * BOUND[precision] * np.abs(on_cpu.displacement).max()
+    assert set(on_cpu.history) >= {"viscoelasticity ogden" + (" of shape" if element == "smoothed" else "")}
 
 
 def test_block_jacobi_reaches_what_the_inverse_reaches(box):

@@ -175,7 +175,7 @@ class Elasticity:
 
     def end(self, u: wp.array) -> np.ndarray | None:
         """What a source remembers; elasticity by itself remembers nothing."""
-        if self._cases is None:
+        if self._cases is None or not any(source.remembers for source in self._sources):
             return None
         strains = self._strains.of(u.shape[1])
         outputs = [strains[part.first : part.first + part.count] for part in self._parts]

@@ -22,6 +22,11 @@ class Source(Protocol):
         """How many there are at a point."""
         ...
 
+    @property
+    def remembers(self) -> bool:
+        """Whether `end` has anything that must travel."""
+        ...
+
     def law(self, inner: Law, count: int) -> Law:
         """The law that `inner`, which takes `count` numbers, becomes: it takes these first, and then the source's."""
         ...

@@ -230,7 +230,7 @@ class Prony:
         Where its arrays live.
     """
 
-    count = 1 + SIX
+    count, remembers = 1 + SIX, True
 
     def __init__(
         self, name: str, law: Law, coefficients: np.ndarray, pairs: Sequence[Pairs], points: int, device: Device
