@@ -19,6 +19,8 @@ COMMANDS = {
     "judge": "hold models to loads that they have never seen: errors, and whether their bounds hold",
     "export": "write a learnt model as an ONNX file, for programs in other languages",
     "patient": "from a label volume to a brain ready for the scenes: anatomy, simulate, train",
+    "scenes": "list the built-in scenes: effects, who can play them, pictures and cost",
+    "effects": "measure what each effect of a scene costs, and what it changes",
     "demo": "play a scene on a page in the browser",
     "render": "write the frames of a scene as pictures, without display",
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",

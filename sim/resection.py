@@ -10,7 +10,7 @@ import numpy as np
 from .anatomy import Anatomy
 from .effects import Resection
 from .errors import InputError
-from .holding import loosened
+from .holding import check_held, loosened
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +45,13 @@ def remains(anatomy: Anatomy, effect: Resection) -> tuple[Remains, ...]:
     Raises
     ------
     InputError
-        A step that takes a tetrahedron that the mesh does not have, or the last of the body.
+        A body that is not held; a step that takes a tetrahedron that the mesh does not have, or the last of the body.
     """
     return tuple(_remains(anatomy, effect))
 
 
 def _remains(anatomy: Anatomy, effect: Resection) -> Iterator[Remains]:
+    check_held(anatomy.mesh, anatomy.held, anatomy.slide_normal)  # else all of it would count as loose
     yield Remains(0, anatomy, np.zeros(0, np.int64))
     taken: set[int] = set()
     for done, step in enumerate(effect.steps, start=1):

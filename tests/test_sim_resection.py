@@ -312,3 +312,20 @@ class TestHardCases:
 def test_half_a_load_is_of_the_same_body() -> None:
     half = lying([1]).scaled(0.5)
     assert half.of(Resected).done.tolist() == [1.0] and half.of(Posture).share.tolist() == [0.5]  # type: ignore
+
+
+def test_what_nobody_asks_to_be_held_is_free() -> None:
+    """Of the anatomy's held and sliding vertices those count that the effects ask for."""
+    normal = np.zeros_like(MESH.nodes)
+    for axis in range(3):
+        normal[(MESH.nodes[:, axis] < 1e-9) & ~normal.any(axis=1), axis] = -1.0
+    body = hold(MESH, MESH.nodes[:, 2] < 1e-9, normal)
+    sliding = (Elasticity(SOFT), Slide(), Gravity(direction=(0.0, 0.0, -1.0)))
+    corner = Resection((within((2, 2, 2), (3, 3, 4)),))
+    answer = finite_elements(body, (*sliding, corner), TIGHT, "cpu", element="p1").deform(lying([1]))
+    bare, used = compact(remains(hold(MESH, np.zeros(len(MESH.nodes), bool), normal), corner)[1].anatomy)
+    assert len(used) == len(MESH.nodes) - 1
+    alone = Fem(bare, sliding, TIGHT, "cpu", element="p1").deform(posture(DOWN, -1.0))
+    np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-12)
+    with pytest.raises(InputError, match="can move rigidly in 6 of 6 ways"):
+        finite_elements(body, (Elasticity(SOFT), Resection((NEXT,))), TIGHT, "cpu").deform(lying([0]).but(Posture))

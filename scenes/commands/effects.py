@@ -1,0 +1,46 @@
+"""`sulcus effects`: what each effect of a scene costs and changes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from sim.errors import InputError
+
+HEAD = ("effect", "ms a frame", "MB on the device", "MB at most", "tumour mm", "cortex mm", "")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`")
+    parser.add_argument("--every", type=int, default=5, help="solve every so many frames (default %(default)s)")
+    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve the scene with and without each."""
+    from ..ablation import rows
+    from ..scene import find_scene
+    from ..theatre import open_theatre
+
+    if args.every < 1:
+        raise InputError(f"--every {args.every}: give a whole number from 1 up.")
+    scene = find_scene(args.scene)
+    theatre = open_theatre(args.anatomy, device=args.device)
+    table = sys.stderr if args.json else sys.stdout
+    print(f"{scene.name}: all effects together, then what each adds to the others\n", file=table)
+    print(f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}", file=table)
+    found = []
+    for row in rows(theatre, scene, args.every):
+        found.append(row)
+        figures = (row.milliseconds, row.held_mb, row.peak_mb, row.tumour_mm, row.cortex_mm)
+        cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
+        print(f"| {' | '.join([row.effect, *cells, row.refused])} |", file=table, flush=True)
+    if args.json:
+        print(json.dumps({"scene": scene.name, "effects": [asdict(row) for row in found]}))
+    return 0

@@ -1,0 +1,120 @@
+"""What each effect costs and changes, and the list of scenes with its sheet."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import warp as wp
+from theatres import PUSHING, put, short, sinking, theatre_of
+
+from scenes.ablation import ALL, device_bytes, rows, run, without
+from scenes.cli import main
+from scenes.scene import SCENES, find_scene
+from scenes.sheet import halved, sheet
+from sim.effects import Gravity, Held, ToolForce
+from sim.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module")
+def anatomy(theatre, tmp_path_factory):
+    return str(put(theatre, tmp_path_factory.mktemp("ablation") / "box.vtu"))
+
+
+def test_a_scene_is_left_without_one_effect():
+    scene = sinking()
+    assert Gravity() not in without(scene, Gravity()).effects and len(without(scene, Held()).effects) == 3
+    cut = find_scene("resection")
+    assert without(cut, object()).surgery is None and without(cut, Held()).surgery is not None  # type: ignore
+
+
+def test_each_effect_has_its_row(theatre):
+    both = replace(short(), effects=(*short().effects, Gravity()), lying=sinking().lying)
+    found = {row.effect: row for row in rows(theatre, both, 1)}
+    assert list(found) == [ALL, "Elasticity", "Held", "Slide", "ToolForce", "Gravity"]
+    assert "nothing else resists" in found["Elasticity"].refused and found["Elasticity"].milliseconds is None
+    assert "can move rigidly" in found["Held"].refused
+    slide = found["Slide"]  # nothing slides in this body
+    assert slide.tumour_mm == slide.cortex_mm == 0.0 and not slide.refused
+    # Each moves the tumour, both together no farther than the sum.
+    push, weight, whole = found["ToolForce"], found["Gravity"], found[ALL]
+    assert push.tumour_mm > 0.1 and weight.tumour_mm > 0.1
+    assert max(push.tumour_mm, weight.tumour_mm) < whole.tumour_mm < 1.1 * (push.tumour_mm + weight.tumour_mm)
+    assert whole.milliseconds > 0.0 and whole.held_mb > 0.1 and (whole.peak_mb is None or whole.peak_mb > 50.0)
+
+
+def test_the_change_is_that_between_the_answers(theatre):
+    """By another way: an effect that does all that is done."""
+    scene = sinking()
+    found = {row.effect: row for row in rows(theatre, scene, 2)}
+    whole = run(replace(theatre, models={}), scene, 2).displacement[:, theatre.anatomy.tumour_nodes]
+    largest = 1e3 * np.linalg.norm(whole, axis=2).mean(axis=1).max()
+    assert found["Gravity"].tumour_mm == found[ALL].tumour_mm == pytest.approx(largest, rel=1e-6)
+
+
+def test_a_frame_that_is_not_answered_is_a_sentence(theatre):
+    scene = replace(short(), accuracy=replace(short().accuracy, outer=1, inner=1, steps=0))
+    with pytest.raises(InputError, match=r"the frame at 0\.\d+ s is not answered: stopped"):
+        run(theatre, scene, 1)
+
+
+def test_bytes_are_those_of_arrays_that_live():
+    before = device_bytes()
+    array = wp.zeros(1_000_000, dtype=wp.float32, device="cpu")
+    view = array[:500_000]
+    assert device_bytes() - before == pytest.approx(4e6, abs=1e3) and len(view) == 500_000
+    del array, view
+    assert device_bytes() - before == pytest.approx(0.0, abs=1e3)
+
+
+def test_the_command_tells_rows(anatomy, capsys):
+    assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "60", "--device", "cpu", "--json"]) == 0
+    out, error = capsys.readouterr()
+    told = json.loads(out)
+    assert out.count("\n") == 1 and told["scene"] == "brain_shift"
+    assert [row["effect"] for row in told["effects"]] == [ALL, "Elasticity", "Held", "Slide", "Gravity"]
+    assert "| Gravity | " in error and "MB on the device" in error
+    assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "0"]) == 2
+    assert "give a whole number" in capsys.readouterr().err
+
+
+class TestScenes:
+    def test_they_are_listed_with_who_can_play_them(self, anatomy, capsys):
+        assert main(["scenes", "--anatomy", anatomy, "--device", "cpu", "--json"]) == 0
+        told = {row["scene"]: row for row in json.loads(capsys.readouterr().out)["scenes"]}
+        assert tuple(told) == SCENES
+        for name, row in told.items():
+            assert row["deformers"] == (["linear", "svr", "fem"] if name in PUSHING else ["fem"])
+            assert ("ToolForce" in row["effects"]) == (ToolForce() in find_scene(name).effects)
+        assert "Resection" in told["resection"]["effects"] and "milliseconds" not in told["press"]
+
+    def test_pictures_and_a_sheet(self, anatomy, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr("scenes.scene.SCENES", ("press", "brain_shift"))
+        out = tmp_path / "new" / "sheet"
+        assert main(["scenes", "--anatomy", anatomy, "--device", "cpu", "--out", str(out)]) == 0
+        assert "ms a frame by linear; the tumour moves" in capsys.readouterr().out
+        assert sorted(path.name for path in out.iterdir()) == ["brain_shift.png", "press.png", "sheet.png"]
+        whole, one = (cv2.imread(str(out / name)) for name in ("sheet.png", "press.png"))
+        assert one.shape == (240, 320, 3) and whole.shape == (240, 960, 3)
+        assert np.array_equal(whole[:, :320], one) and (whole[:, 640:] == 12).all()
+
+    def test_a_file_is_no_folder(self, anatomy, tmp_path, capsys):
+        (tmp_path / "file").touch()
+        assert main(["scenes", "--anatomy", anatomy, "--out", str(tmp_path / "file")]) == 2
+        assert "need a folder" in capsys.readouterr().err
+
+
+def test_half_a_picture_keeps_its_light():
+    colour = np.random.default_rng(0).integers(0, 256, (7, 10, 3), dtype=np.uint8)
+    small = halved(colour)
+    assert small.shape == (3, 5, 3)
+    assert small[1, 2].tolist() == np.rint(colour[2:4, 4:6].reshape(4, 3).mean(axis=0)).tolist()
+    assert sheet([small] * 4).shape == (6, 15, 3) and (sheet([small] * 4)[3:, 5:] == 12).all()
