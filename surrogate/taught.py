@@ -31,6 +31,9 @@ def refusal(model: Learned, effects: Iterable[Effect]) -> str | None:
     Where nothing slides in its anatomy it is all one whether `Slide` is asked for.
     """
     taught, asked = taught_effects(model), frozenset(type(effect).__name__ for effect in effects)
+    if ToolForce.__name__ not in asked:
+        others = ", ".join(sorted(asked - taught))
+        return f"it was taught what a tool's force does, and here is none{f', but {others}' if others else ''}"
     idle = set() if model.anatomy.slide_normal.any() else {"Slide"}
     strange, missing = asked - taught - idle, taught - asked - ON_CALL - idle
     if not strange and not missing:

@@ -91,10 +91,14 @@ class TestLearnt:
     def test_it_refuses_effects_that_it_was_not_taught(self, theatre):
         model = theatre.models["linear"]
         assert refusal(model, short().effects) is None
-        why = refusal(model, sinking().effects)
+        why = refusal(model, (*short().effects, Gravity()))
         assert why is not None and "not under Gravity" in why
-        with pytest.raises(InputError, match=r"svr does not know the scene sinking.*not under Gravity.*one of fem"):
+        with pytest.raises(InputError, match=r"svr does not know the scene sinking.*but Gravity. Choose one of fem"):
             theatre.player("svr", sinking())
+        # No force at all: it has nothing to say of that either.
+        assert "here is none" in (refusal(model, EFFECTS) or "") and theatre.names(
+            replace(short(), effects=EFFECTS)
+        ) == ("fem",)
         assert theatre.names(short()) == ("linear", "svr", "fem") and theatre.names(sinking()) == ("fem",)
         assert theatre.best(sinking()) == "fem"
 
