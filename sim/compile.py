@@ -26,6 +26,7 @@ from .effects import (
     Pulsation,
     Resection,
     Retraction,
+    SkullContact,
     Slide,
     ToolContact,
     ToolDisplacement,
@@ -49,7 +50,7 @@ from .loads import (
 )
 from .material import Tissue, coefficients_of, portion
 from .problem import Imposed, Problem
-from .term import Curved, Moving, Term
+from .term import Barrier, Curved, Term
 
 CAUSES = {
     ToolForce: Pushed,
@@ -87,10 +88,12 @@ def compile_problem(
             raise InputError(f"the effect {kind.__name__} is asked for {kinds.count(kind)} times: once is enough.")
     if Elasticity not in kinds:
         raise InputError("no effect resists deformation: add Elasticity.")
+    if Slide in kinds and SkullContact in kinds:
+        raise InputError("Slide and SkullContact contradict each other: one keeps the brain on the skull. Choose one.")
     space = space or discretise(anatomy.mesh, "p1")
     skin = skin or Skin(space.nodes, space.surface, device)
     terms: list[Term] = []
-    moving: list[Moving] = []
+    barriers: list[Barrier] = []
     held = np.zeros_like(anatomy.held)
     normal = np.zeros_like(anatomy.slide_normal)
     pulsation = next((effect for effect in effects if isinstance(effect, Pulsation)), None)
@@ -124,7 +127,11 @@ def compile_problem(
             case ToolContact() | Retraction():
                 from .terms.contact import contact_of
 
-                moving.append(contact_of(effect, anatomy, space, _shear(effects), device))
+                barriers.append(contact_of(effect, anatomy, space, _shear(effects), device))
+            case SkullContact():
+                from .terms.skull_contact import skull_of
+
+                barriers.append(skull_of(effect, anatomy, space, _shear(effects), device))
             case ToolDisplacement():
                 pass  # a constraint: `_impose` reads the loads
             case Resection():
@@ -134,7 +141,7 @@ def compile_problem(
                 raise InputError(f"no effect is called {type(effect).__name__}: choose from {allowed}.")
     check_held(anatomy.mesh, held, normal)
     constraint = Constraint(space.held(held), space.sliding(normal, held), device)
-    return Problem((*terms, *moving), constraint, device, partial(_impose, space, skin), tuple(moving))
+    return Problem((*terms, *barriers), constraint, device, partial(_impose, space, skin), tuple(barriers))
 
 
 def _shear(effects: Iterable[Effect]) -> float:

@@ -269,7 +269,27 @@ class Retraction:
         _check_gap(self)
 
 
-def _check_gap(effect: ToolContact | Retraction) -> None:
+@dataclass(frozen=True)
+class SkullContact:
+    """The skull holds the brain on its side without friction, and lets go of it: where `Slide` would keep it on.
+
+    Nodes with a normal in `Anatomy.slide_normal` stay on their side of the plane across it, `gap` [m] above where they
+    are at rest; they feel it in the last tenth of a millimetre. The body needs what `Held` holds: bone alone only bars
+    its way. A plane for each node is right as long as nodes slide less than the skull curves.
+
+    Raises
+    ------
+    InputError
+        A gap that is not positive.
+    """
+
+    gap: float = 1e-4
+
+    def __post_init__(self) -> None:
+        _check_gap(self)
+
+
+def _check_gap(effect: ToolContact | Retraction | SkullContact) -> None:
     if not 0.0 < effect.gap < math.inf:
         raise InputError(f"{type(effect).__name__}.gap is {effect.gap} m: give a positive number.")
 
@@ -287,6 +307,7 @@ Effect = (
     | Resection
     | ToolContact
     | Retraction
+    | SkullContact
 )
 """Everything that a scene may ask for."""
 

@@ -348,7 +348,7 @@ class Fem:
         on_footprint = None
         if cases.loads.of(Displaced) is not None:
             on_footprint = self.problem.constraint.force_on_footprint(self.problem.gradient(found.u))
-        touching = [term.reaction(found.u) for term in self.problem.moving]
+        touching = [term.reaction(found.u) for term in self.problem.barriers]
         reaction = np.concatenate([self._reaction(cases.loads, on_footprint), *touching], axis=1)
         vertices = len(self._anatomy.mesh.nodes)
         nodes = np.arange(vertices) if at is None else at

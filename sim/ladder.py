@@ -179,7 +179,7 @@ class Ladder:
         # Rest satisfies whatever the batch does not move.
         imposed = problem.constraint.imposes or (start is not None and problem.gap(start)[1].any())
         start = device.zeros(problem.rows, count) if start is None else start
-        if problem.moving:
+        if problem.barriers:
             return self._moved(cases, start)
         if imposed or problem.steep or self.accuracy.outer < FEWEST:
             return self._thorough(start, self.accuracy.outer)
@@ -222,7 +222,7 @@ class Ladder:
         widest = int(np.ceil(np.log(max(gaps / WIDE_ENOUGH, 1.0)) / np.log(CLOSING)))
         for times in CLOSING ** np.arange(widest, 0.0, -1.0):
             self.problem.begin(cases)
-            for term in self.problem.moving:
+            for term in self.problem.barriers:
                 term.widen(float(times))
             found = self._thorough(start, outer, max(OPEN_TOLERANCE, self.accuracy.tolerance))
             start, iterations, linear = found.u, iterations + found.iterations, linear + found.linear_iterations
@@ -280,8 +280,8 @@ class Ladder:
         that these ask for is one more than the `most` steps. Outcomes are good where the share is 1.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
-        longest = np.minimum.reduce([np.ones(count), *(term.stride(cases) for term in problem.moving)])
-        gaps = np.maximum.reduce([np.zeros(count), *(term.gaps(cases) for term in problem.moving)])
+        longest = np.minimum.reduce([np.ones(count), *(term.stride(cases) for term in problem.barriers)])
+        gaps = np.maximum.reduce([np.zeros(count), *(term.gaps(cases) for term in problem.barriers)])
         asked = int(np.ceil(1.0 / longest.min(initial=1.0)))
         u, step, spent = wp.clone(start), np.minimum(first, longest), 0
         least = LEAST_STEP * np.minimum(1.0, 4.0 * longest)

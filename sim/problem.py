@@ -16,7 +16,7 @@ from .columns import combined, norms
 from .constraint import Constraint
 from .device import Device
 from .loads import Loads
-from .term import Cases, Moving, Paced, Term
+from .term import Barrier, Cases, Paced, Term
 
 # A gap of so many last digits of the largest displacement is closed.
 CLOSED = 100.0
@@ -40,14 +40,14 @@ def nothing_imposed(loads: Loads) -> Imposed:
 class Problem:
     """Terms, constraints, and how loads impose displacements; N nodes on one device.
 
-    Arrays are (3N, b): one column per live load case. `moving` are those of the terms whose tools move.
+    Arrays are (3N, b): one column per live load case. `barriers` are those of the terms that bodies touch.
     """
 
     terms: tuple[Term, ...]
     constraint: Constraint
     device: Device
     impose: Callable[[Loads], Imposed] = nothing_imposed
-    moving: tuple[Moving, ...] = ()
+    barriers: tuple[Barrier, ...] = ()
 
     @property
     def rows(self) -> int:

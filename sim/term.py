@@ -154,15 +154,15 @@ class Paced(Term, Protocol):
         ...
 
 
-class Moving(Term, Protocol):
-    """A Term of tools that move from where they were, and of a gap that they keep, which a descent may open first."""
+class Barrier(Term, Protocol):
+    """A Term of bodies that tissue touches: they keep a gap, which a descent may open first; some move, as tools do."""
 
     def stride(self, cases: Cases) -> np.ndarray:
         """The longest share (B,), at most 1, of their way that the tools may go at once."""
         ...
 
     def gaps(self, cases: Cases) -> np.ndarray:
-        """How many times (B,) the gap the tools go on their whole way."""
+        """How many times (B,) the gap the tools go on their whole way, or tissue may."""
         ...
 
     def widen(self, times: float) -> None:
