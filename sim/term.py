@@ -133,7 +133,10 @@ class Term(Protocol):
         ...
 
     def rest_curvature(self) -> sp.csc_array | None:
-        """Curvature at rest (3N, 3N) [N/m], assembled, for factorised preconditioners; None leaves the term out."""
+        """Curvature at rest (3N, 3N) [N/m], assembled, for factorised preconditioners; None leaves the term out.
+
+        A steep term may offer what stands better for where it is going.
+        """
         ...
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:

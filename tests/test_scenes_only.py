@@ -47,6 +47,11 @@ OF_EFFECT = {
     "Resection": cost(),
     "ToolContact": cost("barrier contact touch", "", "Contact"),  # no tool has a pose yet
     "Retraction": cost("barrier contact touch", "", "Contact"),
+    "SkullContact": cost(
+        "barrier skull_contact",
+        "skull_contact:add_gradient skull_contact:add_curvature skull_contact:bound_step",
+        "Skull",
+    ),
 }
 OF_LAW = {
     "linear": cost("linear"),
@@ -123,7 +128,17 @@ def test_a_scene_costs_its_effects_and_nothing_else(scene):
 
 
 @pytest.mark.parametrize(
-    "more", ["Inertia", "Pulsation", "NodalForce", "ToolDisplacement", "ToolContact", "Retraction", "Inertia+Gravity"]
+    "more",
+    [
+        "Inertia",
+        "Pulsation",
+        "NodalForce",
+        "ToolDisplacement",
+        "ToolContact",
+        "Retraction",
+        "SkullContact",
+        "Inertia+Gravity",
+    ],
 )
 def test_one_more_effect_costs_itself_alone(more):
     check(witnessed("press", more), [*effects_of("press"), *more.split("+")], law_of("press"))

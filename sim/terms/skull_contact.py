@@ -26,7 +26,7 @@ FELT = 1e-4
 # A step takes no node farther than this share of its distance to the bone.
 ROOM_KEPT = 0.9
 # Preconditioners count the skull as stiff as this share of the shear modulus over what is felt: between open and shut.
-HALF_SHUT = 0.02
+HALF_SHUT = 0.2
 # How far [m] brain may come at once, from rest and from where it was: the barrier is as wide at first.
 AT_FIRST, AGAIN = 1e-2, 1e-3
 # The wall's bend at a node is read off so many nearest nodes, of those whose normals are less than 60 degrees apart.
