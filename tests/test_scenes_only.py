@@ -136,7 +136,6 @@ def test_a_scene_costs_its_effects_and_nothing_else(scene):
         "ToolDisplacement",
         "ToolContact",
         "Retraction",
-        "SkullContact",
         "Inertia+Gravity",
     ],
 )
