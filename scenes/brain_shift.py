@@ -1,8 +1,8 @@
-"""The dura is open and the fluid drains: the brain sinks, and sinks otherwise when the head is turned."""
+"""The dura is open and half of the fluid drains: the brain sinks, and sinks otherwise when the head is turned."""
 
 import numpy as np
 
-from sim.effects import Elasticity, Gravity, Held, Slide
+from sim.effects import Elasticity, Gravity, Held, SkullContact
 
 from .lying import drained_then_turned
 from .scene import Scene
@@ -12,8 +12,8 @@ SCENE = Scene(
     "brain_shift",
     __doc__ or "",
     duration=6.0,
-    effects=(Elasticity(), Held(), Slide(), Gravity()),
+    effects=(Elasticity(), Held(), SkullContact(), Gravity()),
     tool=None,
-    lying=drained_then_turned(drain=3.0, pause=0.5, turn=2.0, angle=np.radians(30.0)),
+    lying=drained_then_turned(drain=3.0, pause=0.5, turn=2.0, angle=np.radians(30.0), to=0.5),
     element="smoothed",
 )

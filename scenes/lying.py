@@ -53,12 +53,12 @@ def drained(seconds: float, to: float = 0.0) -> Lie:
     return lambda time: Lying(fluid=1.0 - (1.0 - to) * smooth(time / seconds))
 
 
-def drained_then_turned(drain: float, pause: float, turn: float, angle: float) -> Lie:
-    """On the back while the fluid drains wholly within `drain` [s]; `pause` [s]; then a turn by `angle` [rad].
+def drained_then_turned(drain: float, pause: float, turn: float, angle: float, to: float = 0.0) -> Lie:
+    """On the back while the fluid falls to a share within `drain` [s]; `pause` [s]; then a turn by `angle` [rad].
 
     A positive angle brings the left side down; the turn takes `turn` [s].
     """
-    falling = drained(drain)
+    falling = drained(drain, to)
 
     def lie(time: float) -> Lying:
         turned = angle * smooth((time - drain - pause) / turn)

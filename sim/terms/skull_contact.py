@@ -28,7 +28,7 @@ ROOM_KEPT = 0.9
 # Preconditioners count the skull as stiff as this share of the shear modulus over what is felt: between open and shut.
 HALF_SHUT = 0.2
 # How far [m] brain may come at once, from rest and from where it was: the barrier is as wide at first.
-AT_FIRST, AGAIN = 1e-2, 1e-3
+AT_FIRST, AGAIN = 1e-2, 5e-4
 # The wall's bend at a node is read off so many nearest nodes, of those whose normals are less than 60 degrees apart.
 NEIGHBOURS, FACING = 16, 0.5
 # Of a quadratic triangle's area each corner's share, and each middle's: all positive, so that no node is forgotten.
