@@ -11,7 +11,7 @@ import numpy as np
 from ar.camera import Camera, look_at
 from sim.accuracy import LIVE, Accuracy
 from sim.anatomy import Anatomy
-from sim.effects import Effect, Elasticity, Gravity, Held, Resection, Slide, ToolForce
+from sim.effects import Effect, Elasticity, Gravity, Held, Resection, SkullContact, Slide, ToolForce
 from sim.errors import InputError
 from sim.loads import Cause, Loads, Pushed, Resected
 
@@ -112,8 +112,10 @@ class Scene:
         return np.arange(round(self.duration * self.frames_per_second) + 1) / self.frames_per_second
 
     def effects_on(self, anatomy: Anatomy) -> tuple[Effect, ...]:
-        """Its effects, with those that depend on the body."""
-        return self.effects if self.surgery is None else (*self.effects, _resection(self.surgery, anatomy))
+        """Its effects, with those that depend on the body: from a skull that is held no brain comes off."""
+        gone = () if anatomy.slide_normal.any() else (SkullContact,)
+        kept = tuple(effect for effect in self.effects if not isinstance(effect, gone))
+        return kept if self.surgery is None else (*kept, _resection(self.surgery, anatomy))
 
     def contact(self, site: Site, touch: Touch) -> Contact:
         """The material point that the tool touches."""

@@ -11,6 +11,7 @@ import json
 import sys
 from dataclasses import replace
 
+import numpy as np
 import warp as wp
 from conftest import make_box
 
@@ -20,6 +21,7 @@ from scenes.scene import Scene, find_scene
 from scenes.stage import Stage
 from scenes.theatre import Theatre
 from sim import effects as known
+from sim.anatomy import Anatomy
 from sim.effects import Elasticity
 from sim.material import Material, Ogden
 from sim.tools import Ball, Spatula
@@ -58,9 +60,17 @@ def scene_of(name: str, more: str, law: str, element: str) -> Scene:
     return replace(scene, effects=(*scene.effects, *effects), element=element or scene.element)
 
 
+def slippery(anatomy: Anatomy) -> Anatomy:
+    """The same, its lower side a skull that it slides on."""
+    height = anatomy.mesh.nodes[:, 2]
+    low = height < height.min() + 1e-9
+    return replace(anatomy, held=anatomy.held & ~low[:, None], slide_normal=np.outer(low, [0.0, 0.0, -1.0]))
+
+
 def played(scene: Scene) -> dict[str, list[str]]:
     """Three frames of the scene's middle on a tiny box; the last is watched."""
-    theatre = Theatre(make_box((4, 4, 4), spacing=18e-3, tumour=16e-3, depth=30e-3, opening=26e-3), None, {}, "cpu")
+    box = make_box((4, 4, 4), spacing=18e-3, tumour=16e-3, depth=30e-3, opening=26e-3)
+    theatre = Theatre(slippery(box), None, {}, "cpu")
     player = Player(Stage(scene, theatre.site), theatre.deformer("fem", scene))
     last = None
     for number in range(3):
