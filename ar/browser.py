@@ -63,6 +63,15 @@ class Choice:
 
 
 @dataclass(frozen=True)
+class Toggle:
+    """Something that is on or off; `changed` takes which, on the page's own thread, and must return at once."""
+
+    label: str
+    start: bool
+    changed: Callable[[bool], None]
+
+
+@dataclass(frozen=True)
 class Playback:
     """Play, pause and scrub over frames 0 .. frames - 1: `played` takes whether it plays, `sought` a frame number."""
 
@@ -92,7 +101,7 @@ class Browser:
         bodies: Sequence[Body],
         viewpoint: Viewpoint,
         playback: Playback,
-        controls: Sequence[Slider | Choice] = (),
+        controls: Sequence[Slider | Choice | Toggle] = (),
         title: str = "sulcus",
         caption: str = "",
         host: str = "127.0.0.1",
@@ -234,9 +243,13 @@ class Browser:
 
         self.hear(self.frame, playback.sought)
 
-    def add_control(self, control: Slider | Choice) -> viser.GuiInputHandle:
-        """A slider or a list."""
+    def add_control(self, control: Slider | Choice | Toggle) -> viser.GuiInputHandle:
+        """A slider, a list or a box to tick."""
         gui = self.server.gui
+        if isinstance(control, Toggle):
+            box = gui.add_checkbox(control.label, control.start)
+            self.hear(box, control.changed)
+            return box
         if isinstance(control, Slider):
             slider = gui.add_slider(control.label, control.low, control.high, control.step, control.start)
             self.hear(slider, control.changed)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import threading
 import time as clock
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
-from ar.browser import Body, Browser, Choice, Playback, Slider, Viewpoint
+from ar.browser import Body, Browser, Choice, Playback, Slider, Toggle, Viewpoint
+from sim.effects import Elasticity, Held, Slide
 
+from .ablation import without
 from .paths import Touch
 from .play import Frame, Player
 from .referee import Referee, Truth
@@ -35,6 +38,7 @@ class Wish:
     tool: str = SCRIPT
     plays: bool = True
     number: int = 0
+    off: frozenset[str] = frozenset()
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def set(self, **values: object) -> None:
@@ -48,6 +52,11 @@ class Wish:
         with self.lock:
             tilt = self.touch.tilt[0] if right is None else right, self.touch.tilt[1] if up is None else up
             self.touch, self.tool = replace(self.touch, tilt=tilt, **values), HAND
+
+    def switch(self, effect: str, on: bool) -> None:
+        """Switch an effect on or off."""
+        with self.lock:
+            self.off = self.off - {effect} if on else self.off | {effect}
 
     def next(self, frames: int) -> tuple[int, str, Touch | None]:
         """Frame number, deformer and hand-set touch (None: the script's) of the next frame; playing goes on by one."""
@@ -64,7 +73,7 @@ class Demo:
     def __init__(self, theatre: Theatre, scene: Scene, deformer: str, host: str, port: int) -> None:
         self.stage = Stage(scene, theatre.site, theatre.intensity)
         self.theatre = theatre
-        self.players = {deformer: Player(self.stage, theatre.deformer(deformer, scene))}
+        self.players = {(deformer, frozenset[str]()): Player(self.stage, theatre.deformer(deformer, scene))}
         self.wish = Wish(deformer, Touch(force=0.15))
         self.browser = Browser(
             self._bodies(),
@@ -86,29 +95,35 @@ class Demo:
 
     def run(self, seconds: float = float("inf")) -> int:
         """Play until the time is over; returns the frames drawn."""
-        scene, drawn, previous = self.stage.scene, 0, ""
+        scene, drawn = self.stage.scene, 0
+        previous: tuple[str, frozenset[str]] | None = None
         frame: Frame | None = None
         end = clock.perf_counter() + seconds
         shown: tuple | None = None
-        judged: tuple[Truth, str] | None = None
+        judged: tuple | None = None
         verdict = "error: the finite elements are being prepared"
         while clock.perf_counter() < end:
             begun = clock.perf_counter()
             number, name, touch = self.wish.next(len(scene.times))
-            asked = (number, name, touch)
+            off = self.wish.off
+            name = "fem" if off else name  # nobody else was taught without
+            asked = (number, name, touch, off)
             if asked != shown or frame is None:
                 time = float(scene.times[number])
                 touch = scene.path(time) if touch is None else touch
                 last = frame.deformation if frame is not None else None
-                frame = self._player(name).draw(number, time, touch, last if name == previous else None)
-                previous, shown = name, asked
-                self.tally.took(name, frame.deformation.cost.total)
-                self.referee.ask(number, frame.loads)
-                self._show(frame, name)
+                frame = self._player(name, off).draw(number, time, touch, last if (name, off) == previous else None)
+                previous, shown = (name, off), asked
+                if not off:
+                    self.tally.took(name, frame.deformation.cost.total)
+                self.referee.ask(number, scene.loads(self.stage.site, touch, time))
+                self._show(frame, self._player(name, off))
                 drawn += 1
             truth = self.referee.truth
-            if truth is not None and (truth, name) != judged:
-                verdict, judged = self._judge(truth, name), (truth, name)
+            if truth is not None and (truth, name, off) != judged and (not off or truth.number == frame.number):
+                self._wire(truth, self._player(name, off))
+                verdict = changed(self.stage, truth, frame, off) if off else self._judge(truth, name)
+                judged = (truth, name, off)
             if self.referee.failure is not None:
                 verdict = f"error: the finite elements do not answer any more ({self.referee.failure})"
             self.browser.report(self._report(frame, name, verdict))
@@ -120,17 +135,29 @@ class Demo:
         self.browser.close()
         self.referee.close()
 
-    def _player(self, name: str) -> Player:
-        if name not in self.players:
-            self.players[name] = Player(self.stage, self.theatre.deformer(name, self.stage.scene))
-        return self.players[name]
+    def _player(self, name: str, off: frozenset[str] = frozenset()) -> Player:
+        """Who plays the scene without some effects, of the tissue that it has with them."""
+        if (name, off) not in self.players:
+            scene, theatre = self.stage.scene, self.theatre
+            for effect in scene.effects_on(theatre.anatomy) if off else ():
+                scene = without(scene, effect) if type(effect).__name__ in off else scene
+            knowing = theatre if theatre.knowing(self.stage.scene) else replace(theatre, models={})
+            stage = replace(self.stage, scene=scene) if off else self.stage
+            self.players[name, off] = Player(stage, knowing.deformer(name, scene))
+        return self.players[name, off]
 
-    def _controls(self) -> list[Slider | Choice]:
+    def _controls(self) -> list[Slider | Choice | Toggle]:
         wish, names = self.wish, self.theatre.names(self.stage.scene)
         return [
             Choice("deformer", names, wish.deformer, lambda name: wish.set(deformer=name)),
+            *(Toggle(effect, True, partial(wish.switch, effect)) for effect in self._switched()),
             *(self._hand() if self.stage.scene.tool is not None else []),
         ]
+
+    def _switched(self) -> list[str]:
+        """Effects that a scene can be without: all but those that make it a body at rest."""
+        kinds = (type(effect) for effect in self.stage.scene.effects_on(self.theatre.anatomy))
+        return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Slide)]
 
     def _hand(self) -> list[Slider | Choice]:
         """Who has the tool, and where."""
@@ -172,8 +199,8 @@ class Demo:
         eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
         return Viewpoint(eye, site.origin + 0.015 * site.axis, site.up)
 
-    def _show(self, frame: Frame, name: str) -> None:
-        positions = self._player(name).positions(frame.deformation)
+    def _show(self, frame: Frame, player: Player) -> None:
+        positions = player.positions(frame.deformation)
         self.browser.show(frame.number, frame.shown)
         stage = self.stage.at(frame.loads)
         for layer in (stage.cortex(positions), stage.tumour(positions)):
@@ -182,13 +209,15 @@ class Demo:
         if tool is not None and frame.pose is not None:
             self.browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
 
-    def _judge(self, truth: Truth, name: str) -> str:
-        """Show what the finite elements answered, and say how far off a deformer is under the same loads."""
-        player = self._player(name)
-        stage = self.stage.at(truth.loads)
-        seen = stage.tumour(player.positions(truth.deformation))
+    def _wire(self, truth: Truth, player: Player) -> None:
+        """Show in the 3-D view where the finite elements, under all effects, have the tumour."""
+        seen = self.stage.at(truth.loads).tumour(player.positions(truth.deformation))
         self.browser.move("finite elements", seen.vertices, seen.triangles)
-        nodes = stage.anatomy.tumour_nodes
+
+    def _judge(self, truth: Truth, name: str) -> str:
+        """Say how far off a deformer is under the loads that the finite elements answered."""
+        player = self._player(name)
+        nodes = self.stage.at(truth.loads).anatomy.tumour_nodes
         right = truth.deformation.at(nodes).displacement[0]
         said = "this is the finite elements' own answer"
         if name != "fem":
@@ -219,3 +248,11 @@ class Demo:
         if np.isfinite(bound):
             lines.insert(1, f"in 95 of 100 loads no vertex of the tumour is off by more than {1e3 * bound:.2f} mm")
         return "\n\n".join([*lines, str(self.tally)])
+
+
+def changed(stage: Stage, truth: Truth, frame: Frame, off: frozenset[str]) -> str:
+    """How far from where all effects together have it a frame without some has the tumour."""
+    nodes = stage.at(truth.loads).anatomy.tumour_nodes
+    apart = truth.deformation.at(nodes).displacement[0] - frame.deformation.at(nodes).displacement[0]
+    mean = 1e3 * float(np.linalg.norm(apart, axis=1).mean())
+    return f"without {', '.join(sorted(off))} the tumour is {mean:.2f} mm from where all effects together have it"

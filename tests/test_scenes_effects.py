@@ -8,8 +8,9 @@ import h5py
 import numpy as np
 import pytest
 from theatres import player, short, sinking, small, template_theatre, theatre_of
-from visitor import free_port, wait_for
+from visitor import Visitor, free_port, wait_for
 
+from scenes.ablation import without
 from scenes.check import measure
 from scenes.collect import UNITS, collect
 from scenes.demo import Demo
@@ -20,6 +21,7 @@ from scenes.scene import Bounds, find_scene
 from scenes.stage import CORTEX, TOOL
 from scenes.told import told
 from scenes.truth import truth_of
+from sim.accuracy import TRAIN
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, posture, stacked
@@ -161,11 +163,49 @@ class TestWithoutATool:
     def test_the_page_offers_no_hand(self, theatre):
         demo = Demo(theatre, sinking(), "fem", "127.0.0.1", free_port())
         try:
-            assert set(demo.browser.inputs) == {"deformer"} and "tool" not in demo.browser.meshes
+            assert set(demo.browser.inputs) == {"deformer", "Gravity"} and "tool" not in demo.browser.meshes
             assert wait_for(lambda: demo.run(0.3) and "gravity towards" in demo.browser.text.content)
             assert "tip to tumour" not in demo.browser.text.content
         finally:
             demo.close()
+
+
+class TestSwitches:
+    @pytest.fixture
+    def demo(self, theatre):
+        scene = replace(short(), effects=(*short().effects, Gravity()), lying=sinking().lying)
+        demo = Demo(theatre, scene, "fem", "127.0.0.1", free_port())
+        demo.wish.set(plays=False, number=5)
+        yield demo
+        demo.close()
+
+    def test_effects_go_off_and_on_and_the_change_is_told(self, demo, theatre):
+        page, visitor = demo.browser, Visitor(demo.browser, 1200)
+        assert {"ToolForce", "Gravity"} < set(page.inputs) and not {"Held", "Elasticity"} & set(page.inputs)
+        assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.text.content)
+        visitor.set(page.inputs["Gravity"], False)
+        assert wait_for(lambda: demo.run(0.3) and "without Gravity the tumour is" in page.text.content)
+        said = float(page.text.content.split("the tumour is ")[1].split(" mm")[0])
+        scene, nodes = demo.stage.scene, theatre.anatomy.tumour_nodes
+        plain, less = replace(theatre, models={}), without(scene, Gravity())
+        one, other = (
+            plain.fem(each, TRAIN).deform(each.loads(theatre.site, each.path(5 / 30), 5 / 30)).at(nodes).displacement[0]
+            for each in (scene, less)
+        )
+        change = 1e3 * np.linalg.norm(one - other, axis=1).mean()
+        assert change > 0.1 and said == pytest.approx(change, abs=0.02)
+        assert "gravity" not in page.text.content
+        visitor.set(page.inputs["Gravity"], True)
+        assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.text.content)
+        visitor.wire.close()
+
+    def test_without_any_nothing_moves(self, demo):
+        demo.wish.switch("Gravity", False)
+        demo.wish.switch("ToolForce", False)
+        assert wait_for(lambda: demo.run(0.3) and "without Gravity, ToolForce the" in demo.browser.text.content)
+        assert "time 0.17 s" in demo.browser.text.content
+        demo.wish.switch("Gravity", True)
+        assert demo.wish.off == {"ToolForce"}
 
 
 class TestBrainShift:
