@@ -25,6 +25,7 @@ class Outcome(Enum):
     ROUND_OFF = (
         "stopped because the residual is at the round-off of its number type; float64 or a coarser tolerance goes on"
     )
+    PIERCED = "stopped because a tool came to be inside the tissue, where it has no surface to press on"
     NOT_FINITE = "stopped because a number overflowed"
     GUESSED = "a first guess: nothing was solved"
     PREDICTED = "predicted by a learnt model inside the range that it was taught"

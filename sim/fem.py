@@ -343,7 +343,7 @@ class Fem:
     ) -> Deformation:
         """What was found, as a deformation: reactions, and `more` history; it took `seconds` by stage."""
         solved = time.perf_counter()
-        self.problem.begin(cases)
+        self.problem.begin(replace(cases, share=found.gone, anew=found.anew))
         history = {**self.problem.end(found.u), **found.learnt, **more}
         on_footprint = None
         if cases.loads.of(Displaced) is not None:

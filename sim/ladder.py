@@ -52,7 +52,8 @@ PATIENCE = 4
 class Answer:
     """u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, shares of the load reached, inverted tets.
 
-    The linear iterations of the batch; what of the curvature the next frame may know, as history.
+    The linear iterations of the batch; what of the curvature the next frame may know, as history; where tools move,
+    shares (B,) of their way at which they are, and (B,) bool whose way began at rest.
     """
 
     u: wp.array
@@ -63,6 +64,8 @@ class Answer:
     inverted: np.ndarray
     linear_iterations: int
     learnt: Mapping[str, np.ndarray] = field(default_factory=dict)
+    gone: np.ndarray | None = None
+    anew: np.ndarray | None = None
 
     @property
     def good(self) -> np.ndarray:
@@ -127,19 +130,24 @@ class Ladder:
             guess, astray = self._upright([np.where(acts, one, 0.0) for one in guesses])
             started = guess.any(axis=0)
             learnt = NOTHING if astray.any() else learnt_from(cases, problem.rows)
+            if problem.moving and astray.any():
+                cases = replace(cases, anew=astray.copy())
+                problem.begin(cases)
             answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
             lost = np.where(answer.good, answer.inverted > 0, self._lost(answer))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
-                some = replace(cases.rows(again), anew=True)
+                some = replace(cases.rows(again), anew=np.ones(len(again), bool))
                 problem.begin(some)
                 answer.put(again, self._whole(some), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
-        lost = np.flatnonzero(self._lost(answer))
+        anew, lost = astray.copy(), np.flatnonzero(self._lost(answer))
         if len(lost):
-            answer.put(lost, self._in_steps(cases.rows(lost), answer, lost), device)
-        return answer
+            found = self._in_steps(cases.rows(lost), answer, lost)
+            anew[lost] |= found.reached > answer.reached[lost]
+            answer.put(lost, found, device)
+        return replace(answer, gone=answer.reached, anew=anew) if problem.moving else answer
 
     def _acts(self, count: int) -> np.ndarray:
         """Which cases (b,) of the batch that has begun any force or imposed motion acts on at rest."""
@@ -149,6 +157,8 @@ class Ladder:
         else:
             loud = self.problem.gradient(rest)
         acts = (loud.numpy() != 0.0).any(axis=0)
+        if not acts.all():
+            acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.moving)])
         return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
 
     def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -247,9 +257,10 @@ class Ladder:
     def _in_steps(self, cases: Cases, failed: Answer, index: np.ndarray) -> Answer:
         """From rest, the load raised in steps that grow and shrink; the equilibrium under the largest share found.
 
-        Of cases that are the rows `index` (k,) of what failed; where no share is found that stands.
+        Of cases that are the rows `index` (k,) of what failed; where no larger share is found that stands.
         """
-        problem, device, cases = self.problem, self.problem.device, replace(cases, anew=True)
+        problem, device = self.problem, self.problem.device
+        cases = replace(cases, anew=np.ones(len(index), bool))
 
         def raised(part: Cases, share: np.ndarray) -> Cases:
             return replace(part, loads=part.loads.scaled(share), share=share)
@@ -258,18 +269,31 @@ class Ladder:
         found = self._by_steps(cases, start, raised, FIRST_STEP, self.accuracy.steps)
         outcome = failed.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
-        none = np.flatnonzero(found.reached == 0.0)
+        none = np.flatnonzero(found.reached <= failed.reached[index])
         scattered(device, gathered(device, failed.u, index[none]), none, found.u)
-        residual = np.where(found.reached == 0.0, failed.residual[index], found.residual)
-        return replace(found, outcome=outcome, residual=residual, inverted=self.inversion.count(found.u))
+        found.residual[none], found.reached[none] = failed.residual[index[none]], failed.reached[index[none]]
+        return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
     def _moved(self, cases: Cases, start: wp.array) -> Answer:
-        """From start (3N, b), where the tools were, as far as they may go at once again and again."""
+        """From start (3N, b), where the tools were, as far as they may go at once again and again.
+
+        A body at rest on which nothing acts where they end is there, whatever they met on their way.
+        """
 
         def moved(part: Cases, share: np.ndarray) -> Cases:
             return replace(part, share=share)
 
-        return self._by_steps(cases, start, moved, 1.0, self.accuracy.steps)
+        device, count = self.problem.device, len(cases.loads)
+        acting = np.flatnonzero(self._acts(count))
+        if len(acting) == count:
+            return self._by_steps(cases, start, moved, 1.0, self.accuracy.steps)
+        at_rest, none = device.zeros(*start.shape), np.zeros(count, int)
+        every = np.full(count, Outcome.CONVERGED, object)
+        answer = Answer(at_rest, every, none, np.zeros(count), np.ones(count), none.copy(), 0)
+        if len(acting):
+            part = gathered(device, start, acting)
+            answer.put(acting, self._by_steps(cases.rows(acting), part, moved, 1.0, self.accuracy.steps), device)
+        return answer
 
     def _by_steps(
         self, cases: Cases, start: wp.array, aimed: Callable[[Cases, np.ndarray], Cases], first: float, most: int
@@ -306,6 +330,10 @@ class Ladder:
             outcome[live] = found.outcome
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
+        if problem.moving and len(short) < count:
+            problem.begin(aimed(cases, np.ones(count)))
+            pierced = np.logical_or.reduce([term.buried(u) for term in problem.moving]) & (reached == 1.0)
+            outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):
             problem.begin(cases.rows(short))
             residual[short] = shortfall(problem, gathered(device, u, short))

@@ -20,7 +20,8 @@ class Cases:
 
     loads, B rows; start_time (B,) [s]; history, by term name: arrays with B rows, as `Term.end` returned them;
     displacement (B, N, 3) [m] of the element's nodes at the start, or None: at rest; share (B,) of the way from where
-    they were that tools have gone, 1 if None; anew, whether the descent begins at rest, where nothing is touched yet.
+    they were that tools have gone, 1 if None; anew (B,) bool, whose descent begins at rest, where nothing is touched
+    yet, none if None.
     """
 
     loads: Loads
@@ -28,7 +29,7 @@ class Cases:
     history: Mapping[str, Any] = field(default_factory=dict)
     displacement: np.ndarray | None = None
     share: np.ndarray | None = None
-    anew: bool = False
+    anew: np.ndarray | None = None
 
     @property
     def steps(self) -> np.ndarray:
@@ -53,7 +54,8 @@ class Cases:
         history = {name: value[index] for name, value in self.history.items()}
         displacement = None if self.displacement is None else self.displacement[index]
         share = None if self.share is None else self.share[index]
-        return Cases(self.loads.rows(index), self.start_time[index], history, displacement, share, self.anew)
+        anew = None if self.anew is None else self.anew[index]
+        return Cases(self.loads.rows(index), self.start_time[index], history, displacement, share, anew)
 
     def past(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """What the term `name` remembers, (B, *shape) float64; zeros if nothing.
@@ -166,6 +168,10 @@ class Barrier(Term, Protocol):
 
     def gaps(self, cases: Cases) -> np.ndarray:
         """How many times (B,) the gap the tools go on their whole way, or tissue may."""
+        ...
+
+    def buried(self, u: wp.array) -> np.ndarray:
+        """In which columns (b,) a tool is inside the body at u (3N, b) [m], where it may touch none of its surface."""
         ...
 
     def widen(self, times: float) -> None:

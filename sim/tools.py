@@ -90,6 +90,12 @@ class Core:
     radius: float
 
     @property
+    def corners(self) -> np.ndarray:
+        """Of the box (n, 3) [m], each once."""
+        signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
+        return np.unique(self.centre + signs * self.half, axis=0)
+
+    @property
     def extent(self) -> float:
         """How far the tool's farthest point is from its origin [m], at most."""
         return float(np.linalg.norm(np.abs(self.centre) + self.half)) + self.radius

@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import warp as wp
-from term_examples import EXAMPLES, LOGARITHMIC, MESH, RNG, ROWS, Example
+from contact_examples import CONTACTS
+from term_examples import EXAMPLES as OTHERS
+from term_examples import LOGARITHMIC, MESH, RNG, ROWS, Example
 
 from sim.device import Device, find_device
 from sim.mesh import signed_volumes
 from sim.term import Term
+from sim.terms.contact import Contact
 from sim.terms.loops import VOLUME_KEPT
+
+EXAMPLES = OTHERS | CONTACTS
 
 
 @pytest.fixture(params=EXAMPLES, scope="module")
@@ -166,7 +171,7 @@ def test_keeping_columns_is_starting_with_them(
     term.begin(example.cases.rows(index))
     for after, fresh in zip(kept, answers(), strict=True):
         np.testing.assert_allclose(after, fresh, rtol=1e-13, atol=1e-15)
-        assert after.shape[0 if after is kept[0] or after.ndim == 3 else -1] == len(index)
+        assert after.shape[0 if after is kept[0] or after.ndim >= 3 else -1] == len(index)
 
 
 def test_rest_curvature_is_the_curvature_at_rest(term: Term, example: Example, device: Device) -> None:
@@ -238,6 +243,19 @@ def test_steps_of_the_logarithmic_laws_keep_a_tenth_of_every_volume(law: str, de
     doubled = np.array([(volumes(2.0 * fraction) >= floor).all(axis=1) for fraction in fractions]).all(axis=0)
     assert ((longest == 1.0) | ~doubled).all()
     assert (size >= 0.1) == (longest < 1.0).all()
+
+
+@pytest.mark.parametrize("name", CONTACTS)
+def test_every_tool_of_the_examples_is_felt(name: str, device: Device) -> None:
+    """In every column, else what is tested of contact would be nothing; what tools exert is what the tissue bears."""
+    example = EXAMPLES[name]
+    term = example.build(device)
+    assert isinstance(term, Contact)
+    term.begin(example.cases)
+    force = term.reaction(device.array(example.u))[:, :, :3]
+    assert (np.linalg.norm(force, axis=2) > 0.0).all()
+    bears = -gradient(term, device, example.u).T.reshape(3, -1, 3).sum(axis=1)
+    np.testing.assert_allclose(force.sum(axis=1), bears, atol=1e-9)
 
 
 def test_history_creeps_and_travels_rows_first(device: Device) -> None:

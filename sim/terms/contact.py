@@ -10,6 +10,7 @@ from ..anatomy import Anatomy
 from ..device import Device
 from ..discretisation import Discretisation
 from ..effects import Retraction, ToolContact
+from ..enclosure import enclosed
 from ..errors import InputError
 from ..loads import Retracted, Touching
 from ..motion import Way, approach
@@ -39,6 +40,8 @@ class Contact:
         Cases -> from where to where they go; None where no tool is there.
     nodes, triangles
         (N, 3) [m] at rest; (S, 3) or (S, 6), what may be touched of the surface.
+    whole
+        (W, 3) corners of the whole surface, outwards.
     gap
         Distance [m] at which tissue begins to feel a tool; it is never touched quite.
     shear
@@ -56,11 +59,13 @@ class Contact:
         way: Callable[[Cases], Way | None],
         nodes: np.ndarray,
         triangles: np.ndarray,
+        whole: np.ndarray,
         gap: float,
         shear: float,
         device: Device,
     ):
         self.name = name
+        self._whole, self._corners = (nodes, whole), [core_of(tool).corners for tool in tools]
         self._shapes, self._way, self._device = tools, way, device
         self._kernels = kernels_of(device, triangles.shape[1])
         cores = [core_of(tool) for tool in tools]
@@ -90,6 +95,18 @@ class Contact:
         """As the farthest-moved tool goes."""
         way = self._way(cases)
         return np.zeros(len(cases.loads)) if way is None else way.travel(self._shapes).max(axis=1) / self._gap
+
+    def buried(self, u: wp.array) -> np.ndarray:
+        """In which columns (b,) the middle of a tool, or a corner of what it is made of, is inside the body."""
+        if self._pose is None:
+            return np.zeros(u.shape[1], bool)
+        nodes, surface = self._whole
+        moved = nodes + u.numpy().T.reshape(u.shape[1], -1, 3)
+        inner = [
+            np.concatenate([corners @ T[:3, :3].T + T[:3, 3] for corners, T in zip(self._corners, pose, strict=True)])
+            for pose in self._pose
+        ]
+        return np.array([enclosed(points, body, surface).any() for points, body in zip(inner, moved, strict=True)])
 
     def widen(self, times: float) -> None:
         """The barrier as many times as wide, and as much softer."""
@@ -168,7 +185,7 @@ def contact_of(
     clear = partial(approach, tools, points=space.nodes[np.unique(triangles)], reach=_reach(space.nodes, triangles))
 
     def way(cases: Cases) -> Way | None:
-        last = None if cases.anew else cases.history.get(name)
+        last = cases.history.get(name)
         if contact:
             cause = cases.loads.of(Touching)
             if cause is None:
@@ -177,16 +194,26 @@ def contact_of(
                 raise InputError(
                     f"Touching has poses of {cause.pose.shape[1]} tools, but ToolContact has {len(tools)}."
                 )
-            return Way(clear(cause.pose) if last is None else last, cause.pose)
+            return Way(_begun(last, cases.anew, clear, cause.pose), cause.pose)
         cause = cases.loads.of(Retracted)
         if cause is None:
             return None
         laid = cause.pose[:, None]
         held = laid.copy()
         held[:, 0, :3, 3] += cause.displacement
-        return Way(laid if last is None else last, held)
+        return Way(_begun(last, cases.anew, lambda pose: pose, laid), held)
 
-    return Contact(name, tools, way, space.nodes, triangles, effect.gap, shear, device)
+    return Contact(name, tools, way, space.nodes, triangles, space.surface[:, :3], effect.gap, shear, device)
+
+
+def _begun(
+    last: np.ndarray | None, anew: np.ndarray | None, clear: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
+) -> np.ndarray:
+    """Where ways to poses (B, tools, 4, 4) begin: where tools were last, clear of the body who was nowhere, or anew."""
+    begin = pose.copy() if last is None else last.copy()
+    new = np.ones(len(pose), bool) if last is None else np.zeros(len(pose), bool) if anew is None else anew
+    begin[new] = clear(pose[new])
+    return begin
 
 
 def _reach(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
