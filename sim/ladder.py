@@ -130,7 +130,7 @@ class Ladder:
             guess, astray = self._upright([np.where(acts, one, 0.0) for one in guesses])
             started = guess.any(axis=0)
             learnt = NOTHING if astray.any() else learnt_from(cases, problem.rows)
-            if problem.moving and astray.any():
+            if problem.barriers and astray.any():
                 cases = replace(cases, anew=astray.copy())
                 problem.begin(cases)
             answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
@@ -147,7 +147,7 @@ class Ladder:
             found = self._in_steps(cases.rows(lost), answer, lost)
             anew[lost] |= found.reached > answer.reached[lost]
             answer.put(lost, found, device)
-        return replace(answer, gone=answer.reached, anew=anew) if problem.moving else answer
+        return replace(answer, gone=answer.reached, anew=anew) if problem.barriers else answer
 
     def _acts(self, count: int) -> np.ndarray:
         """Which cases (b,) of the batch that has begun any force or imposed motion acts on at rest."""
@@ -158,7 +158,7 @@ class Ladder:
             loud = self.problem.gradient(rest)
         acts = (loud.numpy() != 0.0).any(axis=0)
         if not acts.all():
-            acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.moving)])
+            acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.barriers)])
         return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
 
     def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -330,9 +330,9 @@ class Ladder:
             outcome[live] = found.outcome
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
-        if problem.moving and len(short) < count:
+        if problem.barriers and len(short) < count:
             problem.begin(aimed(cases, np.ones(count)))
-            pierced = np.logical_or.reduce([term.buried(u) for term in problem.moving]) & (reached == 1.0)
+            pierced = np.logical_or.reduce([term.buried(u) for term in problem.barriers]) & (reached == 1.0)
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):
             problem.begin(cases.rows(short))

@@ -160,7 +160,7 @@ def test_no_force_on_tissue_pulls() -> None:
     """Every node that a blade moves is pushed away from it: what of it touches looks down or aside, never up."""
     fem = body((BLADE,))
     found = fem.deform(touching(BESIDE))
-    term = fem.problem.moving[0]
+    term = fem.problem.barriers[0]
     u = fem.problem.device.array(fem._guess(touching(BESIDE), found))
     gradient = fem.problem.device.zeros(*u.shape)
     term.begin(Cases(touching(BESIDE), np.zeros(1)))

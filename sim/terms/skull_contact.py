@@ -234,8 +234,14 @@ class Skull:
 
     def gaps(self, cases: Cases) -> np.ndarray:
         """As far as brain may have to come from rest, or else from where it was."""
-        known = cases.displacement is not None and not cases.anew
-        return np.full(len(cases.loads), (AGAIN if known else AT_FIRST) / self._felt)
+        known = np.full(len(cases.loads), cases.displacement is not None)
+        if cases.anew is not None:
+            known &= ~cases.anew
+        return np.where(known, AGAIN, AT_FIRST) / self._felt
+
+    def buried(self, u: wp.array) -> np.ndarray:
+        """The skull is never inside what it holds."""
+        return np.zeros(u.shape[1], bool)
 
     def widen(self, times: float) -> None:
         """The barrier as many times as wide, and as much softer; the bone steps back by as much."""
