@@ -10,10 +10,9 @@ import numpy as np
 from ar.layer import Layer, Solid, vertex_normals
 from ar.view import Lamp, lamp_beside
 from sim.anatomy import Anatomy
-from sim.effects import Resection
 from sim.intensity import Intensity
 from sim.loads import Loads, Resected
-from sim.resection import Remains, remains
+from sim.resection import Remains, bodies
 
 from .scene import Scene
 from .site import Site
@@ -76,8 +75,7 @@ class Stage:
     def _after(self) -> tuple[Stage, ...]:
         """The stage after 0, 1, ... steps."""
         whole = self.site.anatomy
-        cut = next(effect for effect in self.scene.effects_on(whole) if isinstance(effect, Resection))
-        return tuple(replace(self, left=left) for left in remains(whole, cut))
+        return tuple(replace(self, left=left) for left in bodies(whole, self.scene.effects_on(whole)))
 
     @cached_property
     def nodes(self) -> np.ndarray:

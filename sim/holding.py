@@ -52,8 +52,9 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray) -> None:
         )
 
 
-def loosened(anatomy: Anatomy) -> np.ndarray:
-    """Tetrahedra (n,) that can move rigidly: joined by faces to nothing held, and not borne by what slides."""
+def loosened(anatomy: Anatomy, slides: bool = True) -> np.ndarray:
+    """Tetrahedra (n,) that can move rigidly: joined by faces to nothing held, nor borne by what slides, if it does."""
+    normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
     cluster, nodes = _clusters(anatomy.mesh.tets), anatomy.mesh.nodes
     loose = []
     for number in np.unique(cluster):
@@ -61,7 +62,7 @@ def loosened(anatomy: Anatomy) -> np.ndarray:
         node = np.unique(anatomy.mesh.table[mine])
         if not anatomy.held[node].any():
             one = np.zeros(len(node), np.int64)
-            if _free_motions(nodes, anatomy.held, anatomy.slide_normal, one, node)[0]:
+            if _free_motions(nodes, anatomy.held, normal, one, node)[0]:
                 loose.append(mine)
     return np.concatenate(loose) if loose else np.zeros(0, np.int64)
 

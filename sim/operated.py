@@ -11,11 +11,11 @@ import numpy as np
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
 from .deformation import Deformation, joined
-from .effects import Effect, Elasticity, Held, Pulsation, Resection, Slide
+from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
 from .fem import Fem
 from .loads import Loads, Resected
-from .resection import Remains, remains
+from .resection import Remains, bodies
 
 # The history's key for how many steps (B,) were done.
 DONE = "resection"
@@ -114,19 +114,13 @@ def finite_elements(
     cuts = [effect for effect in effects if isinstance(effect, Resection)]
     if len(cuts) != 1:
         return Fem(anatomy, effects, accuracy, device, batch, element, live)
-    kinds = {type(effect) for effect in effects}
-    # What nobody asks to be held must not keep what comes loose; vertices of which nothing is left are held even so.
-    whole = anatomy
-    if Held not in kinds and anatomy.held.any():
-        whole = replace(whole, held=np.zeros_like(anatomy.held))
-    if Slide not in kinds and anatomy.slide_normal.any():
-        whole = replace(whole, slide_normal=np.zeros_like(anatomy.slide_normal))
+    # Vertices of which nothing is left are held, whoever asks for it.
     others = [effect for effect in effects if not isinstance(effect, Resection | Held)]
 
     def make(body: Anatomy) -> Fem:
-        return Fem(body, (*_of(others, whole, body), Held()), accuracy, device, batch, element, live)
+        return Fem(body, (*_of(others, anatomy, body), Held()), accuracy, device, batch, element, live)
 
-    return Operated(remains(whole, cuts[0]), make, ahead=live)
+    return Operated(bodies(anatomy, effects), make, ahead=live)
 
 
 def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:

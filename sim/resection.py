@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .anatomy import Anatomy
-from .effects import Resection
+from .effects import Effect, Held, Resection, Slide
 from .errors import InputError
 from .holding import check_held, loosened
 
@@ -39,19 +39,36 @@ class Remains:
         return f"{said}; {len(self.loose)} tetrahedra that nothing held any more went too"
 
 
-def remains(anatomy: Anatomy, effect: Resection) -> tuple[Remains, ...]:
-    """What is left after 0, 1, ... all steps.
+def bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[Remains, ...]:
+    """`remains` under effects, `Resection` one of them: what none of them holds, or keeps on the skull, comes loose.
+
+    Raises
+    ------
+    InputError
+        As `remains`.
+    """
+    effects = tuple(effects)
+    cut = next(effect for effect in effects if isinstance(effect, Resection))
+    kinds = {type(effect) for effect in effects}
+    held = Held in kinds or not anatomy.held.any()
+    whole = anatomy if held else replace(anatomy, held=np.zeros_like(anatomy.held))
+    return remains(whole, cut, Slide in kinds)
+
+
+def remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[Remains, ...]:
+    """What is left after 0, 1, ... all steps; `slides`: slide normals keep tissue on the skull.
 
     Raises
     ------
     InputError
         A body that is not held; a step that takes a tetrahedron that the mesh does not have, or the last of the body.
     """
-    return tuple(_remains(anatomy, effect))
+    return tuple(_remains(anatomy, effect, slides))
 
 
-def _remains(anatomy: Anatomy, effect: Resection) -> Iterator[Remains]:
-    check_held(anatomy.mesh, anatomy.held, anatomy.slide_normal)  # else all of it would count as loose
+def _remains(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[Remains]:
+    normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
+    check_held(anatomy.mesh, anatomy.held, normal)  # else all of it would count as loose
     yield Remains(0, anatomy, np.zeros(0, np.int64))
     taken: set[int] = set()
     for done, step in enumerate(effect.steps, start=1):
@@ -60,7 +77,7 @@ def _remains(anatomy: Anatomy, effect: Resection) -> Iterator[Remains]:
         try:
             left = anatomy.without(gone)
             kept = np.setdiff1d(np.arange(len(anatomy.mesh.tets)), gone)
-            loose = kept[loosened(left)]
+            loose = kept[loosened(left, slides)]
             yield Remains(done, anatomy.without(np.concatenate([gone, loose])) if len(loose) else left, loose)
         except InputError as error:
             raise InputError(f"step {done} of Resection cannot be done: {error}") from error

@@ -14,14 +14,25 @@ from sim.compile import compile_problem
 from sim.deformation import guess
 from sim.device import find_device
 from sim.discretisation import ELEMENTS
-from sim.effects import Effect, Elasticity, Gravity, Held, Inertia, NodalForce, Resection, Slide, ToolForce
+from sim.effects import (
+    Effect,
+    Elasticity,
+    Gravity,
+    Held,
+    Inertia,
+    NodalForce,
+    Resection,
+    SkullContact,
+    Slide,
+    ToolForce,
+)
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Posture, Resected, posture, push
 from sim.material import Material
 from sim.mesh import TetMesh
 from sim.operated import Operated, finite_elements
-from sim.resection import remains
+from sim.resection import bodies, remains
 
 TIGHT = Accuracy(tolerance=1e-11)
 SOFT = Material("neo-hookean", 3000.0, 0.4)
@@ -312,6 +323,23 @@ class TestHardCases:
 def test_half_a_load_is_of_the_same_body() -> None:
     half = lying([1]).scaled(0.5)
     assert half.of(Resected).done.tolist() == [1.0] and half.of(Posture).share.tolist() == [0.5]  # type: ignore
+
+
+def test_bone_that_only_bars_the_way_keeps_nothing_on() -> None:
+    """Under `SkullContact` a piece on the wall comes loose; what is left still meets its bone."""
+    wall = np.where((MESH.nodes[:, :1] > 0.06 - 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)
+    body, cut = hold(MESH, MESH.nodes[:, 2] < 1e-9, wall), Resection((within((2, 2, 2), (3, 3, 4)),))
+    effects = (Elasticity(SOFT), Held(), SkullContact(), Gravity(direction=(0.0, 0.0, -1.0)))
+    left = bodies(body, (*effects, cut))[1].anatomy
+    assert left.slide_normal.any() and left.orphaned.any()
+    aside = posture(np.array([1.0, 0.0, -0.2]), -1.0)
+    answer = finite_elements(body, (*effects, cut), TIGHT, "cpu", element="p1").deform(aside)
+    compacted, used = compact(left)
+    alone = Fem(compacted, effects, TIGHT, "cpu", element="p1").deform(aside)
+    np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-9)
+    assert 1e-6 < answer.displacement[0, left.slide_normal.any(axis=1), 0].max() < 1.1e-4  # the gap of the bone
+    slice_ = Resection((TestWhatComesLoose.SLICE,))
+    assert len(bodies(body, (*effects, slice_))[1].loose) == len(within((0, 0, 2), (3, 3, 4)))
 
 
 def test_what_nobody_asks_to_be_held_is_free() -> None:
