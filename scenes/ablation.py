@@ -17,6 +17,7 @@ from sim.errors import InputError
 
 from .scene import Scene
 from .site import Site
+from .stage import Stage
 from .theatre import Theatre
 
 # Frames that are not timed: kernels are loaded.
@@ -26,7 +27,7 @@ ALL = "all"
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A scene's frames by finite elements: displacements (F, V, 3) [m], and what they took.
+    """A scene's frames by finite elements: displacements (F, V, 3) [m], NaN of what was cut out, and what they took.
 
     milliseconds, median a frame; held, bytes of device arrays; peak, bytes of the process, or of the card's pool, at
     most, or None where the system does not say.
@@ -106,15 +107,15 @@ def run(theatre: Theatre, scene: Scene, every: int) -> Run:
 
 
 def _solved(fem: Deformer, scene: Scene, site: Site, times: list[float]) -> tuple[list[np.ndarray], list[float]]:
-    """Displacements (V, 3) [m] and seconds of each frame."""
-    last, found, seconds = None, [], []
+    """Displacements (V, 3) [m], NaN of what was cut out, and seconds of each frame."""
+    last, found, seconds, stage = None, [], [], Stage(scene, site)
     for time in times:
         loads = scene.loads(site, scene.path(time), time)
         wp.synchronize()
         begun = clock.perf_counter()
         last = fem.deform(loads, start=last)
         seconds.append(clock.perf_counter() - begun)
-        found.append(last.displacement[0])
+        found.append(np.where(stage.at(loads).anatomy.orphaned[:, None], np.nan, last.displacement[0]))
         if not last.outcome[0].good:
             raise InputError(f"the frame at {time:.2f} s is not answered: {last.outcome[0].value}")
     return found, seconds
@@ -151,7 +152,7 @@ def _row(theatre: Theatre, name: str, whole: Run, less: Run) -> Row:
 
     def apart(nodes: np.ndarray) -> float:
         difference = (whole.displacement - less.displacement)[:, nodes]
-        return 1e3 * float(np.linalg.norm(difference, axis=2).mean(axis=1).max())
+        return 1e3 * float(np.nanmean(np.linalg.norm(difference, axis=2), axis=1).max())
 
     return Row(
         name,
