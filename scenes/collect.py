@@ -18,7 +18,7 @@ from ar.overlay import silhouette
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.files import written_whole
-from sim.loads import Loads, Posture, Pushed, Resected
+from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
 
 from .play import STAGES, Frame, Player
 from .stage import NAMES
@@ -104,8 +104,10 @@ def caused(loads: Loads) -> dict[str, np.ndarray]:
         match cause:
             case Pushed():
                 found |= {"force": cause.force[0], "contact": cause.point[0]}
-            case Posture() | Resected():
+            case Posture() | Resected() | Retracted():
                 found |= {name: array[0] for name, array in vars(cause).items()}
+            case Touching():
+                pass  # T_world_tool says it
             case _:
                 raise InputError(f"episodes hold no {type(cause).__name__}: collect a scene without it.")
     return found

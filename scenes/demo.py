@@ -13,7 +13,7 @@ from ar.browser import Body, Browser, Choice, Playback, Slider, Toggle, Viewpoin
 from sim.effects import Elasticity, Held, Slide
 
 from .ablation import without
-from .paths import Touch
+from .paths import AIR, Touch
 from .play import Frame, Player
 from .referee import Referee, Truth
 from .scene import Scene
@@ -74,7 +74,7 @@ class Demo:
         self.stage = Stage(scene, theatre.site, theatre.intensity)
         self.theatre = theatre
         self.players = {(deformer, frozenset[str]()): Player(self.stage, theatre.deformer(deformer, scene))}
-        self.wish = Wish(deformer, Touch(force=0.15))
+        self.wish = Wish(deformer, Touch(force=0.15, depth=2e-3))
         self.browser = Browser(
             self._bodies(),
             self._viewpoint(),
@@ -164,12 +164,20 @@ class Demo:
         wish = self.wish
         return [
             Choice("tool", (SCRIPT, HAND), SCRIPT, self._give),
-            Slider("force [N]", 0.0, 0.4, 0.01, wish.touch.force, lambda value: self._take(force=value)),
+            self._strength(),
             Slider("direction right [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(right=np.radians(value))),
             Slider("direction up [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(up=np.radians(value))),
             Slider("place right [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(x=1e-3 * value)),
             Slider("place up [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(y=1e-3 * value)),
         ]
+
+    def _strength(self) -> Slider:
+        """How hard the hand pushes, or how deep it goes."""
+        touch = self.wish.touch
+        if self.stage.scene.posed:
+            low, high, now = -1e3 * AIR, 8.0, 1e3 * touch.depth
+            return Slider("depth [mm]", low, high, 0.1, now, lambda value: self._take(depth=1e-3 * value))
+        return Slider("force [N]", 0.0, 0.4, 0.01, touch.force, lambda value: self._take(force=value))
 
     def _give(self, tool: str, **wishes: int) -> None:
         """The menu, or the frame slider, gave the tool away; the menu says so after whatever is on its way to it."""
@@ -234,7 +242,7 @@ class Demo:
     def _report(self, frame: Frame, name: str, verdict: str) -> str:
         """The outcome, milliseconds a stage, and the verdict on the frame that the finite elements answered last."""
         left = self.stage.at(frame.loads).left
-        acts = [told(frame.loads)] if frame.loads.causes else [f"time {frame.time:.2f} s"]
+        acts = [told(frame.loads, frame.deformation)] if frame.loads.causes else [f"time {frame.time:.2f} s"]
         acts += [] if frame.distance is None else [f"tip to tumour {1e3 * frame.distance:.1f} mm"]
         stages = " · ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
         lines = [

@@ -20,16 +20,23 @@ class Touch:
         How hard [N]; zero is no contact.
     tilt
         Direction of the force against the inward normal, towards x and y [rad].
+    depth
+        Of a tool that is moved, not pushed: how far it is beyond where it would just touch the tissue at rest, along
+        that direction [m]; negative in the air.
     """
 
     x: float = 0.0
     y: float = 0.0
     force: float = 0.0
     tilt: tuple[float, float] = (0.0, 0.0)
+    depth: float = 0.0
 
 
 Path = Callable[[float], Touch]
 """Time [s] -> Touch."""
+
+# A tool that is moved comes from so far above the tissue [m].
+AIR = 4e-3
 
 
 def smooth(t: float) -> float:
@@ -68,15 +75,35 @@ def slide(
     return path
 
 
-def retract(
-    force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tuple[float, float] = (0.0, 0.0)
-) -> Path:
+def draw(force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tuple[float, float] = (0.0, 0.0)) -> Path:
     """Lay on, then draw the tissue aside: the force turns by `tilt` [rad] towards x while it rises; hold; let go."""
 
     def path(time: float) -> Touch:
         drawn = smooth((time - 0.5 * rise) / rise)
         let_go = smooth((time - 1.5 * rise - hold) / rise)
         return Touch(*at, force * (smooth(time / rise) - let_go), (tilt * drawn, 0.0))
+
+    return path
+
+
+def palpate(
+    depth: float, start: tuple[float, float], end: tuple[float, float], seconds: float, rise: float = 0.8
+) -> Path:
+    """Come down by `AIR` [m] and on to `depth` [m] within `rise` [s], slide from `start` to `end` [m], and lift off."""
+    stroke = slide(1.0, start, end, seconds, rise)
+
+    def path(time: float) -> Touch:
+        touch = stroke(time)
+        return Touch(touch.x, touch.y, depth=touch.force * (AIR + depth) - AIR)
+
+    return path
+
+
+def lay(depth: float, tilt: float = 0.0, rise: float = 1.5, at: tuple[float, float] = (0.0, 0.0)) -> Path:
+    """Come down by `AIR` [m] and on to `depth` [m] within `rise` [s], `tilt` [rad] towards x, and stay there."""
+
+    def path(time: float) -> Touch:
+        return Touch(*at, tilt=(tilt, 0.0), depth=smooth(time / rise) * (AIR + depth) - AIR)
 
     return path
 

@@ -24,7 +24,7 @@ from .scene import Scene
 from .site import Site
 from .stage import TOOL, Stage
 from .told import told
-from .tool import Probe
+from .tool import Blade, Probe
 
 STAGES = ("deform", "render", "overlay")
 """What the time of a frame is spent on."""
@@ -143,9 +143,15 @@ class Player:
         positions[deformation.nodes] += deformation.displacement[row]
         return positions
 
-    def tool(self, tool: Probe, touch: Touch, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Tip (3,) [m] and pose T_world_tool (4, 4): resting on the deformed surface, lifted off where it is idle."""
+    def tool(self, tool: Probe | Blade, touch: Touch, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Tip (3,) [m] and pose T_world_tool (4, 4).
+
+        Of a tool that pushes: resting on the deformed surface, lifted off where it is idle.
+        """
         contact = self.scene.contact(self.site, touch)
+        if self.scene.posed:
+            tip = contact.point + touch.depth * self.site.direction(touch)
+            return tip, self.scene.pose(self.site, touch)
         inward = self.site.direction(replace(touch, tilt=(0.0, 0.0)))
         lift = 4e-3 * max(0.0, 1.0 - touch.force / 0.02)
         tip = contact.carried(positions) - lift * inward
@@ -164,7 +170,7 @@ def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:
     An answer that may not be relied on looks like any other, so the panel says it.
     """
     stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-    acts = told(frame.loads)
+    acts = told(frame.loads, frame.deformation)
     lines = [f"{name}   t {frame.time:.2f} s   tumour moved {1e3 * frame.moved:.2f} mm"]
     lines += [*([acts] if acts else []), f"ms: {stages}"]
     if error is not None:

@@ -1,13 +1,23 @@
-"""A palpation ball lies on the cortex beside the tumour and draws it aside."""
+"""A spatula is laid on the cortex, draws it aside, and is held there while the tissue relaxes under it."""
 
 import numpy as np
 
-from .paths import retract
+from sim.effects import Elasticity, Held, Retraction, Slide
+from sim.material import Material
+
+from .paths import lay
 from .scene import Scene
+from .tool import Blade
+
+BLADE = Blade()
+# A Prony series of brain in vitro: Miller, Chinzei 2002, J. Biomech. 35:483-490.
+RELAXING = Material("neo-hookean", 3000.0, 0.45, prony=((0.45, 0.5), (0.365, 50.0)))
 
 SCENE = Scene(
     "retract",
     __doc__ or "",
-    retract(force=0.25, tilt=np.radians(38.0), rise=1.2, hold=0.8, at=(-0.008, 0.0)),
-    duration=4.2,
+    lay(depth=8e-3, tilt=np.radians(30.0), rise=1.5),
+    duration=4.0,
+    effects=(Elasticity(RELAXING), Held(), Slide(), Retraction(BLADE.shape)),
+    tool=BLADE,
 )

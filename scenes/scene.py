@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -11,15 +11,26 @@ import numpy as np
 from ar.camera import Camera, look_at
 from sim.accuracy import LIVE, Accuracy
 from sim.anatomy import Anatomy
-from sim.effects import Effect, Elasticity, Gravity, Held, Resection, SkullContact, Slide, ToolForce
+from sim.effects import (
+    Effect,
+    Elasticity,
+    Gravity,
+    Held,
+    Resection,
+    Retraction,
+    SkullContact,
+    Slide,
+    ToolContact,
+    ToolForce,
+)
 from sim.errors import InputError
-from sim.loads import Cause, Loads, Pushed, Resected
+from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
 
 from .lying import Lie, supine
-from .paths import Path, Touch, idle
+from .paths import AIR, Path, Touch, idle
 from .site import Contact, Site
 from .surgery import Debulking
-from .tool import Probe
+from .tool import Blade, Probe
 
 
 @dataclass(frozen=True)
@@ -62,6 +73,8 @@ class Bounds:
 
 
 PALPATION = Probe()
+HANDLED = (ToolForce, ToolContact, Retraction)
+"""Effects that need a tool in somebody's hand."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +96,7 @@ class Scene:
     Raises
     ------
     InputError
-        A tool's force without a tool.
+        A tool's force or pose without a tool.
     """
 
     name: str
@@ -91,7 +104,7 @@ class Scene:
     path: Path = idle
     duration: float = 4.0
     effects: tuple[Effect, ...] = (Elasticity(), Held(), Slide(), ToolForce())
-    tool: Probe | None = PALPATION
+    tool: Probe | Blade | None = PALPATION
     lying: Lie = supine
     surgery: Debulking | None = None
     viewpoint: Viewpoint = Viewpoint()
@@ -101,9 +114,10 @@ class Scene:
     frames_per_second: float = 30.0
 
     def __post_init__(self) -> None:
-        if self.tool is None and ToolForce() in self.effects:
+        needs = [type(effect).__name__ for effect in self.effects if isinstance(effect, HANDLED)]
+        if self.tool is None and needs:
             raise InputError(
-                f"the scene {self.name} asks for ToolForce, but has no tool: give it one, or leave it out."
+                f"the scene {self.name} asks for {needs[0]}, but has no tool: give it one, or leave it out."
             )
 
     @property
@@ -122,6 +136,17 @@ class Scene:
         assert self.tool is not None
         return site.contact(touch.x, touch.y, self.tool.radius)
 
+    @property
+    def posed(self) -> bool:
+        """Whether the hand moves its tool, instead of pushing with it."""
+        return any(isinstance(effect, ToolContact | Retraction) for effect in self.effects)
+
+    def pose(self, site: Site, touch: Touch) -> np.ndarray:
+        """T_world_tool (4, 4) of a tool that is moved; it faces the tissue whichever way it is moved."""
+        assert self.tool is not None
+        tip = self.contact(site, touch).point + touch.depth * site.direction(touch)
+        return self.tool.pose(tip, site.axis, site.right)
+
     def loads(self, site: Site, touch: Touch, time: float) -> Loads:
         """One load case: the cause of every effect that has one; where none has, time alone goes on."""
         causes = (self._cause(effect, site, touch, time) for effect in self.effects_on(site.anatomy))
@@ -135,6 +160,11 @@ class Scene:
             case Resection():
                 assert self.surgery is not None
                 return Resected(np.array([self.surgery.done(time)]))
+            case ToolContact():
+                return Touching(self.pose(site, touch)[None, None])
+            case Retraction():
+                laid = self.pose(site, replace(touch, depth=-AIR))
+                return Retracted(laid[None], (self.pose(site, touch) - laid)[None, :3, 3])
             case Gravity():
                 return self.lying(time).posture(site.anatomy.mesh.nodes)
             case _:
@@ -152,7 +182,7 @@ def _resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
     return surgery.resection(anatomy)
 
 
-SCENES = ("press", "slide", "retract", "brain_shift", "resection")
+SCENES = ("press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation")
 """The built-in scenes, each a module of this room that exports SCENE."""
 
 

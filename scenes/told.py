@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.loads import Cause, Loads, Posture, Pushed, Resected
+from sim.deformation import Deformation
+from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touching
 
 # Sides of the body along the axes of RAS, and against them.
 SIDES = ("RL", "AP", "SI")
@@ -12,12 +13,12 @@ SIDES = ("RL", "AP", "SI")
 TOLD = 0.05
 
 
-def told(loads: Loads) -> str:
-    """What acts in the first load case, as one line; empty where time alone goes on."""
-    return ", ".join(words for words in map(_words, loads.causes) if words)
+def told(loads: Loads, answer: Deformation) -> str:
+    """What acts in the first load case, and its tool reads, as one line; empty where time alone goes on."""
+    return ", ".join(words for words in (_words(cause, answer) for cause in loads.causes) if words)
 
 
-def _words(cause: Cause) -> str:
+def _words(cause: Cause, answer: Deformation) -> str:
     match cause:
         case Pushed():
             return f"force {np.linalg.norm(cause.force[0]):.2f} N"
@@ -29,5 +30,7 @@ def _words(cause: Cause) -> str:
             return f"gravity towards {' '.join(ways)}, fluid up to {1e3 * cause.csf_level[0]:.0f} mm"
         case Resected():
             return f"resection: {cause.done[0]:.0f} steps done"
+        case Touching() | Retracted():
+            return f"the tool reads {np.linalg.norm(answer.reaction[0, -1, :3]):.2f} N"
         case _:
             return ""

@@ -8,6 +8,8 @@ from functools import cached_property
 import numpy as np
 import trimesh
 
+from sim.tools import Ball, Spatula, core_of
+
 
 @dataclass(frozen=True)
 class Probe:
@@ -39,10 +41,12 @@ class Probe:
         shaft.apply_translation([0.0, 0.0, self.radius + 0.5 * self.length])
         grip = trimesh.creation.capsule(0.6 * self.length, 2.2 * self.shaft, count=(16, 24))
         grip.apply_translation([0.0, 0.0, self.radius + 0.55 * self.length])
-        parts = [ball, shaft, grip]
-        starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-        faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
-        return trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), process=False)
+        return _joined([ball, shaft, grip])
+
+    @property
+    def shape(self) -> Ball:
+        """What of it touches tissue."""
+        return Ball(self.radius)
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
         """T_world_tool (4, 4): the ball touches `tip` (3,) [m] from outside; the shaft leans towards `aside` (3,).
@@ -56,3 +60,58 @@ class Probe:
         T[:3, :3] = np.column_stack([np.cross(across, shaft), across, shaft])
         T[:3, 3] = centre - self.radius * shaft
         return T
+
+
+@dataclass(frozen=True)
+class Blade:
+    """A brain spatula: a flat blade with a round edge, on an arm that goes up from one end.
+
+    Parameters
+    ----------
+    width, length
+        Of the blade [m].
+    edge
+        Radius of its edge [m]; it is twice as thick.
+    arm
+        Length of the arm [m].
+    """
+
+    width: float = 0.012
+    length: float = 0.026
+    edge: float = 1.5e-3
+    arm: float = 0.12
+
+    @property
+    def radius(self) -> float:
+        """Of the circle round its tip end to end: the room that it needs in an opening [m]."""
+        return 0.5 * float(np.hypot(self.width, self.length))
+
+    @property
+    def shape(self) -> Spatula:
+        """What of it touches tissue."""
+        return Spatula(self.width, self.length, self.edge)
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """Surface in the tool's own frame [m]: the blade's face downwards through the origin, the arm along +z."""
+        core = core_of(self.shape)
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=self.edge).vertices
+        corners = core.centre + core.half * np.array([[x, y, 0.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+        blade = trimesh.convex.convex_hull((corners[:, None] + ball).reshape(-1, 3))
+        arm = trimesh.creation.box([0.5 * self.width, 2.0 * self.edge, self.arm])
+        arm.apply_translation([0.0, 0.5 * self.length - self.edge, 0.5 * self.arm])
+        return _joined([blade, arm])
+
+    def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
+        """T_world_tool (4, 4): the middle of its face at `tip` (3,) [m], facing `inward` (3,), wide along `aside`."""
+        T = np.eye(4)
+        T[:3, :3] = np.column_stack([aside, np.cross(-inward, aside), -inward])
+        T[:3, 3] = tip
+        return T
+
+
+def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """One mesh of several, as they are."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
+    return trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), process=False)

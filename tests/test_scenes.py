@@ -9,7 +9,7 @@ from theatres import PUSHING, on_template, small, template_theatre
 
 from ar.camera import project_cv2
 from scenes.lying import Lying
-from scenes.paths import Touch, press, retract, slide, smooth
+from scenes.paths import Touch, draw, press, slide, smooth
 from scenes.scene import SCENES, Viewpoint, find_scene
 from scenes.site import site_of
 from scenes.stage import CORTEX, DRAPE, TOOL, Stage, clipped
@@ -22,9 +22,9 @@ START, END = (-0.01, -0.004), (0.008, 0.006)
 PATHS = {
     "press": press(0.25, rise=1.0, hold=0.5, at=(0.003, -0.002)),
     "slide": slide(0.2, START, END, seconds=2.0, rise=0.5),
-    "retract": retract(0.3, tilt=0.6, rise=1.0, hold=1.0),
+    "draw": draw(0.3, tilt=0.6, rise=1.0, hold=1.0),
 }
-LENGTH = {"press": 2.5, "slide": 3.0, "retract": 3.5}
+LENGTH = {"press": 2.5, "slide": 3.0, "draw": 3.5}
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +78,8 @@ class TestPaths:
         along = (motion[:, :2] - START) @ np.subtract(END, START)
         assert (np.diff(along) >= 0.0).all() and not motion[:, 3:].any()
 
-    def test_retract_turns_the_force_aside_and_holds(self):
-        motion = sampled(PATHS["retract"], np.linspace(0.0, 2.5, 251))
+    def test_draw_turns_the_force_aside_and_holds(self):
+        motion = sampled(PATHS["draw"], np.linspace(0.0, 2.5, 251))
         assert motion[0, 3] == 0.0 and (np.diff(motion[:, 3]) >= 0.0).all() and not motion[:, 4].any()
         held = motion[np.linspace(0.0, 2.5, 251) >= 1.5]
         assert np.allclose(held[:, 2], 0.3) and np.allclose(held[:, 3], 0.6)
@@ -242,5 +242,5 @@ def test_clipping_keeps_the_positive_part():
 
 
 def test_an_unknown_scene_is_named_with_the_known_ones():
-    with pytest.raises(InputError, match=r"'dance'.*press, slide, retract"):
+    with pytest.raises(InputError, match=r"'dance'.*press, slide, draw"):
         find_scene("dance")

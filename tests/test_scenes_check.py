@@ -155,9 +155,9 @@ class TestCommand:
         assert err.count("passes") == len(SCENES)
 
     def test_one_scene_by_finite_elements(self, anatomy, capsys):
-        words = ["check", "retract", "--anatomy", str(anatomy), "--every", "40", "--deformer", "fem", "--device", "cpu"]
+        words = ["check", "draw", "--anatomy", str(anatomy), "--every", "40", "--deformer", "fem", "--device", "cpu"]
         assert main(words) == 0
-        assert capsys.readouterr().out.split()[:2] == ["retract", "passes"]
+        assert capsys.readouterr().out.split()[:2] == ["draw", "passes"]
 
     def test_a_wrong_model_fails_with_its_figures(self, theatre, anatomy, tmp_path, capsys):
         linear = theatre.models["linear"]

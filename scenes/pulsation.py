@@ -1,0 +1,15 @@
+"""Heartbeat and breath lift the open brain under a ball that rests on it."""
+
+from sim.effects import Elasticity, Held, Pulsation, Slide, ToolContact
+
+from .paths import lay
+from .scene import PALPATION, Scene
+
+SCENE = Scene(
+    "pulsation",
+    __doc__ or "",
+    lay(depth=0.5e-3, rise=1.0),
+    duration=6.0,
+    effects=(Elasticity(), Held(), Slide(), Pulsation(), ToolContact((PALPATION.shape,))),
+    element="smoothed",
+)
