@@ -161,7 +161,6 @@ class Demo:
 
     def _hand(self) -> list[Slider | Choice]:
         """Who has the tool, and where."""
-        wish = self.wish
         return [
             Choice("tool", (SCRIPT, HAND), SCRIPT, self._give),
             self._strength(),

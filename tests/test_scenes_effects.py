@@ -22,12 +22,14 @@ from scenes.stage import CORTEX, TOOL
 from scenes.told import told
 from scenes.truth import truth_of
 from sim.accuracy import TRAIN
+from sim.deformation import guess
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, posture, stacked
 from surrogate.taught import refusal, taught_effects
 
 EFFECTS = (Elasticity(), Held(), Slide())
+STILL = guess(np.zeros((1, 3, 3)))
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +62,10 @@ class TestCauses:
 
     def test_they_are_told_in_words(self, theatre):
         both = replace(short(), effects=(*EFFECTS, Gravity(), ToolForce()))
-        words = told(both.loads(theatre.site, Touch(force=0.2), 0.0))
+        words = told(both.loads(theatre.site, Touch(force=0.2), 0.0), STILL)
         assert "force 0.20 N" in words and "gravity towards P 1.00, fluid up to" in words
-        assert told(Loads((), np.zeros(1))) == ""
-        assert "towards L 0.60 S 0.80, fluid up to -12 mm" in told(posture(np.array([-3.0, 0.0, 4.0]), -0.012))
+        assert told(Loads((), np.zeros(1)), STILL) == ""
+        assert "towards L 0.60 S 0.80, fluid up to -12 mm" in told(posture(np.array([-3.0, 0.0, 4.0]), -0.012), STILL)
 
 
 class TestLying:

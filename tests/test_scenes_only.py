@@ -45,13 +45,9 @@ OF_EFFECT = {
     "Inertia": cost("inertia", "inertia:add_force", "Inertia Kernels"),
     "Pulsation": cost("swelling", "swelling:fill loops:spread", "Swelling"),
     "Resection": cost(),
-    "ToolContact": cost("barrier contact touch", "", "Contact"),  # no tool has a pose yet
-    "Retraction": cost("barrier contact touch", "", "Contact"),
-    "SkullContact": cost(
-        "barrier skull_contact",
-        "skull_contact:add_gradient skull_contact:add_curvature skull_contact:bound_step",
-        "Skull",
-    ),
+    "ToolContact": cost("barrier contact touch", "touch:add_gradient touch:add_reaction", "Contact"),
+    "Retraction": cost("barrier contact touch", "touch:add_gradient touch:add_reaction", "Contact"),
+    "SkullContact": cost("barrier skull_contact", "skull_contact:add_gradient", "Skull"),
 }
 OF_LAW = {
     "linear": cost("linear"),
@@ -68,6 +64,7 @@ ANY = {f"loops:{name}" for name in ("add_energy", "add_curvature", "add_diagonal
     "dead_force:subtract_work",
     "inertia:add_energy",
     "inertia:add_blocks",
+    *(f"{name}:{kernel}" for name in ("touch", "skull_contact") for kernel in ("add_curvature", "bound_step")),
 }
 
 
@@ -114,7 +111,7 @@ def law_of(name: str) -> str:
     """The law of a built-in scene's tissue."""
     (tissue,) = (effect.default for effect in find_scene(name).effects if isinstance(effect, Elasticity))
     assert tissue is not None
-    return tissue.law
+    return "prony" if tissue.prony else tissue.law
 
 
 def test_every_effect_and_law_has_its_line():

@@ -1,0 +1,111 @@
+"""Scenes whose hand moves its tool: what it reads, and that nothing but time and the start decides an answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from theatres import player, theatre_of
+
+from scenes.paths import AIR, Touch
+from scenes.scene import Scene, Viewpoint, find_scene
+from scenes.told import told
+from scenes.truth import truth_of
+from sim.effects import Held, Pulsation
+from sim.errors import InputError
+from sim.loads import Retracted, Touching
+from sim.tools import distances_to
+
+SMALL = Viewpoint(width=160, height=120)
+
+
+def small(name: str) -> Scene:
+    """A built-in scene with a small picture and linear elements."""
+    return replace(find_scene(name), viewpoint=SMALL, element=None)
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module")
+def palpated(theatre):
+    return list(player(theatre, small("palpate"), "fem").frames(10))
+
+
+class TestPalpate:
+    def test_the_tool_reads_the_tissue_while_it_is_in_it(self, palpated):
+        reads = np.array([-frame.deformation.reaction[0, 0, 2] for frame in palpated])
+        depth = np.array([frame.touch.depth for frame in palpated])
+        assert all(frame.deformation.outcome[0].good for frame in palpated)
+        assert (reads[depth > 2e-3] > 0.02).all() and (reads[depth < -2e-3] == 0.0).all()
+        assert depth.min() == -AIR and depth.max() == pytest.approx(4e-3)
+
+    def test_no_vertex_is_inside_the_drawn_tool(self, theatre, palpated):
+        shape = find_scene("palpate").tool.shape
+        for frame in palpated:
+            (cause,) = frame.loads.causes
+            assert isinstance(cause, Touching)
+            np.testing.assert_array_equal(cause.pose[0, 0], frame.pose)
+            positions = theatre.anatomy.mesh.nodes + frame.deformation.displacement[0]
+            assert distances_to(shape, frame.pose, positions).min() > 0.0
+
+    def test_scrubbing_back_answers_as_before(self, theatre, palpated):
+        """A frame is a function of its loads and of the answer that it starts from."""
+        again = player(theatre, small("palpate"), "fem")
+        for row in (8, 3, 6):
+            frame = palpated[row]
+            drawn = again.draw(frame.number, frame.time, frame.touch, palpated[row - 1].deformation)
+            np.testing.assert_array_equal(drawn.deformation.displacement, frame.deformation.displacement)
+
+    def test_the_page_says_what_it_reads(self, palpated):
+        frame = palpated[6]
+        reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
+        assert told(frame.loads, frame.deformation) == f"the tool reads {reads:.2f} N"
+
+    def test_learnt_models_of_pushes_do_not_know_it(self, theatre):
+        with pytest.raises(InputError, match="palpate"):
+            theatre.deformer("linear", small("palpate"))
+        assert theatre.names(small("palpate")) == ("fem",)
+
+
+class TestRetract:
+    def test_the_blade_bears_less_and_less_while_it_is_held(self, theatre):
+        frames = list(player(theatre, small("retract"), "fem").frames(15))
+        (cause,) = frames[-1].loads.causes
+        assert isinstance(cause, Retracted)
+        reads = np.array([np.linalg.norm(frame.deformation.reaction[0, 0, :3]) for frame in frames])
+        held = np.array([frame.time for frame in frames]) >= 1.5
+        assert (np.diff(reads[held]) < 0.0).all() and reads[-1] < 0.9 * reads[held][0]
+        assert reads[0] == 0.0 and all(frame.deformation.outcome[0].good for frame in frames)
+
+
+class TestPulsation:
+    def test_the_ball_reads_the_pulse(self, theatre):
+        scene = replace(small("pulsation"), duration=3.0)
+        frames = list(player(theatre, scene, "fem").frames(3))
+        reads = np.array([-frame.deformation.reaction[0, 0, 2] for frame in frames if frame.time >= 1.0])
+        swells = Pulsation().swelling(np.array([frame.time for frame in frames if frame.time >= 1.0]))
+        assert np.corrcoef(reads, swells)[0, 1] > 0.95
+        assert reads.max() > 1.05 * reads.min() > 0.0
+
+    def test_frames_after_one_another_are_the_truth(self, theatre):
+        scene = small("pulsation")
+        loads = [scene.loads(theatre.site, scene.path(time), time) for time in (0.0, 0.8, 1.25, 1.6)]
+        truth = truth_of(theatre, scene, loads)
+        assert all(outcome.good for outcome in truth.outcome) and truth.displacement[3].any()
+
+
+def test_a_moved_tool_needs_a_hand():
+    with pytest.raises(InputError, match="asks for ToolContact, but has no tool"):
+        replace(find_scene("palpate"), tool=None)
+
+
+def test_a_tool_in_the_air_touches_nothing(theatre):
+    scene = small("palpate")
+    fem = theatre.fem(scene, scene.accuracy)
+    loads = scene.loads(theatre.site, Touch(depth=-1e-3), 0.0)
+    np.testing.assert_array_equal(fem.deform(loads).displacement, 0.0)
+    assert Held() in fem.effects
