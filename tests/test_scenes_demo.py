@@ -147,7 +147,7 @@ def test_visitors_take_over_scrub_and_switch(running):
     assert wait_for(lambda: "force 0.31 N" in report(demo) and page.inputs["tool"].value == HAND)
     visitor.set(page.inputs["direction right [deg]"], 20.0)
     visitor.set(page.inputs["place up [mm]"], -5.0)
-    assert wait_for(lambda: demo.wish.touch == Touch(0.0, -5e-3, 0.31, (np.radians(20.0), 0.0)))
+    assert wait_for(lambda: demo.wish.touch == Touch(0.0, -5e-3, 0.31, (np.radians(20.0), 0.0), 2e-3))
     visitor.set(page.inputs["deformer"], "fem")
     assert wait_for(lambda: report(demo).startswith("**fem**: converged"))
     assert wait_for(lambda: "finite elements' own answer" in report(demo))
