@@ -161,6 +161,11 @@ class Ladder:
             acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.barriers)])
         return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
 
+    def _rested(self, start: wp.array) -> wp.array:
+        """Start (3N, b) [m], or rest where nothing acts there: in float32 no descent would end in letting go."""
+        acts = self._acts(start.shape[1])
+        return start if acts.all() else self.problem.device.array(np.where(acts, start.numpy(), 0.0))
+
     def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The first of some guesses (3N, B) [m] of each case that is not inside out; which cases (B,) have none."""
         device = self.problem.device
@@ -234,10 +239,10 @@ class Ladder:
             self.problem.begin(cases)
             for term in self.problem.barriers:
                 term.widen(float(times))
-            found = self._thorough(start, outer, max(OPEN_TOLERANCE, self.accuracy.tolerance))
+            found = self._thorough(self._rested(start), outer, max(OPEN_TOLERANCE, self.accuracy.tolerance))
             start, iterations, linear = found.u, iterations + found.iterations, linear + found.linear_iterations
         self.problem.begin(cases)
-        found = self._thorough(start, outer)
+        found = self._thorough(self._rested(start), outer)
         linear += found.linear_iterations
         return replace(found, iterations=iterations + found.iterations, linear_iterations=linear)
 
