@@ -12,7 +12,7 @@ from sim.loads import Loads
 
 from .bound import LEVELS
 from .encode import directions
-from .learned import Learned, only_pushed
+from .learned import Learned
 
 TENTHS = 10
 
@@ -68,7 +68,7 @@ def coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
     answer = model.deform(loads, at=model.anatomy.tumour_nodes)
     worst = np.linalg.norm(answer.displacement - truth, axis=2).max(axis=1)
     held = worst <= answer.bound
-    by_force = np.array_split(np.argsort(directions(only_pushed(loads))[0], kind="stable"), TENTHS)
+    by_force = np.array_split(np.argsort(directions(model.asked(loads))[0], kind="stable"), TENTHS)
     return Coverage(
         len(loads),
         (float(held[0].mean()), float(held[1].mean())),

@@ -2,7 +2,8 @@
 
 Layout: `anatomy/` the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/`, each with `displacement`
 (n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `done`. `answers/` belongs to `loads/`; `unit/` holds the
-small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, y and z in turn.
+small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, y and z in turn; of
+data of poses there is none.
 """
 
 from __future__ import annotations
@@ -17,10 +18,12 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.deformation import Outcome
 from sim.errors import InputError
-from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed
+from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Touching
 from sim.mesh import TetMesh
 
-CAUSES: dict[str, type[Cause]] = {kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture)}
+CAUSES: dict[str, type[Cause]] = {
+    kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture, Touching)
+}
 FORMAT = "sulcus data 1"
 # The arrays of a mesh; linear ones have no `middles`.
 MESH = ("nodes", "tets", "region", "middles")
@@ -58,6 +61,11 @@ class Dataset:
     residual: np.ndarray
     unit_good: np.ndarray
     provenance: Mapping[str, str]
+
+    @property
+    def ball(self) -> float | None:
+        """Radius [m] of the ball whose poses the loads are; None: they are pushes."""
+        return float(self.provenance["ball"]) if "ball" in self.provenance else None
 
     @property
     def good(self) -> np.ndarray:

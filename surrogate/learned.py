@@ -18,6 +18,7 @@ from sim.loads import Loads, Pushed
 from .bound import Bound, features_of
 from .encode import ENCODERS, Basis, directions
 from .envelope import Envelope, measured
+from .indentation import indented
 from .patch import Patch, open_patch
 from .regressor import Fitted
 from .remainder import Remainder
@@ -71,6 +72,8 @@ class Learned:
         What it promises of each load, if loads were kept apart to calibrate it.
     training
         What it was taught with, as text.
+    ball
+        Radius [m] of the ball whose poses it answers; None: it answers pushes. Where it says force, there is depth [m].
     """
 
     anatomy: Anatomy
@@ -79,6 +82,7 @@ class Learned:
     bound: float = float("nan")
     bounds: Bound | None = None
     training: Mapping[str, str] = field(default_factory=dict)
+    ball: float | None = None
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -135,7 +139,7 @@ class Learned:
             )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Predict the static answer to `Pushed` loads; `start` has no influence.
+        """Predict the static answer to `Pushed` loads, or to `Touching` of its ball; `start` has no influence.
 
         Raises
         ------
@@ -148,7 +152,7 @@ class Learned:
                 f"{len(loads)} load cases."
             )
         begun = time.perf_counter()
-        pushed = only_pushed(loads)
+        pushed = self.asked(loads)
         nodes = self.nodes if at is None else np.asarray(at)
         if len(loads) == 1 and np.array_equal(nodes, self.anatomy.tumour_nodes) and self._swift is not None:
             displacement, excess, promised = self._swift.answer(pushed)
@@ -179,6 +183,16 @@ class Learned:
             promised = np.where(weaker > 0.0, self.bounds.of(told, magnitude, excess), 0.0) * weaker
         return predicted(displacement, nodes, loads, excess > 0.0, begun, promised)
 
+    def asked(self, loads: Loads) -> Pushed:
+        """What the model is asked: pushes, or the poses of its ball as `indentation.indented` has them.
+
+        Raises
+        ------
+        InputError
+            Loads of another kind.
+        """
+        return only_pushed(loads) if self.ball is None else indented(loads, self.ball, self._patch)
+
     def margin(self, answer: Deformation) -> np.ndarray:
         """A field (B, n) [m] over `anatomy.tumour_nodes`, scaled from an answer's bound at 0.95: where it is needed.
 
@@ -202,13 +216,15 @@ def predicted(
     begun: float,
     bound: np.ndarray,
 ) -> Deformation:
-    """What a learnt model, asked at `begun` [s], answers pushes with; `outside` (B,) of what it was taught or not.
+    """What a learnt model, asked at `begun` [s], answers loads with; `outside` (B,) of what it was taught or not.
 
     displacement (B, n, 3) [m] of `nodes` (n,); bound as in `Deformation`.
     """
     count = len(loads)
-    unknown, reaction = np.full(count, np.nan), np.zeros((count, 1, 6))
-    reaction[:, 0, :3] = only_pushed(loads).force
+    pushed, unknown = loads.of(Pushed), np.full(count, np.nan)
+    reaction = np.zeros((count, 0 if pushed is None else 1, 6))  # what force a pose takes it was not taught
+    if pushed is not None:
+        reaction[:, 0, :3] = pushed.force
     return Deformation(
         displacement,
         nodes,

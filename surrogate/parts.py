@@ -40,6 +40,8 @@ LEARNT: dict[str, tuple[str, Callable[[], Regressor]]] = {
     "gp": ("tool", Gp),
     "residual": ("tool", Ann),
 }
+# Those that poses teach: where the ball is stands for what it presses with, and there is no compliance to add to.
+POSED = ("gp", "ann", "svr")
 # Those that ask the finite elements for their series, of which the second learns what it leaves.
 EXPANDED = ("series", "series-gp")
 # Share of the responses that a learner's basis may lose, and its most modes; the same of the tables, and of the series.
@@ -237,6 +239,11 @@ def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
         return (tumour, learnt, *cortex, left)
     if name == "linear":
         return (known.table, *known.cortex_table)
+    if known.data.ball is not None:
+        both = ((known.tumour, lesson.tumour), (known.cortex, lesson.cortex))
+        return tuple(
+            _taught(LEARNT[name], (), nodes, known.patch, lesson.loads, truth) for nodes, truth in both if len(nodes)
+        )
     before = (known.table,) if name == "residual" else ()
     learnt = _taught(LEARNT[name], before, known.tumour, known.patch, lesson.loads, lesson.tumour)
     return (*before, learnt, *known.cortex_table)

@@ -13,7 +13,7 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Deformer, Outcome
 from sim.errors import InputError
-from sim.loads import Loads, Nodal
+from sim.loads import Loads, Nodal, Touching
 from sim.stages import listened, stage
 
 from .dataset import FORMAT, read_loads, stored, write_embedded, write_loads
@@ -50,7 +50,7 @@ def simulate(
     batch: int = 64,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Solved:
-    """Answer every load, and the unit forces on the open cortex, into an HDF5 file.
+    """Answer every load, and the unit forces on the open cortex unless the loads are poses, into an HDF5 file.
 
     Rows go to `PATH.partial`, whose whole space is laid out first: a kill at any moment leaves a file that opens, and
     the same call goes on at the first unfinished batch with the same batches, so the result has the same bytes. The
@@ -151,7 +151,7 @@ def _lay_out(
     partial: Path, anatomy: Anatomy, loads: Loads, stated: Mapping[str, str], finished: Path | None, batch: int
 ) -> None:
     """Create the file with all its space; keep the whole batches of a `finished` file that it extends."""
-    nodes = open_patch(anatomy).nodes
+    nodes = open_patch(anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
     draft = partial.with_name(f".{partial.name}")
     try:
         with h5py.File(draft, "w") as file:
@@ -168,8 +168,9 @@ def _lay_out(
                     ("residual", (rows,), np.float64),
                     ("done", (rows,), bool),
                 ):
-                    # A first write makes HDF5 allocate the whole array: later writes touch no metadata.
-                    group.create_dataset(item, shape, kind)[-1] = np.zeros(shape[1:], kind)
+                    array = group.create_dataset(item, shape, kind)
+                    if rows:  # a first write makes HDF5 allocate the whole array: later writes touch no metadata
+                        array[-1] = np.zeros(shape[1:], kind)
             file["unit/node"] = np.repeat(nodes, 3)
             if finished is not None:
                 with h5py.File(finished, "r") as source:

@@ -122,6 +122,7 @@ def _described(model: Learned, put: Any) -> dict[str, Any]:
         "bound": model.bound,
         "bounds": bounds,
         "training": dict(model.training),
+        "ball": model.ball,
     }
 
 
@@ -140,4 +141,12 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         envelope[name] = tuple(envelope[name])
     promised = description["bounds"]
     bounds = None if promised is None else Bound(**{name: arrays[key] for name, key in promised.items()})
-    return Learned(anatomy, parts, Envelope(**envelope), description["bound"], bounds, description["training"])
+    return Learned(
+        anatomy,
+        parts,
+        Envelope(**envelope),
+        description["bound"],
+        bounds,
+        description["training"],
+        description.get("ball"),
+    )

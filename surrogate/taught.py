@@ -5,7 +5,18 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterable
 
-from sim.effects import Effect, Elasticity, Gravity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
+from sim.effects import (
+    Effect,
+    Elasticity,
+    Gravity,
+    Held,
+    NodalForce,
+    Slide,
+    ToolContact,
+    ToolDisplacement,
+    ToolForce,
+)
+from sim.tools import Ball
 
 from .learned import Learned
 
@@ -28,10 +39,17 @@ def taught_effects(model: Learned) -> frozenset[str]:
 def refusal(model: Learned, effects: Iterable[Effect]) -> str | None:
     """Why a model may not answer under these effects, or None if it may.
 
-    Where nothing slides in its anatomy it is all one whether `Slide` is asked for.
+    A model of poses answers where its ball touches, one of pushes where a tool's force acts. Where nothing slides in
+    its anatomy it is all one whether `Slide` is asked for.
     """
+    effects = tuple(effects)
     taught, asked = taught_effects(model), frozenset(type(effect).__name__ for effect in effects)
-    if ToolForce.__name__ not in asked:
+    if model.ball is not None:
+        here = next((effect.tools for effect in effects if isinstance(effect, ToolContact)), ())
+        if here != (Ball(model.ball),):
+            tools = ", ".join(map(repr, here)) or "none"
+            return f"it was taught the poses of one ball of {1e3 * model.ball:g} mm, and the tools here are {tools}"
+    elif ToolForce.__name__ not in asked:
         others = ", ".join(sorted(asked - taught))
         return f"it was taught what a tool's force does, and here is none{f', but {others}' if others else ''}"
     idle = set() if model.anatomy.slide_normal.any() else {"Slide"}

@@ -16,8 +16,9 @@ from .coverage import TENTHS, Coverage, coverage
 from .dataset import Dataset
 from .encode import directions
 from .envelope import Envelope, envelope_of, measured
-from .learned import Learned
-from .parts import EXPANDED, LEARNT, Classroom, Expansion, Lesson, parts_of
+from .indentation import indented
+from .learned import Learned, only_pushed
+from .parts import EXPANDED, LEARNT, POSED, Classroom, Expansion, Lesson, parts_of
 from .patch import Patch, nearest
 from .score import Score, errors, score
 from .split import APART, MOST_APART, Split, leave_discs_out
@@ -47,7 +48,9 @@ class Trained:
 
 
 def learners_for(data: Dataset) -> tuple[str, ...]:
-    """All that a data set can teach: series need finite elements, of a tissue that the data names."""
+    """All that a data set can teach: series need finite elements, of a tissue that the data names, and forces."""
+    if data.ball is not None:
+        return POSED
     return tuple(name for name in LEARNERS if name not in EXPANDED or "tissue" in data.provenance)
 
 
@@ -81,13 +84,18 @@ def train(
     Raises
     ------
     InputError
-        Unknown learners, nothing to teach, data with other causes than `Pushed`, an anatomy without tumour, too few
-        loads, or unit responses that did not converge.
+        Unknown learners, or such as poses do not teach, nothing to teach, data with other causes than `Pushed` or the
+        `Touching` of a ball, an anatomy without tumour, too few loads, or unit responses that did not converge.
     """
     wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
     unknown = [name for name in wanted if name not in LEARNERS]
     if unknown or not wanted:
         raise InputError(f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {', '.join(LEARNERS)}.")
+    strange = [name for name in wanted if data.ball is not None and name not in POSED]
+    if strange:
+        raise InputError(
+            f"{data.path}: holds poses, of which {', '.join(strange)} cannot be had: choose from {', '.join(POSED)}."
+        )
     if most is not None and most < 1:
         raise InputError(f"{most} loads teach nothing: give at least 1.")
     if not data.unit_good.all():
@@ -96,9 +104,9 @@ def train(
             "table: simulate anew with a looser --tolerance."
         )
     loads = data.loads.rows(np.flatnonzero(data.good))
-    pushed = _pushed(loads)
     shared = expansion or Expansion(data)
     patch, nodes = shared.patch, shared.tumour
+    pushed = _asked(data, loads, patch)
     if not len(nodes):
         raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
     apart = np.zeros(len(loads), bool)
@@ -110,16 +118,17 @@ def train(
         cortex = data.displacement(shared.cortex)[data.good]
 
     def lesson(rows: np.ndarray) -> Lesson:
-        return Lesson(_pushed(loads.rows(np.flatnonzero(rows))), truth[rows], cortex[rows])
+        return Lesson(_rows(pushed, rows), truth[rows], cortex[rows])
 
     lessons = [lesson(_first(split.taught, most)), *([lesson(_first(~apart, most))] if apart.any() else [])]
     rooms = [Classroom(each, shared) for each in lessons]
     test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
+    tested, left = (_rows(pushed, rows) for rows in (split.test, apart))
     beside = np.zeros(0, int)
-    envelopes = [envelope_of(patch, lessons[0].loads, _pushed(test))]
+    envelopes = [envelope_of(patch, lessons[0].loads, tested)]
     if apart.any():
-        beside = np.flatnonzero(nearest(_pushed(fresh).point, split.centres)[1] > split.radius)
-        envelopes.append(envelope_of(patch, lessons[1].loads, _pushed(fresh)))
+        beside = np.flatnonzero(nearest(left.point, split.centres)[1] > split.radius)
+        envelopes.append(envelope_of(patch, lessons[1].loads, left))
     models, scores, left_out = {}, [], {}
     for name in wanted:
         with stage(f"learn {name}"):
@@ -128,11 +137,12 @@ def train(
                 parts_of(name, rooms[0], lessons[0]),
                 envelopes[0],
                 training={"learner": name, **data.provenance},
+                ball=data.ball,
             )
         with stage("score"):
             scores.append(score(name, model, test, truth[split.test], nodes))
             held_out = errors(model, test, truth[split.test], nodes).max(axis=1)
-        seen = _features(patch, _pushed(test), envelopes[0]), held_out
+        seen = _features(patch, tested, envelopes[0]), held_out
         models[name] = replace(model, bound=min(conformal(held_out, LEVELS[0]), float(held_out.max())))
         if len(beside) >= 2 * FEWEST_APART and len(test) >= TENTHS:
             with stage("calibrate"):
@@ -155,7 +165,7 @@ def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, node
     scale, share = loads.rows(slice(None, None, 2)), loads.rows(slice(1, None, 2))
     error = errors(model, scale, truth[::2], nodes).max(axis=1)
     return _calibrated(
-        model, patch, (_features(patch, _pushed(scale), model.envelope), error), share, truth[1::2], nodes
+        model, patch, (_features(patch, model.asked(scale), model.envelope), error), share, truth[1::2], nodes
     )
 
 
@@ -168,7 +178,7 @@ def _calibrated(
     nodes: np.ndarray,
 ) -> Learned:
     """With bounds whose scale follows what was `seen` (features and errors), calibrated on other loads."""
-    pushed = _pushed(loads)
+    pushed = model.asked(loads)
     error = errors(model, loads, truth, nodes)
     features = _features(patch, pushed, model.envelope)
     return replace(model, bounds=fitted_bound(seen, features, directions(pushed)[0], error))
@@ -192,8 +202,18 @@ def _without(split: Split, apart: np.ndarray) -> Split:
     return replace(split, disc=disc)
 
 
-def _pushed(loads: Loads) -> Pushed:
-    pushed = loads.only(Pushed)
-    if pushed is None:
-        raise InputError("the data holds other loads than `Pushed`, which the learners do not take: simulate pushes.")
-    return pushed
+def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
+    """What loads of a data set ask of a model, as `Learned.asked` has it."""
+    if data.ball is not None:
+        return indented(loads, data.ball, patch)
+    if loads.only(Pushed) is None:
+        raise InputError(
+            "the data holds other loads than `Pushed`, which the learners do not take: simulate pushes, or one ball's "
+            "poses."
+        )
+    return only_pushed(loads)
+
+
+def _rows(pushed: Pushed, rows: np.ndarray) -> Pushed:
+    """Those of the chosen rows (B,) bool."""
+    return Pushed(pushed.point[rows], pushed.force[rows], pushed.footprint[rows])

@@ -11,7 +11,6 @@ import numpy as np
 from sim.errors import InputError
 from surrogate.coverage import coverage
 from surrogate.dataset import read_dataset
-from surrogate.learned import only_pushed
 from surrogate.score import score, table
 from surrogate.store import load
 
@@ -44,8 +43,8 @@ def run(args: argparse.Namespace) -> int:
                     f"{args.data}: its {what} is {here}, but {name} was taught {taught}: that would judge the "
                     "difference of two bodies. Simulate with the model's own."
                 )
-    point = only_pushed(loads).point.astype(np.float32)
     for name, model in models.items():
+        point = model.asked(loads).point.astype(np.float32)
         if (model.envelope.points[:, None] == point[: len(point) : max(1, len(point) // 100)]).all(axis=2).any():
             raise InputError(
                 f"{args.data}: holds loads at places where {name} was taught: simulate others, with another --seed."

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from sim.accuracy import Accuracy
 from sim.deformation import Outcome
-from sim.effects import NodalForce, pushed_effects
+from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effects
 from sim.fem import Fem
 from sim.files import check_output
 from sim.material import tissue_to_json
@@ -21,6 +21,7 @@ from sim.memory import WIDEST, WIDEST_ON_CUDA
 from sim.meshfile import read_anatomy
 from sim.stages import stage
 from surrogate.dataset import read_outcomes
+from surrogate.poses import ball_of, draw_poses
 from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import Solved, simulate
 
@@ -38,6 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="DATA.h5", help="the data set; an unfinished one goes on")
     parser.add_argument("--count", type=int, default=2000, help="loads to draw (default %(default)s)")
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
+    parser.add_argument(
+        "--poses",
+        action="store_true",
+        help="a rigid ball of the tool's middle radius, moved by pose, instead of a force on its footprint",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
     add_tissue_arguments(parser)
     add_element_argument(parser)
@@ -54,10 +60,14 @@ def run(args: argparse.Namespace) -> int:
     out = check_output(args.out, ".h5")
     with stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
-        loads = draw(args.preset, anatomy, args.count, args.seed)
+        loads = (draw_poses if args.poses else draw)(args.preset, anatomy, args.count, args.seed)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
     tissue = tissue_of(args)
-    effects = (*pushed_effects(anatomy, tissue), NodalForce())
+    effects: tuple[Effect, ...] = (*pushed_effects(anatomy, tissue), NodalForce())
+    ball = ball_of(args.preset) if args.poses else None
+    if ball is not None:
+        passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
+        effects = (*passive, ToolContact((ball,)))
     with stage("set-up"):
         fem = Fem(anatomy, effects, accuracy, args.device, args.batch, args.element)
     provenance = {
@@ -68,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
         "device": fem.problem.device.name.split(":")[0],
         "preset": args.preset,
         "seed": str(args.seed),
+        **({} if ball is None else {"ball": repr(ball.radius)}),
         **{f"{name} version": version(name) for name in ("sulcus", "warp-lang", "numpy")},
     }
     with tqdm(unit="load", disable=args.json, file=sys.stderr) as bar:

@@ -1,0 +1,218 @@
+"""Models that are told where the tool is: poses as indentations, how they are drawn, learnt, stored and refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes.cli import main
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, Deformer, Outcome
+from sim.effects import Elasticity, Held, NodalForce, ToolContact, ToolForce
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Pushed, Touching
+from sim.meshfile import read_anatomy, write_anatomy
+from sim.tools import Ball, Capsule
+from surrogate.dataset import Dataset, read_dataset
+from surrogate.indentation import indented
+from surrogate.learned import Learned
+from surrogate.parts import POSED
+from surrogate.patch import Patch, open_patch
+from surrogate.poses import DEEP, SHALLOW, ball_of, draw_poses, poses_at
+from surrogate.sampling import draw
+from surrogate.score import errors
+from surrogate.simulate import simulate
+from surrogate.store import load, save
+from surrogate.taught import refusal
+from surrogate.train import Trained, learners_for, train
+
+BALL = ball_of("palpation")
+EFFECTS = (Elasticity(), Held(), ToolContact((BALL,)))
+SAID = {"ball": repr(BALL.radius), "effects": repr(EFFECTS)}
+
+
+def domed(points: np.ndarray) -> np.ndarray:
+    """A cortex that is not flat: edges and corners are touched, too."""
+    out = points.copy()
+    out[:, 2] += 3e-3 * np.sin(90.0 * points[:, 0]) * np.cos(110.0 * points[:, 1])
+    return out
+
+
+def samples(patch: Patch) -> np.ndarray:
+    share = np.array([(i, j, 24 - i - j) for i in range(25) for j in range(25 - i)]) / 24.0
+    return np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)
+
+
+def test_first_touch_is_where_a_ball_comes_to_lie_on_the_surface(box: Anatomy) -> None:
+    """Taken back by its depth it touches at the point, and nowhere is nearer; a little further back nothing is."""
+    patch = open_patch(box)
+    bumpy = replace(patch, points=domed(patch.points))
+    loads = draw_poses("palpation", box, 60, 3)
+    pushed = indented(loads, BALL.radius, bumpy)
+    cause = loads.of(Touching)
+    assert cause is not None
+    pose = cause.pose[:, 0]
+    depth = np.linalg.norm(pushed.force, axis=1)
+    assert (depth > 0.0).sum() > 50
+    touched = pose[:, :3, 3] + (BALL.radius + depth)[:, None] * pose[:, :3, 2]
+    on = depth > 0.0
+    np.testing.assert_allclose(np.linalg.norm(touched - pushed.point, axis=1)[on], BALL.radius, rtol=1e-9)
+    surface = samples(bumpy)
+    nearest = np.array([np.linalg.norm(surface - middle, axis=1).min() for middle in touched[on]])
+    assert nearest.min() > BALL.radius - 1e-9
+    assert nearest.max() < BALL.radius + 2e-5
+    np.testing.assert_allclose(pushed.force[on], -depth[on, None] * pose[on, :3, 2], rtol=1e-12)
+
+
+def test_on_a_flat_cortex_poses_are_what_was_drawn(box: Anatomy) -> None:
+    patch = open_patch(box)
+    forces = draw("palpation", box, 40, 0).of(Pushed)
+    assert forces is not None
+    normal = patch.normal_near(forces.point)
+    motion = 3e-3 * forces.force / np.linalg.norm(forces.force, axis=1, keepdims=True)
+    found = indented(Loads((poses_at(BALL, forces.point, normal, motion),)), BALL.radius, patch)
+    np.testing.assert_allclose(found.point, forces.point, atol=1e-9)
+    np.testing.assert_allclose(found.force, motion, atol=1e-9)
+
+
+def test_a_ball_in_the_air_or_beside_the_cortex_has_no_depth(box: Anatomy) -> None:
+    patch = open_patch(box)
+    point = patch.points[[3, 3]] + [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
+    away = poses_at(BALL, point, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[0.0, 0.0, -1e-3]] * 2))
+    away.pose[0, 0, 2, 3] += 2e-3
+    found = indented(Loads((away,)), BALL.radius, patch)
+    assert not found.force.any()
+    assert np.isfinite(found.point).all()
+
+
+def test_draws_are_each_of_their_own_number(box: Anatomy) -> None:
+    few, many = draw_poses("palpation", box, 10, 4), draw_poses("palpation", box, 30, 4)
+    some, all_of = few.of(Touching), many.of(Touching)
+    assert some is not None
+    assert all_of is not None
+    np.testing.assert_array_equal(some.pose, all_of.pose[:10])
+    other = draw_poses("palpation", box, 10, 5).of(Touching)
+    assert other is not None
+    assert not np.array_equal(some.pose, other.pose)
+    depth = np.linalg.norm(indented(many, BALL.radius, open_patch(box)).force, axis=1) / BALL.radius
+    assert depth.min() >= SHALLOW - 1e-9
+    assert depth.max() <= DEEP + 1e-9
+
+
+@dataclass(frozen=True)
+class PosedPretender:
+    """Answers poses as pushes whose force goes with depth to the power of 1.5."""
+
+    pretender: Deformer
+
+    @property
+    def anatomy(self) -> Anatomy:
+        return self.pretender.anatomy
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        pushed = indented(loads, BALL.radius, open_patch(self.anatomy))
+        depth = np.linalg.norm(pushed.force, axis=1, keepdims=True)
+        force = 400.0 * np.sqrt(BALL.radius) * np.sqrt(depth) * pushed.force
+        return self.pretender.deform(Loads((replace(pushed, force=force),), loads.times), start, at)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory, pretender: Deformer) -> Dataset:
+    path = tmp_path_factory.mktemp("poses") / "data.h5"
+    told = simulate(path, PosedPretender(pretender), draw_poses("palpation", pretender.anatomy, 360, 0), SAID)
+    assert (told.loads, told.units) == (360, 0)
+    return read_dataset(path)
+
+
+@pytest.fixture(scope="module")
+def trained(data: Dataset) -> Trained:
+    return train(data, ["gp"])
+
+
+def test_poses_teach_where_there_is_no_force(
+    data: Dataset, trained: Trained, pretender: Deformer, box: Anatomy
+) -> None:
+    """Fresh poses, as drawn: learnt to a few per cent, and bounds hold about as often as they say."""
+    assert learners_for(data) == POSED
+    model, fresh = trained.models["gp"], draw_poses("palpation", box, 100, 77)
+    nodes = box.tumour_nodes
+    truth = PosedPretender(pretender).deform(fresh).at(nodes).displacement
+    error = errors(model, fresh, truth, nodes)
+    assert error.mean() < 0.05 * np.linalg.norm(truth, axis=2).mean()
+    found = model.deform(fresh, at=nodes)
+    assert found.outcome.count(Outcome.PREDICTED) > 90
+    assert (error.max(axis=1) <= found.bound[0]).mean() > 0.85
+    assert found.reaction.shape == (100, 0, 6)
+    cortex = open_patch(box).nodes
+    exact = PosedPretender(pretender).deform(fresh).at(cortex).displacement
+    assert np.linalg.norm(model.deform(fresh, at=cortex).displacement - exact) < 0.2 * np.linalg.norm(exact)
+
+
+def test_deeper_or_elsewhere_than_taught_is_said(trained: Trained, box: Anatomy) -> None:
+    model, patch = trained.models["gp"], open_patch(box)
+    middle = patch.points.mean(axis=0, keepdims=True)
+    way = patch.normal_near(middle)
+    deep = Loads((poses_at(BALL, middle, way, 1.2 * BALL.radius * way),))
+    assert model.deform(deep).outcome == (Outcome.EXTRAPOLATED,)
+    off = Loads((poses_at(BALL, middle + [0.024, 0.0, 0.0], way, 2e-3 * way),))
+    assert model.deform(off).outcome == (Outcome.EXTRAPOLATED,)
+    air = Loads((poses_at(BALL, middle - 0.02 * way, way, 2e-3 * way),))
+    assert not model.deform(air).displacement.any()
+    assert model.deform(air).outcome == (Outcome.PREDICTED,)
+
+
+def test_a_stored_model_knows_its_ball(tmp_path: Path, trained: Trained, box: Anatomy) -> None:
+    save(tmp_path / "model.npz", trained.models)
+    again, fresh = load(tmp_path / "model.npz", box)["gp"], draw_poses("palpation", box, 5, 1)
+    assert again.ball == BALL.radius
+    np.testing.assert_array_equal(again.deform(fresh).displacement, trained.models["gp"].deform(fresh).displacement)
+
+
+def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(trained: Trained, box: Anatomy) -> None:
+    model = trained.models["gp"]
+    with pytest.raises(InputError, match="causes Pushed, but this model was taught the poses of one ball"):
+        model.deform(draw("palpation", box, 2, 0))
+    two = Touching(np.tile(np.eye(4), (1, 2, 1, 1)))
+    with pytest.raises(InputError, match="poses of one ball"):
+        model.deform(Loads((two,)))
+    forces = Learned(box, model.parts, model.envelope)
+    with pytest.raises(InputError, match="taught pushing forces only"):
+        forces.deform(draw_poses("palpation", box, 2, 0))
+    assert refusal(model, EFFECTS) is None
+    for tools in ((Ball(5e-3),), (BALL, BALL), (Capsule(BALL.radius, 0.01),)):
+        assert "the tools here are" in str(refusal(model, (Elasticity(), Held(), ToolContact(tools))))
+    assert "the tools here are none" in str(refusal(model, (Elasticity(), Held(), ToolForce())))
+    assert "not under ToolForce" in str(refusal(model, (*EFFECTS, ToolForce())))
+    assert "here is none, but ToolContact" in str(refusal(forces, EFFECTS))
+
+
+def test_what_poses_cannot_teach_is_refused(data: Dataset, box: Anatomy) -> None:
+    with pytest.raises(InputError, match="holds poses, of which linear, series cannot be had: choose from gp"):
+        train(data, ["linear", "gp", "series"])
+    with pytest.raises(InputError, match="no ball stands for the preset spatula: choose one of palpation"):
+        draw_poses("spatula", box, 2, 0)
+    with pytest.raises(InputError, match="holds other loads than `Pushed`"):
+        train(replace(data, provenance={}), ["gp"])
+
+
+def test_the_command_makes_poses_that_finite_elements_answer(tmp_path: Path, box: Anatomy) -> None:
+    mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
+    write_anatomy(mesh, box)
+    wanted = ["simulate", str(mesh), "--out", str(out), "--poses", "--count", "3", "--json"]
+    assert main(wanted) == 0
+    data = read_dataset(out)
+    assert data.good.all()
+    assert data.ball == BALL.radius
+    assert "NodalForce" not in data.provenance["effects"]
+    fem = Fem(read_anatomy(mesh), EFFECTS, device="cpu", batch=1)
+    truth = fem.deform(data.loads)
+    stored = data.displacement(np.arange(len(box.mesh.nodes)))
+    assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
+    force = truth.reaction[:, 0, :3]
+    shaft = data.loads.of(Touching).pose[:, 0, :3, 2]  # pyright: ignore[reportOptionalMemberAccess]
+    assert (np.einsum("bi,bi->b", force, shaft) < 0.0).all()
+    assert NodalForce not in {type(effect) for effect in fem.effects}
