@@ -97,7 +97,7 @@ class Player:
         return self.scene.viewpoint.camera(self.site)
 
     def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
-        """The frame of a touch at a time [s]; `last` warms the deformer up."""
+        """The frame of a touch at a time [s]; `last`, unless it is of a later time, is where the deformer starts."""
         begun = clock.perf_counter()
         loads = self.scene.loads(self.site, touch, time)
         # A learnt model knows the drawn vertices alone; the finite elements start from their whole last answer.
@@ -105,7 +105,7 @@ class Player:
             deformation = self.deformer.deform(loads, at=self.stage.nodes)
             margin = self._margin(self.deformer, deformation)
         else:
-            margin, deformation = 0.0, self.deformer.deform(loads, start=last)
+            margin, deformation = 0.0, self.deformer.deform(loads, start=not_after(last, time))
         solved = clock.perf_counter()
         positions = self.positions(deformation)
         tip, pose = (None, None) if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
@@ -156,6 +156,11 @@ class Player:
         lift = 4e-3 * max(0.0, 1.0 - touch.force / 0.02)
         tip = contact.carried(positions) - lift * inward
         return tip, tool.pose(tip, inward, self.site.right)
+
+
+def not_after(last: Deformation | None, time: float) -> Deformation | None:
+    """An answer to start from at a time [s]; none if it is of a later one: what tissue remembers is not undone."""
+    return None if last is None or last.time[0] > time else last
 
 
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:

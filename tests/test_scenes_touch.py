@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from theatres import player, theatre_of
+from visitor import wait_for
 
 from scenes.paths import AIR, Touch
+from scenes.referee import Referee
 from scenes.scene import Scene, Viewpoint, find_scene
 from scenes.told import told
 from scenes.truth import truth_of
@@ -80,6 +82,22 @@ class TestRetract:
         held = np.array([frame.time for frame in frames]) >= 1.5
         assert (np.diff(reads[held]) < 0.0).all() and reads[-1] < 0.9 * reads[held][0]
         assert reads[0] == 0.0 and all(frame.deformation.outcome[0].good for frame in frames)
+
+    def test_time_goes_back_where_the_script_begins_again(self, theatre):
+        """What tissue remembers is not undone: a frame before its start begins at rest, on the page and behind it."""
+        scene = small("retract")
+        again = player(theatre, scene, "fem")
+        late, early = (float(time) for time in scene.times[[20, 18]])
+        last = again.draw(20, late, scene.path(late)).deformation
+        back, fresh = (again.draw(18, early, scene.path(early), start).deformation for start in (last, None))
+        np.testing.assert_array_equal(back.displacement, fresh.displacement)
+        referee = Referee(theatre, scene)
+        for number in (20, 18):
+            time = float(scene.times[number])
+            referee.ask(number, scene.loads(theatre.site, scene.path(time), time))
+            assert wait_for(lambda number=number: referee.truth is not None and referee.truth.number == number)
+        referee.close()
+        assert referee.failure is None
 
 
 class TestPulsation:
