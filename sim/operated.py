@@ -14,6 +14,7 @@ from .deformation import Deformation, joined
 from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
 from .fem import Fem
+from .ladder import LEARNT_KEY
 from .loads import Loads, Resected
 from .resection import Remains, bodies
 
@@ -54,7 +55,7 @@ class Operated:
         return self._bodies[done]
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """As `Fem.deform`; `start` may be an answer after other steps: positions and what nodes remember go on.
+        """As `Fem.deform`; `start` may be an answer after other steps: positions, what nodes remember and tools go on.
 
         Raises
         ------
@@ -64,10 +65,11 @@ class Operated:
         done, most = self._done(loads), len(self._bodies) - 1
         if (done > most).any():
             raise InputError(f"Resected.done is {done.max()}, but Resection has {most} steps: give at most that.")
+        same = np.zeros(len(done), bool) if start is None or DONE not in start.history else start.history[DONE] == done
         order, parts = [], []
-        for stage in np.unique(done).tolist():
-            rows = np.flatnonzero(done == stage)
-            begun = None if start is None else self._carried(start.rows(rows), stage)
+        for stage, stays in sorted(set(zip(done.tolist(), same.tolist(), strict=True))) or [(most, False)]:
+            rows = np.flatnonzero((done == stage) & (same == stays))
+            begun = None if start is None else self._carried(start.rows(rows), stage, stays)
             answer = self._solver(stage).deform(loads.but(Resected).rows(rows), begun, at)
             order.append(rows)
             parts.append(self._masked(answer, stage))
@@ -77,20 +79,22 @@ class Operated:
         cause = loads.of(Resected)
         return np.full(len(loads), len(self._bodies) - 1) if cause is None else cause.done.astype(int)
 
-    def _carried(self, start: Deformation, stage: int) -> Deformation:
+    def _carried(self, start: Deformation, stage: int, stays: bool) -> Deformation:
         """An earlier answer as one of this body: after other steps, what elements remember is another body's."""
-        history = dict(start.history)
-        before = history.pop(DONE, None)
-        if before is None or (before != stage).any():
-            vertex = (len(self.anatomy.mesh.nodes), 3)
-            history = {name: value for name, value in history.items() if value.shape[1:] == vertex}
+        history = {name: _stripped(value) for name, value in start.history.items() if name != DONE}
+        if not stays:
+            vertex, pose = (len(self.anatomy.mesh.nodes), 3), (4, 4)
+            history = {
+                name: value for name, value in history.items() if value.shape[1:] == vertex or value.shape[2:] == pose
+            }
+        history = {name: value for name, value in history.items() if value.size or not len(start)}
         return self._masked(replace(start, history=history), stage, marked=False)
 
     def _masked(self, answer: Deformation, stage: int, marked: bool = True) -> Deformation:
         """The answer with orphaned vertices at rest; `marked` with the steps that it is of."""
         orphaned = self._bodies[stage].anatomy.orphaned[answer.nodes]
         displacement = np.where(orphaned[:, None], 0.0, answer.displacement)
-        history = {**answer.history, DONE: np.full(len(answer), stage)} if marked else answer.history
+        history = {**answer.history, DONE: np.full(len(answer), float(stage))} if marked else answer.history
         return replace(answer, displacement=displacement, history=history)
 
 
@@ -138,12 +142,29 @@ def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effec
 
 
 def _together(parts: list[Deformation]) -> Deformation:
-    """Answers of several bodies; of what nodes and elements remember, that which has the same shape in all."""
-    shapes: dict[str, set[tuple[int, ...]]] = {}
+    """Answers of several bodies; what fewer elements remember is filled up to one shape, as `_stripped` takes off."""
+    shapes: dict[str, list[tuple[int, ...]]] = {}
     for part in parts:
         for name, value in part.history.items():
-            shapes.setdefault(name, set()).add(value.shape[1:])
-    kept = {name for name, found in shapes.items() if len(found) == 1}
-    return joined(
-        [replace(part, history={name: part.history[name] for name in kept & set(part.history)}) for part in parts]
-    )
+            if not name.startswith(LEARNT_KEY):
+                shapes.setdefault(name, []).append(value.shape[1:])
+
+    def filled(part: Deformation, name: str) -> np.ndarray:
+        whole = np.full((len(part), *np.max(shapes[name], axis=0).astype(int)), np.nan)
+        value = part.history.get(name)
+        if value is not None:
+            whole[tuple(map(slice, value.shape))] = value
+        return whole
+
+    return joined([replace(part, history={name: filled(part, name) for name in shapes}) for part in parts])
+
+
+def _stripped(value: np.ndarray) -> np.ndarray:
+    """History (B, ...) without the rows of each axis but the first that `_together` filled up."""
+    if not np.isnan(value).any():
+        return value
+    known = ~np.isnan(value)
+    for axis in range(1, value.ndim):
+        some = known.any(axis=tuple(other for other in range(value.ndim) if other != axis))
+        value, known = (np.take(array, np.flatnonzero(some), axis=axis) for array in (value, known))
+    return value

@@ -24,15 +24,17 @@ from sim.effects import (
     Resection,
     SkullContact,
     Slide,
+    ToolContact,
     ToolForce,
 )
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Loads, Nodal, Posture, Resected, posture, push
+from sim.loads import Loads, Nodal, Posture, Resected, Touching, posture, push
 from sim.material import Material
 from sim.mesh import TetMesh
 from sim.operated import Operated, finite_elements
 from sim.resection import bodies, remains
+from sim.tools import Ball
 
 TIGHT = Accuracy(tolerance=1e-11)
 SOFT = Material("neo-hookean", 3000.0, 0.4)
@@ -357,3 +359,41 @@ def test_what_nobody_asks_to_be_held_is_free() -> None:
     np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-12)
     with pytest.raises(InputError, match="can move rigidly in 6 of 6 ways"):
         finite_elements(body, (Elasticity(SOFT), Resection((NEXT,))), TIGHT, "cpu").deform(lying([0]).but(Posture))
+
+
+RELAXING = Material("neo-hookean", 3000.0, 0.4, prony=((0.5, 0.2), (0.2, 5.0)))
+
+
+@pytest.mark.parametrize("element", ["p1", "p2"])
+def test_batches_after_different_steps_remember_as_each_by_itself(element: str) -> None:
+    """What elements went through is kept case by case: another body's beside it, or another's cut, takes none away."""
+    fem = finite_elements(BODY, (*EFFECTS[1:], Elasticity(RELAXING), Inertia(), STEPS), TIGHT, "cpu", element=element)
+    frames = [(0, 1), (1, 1), (1, 2)]
+
+    def at(frame: int, rows: list[int]) -> Loads:
+        asked = lying([frames[frame][row] for row in rows])
+        return Loads(asked.causes, np.full(len(rows), 0.1 * (frame + 1)))
+
+    whole, alone = None, [None, None]
+    for frame in range(len(frames)):
+        whole = fem.deform(at(frame, [0, 1]), whole)
+        for row in (0, 1):
+            alone[row] = fem.deform(at(frame, [row]), alone[row])
+            assert np.abs(whole.displacement[row] - alone[row].displacement[0]).max() < 1e-9
+    assert np.abs(whole.displacement).max() > 1e-4
+
+
+def test_no_cases_have_no_answers() -> None:
+    fem = finite_elements(BODY, (*EFFECTS, Inertia(), STEPS), TIGHT, "cpu")
+    assert fem.deform(lying([])).displacement.shape == (0, len(MESH.nodes), 3)
+
+
+def test_a_tool_stays_where_it_is_when_tissue_is_taken() -> None:
+    fem = finite_elements(BODY, (*EFFECTS[:2], ToolContact((Ball(0.01),)), STEPS), TIGHT, "cpu")
+    pose = np.eye(4)
+    pose[:3, 3] = [0.01, 0.03, 0.057]
+    standing = Touching(pose[None, None])
+    before, after = (fem.deform(Loads((standing, Resected(np.array([done]))))) for done in (0, 1))
+    cut = fem.deform(Loads((standing, Resected(np.array([1])))), before)
+    assert cut.outcome[0].good and cut.iterations[0] < after.iterations[0]
+    assert np.abs(cut.displacement - after.displacement).max() < 1e-9
