@@ -16,7 +16,7 @@ from .term import Cases
 
 @dataclass(frozen=True, eq=False)
 class Still:
-    """Stands in for a `Ladder`: what has mass does not move at once, whatever pulls at it."""
+    """Stands in for a `Ladder`: what has mass does not move at once, whatever pulls at it, nor do tools."""
 
     problem: Problem
     inversion: Inversion
@@ -26,4 +26,6 @@ class Still:
         device, count = self.problem.device, len(cases.loads)
         u = device.array(guesses[-1]) if guesses else device.zeros(self.problem.rows, count)
         outcome, none = np.full(count, Outcome.CONVERGED, object), np.zeros(count, int)
-        return Answer(u, outcome, none, np.zeros(count), np.ones(count), self.inversion.count(u), 0)
+        return Answer(
+            u, outcome, none, np.zeros(count), np.ones(count), self.inversion.count(u), 0, gone=np.zeros(count)
+        )

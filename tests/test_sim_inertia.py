@@ -15,16 +15,17 @@ from sim.compile import compile_problem
 from sim.deformation import Deformation, guess
 from sim.device import find_device
 from sim.discretisation import ELEMENTS, discretise
-from sim.effects import Elasticity, Held, Inertia, NodalForce
+from sim.effects import Elasticity, Held, Inertia, NodalForce, ToolContact
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Loads, Nodal
+from sim.loads import Loads, Nodal, Touching
 from sim.material import Material
 from sim.mesh import TetMesh
 from sim.pace import alike
 from sim.problem import Problem
 from sim.term import Cases
 from sim.terms.inertia import lumped_mass
+from sim.tools import Ball, distances_to
 
 TIGHT = Accuracy(tolerance=1e-10)
 DENSITY, YOUNG, LENGTH = 1040.0, 3000.0, 0.1
@@ -252,3 +253,31 @@ def test_the_preconditioner_knows_the_mass() -> None:
     assert after(fem, None, 1, 2.0**-13, force).iterations[0] <= 4
     device = find_device("cpu", "float64")
     assert fem.problem.paced and not compile_problem([Elasticity(), Held()], BLOCK, device).paced
+
+
+def test_no_cases_have_no_answers() -> None:
+    fem = Fem(BLOCK, (Elasticity(), Held(), Inertia()), TIGHT, "cpu")
+    assert fem.deform(at()).displacement.shape == (0, len(BLOCK.mesh.nodes), 3)
+
+
+def test_where_no_time_passes_tools_stay_where_they_are() -> None:
+    """A tool that came through a body that cannot move would be inside it, and push as nothing does."""
+    ball = Ball(0.02)
+    fem = Fem(BLOCK, (Elasticity(), Held(), Inertia(), ToolContact((ball,))), Accuracy(), "cpu")
+
+    def pressed(height: float, time: float) -> Loads:
+        pose = np.eye(4)
+        pose[:3, 3] = [0.04, 0.06, height]
+        return Loads((Touching(pose[None, None]),), np.array([time]))
+
+    first = fem.deform(pressed(0.095, 0.0))
+    assert not first.displacement.any() and not first.reaction.any()
+    touched = fem.deform(pressed(0.095, 0.5), first)
+    stays = fem.deform(pressed(0.080, 0.5), touched)
+    assert touched.reaction[0, 0, 2] < 0.0 and stays.outcome[0].good
+    np.testing.assert_array_equal(stays.history["tool contact"], touched.history["tool contact"])
+    np.testing.assert_allclose(stays.reaction, touched.reaction)
+    moved = fem.deform(pressed(0.080, 1.0), stays)
+    nodes = BLOCK.mesh.nodes + moved.displacement[0]
+    assert moved.outcome[0].good and distances_to(ball, moved.history["tool contact"][0, 0], nodes).min() > 0.0
+    np.testing.assert_array_equal(moved.history["tool contact"][0, 0, :3, 3], [0.04, 0.06, 0.080])

@@ -137,7 +137,7 @@ class Inertia:
         aim = self._start(cases) + drift[:, None, None] * self._velocity(cases)
         passes = np.where(steps > 0.0, steps, np.inf)
         self._weight.of(count).assign(1.0 / passes**2 + self._damping / passes)
-        self._aim.of(count).assign(np.ascontiguousarray(aim.reshape(count, -1).T))
+        self._aim.of(count).assign(np.ascontiguousarray(aim.reshape(count, 3 * len(self._masses)).T))
 
     def keep(self, columns: np.ndarray) -> None:
         """Keep the aims of these columns."""
@@ -178,7 +178,7 @@ class Inertia:
     def end(self, u: wp.array) -> np.ndarray:
         """Velocities (B, N, 3) [m/s] at the end of the step."""
         assert self._cases is not None
-        now = u.numpy().astype(np.float64).T.reshape(u.shape[1], -1, 3)
+        now = u.numpy().astype(np.float64).T.reshape(u.shape[1], len(self._masses), 3)
         steps = self._cases.steps[:, None, None]
         passes = np.where(steps > 0.0, steps, np.inf)
         return np.where(steps > 0.0, (now - self._start(self._cases)) / passes, self._velocity(self._cases))
