@@ -1,7 +1,8 @@
-"""Poses of a ball as pushes: where it first touches the open cortex on its way along its shaft, and how far it goes on.
+"""Poses of a ball as pushes: where on the cortex at rest it is deepest, and how deep.
 
-A tool's pose is tracked where its force is not known. To learners a depth along a direction is what a force is: both
-are nothing where nothing moves.
+A tool's pose is tracked where its force is not known. A ball without friction presses along the surface's normal, and
+its answer depends on where its middle is, not on how it came there: place and depth say all of it. To learners a depth
+is what a force is: both are nothing where nothing moves.
 """
 
 from __future__ import annotations
@@ -13,16 +14,16 @@ from sim.loads import Loads, Pushed, Touching
 
 from .patch import Patch
 
-# Swept against the patch together.
+# Held against the patch together.
 BLOCK = 64
-# How far beside a triangle a contact still counts as its own, as a share of its size: round-off tears no holes.
-SLACK = 1e-9
+# A middle so near to the surface [m] has the surface's normal.
+ON_IT = 1e-6
 
 
 def indented(loads: Loads, radius: float, patch: Patch) -> Pushed:
-    """One ball's poses as pushes: point (B, 3) [m] of first touch, depth times direction for force [m], its radius.
+    """One ball's poses as pushes: point (B, 3) [m] nearest to its middle, depth along the normal for force [m], radius.
 
-    A ball that touches nothing has no depth; its point is the patch's nearest node.
+    A ball that touches nothing has no depth.
 
     Raises
     ------
@@ -37,79 +38,30 @@ def indented(loads: Loads, radius: float, patch: Patch) -> Pushed:
             "one tool alone, or ask the finite elements."
         )
     pose = touching.pose[:, 0]
-    shaft = pose[:, :3, 2]
-    middle = pose[:, :3, 3] + radius * shaft
-    parts = [slice(first, first + BLOCK) for first in range(0, len(pose), BLOCK)]
-    found = [_first_touch(middle[part], shaft[part], radius, patch) for part in parts]
-    depth, point = (np.concatenate(column) for column in zip(*found, strict=True))
-    return Pushed(point, -np.maximum(depth, 0.0)[:, None] * shaft, np.full(len(pose), radius))
+    middle = pose[:, :3, 3] + radius * pose[:, :3, 2]
+    parts = [middle[first : first + BLOCK] for first in range(0, len(middle), BLOCK)]
+    point = np.concatenate([_nearest(part, patch) for part in parts])
+    inward, away = patch.normal_near(point), point - middle
+    # Positive where the middle is still outside.
+    distance = np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, inward))
+    near = np.abs(distance) < ON_IT
+    direction = np.where(near[:, None], inward, away / np.where(near, 1.0, distance)[:, None])
+    return Pushed(point, np.maximum(radius - distance, 0.0)[:, None] * direction, np.full(len(pose), radius))
 
 
-def _first_touch(middle: np.ndarray, shaft: np.ndarray, radius: float, patch: Patch) -> tuple[np.ndarray, np.ndarray]:
-    """How far (B,) [m] balls at `middle` (B, 3) went on since they touched, along minus `shaft` (B, 3); where (B, 3).
-
-    Exactly: against faces, edges and corners, each as far back as a ball touches it. Not touched: minus infinity.
-    """
+def _nearest(middle: np.ndarray, patch: Patch) -> np.ndarray:
+    """The point (B, 3) [m] of the patch that is nearest to each of (B, 3): on a face, an edge or a corner."""
     corner = patch.points[patch.triangles]
     edge = np.roll(corner, -1, axis=1) - corner
-    tried = [
-        _faces(middle, shaft, radius, corner, edge),
-        _edges(middle, shaft, radius, corner.reshape(-1, 3), edge.reshape(-1, 3)),
-        _corners(middle, shaft, radius, patch.points),
-    ]
-    back = np.concatenate([part[0] for part in tried], axis=1)
-    last = back.argmax(axis=1)
-    rows = np.arange(len(middle))
-    where = np.concatenate([part[1] for part in tried], axis=1)[rows, last]
-    depth = back[rows, last]
-    missed = np.isneginf(depth)
-    if missed.any():
-        where[missed] = patch.points[np.linalg.norm(middle[missed, None] - patch.points, axis=2).argmin(axis=1)]
-    return depth, where
-
-
-def _faces(
-    middle: np.ndarray, shaft: np.ndarray, radius: float, corner: np.ndarray, edge: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
     normal = np.cross(edge[:, 0], edge[:, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    along = shaft @ normal.T
     height = np.einsum("bsi,si->bs", middle[:, None] - corner[:, 0], normal)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        back = (radius - height) / along
-        where = middle[:, None] + back[..., None] * shaft[:, None] - radius * normal
-        # Inward normals of the edges, in the plane: inside of all three.
-        aside = np.einsum("bscx,scx->bsc", where[:, :, None] - corner, np.cross(normal[:, None], edge))
-        inside = (aside >= -SLACK * np.einsum("scx,scx->sc", edge, edge)).all(axis=2) & (along > 0.0)
-    return np.where(inside, back, -np.inf), where
-
-
-def _edges(
-    middle: np.ndarray, shaft: np.ndarray, radius: float, start: np.ndarray, edge: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    length = np.einsum("ei,ei->e", edge, edge)
-    offset = middle[:, None] - start
-    at, rate = np.einsum("bei,ei->be", offset, edge) / length, shaft @ edge.T / length
-    across, moving = offset - at[..., None] * edge, shaft[:, None] - rate[..., None] * edge
-    back = _larger_root(moving, across, radius)
-    with np.errstate(invalid="ignore"):  # what is never touched
-        share = at + back * rate
-        where = start + share[..., None] * edge
-        inside = (share >= 0.0) & (share <= 1.0)
-    return np.where(inside, back, -np.inf), where
-
-
-def _corners(middle: np.ndarray, shaft: np.ndarray, radius: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    offset = middle[:, None] - points
-    back = _larger_root(np.broadcast_to(shaft[:, None], offset.shape), offset, radius)
-    return back, np.broadcast_to(points, offset.shape)
-
-
-def _larger_root(moving: np.ndarray, offset: np.ndarray, radius: float) -> np.ndarray:
-    """The largest t (B, n) with |offset + t moving| = radius, minus infinity where there is none."""
-    a = np.einsum("bni,bni->bn", moving, moving)
-    b = np.einsum("bni,bni->bn", moving, offset)
-    c = np.einsum("bni,bni->bn", offset, offset) - radius**2
-    inner = b * b - a * c
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where((inner >= 0.0) & (a > 0.0), (-b + np.sqrt(np.maximum(inner, 0.0))) / a, -np.inf)
+    on_face = middle[:, None] - height[..., None] * normal
+    aside = np.einsum("bscx,scx->bsc", on_face[:, :, None] - corner, np.cross(normal[:, None], edge))
+    start, along = corner.reshape(-1, 3), edge.reshape(-1, 3)
+    share = np.einsum("bei,ei->be", middle[:, None] - start, along) / np.einsum("ei,ei->e", along, along)
+    on_edge = start + np.clip(share, 0.0, 1.0)[..., None] * along
+    tried = np.concatenate([on_face, on_edge], axis=1)
+    distance = np.linalg.norm(tried - middle[:, None], axis=2)
+    distance[:, : len(corner)][(aside < 0.0).any(axis=2)] = np.inf
+    return tried[np.arange(len(middle)), distance.argmin(axis=1)]

@@ -156,6 +156,16 @@ def test_a_ball_feels_no_moment_about_its_middle() -> None:
     assert np.linalg.norm(np.cross(middle, force)) > 1e-3 * BALL.radius * np.linalg.norm(force)
 
 
+def test_where_the_tool_is_how_stiff_tissue_is_does_not_matter() -> None:
+    """Twice as stiff it moves as far, and bears twice as much."""
+    stiff = Fem(
+        BLOCK, [Elasticity(replace(SOFT, young=2.0 * SOFT.young)), Held(), ToolContact((BALL,))], TIGHT, "cpu"
+    ).deform(touching(BESIDE))
+    found = body((BALL,)).deform(touching(BESIDE))
+    np.testing.assert_allclose(stiff.displacement, found.displacement, atol=1e-7 * np.abs(found.displacement).max())
+    np.testing.assert_allclose(stiff.reaction, 2.0 * found.reaction, atol=1e-6 * np.abs(stiff.reaction).max())
+
+
 def test_no_force_on_tissue_pulls() -> None:
     """Every node that a blade moves is pushed away from it: what of it touches looks down or aside, never up."""
     fem = body((BLADE,))

@@ -23,7 +23,7 @@ from surrogate.learned import Learned
 from surrogate.parts import POSED
 from surrogate.patch import Patch, open_patch
 from surrogate.poses import DEEP, SHALLOW, ball_of, draw_poses, poses_at
-from surrogate.sampling import draw
+from surrogate.sampling import TOOLS, draw
 from surrogate.score import errors
 from surrogate.simulate import simulate
 from surrogate.store import load, save
@@ -47,8 +47,8 @@ def samples(patch: Patch) -> np.ndarray:
     return np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)
 
 
-def test_first_touch_is_where_a_ball_comes_to_lie_on_the_surface(box: Anatomy) -> None:
-    """Taken back by its depth it touches at the point, and nowhere is nearer; a little further back nothing is."""
+def test_a_pose_is_where_the_ball_is_deepest(box: Anatomy) -> None:
+    """Its point is on the surface, nowhere else is nearer to its middle, and depth is what is left of the radius."""
     patch = open_patch(box)
     bumpy = replace(patch, points=domed(patch.points))
     loads = draw_poses("palpation", box, 60, 3)
@@ -56,27 +56,39 @@ def test_first_touch_is_where_a_ball_comes_to_lie_on_the_surface(box: Anatomy) -
     cause = loads.of(Touching)
     assert cause is not None
     pose = cause.pose[:, 0]
+    middle = pose[:, :3, 3] + BALL.radius * pose[:, :3, 2]
     depth = np.linalg.norm(pushed.force, axis=1)
     assert (depth > 0.0).sum() > 50
-    touched = pose[:, :3, 3] + (BALL.radius + depth)[:, None] * pose[:, :3, 2]
-    on = depth > 0.0
-    np.testing.assert_allclose(np.linalg.norm(touched - pushed.point, axis=1)[on], BALL.radius, rtol=1e-9)
     surface = samples(bumpy)
-    nearest = np.array([np.linalg.norm(surface - middle, axis=1).min() for middle in touched[on]])
-    assert nearest.min() > BALL.radius - 1e-9
-    assert nearest.max() < BALL.radius + 2e-5
-    np.testing.assert_allclose(pushed.force[on], -depth[on, None] * pose[on, :3, 2], rtol=1e-12)
+    nearest = np.array([np.linalg.norm(surface - one, axis=1).min() for one in middle])
+    distance = np.linalg.norm(pushed.point - middle, axis=1)
+    assert (distance <= nearest + 1e-12).all()
+    assert (nearest - distance).max() < 3e-5
+    outside = depth < BALL.radius
+    np.testing.assert_allclose(depth[outside], np.maximum(BALL.radius - distance, 0.0)[outside], atol=1e-12)
+    # The way in: from the middle to the point.
+    on = depth > 0.0
+    reached = middle[on] + (BALL.radius - depth[on])[:, None] * unit(pushed.force[on])
+    np.testing.assert_allclose(reached, pushed.point[on], atol=1e-9)
 
 
-def test_on_a_flat_cortex_poses_are_what_was_drawn(box: Anatomy) -> None:
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def test_how_a_ball_came_there_is_nothing(box: Anatomy) -> None:
+    """On a flat cortex an oblique way is a straight one to beside it; a ball sunk to its middle has the normal."""
     patch = open_patch(box)
     forces = draw("palpation", box, 40, 0).of(Pushed)
     assert forces is not None
     normal = patch.normal_near(forces.point)
-    motion = 3e-3 * forces.force / np.linalg.norm(forces.force, axis=1, keepdims=True)
+    motion = 3e-3 * unit(forces.force)
+    straight = np.einsum("bi,bi->b", motion, normal)[:, None] * normal
     found = indented(Loads((poses_at(BALL, forces.point, normal, motion),)), BALL.radius, patch)
-    np.testing.assert_allclose(found.point, forces.point, atol=1e-9)
-    np.testing.assert_allclose(found.force, motion, atol=1e-9)
+    np.testing.assert_allclose(found.point, forces.point + motion - straight, atol=1e-9)
+    np.testing.assert_allclose(found.force, straight, atol=1e-9)
+    sunk = indented(Loads((poses_at(BALL, forces.point, normal, BALL.radius * normal),)), BALL.radius, patch)
+    np.testing.assert_allclose(sunk.force, BALL.radius * normal, atol=1e-9)
 
 
 def test_a_ball_in_the_air_or_beside_the_cortex_has_no_depth(box: Anatomy) -> None:
@@ -99,7 +111,7 @@ def test_draws_are_each_of_their_own_number(box: Anatomy) -> None:
     assert other is not None
     assert not np.array_equal(some.pose, other.pose)
     depth = np.linalg.norm(indented(many, BALL.radius, open_patch(box)).force, axis=1) / BALL.radius
-    assert depth.min() >= SHALLOW - 1e-9
+    assert depth.min() >= SHALLOW * np.cos(TOOLS["palpation"].cone) - 1e-9
     assert depth.max() <= DEEP + 1e-9
 
 
