@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from operator import index
 
 import numpy as np
 
@@ -149,13 +150,17 @@ class Resection:
     Raises
     ------
     InputError
-        No steps, a step that takes nothing, a tetrahedron that is taken twice.
+        No steps, steps that are no whole numbers, a step that takes nothing, a tetrahedron that is taken twice.
     """
 
     steps: tuple[tuple[int, ...], ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "steps", tuple(tuple(int(number) for number in step) for step in self.steps))
+        try:
+            steps = tuple(tuple(index(number) for number in step) for step in self.steps)
+        except TypeError as error:
+            raise InputError("Resection.steps are not numbers of tetrahedra: give those of each step.") from error
+        object.__setattr__(self, "steps", steps)
         if not self.steps:
             raise InputError("Resection has no steps: give the tetrahedra of at least one, or leave it out.")
         taken: dict[int, int] = {}
@@ -216,11 +221,20 @@ class Pulsation:
         What heart and breath do; they add up.
     regions
         Labels of the regions that swell; None: all.
+
+    Raises
+    ------
+    InputError
+        No region.
     """
 
     cardiac: Wave = Wave(1.0, CARDIAC)
     respiratory: Wave = Wave(0.2, RESPIRATORY)
     regions: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.regions is not None and not self.regions:
+            raise InputError("Pulsation swells no region: name some, give None for all, or leave the effect out.")
 
     def swelling(self, times: np.ndarray) -> np.ndarray:
         """Change of volume (B,) as a share of it, at times (B,) [s]."""
@@ -238,15 +252,20 @@ class ToolContact:
     Raises
     ------
     InputError
-        No tool, or a gap that is not positive.
+        No tool, what is no tool, or a gap that is not positive.
     """
 
     tools: tuple[Tool, ...]
     gap: float = 1e-4
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "tools", tuple(self.tools) if isinstance(self.tools, Iterable) else (self.tools,))
         if not self.tools:
             raise InputError("ToolContact has no tool: give at least one, such as Ball(7e-3), or leave the effect out.")
+        for tool in self.tools:
+            if not isinstance(tool, Tool):
+                allowed = ", ".join(kind.__name__ for kind in Tool.__args__)
+                raise InputError(f"ToolContact has {tool!r} for a tool: choose from {allowed}.")
         _check_gap(self)
 
 
@@ -259,13 +278,15 @@ class Retraction:
     Raises
     ------
     InputError
-        A gap that is not positive.
+        A blade that is none, or a gap that is not positive.
     """
 
     blade: Spatula
     gap: float = 1e-4
 
     def __post_init__(self) -> None:
+        if not isinstance(self.blade, Spatula):
+            raise InputError(f"Retraction has {self.blade!r} for a blade: give a Spatula; ToolContact has other tools.")
         _check_gap(self)
 
 
@@ -273,9 +294,9 @@ class Retraction:
 class SkullContact:
     """The skull holds the brain on its side without friction, and lets go of it: where `Slide` would keep it on.
 
-    Nodes with a normal in `Anatomy.slide_normal` stay on their side of the plane across it, `gap` [m] above where they
-    are at rest; they feel it in the last tenth of a millimetre. The body needs what `Held` holds: bone alone only bars
-    its way. A plane for each node is right as long as nodes slide less than the skull curves.
+    Nodes with a normal in `Anatomy.slide_normal` stay on their side of a wall across it that bends as the normals round
+    them do, `gap` [m] above where they are at rest; they feel it in the last tenth of a millimetre. The body needs what
+    `Held` holds: bone alone only bars its way.
 
     Raises
     ------

@@ -112,7 +112,7 @@ class Loads:
     Parameters
     ----------
     causes
-        `Pushed`, `Displaced`, `Nodal`, `Prescribed`, `Posture`, `Resected`.
+        `Pushed`, `Displaced`, `Nodal`, `Prescribed`, `Posture`, `Resected`, `Touching`, `Retracted`.
     time
         (B,) [s]; the time at which the answer is wanted. Zero where nothing depends on time.
 

@@ -131,14 +131,15 @@ def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effec
     """Effects without what they say of regions that are gone altogether."""
     gone = set(whole.mesh.region.tolist()) - set(body.mesh.region.tolist())
 
-    def kept(effect: Effect) -> Effect:
+    def kept(effect: Effect) -> Effect | None:
         if isinstance(effect, Pulsation) and effect.regions is not None:
-            return replace(effect, regions=tuple(label for label in effect.regions if label not in gone))
+            left = tuple(label for label in effect.regions if label not in gone)
+            return replace(effect, regions=left) if left else None
         if not isinstance(effect, Elasticity):
             return effect
         return replace(effect, regions={label: law for label, law in effect.regions.items() if label not in gone})
 
-    return tuple(map(kept, effects))
+    return tuple(effect for effect in map(kept, effects) if effect is not None)
 
 
 def _together(parts: list[Deformation]) -> Deformation:

@@ -63,14 +63,14 @@ class Cases:
         Raises
         ------
         InputError
-            A history of another body or discretisation.
+            A history of another body or discretisation, or of other tools.
         """
         whole = (len(self.loads), *shape)
         found = self.history.get(name)
         if found is not None and found.shape != whole:
             raise InputError(
                 f"the start's history of {name} has shape {found.shape}, not {whole}: start from an answer of the same "
-                "mesh and element, or from rest."
+                "mesh, element and tools, or from rest."
             )
         return np.zeros(whole) if found is None else np.asarray(found, np.float64)
 

@@ -221,6 +221,15 @@ def skewed() -> np.ndarray:
             "finds no surface to touch: all of it is held or slides",
         ),
         (lambda: ToolContact(()), "ToolContact has no tool"),
+        (lambda: ToolContact((7e-3,)), r"ToolContact has 0\.007 for a tool: choose from Ball, Capsule, Spatula"),  # type: ignore
+        (lambda: ToolContact(7e-3), r"ToolContact has 0\.007 for a tool"),  # type: ignore
+        (lambda: Retraction(BALL), r"Retraction has Ball\(radius=.*\) for a blade: give a Spatula"),  # type: ignore
+        (
+            lambda: solver(Hard((), (BALL, BALL))).deform(
+                touching(DOWN, DOWN), solver(Hard(())).deform(touching(DOWN))
+            ),
+            r"history of tool contact has shape \(1, 1, 4, 4\), not \(1, 2, 4, 4\): start from .* tools",
+        ),
         (lambda: ToolContact((BALL,), 0.0), r"ToolContact\.gap is 0\.0 m"),
         (lambda: Retraction(Spatula(0.01, 0.01, 1e-3), np.inf), r"Retraction\.gap is inf"),
         (lambda: Ball(-1.0), r"Ball\.radius is -1\.0 m"),

@@ -16,14 +16,15 @@ from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.device import find_device
 from sim.discretisation import ELEMENTS, discretise
-from sim.effects import Elasticity, Held, Pulsation, Slide, Wave
+from sim.effects import Elasticity, Held, Pulsation, Resection, Slide, Wave
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Loads
+from sim.loads import Loads, Resected
 from sim.material import Tissue
 from sim.mesh import TetMesh
 from sim.meshfile import read_anatomy
 from sim.normals import unit
+from sim.operated import finite_elements
 from sim.problem import Problem
 from sim.term import Cases
 
@@ -158,9 +159,19 @@ def absent() -> object:
         (lambda: Wave(0.0, 1e-3), r"Wave\.frequency is 0\.0 Hz: give a positive"),
         (lambda: Wave(1.0, -1e-3), r"Wave\.amplitude is -0\.001 of the volume: give a share from 0 to 0\.3"),
         (lambda: Wave(1.0, 0.5), r"amplitude is 0\.5"),
+        (lambda: Pulsation(regions=()), "Pulsation swells no region"),
         (absent, r"Pulsation is asked of region 7, but the mesh has the regions \[0\]"),
     ],
 )
 def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         build()
+
+
+def test_tissue_that_is_taken_altogether_swells_no_more() -> None:
+    region = (np.arange(len(MESH.tets)) == 0).astype(int)
+    body = base_held(replace(MESH, region=region))
+    effects = [Elasticity(), Held(), Pulsation(regions=(1,)), Resection(((0,),))]
+    asked = Loads((Resected(np.array([0, 1])),), np.full(2, 0.25))
+    answer = finite_elements(body, effects, TIGHT, "cpu").deform(asked)
+    assert answer.displacement[0].any() and not answer.displacement[1].any()

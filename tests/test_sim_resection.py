@@ -269,6 +269,7 @@ class TestHardCases:
         ("steps", "sentence"),
         [
             ((), "no steps"),
+            ((1, 2), "not numbers of tetrahedra: give those of each step"),
             (((1, 2), ()), "step 2 of Resection takes nothing"),
             (((1, 2), (5, 2)), "tetrahedron 2 in step 1 and again in step 2: name it once"),
             (((4, 4),), "tetrahedron 4 in step 1 and again in step 1"),

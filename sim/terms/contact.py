@@ -185,7 +185,7 @@ def contact_of(
     clear = partial(approach, tools, points=space.nodes[np.unique(triangles)], reach=_reach(space.nodes, triangles))
 
     def way(cases: Cases) -> Way | None:
-        last = cases.history.get(name)
+        last = cases.past(name, (len(tools), 4, 4)) if name in cases.history else None
         if contact:
             cause = cases.loads.of(Touching)
             if cause is None:
