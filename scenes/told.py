@@ -30,7 +30,7 @@ def _words(cause: Cause, answer: Deformation) -> str:
             return f"gravity towards {' '.join(ways)}, fluid up to {1e3 * cause.csf_level[0]:.0f} mm"
         case Resected():
             return f"resection: {cause.done[0]:.0f} steps done"
-        case Touching() | Retracted():
+        case Touching() | Retracted() if answer.reaction.shape[1]:  # a learnt model does not know it
             return f"the tool reads {np.linalg.norm(answer.reaction[0, -1, :3]):.2f} N"
         case _:
             return ""

@@ -67,6 +67,11 @@ class TestPalpate:
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
         assert told(frame.loads, frame.deformation) == f"the tool reads {reads:.2f} N"
 
+    def test_what_a_learnt_model_does_not_know_is_not_said(self, palpated):
+        """Taught where a ball is, it answers without the force that it takes."""
+        frame = palpated[6]
+        assert told(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6)))) == ""
+
     def test_learnt_models_of_pushes_do_not_know_it(self, theatre):
         with pytest.raises(InputError, match="palpate"):
             theatre.deformer("linear", small("palpate"))
