@@ -44,6 +44,8 @@ STEP_OUTER, MOST_STEP_OUTER = 8, 15
 # Tools that go farther than so many gaps at once begin with one that is wider by a power of the closing; until it is
 # their own they are settled to this tolerance.
 WIDE_ENOUGH, CLOSING, OPEN_TOLERANCE = 8.0, 4.0, 0.05
+# A step that failed is tried again, shorter, from a gap so many times as wide.
+WIDER = 16.0
 # Load steps end when the batch has spent so many times the linear iterations that one outer step may take.
 PATIENCE = 4
 
@@ -316,9 +318,9 @@ class Ladder:
         least = LEAST_STEP * np.minimum(1.0, 4.0 * longest)
         reached, iterations, residual = np.zeros(count), np.zeros(count, int), np.full(count, np.inf)
         outcome = np.full(count, Outcome.BUDGET, object)
-        lets, outer = (
-            (STEP_OUTER, min(MOST_STEP_OUTER, self.accuracy.outer)) if first < 1.0 else 2 * (self.accuracy.outer,)
-        )
+        lets = outer = self.accuracy.outer
+        if not problem.barriers:
+            lets, outer = STEP_OUTER, min(MOST_STEP_OUTER, outer)
         for _ in range(most + asked):
             live = np.flatnonzero((reached < 1.0) & (step >= least))
             if len(live) == 0 or spent > PATIENCE * self.accuracy.inner * asked:
@@ -328,6 +330,7 @@ class Ladder:
             found = self._closed(aimed(cases.rows(live), aim), gathered(device, u, live), outer, gone)
             good, spent = found.good, spent + found.linear_iterations
             iterations[live] += found.iterations
+            gaps[live] *= np.where(good, 1.0, WIDER)
             step[live] *= np.where(good, np.clip(lets / np.maximum(found.iterations, 1), 0.5, 2.0), CUT)
             step = np.minimum(step, longest)
             scattered(device, gathered(device, found.u, np.flatnonzero(good)), live[good], u)

@@ -10,13 +10,26 @@ from oracle import EVERY_LAW, tissue
 from scenes.shipped import template_path
 from sim.accuracy import LIVE, TRAIN, Accuracy
 from sim.discretisation import ELEMENTS
-from sim.effects import Elasticity, Gravity, Held, Inertia, Pulsation, Slide, ToolDisplacement, ToolForce
+from sim.effects import (
+    Elasticity,
+    Gravity,
+    Held,
+    Inertia,
+    Pulsation,
+    SkullContact,
+    Slide,
+    ToolContact,
+    ToolDisplacement,
+    ToolForce,
+)
 from sim.fem import Fem
 from sim.following import Kept
 from sim.linear import BlockJacobi
-from sim.loads import Displaced, Loads, posture, push
+from sim.loads import Displaced, Loads, Touching, posture, push
+from sim.material import Material
 from sim.meshfile import read_anatomy
 from sim.symmetric import add_product, tiles_of
+from sim.tools import Ball, Spatula
 from surrogate.sampling import draw
 
 pytestmark = [
@@ -95,6 +108,50 @@ def test_steps_in_time(box, moving, element, precision):
     off = np.abs(on_cpu.displacement - on_cuda.displacement).max()
     assert off <= 3.0 * BOUND[precision] * np.abs(on_cpu.displacement).max()
     assert set(on_cpu.history) >= {"viscoelasticity ogden" + (" of shape" if element == "smoothed" else "")}
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_a_batch_of_moved_tools(box, element, precision):
+    """A ball and a blade in each case, in the air, touching and deep; then on from there."""
+    accuracy = Accuracy(1e-7) if precision == "float64" else TRAIN
+    tools = (Ball(5e-3), Spatula(8e-3, 14e-3, 1.5e-3))
+    effects = (Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), ToolContact(tools))
+    pose = np.tile(np.eye(4), (5, 2, 1, 1))
+    pose[:, 0, :3, 3], pose[:, 1, :3, 3] = [-8e-3, 1e-3, 0.0], [9e-3, -2e-3, 0.0]
+    pose[:, :, 2, 3] = -np.array([-2e-3, 0.0, 1e-3, 2e-3, 3e-3])[:, None]
+    on = pose.copy()
+    on[:, :, 0, 3] += 1e-3
+    answers = []
+    for name in ("cpu", "cuda"):
+        fem = Fem(box, effects, accuracy, name, element=element)
+        answers.append(fem.deform(Loads((Touching(on),)), fem.deform(Loads((Touching(pose),)))))
+    on_cpu, on_cuda = answers
+    assert all(outcome.good for outcome in on_cuda.outcome)
+    size = np.abs(on_cpu.displacement).max()
+    assert np.abs(on_cpu.displacement - on_cuda.displacement).max() <= 3.0 * BOUND[precision] * size
+    force = np.abs(on_cpu.reaction).max()
+    assert np.abs(on_cpu.reaction - on_cuda.reaction).max() <= 10.0 * BOUND[precision] * force
+    assert not on_cuda.displacement[0].any() and force > 0.01
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_a_skull_that_lets_go(box, element, precision):
+    """The box's lower side rests on bone, its weight turned over in half of the cases."""
+    accuracy = Accuracy(1e-7) if precision == "float64" else TRAIN
+    height = box.mesh.nodes[:, 2]
+    low = height < height.min() + 1e-9
+    body = replace(box, held=box.held & ~low[:, None], slide_normal=np.outer(low, [0.0, 0.0, -1.0]))
+    effects = (Elasticity(Material("neo-hookean", 1000.0, 0.45)), Held(), Gravity((0.0, 1.0, 0.0)), SkullContact())
+    way = np.array([[0.0, 0.0, -1.0], [0.0, 0.5, 1.0], [0.3, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    loads = posture(way, -1.0)
+    on_cpu, on_cuda = (Fem(body, effects, accuracy, name, element=element).deform(loads) for name in ("cpu", "cuda"))
+    assert all(outcome.good for outcome in on_cuda.outcome)
+    size = np.abs(on_cpu.displacement).max()
+    assert np.abs(on_cpu.displacement - on_cuda.displacement).max() <= 3.0 * BOUND[precision] * size
+    drop = on_cuda.displacement[:, low, 2]
+    assert drop.min() > -1e-4 and drop[3].max() > 2e-4
 
 
 def test_block_jacobi_reaches_what_the_inverse_reaches(box):
