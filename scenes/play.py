@@ -15,7 +15,8 @@ from ar.hud import panel
 from ar.layer import Layer
 from ar.overlay import Gauge, Style, composite
 from ar.view import Picture, render
-from sim.deformation import Deformation, Deformer
+from sim.deformation import Deformation, Deformer, guess
+from sim.effects import Inertia
 from sim.loads import Loads
 from surrogate.learned import Learned
 
@@ -97,7 +98,7 @@ class Player:
         return self.scene.viewpoint.camera(self.site)
 
     def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
-        """The frame of a touch at a time [s]; `last`, unless it is of a later time, is where the deformer starts."""
+        """The frame of a touch at a time [s]; the deformer starts as `start_of` has it."""
         begun = clock.perf_counter()
         loads = self.scene.loads(self.site, touch, time)
         # A learnt model knows the drawn vertices alone; the finite elements start from their whole last answer.
@@ -105,7 +106,7 @@ class Player:
             deformation = self.deformer.deform(loads, at=self.stage.nodes)
             margin = self._margin(self.deformer, deformation)
         else:
-            margin, deformation = 0.0, self.deformer.deform(loads, start=not_after(last, time))
+            margin, deformation = 0.0, self.deformer.deform(loads, start=start_of(self.scene, last, time))
         solved = clock.perf_counter()
         positions = self.positions(deformation)
         tip, pose = (None, None) if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
@@ -158,9 +159,15 @@ class Player:
         return tip, tool.pose(tip, inward, self.site.right)
 
 
-def not_after(last: Deformation | None, time: float) -> Deformation | None:
-    """An answer to start from at a time [s]; none if it is of a later one: what tissue remembers is not undone."""
-    return None if last is None or last.time[0] > time else last
+def start_of(scene: Scene, last: Deformation | None, time: float) -> Deformation | None:
+    """What the frame of a time [s] starts from: the last answer; of a later one its shape as a first guess.
+
+    What tissue remembers of a later time is not undone. Tissue that keeps its velocity begins at rest, at once.
+    """
+    if last is None or last.time[0] <= time:
+        return last
+    keeps = any(isinstance(effect, Inertia) for effect in scene.effects)
+    return None if keeps else guess(last.displacement)
 
 
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from sim.deformation import Deformation
 from sim.loads import Loads
 
-from .play import not_after
+from .play import start_of
 from .scene import Scene
 from .theatre import Theatre
 
@@ -68,5 +68,5 @@ class Referee:
                     return
                 (number, loads), self.newest = self.newest, None
             begun = clock.perf_counter()
-            last = deformer.deform(loads, start=not_after(last, loads.times[0]))
+            last = deformer.deform(loads, start=start_of(scene, last, loads.times[0]))
             self.truth = Truth(number, loads, last, clock.perf_counter() - begun)
