@@ -24,12 +24,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
     from ..bench import machine, rows
-    from ..scene import find_scene
+    from sim.effects import ToolForce
+
+    from ..scene import SCENES, find_scene
     from ..theatre import open_theatre
 
     if args.batch < 1:
         raise InputError(f"--batch {args.batch} solves nothing: give a whole number from 1 up.")
     scene = find_scene(args.scene)
+    if not any(isinstance(effect, ToolForce) for effect in scene.effects):
+        pushing = ", ".join(name for name in SCENES if ToolForce() in find_scene(name).effects)
+        raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
