@@ -184,6 +184,11 @@ class Fem:
         if len(beyond):
             raise InputError(f"the mesh has no vertex {beyond[0]}: ask for some of 0 to {count - 1}.")
 
+    def _check_static(self, loads: Loads) -> None:
+        check_causes(self.effects, loads)
+        if self.problem.paced:
+            raise InputError("answers under Inertia are steps in time, which no equilibrium is behind: leave it out.")
+
     def _unsmoothed(self, step: float) -> sp.csc_array:
         """Rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh, over a step in time [s]."""
         linear = discretise(self._anatomy.mesh, "p1")
@@ -195,9 +200,9 @@ class Fem:
         Raises
         ------
         InputError
-            As `deform`.
+            As `deform`; tissue that keeps its velocity, whose answers are steps in time.
         """
-        check_causes(self.effects, loads)
+        self._check_static(loads)
         self.problem.begin(Cases(loads, answer.time, answer.history))
         return shortfall(self.problem, self.problem.device.array(self._guess(loads, answer)))
 
@@ -212,9 +217,9 @@ class Fem:
         Raises
         ------
         InputError
-            As `deform`.
+            As `residual`.
         """
-        check_causes(self.effects, loads)
+        self._check_static(loads)
         self._check_vertices(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
         guess, cases = self._guess(loads, answer), Cases(loads, answer.time, answer.history)

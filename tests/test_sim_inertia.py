@@ -281,3 +281,11 @@ def test_where_no_time_passes_tools_stay_where_they_are() -> None:
     nodes = BLOCK.mesh.nodes + moved.displacement[0]
     assert moved.outcome[0].good and distances_to(ball, moved.history["tool contact"][0, 0], nodes).min() > 0.0
     np.testing.assert_array_equal(moved.history["tool contact"][0, 0, :3, 3], [0.04, 0.06, 0.080])
+
+
+def test_a_step_in_time_is_not_held_against_an_equilibrium() -> None:
+    fem = Fem(BLOCK, (Elasticity(), Held(), Inertia()), TIGHT, "cpu")
+    answer = fem.deform(at(0.1))
+    for judged in (lambda: fem.residual(at(0.1), answer), lambda: fem.corrected(at(0.1), answer, np.zeros(1, int))):
+        with pytest.raises(InputError, match="answers under Inertia are steps in time"):
+            judged()

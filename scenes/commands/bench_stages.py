@@ -23,9 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
-    from ..bench import machine, rows
     from sim.effects import ToolForce
 
+    from ..bench import machine, rows
     from ..scene import SCENES, find_scene
     from ..theatre import open_theatre
 
