@@ -13,7 +13,7 @@ from ar.camera import project_cv2
 from scenes.cli import main
 from scenes.paths import Touch
 from scenes.play import STAGES, labelled
-from scenes.scene import SCENES, find_scene
+from scenes.scene import find_scene
 from scenes.shipped import template_path
 from scenes.stage import CORTEX, TOOL
 from scenes.theatre import Theatre, model_path, open_theatre
@@ -231,6 +231,7 @@ def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
     theatre = open_theatre(device="cpu")
     assert {"linear", "ann", "svr"} <= set(theatre.models) and theatre.intensity is not None
     assert all(model.bound < 1e-3 for model in theatre.models.values()) and theatre.best(find_scene("press")) != "fem"
-    assert main(["check", "--every", "40", "--device", "cpu", "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["passed"] and len(report["scenes"]) == len(SCENES)
+    for name in PUSHING:
+        assert main(["check", name, "--every", "40", "--device", "cpu", "--json"]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert report["passed"] and [row["deformer"] for row in report["scenes"]] != ["fem"]
