@@ -96,13 +96,14 @@ def run(theatre: Theatre, scene: Scene, every: int) -> Run:
     InputError
         A body that is not held, a frame of which no good answer is found.
     """
-    before = device_bytes()
+    before = device_arrays()  # whoever lets go of them meanwhile, they were not the scene's
     reset_peak()
     fem = theatre.fem(scene, scene.accuracy, live=True)
     times = scene.times[::every].tolist()
     found, seconds = _solved(fem, scene, theatre.site, times)
     wp.synchronize()
-    held = device_bytes() - before
+    known = {id(array) for array in before}
+    held = sum(array.capacity for array in device_arrays() if id(array) not in known)
     return Run(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held, peak())
 
 
@@ -121,11 +122,10 @@ def _solved(fem: Deformer, scene: Scene, site: Site, times: list[float]) -> tupl
     return found, seconds
 
 
-def device_bytes() -> int:
-    """Bytes of all Warp arrays that live and own their memory."""
+def device_arrays() -> list[wp.array]:
+    """All Warp arrays that live and own their memory."""
     gc.collect()
-    arrays = [thing for thing in gc.get_objects() if type(thing) is wp.array]
-    return sum(array.capacity for array in arrays if array.deleter is not None)
+    return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]
 
 
 def peak() -> int | None:

@@ -108,7 +108,7 @@ class Fem:
         patch = patching(problem, preconditioner, self.effects, self.space) if patching_pays else None
         inversion = Inversion(self.space, problem.device)
         self._ladder = Ladder(problem, preconditioner, inversion, accuracy, near, vicinity or patch)
-        self._paced = lru_cache(KEPT)(self._ladder_at)
+        self._paced = lru_cache(KEPT)(self._ladder_over)
 
     @property
     def problem(self) -> Problem:
@@ -145,18 +145,20 @@ class Fem:
             cases = Cases(loads, start.time, start.history, last.T.reshape(len(loads), -1, 3))
         some = alike(cases.steps, self.batch) if self.problem.paced else None
         batches = some or [(math.inf, rows) for rows in self._batches(len(loads))]
-        answer = _joined(
-            [
-                self._solve(self._paced(step), cases.rows(rows), None if last is None else last[:, rows], at)
-                for step, rows in batches
-            ]
-        )
+        parts = []
+        for step, rows in batches:
+            guess = None if last is None else last[:, rows]
+            parts.append(self._solve(self._ladder_at(step), cases.rows(rows), guess, at))
+        answer = _joined(parts)
         return answer.rows(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
     def _ladder_at(self, step: float) -> Ladder | Still:
         """Whose preconditioner knows the step in time [s]; of an infinite one, the ladder of statics."""
         if step == 0.0 or step == math.inf:
             return self._ladder if step else Still(self.problem, self._ladder.inversion)
+        return self._paced(step)
+
+    def _ladder_over(self, step: float) -> Ladder:
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed, step)
         return Ladder(self.problem, preconditioner, self._ladder.inversion, self.accuracy)
 

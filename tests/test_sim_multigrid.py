@@ -37,8 +37,8 @@ def built(
     space = discretise(anatomy.mesh, "p2" if kind == "tetra10" else kind)
     problem = compile_problem(effects, anatomy, device, space)
 
-    def unsmoothed() -> sp.csc_array:
-        return compile_problem(effects, anatomy, device, discretise(anatomy.mesh, "p1")).rest_curvature()
+    def unsmoothed(step: float) -> sp.csc_array:
+        return compile_problem(effects, anatomy, device, discretise(anatomy.mesh, "p1")).rest_curvature(step)
 
     return problem, choose_preconditioner(problem, space, unsmoothed)
 
