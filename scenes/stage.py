@@ -31,6 +31,8 @@ READ_BELOW = 2.0e-3
 # So far under the bone the cortex may come to light [m].
 RIM = 10e-3
 DRAPE_HEIGHT, DRAPE_DEPTH = 3.0e-3, 8.0e-3
+# What is beyond the hole is drawn lower by so many times as far as it is beyond, to the depth of the drape's wall.
+DIP = 3.0
 # Radius of the drape's hole over that of the largest circle of open cortex: its rim hides the mesh's ragged border.
 HOLE = 0.98
 
@@ -94,8 +96,14 @@ class Stage:
         return self._cortex.at(positions)
 
     def visible(self, positions: np.ndarray) -> Layer:
-        """The open cortex, and what lies just under the edge of the bone: it comes to light where the brain shifts."""
-        return self._visible.at(positions)
+        """The open cortex, and what lies just under the edge of the bone: it comes to light where the brain shifts.
+
+        What is beyond the drape's hole is drawn below it: in the body nothing bars open cortex that slides under bone.
+        """
+        layer = self._visible.at(positions)
+        beyond = self.site.across(layer.vertices) - HOLE * self.site.clearance
+        below = np.minimum(DIP * beyond.clip(0.0), DRAPE_DEPTH)
+        return replace(layer, vertices=layer.vertices + below[:, None] * self.site.axis)
 
     @cached_property
     def brain(self) -> Layer:

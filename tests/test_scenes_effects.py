@@ -18,7 +18,7 @@ from scenes.lying import SUPINE, Lying, drained_then_turned, supine
 from scenes.paths import Touch
 from scenes.play import labelled
 from scenes.scene import Bounds, find_scene
-from scenes.stage import CORTEX, TOOL
+from scenes.stage import CORTEX, HOLE, TOOL, Stage
 from scenes.told import told
 from scenes.truth import truth_of
 from sim.accuracy import TRAIN
@@ -226,6 +226,15 @@ class TestBrainShift:
         # It sinks along gravity where it can, and turns with the head.
         way = answer.displacement[3:, cortex].mean(axis=1)
         assert way[0, 1] < -0.8 * np.linalg.norm(way[0]) and way[1, 0] < way[0, 0] - 5e-4
+
+    def test_cortex_that_slides_under_the_bone_is_not_drawn_above_it(self):
+        theatre, scene = template_theatre(), small("brain_shift")
+        stage, site = Stage(scene, theatre.site), theatre.site
+        moved = theatre.anatomy.mesh.nodes + 8e-3 * site.right
+        drawn, true = stage.visible(moved).vertices, moved[stage._visible.vertices]
+        beyond = site.across(true) - HOLE * site.clearance
+        low = (drawn - true) @ site.axis
+        assert (low[beyond < 0.0] == 0.0).all() and (low[beyond > 2e-3] > 5e-3).all() and (beyond > 2e-3).sum() > 20
 
     def test_its_border_stays_hidden(self):
         """The cortex that moves out from under the bone is drawn too: nothing is seen through the hole beside it."""
