@@ -98,9 +98,12 @@ class Stage:
     def visible(self, positions: np.ndarray) -> Layer:
         """The open cortex, and what lies just under the edge of the bone: it comes to light where the brain shifts.
 
-        What is beyond the drape's hole is drawn below it: in the body nothing bars open cortex that slides under bone.
+        Where the brain comes off the skull, what is beyond the drape's hole is drawn below it: in the body nothing bars
+        open cortex that slides under bone.
         """
         layer = self._visible.at(positions)
+        if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):
+            return layer
         beyond = self.site.across(layer.vertices) - HOLE * self.site.clearance
         below = np.minimum(DIP * beyond.clip(0.0), DRAPE_DEPTH)
         return replace(layer, vertices=layer.vertices + below[:, None] * self.site.axis)
