@@ -10,6 +10,7 @@ import numpy as np
 from ar.layer import Layer, Solid, vertex_normals
 from ar.view import Lamp, lamp_beside
 from sim.anatomy import Anatomy
+from sim.effects import SkullContact
 from sim.intensity import Intensity
 from sim.loads import Loads, Resected
 from sim.resection import Remains, bodies
