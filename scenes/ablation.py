@@ -15,6 +15,7 @@ from sim.deformation import Deformer
 from sim.effects import Effect, Elasticity
 from sim.errors import InputError
 
+from .peak import peak_memory
 from .scene import Scene
 from .site import Site
 from .stage import Stage
@@ -132,11 +133,8 @@ def peak() -> int | None:
     """Most bytes of a graphics card's pool, or of this process, since `reset_peak`; None where nobody says."""
     if wp.get_preferred_device().is_cuda:
         return wp.get_mempool_used_mem_high(wp.get_preferred_device())
-    try:
-        status = Path("/proc/self/status").read_text()
-    except OSError:
-        return None
-    return next((1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")), None)
+    most = peak_memory()
+    return None if most is None else round(most * 2**30)
 
 
 def reset_peak() -> None:

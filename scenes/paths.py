@@ -35,7 +35,7 @@ class Touch:
 Path = Callable[[float], Touch]
 """Time [s] -> Touch."""
 
-# A tool that is moved comes from so far above the tissue [m].
+# A tool that does not touch is so far above the tissue [m].
 AIR = 4e-3
 
 
@@ -94,7 +94,7 @@ def palpate(
 
     def path(time: float) -> Touch:
         touch = stroke(time)
-        return Touch(touch.x, touch.y, depth=touch.force * (AIR + depth) - AIR)
+        return Touch(touch.x, touch.y, depth=_lowered(touch.force, depth))
 
     return path
 
@@ -103,9 +103,14 @@ def lay(depth: float, tilt: float = 0.0, rise: float = 1.5, at: tuple[float, flo
     """Come down by `AIR` [m] and on to `depth` [m] within `rise` [s], `tilt` [rad] towards x, and stay there."""
 
     def path(time: float) -> Touch:
-        return Touch(*at, tilt=(tilt, 0.0), depth=smooth(time / rise) * (AIR + depth) - AIR)
+        return Touch(*at, tilt=(tilt, 0.0), depth=_lowered(smooth(time / rise), depth))
 
     return path
+
+
+def _lowered(share: float, depth: float) -> float:
+    """How deep [m] a tool is after a share of its way from the air to `depth` [m]."""
+    return share * (AIR + depth) - AIR
 
 
 def wander(force: float, radius: float, speed: float) -> Path:

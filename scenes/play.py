@@ -20,7 +20,7 @@ from sim.effects import Inertia
 from sim.loads import Loads
 from surrogate.learned import Learned
 
-from .paths import Touch
+from .paths import AIR, Touch
 from .scene import Scene
 from .site import Site
 from .stage import TOOL, Stage
@@ -149,13 +149,11 @@ class Player:
 
         Of a tool that pushes: resting on the deformed surface, lifted off where it is idle.
         """
-        contact = self.scene.contact(self.site, touch)
         if self.scene.posed:
-            tip = contact.point + touch.depth * self.site.direction(touch)
-            return tip, self.scene.pose(self.site, touch)
+            return self.scene.tip(self.site, touch), self.scene.pose(self.site, touch)
         inward = self.site.direction(replace(touch, tilt=(0.0, 0.0)))
-        lift = 4e-3 * max(0.0, 1.0 - touch.force / 0.02)
-        tip = contact.carried(positions) - lift * inward
+        lift = AIR * max(0.0, 1.0 - touch.force / 0.02)
+        tip = self.scene.contact(self.site, touch).carried(positions) - lift * inward
         return tip, tool.pose(tip, inward, self.site.right)
 
 

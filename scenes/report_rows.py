@@ -11,6 +11,7 @@ from threadpoolctl import ThreadpoolController
 from sim.errors import InputError
 
 from .growth import watched_card
+from .peak import peak_memory
 from .report_elements import Elements, measure_elements
 from .report_learner import Learner, measure_learner
 from .report_row import Row
@@ -44,12 +45,3 @@ def _on_one_core(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
     """Products this small take longer on several, and say less."""
     with ThreadpoolController().limit(limits=1, user_api="blas"):
         return measure_learner(study, spec)
-
-
-def peak_memory() -> float | None:
-    """The largest resident size of this process so far [GiB], as Linux tells it."""
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) / 2**20 for line in lines if line.startswith("VmHWM:")), None)

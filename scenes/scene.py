@@ -141,11 +141,14 @@ class Scene:
         """Whether the hand moves its tool, instead of pushing with it."""
         return any(isinstance(effect, ToolContact | Retraction) for effect in self.effects)
 
+    def tip(self, site: Site, touch: Touch) -> np.ndarray:
+        """Where a tool that is moved would touch first (3,) [m]."""
+        return self.contact(site, touch).point + touch.depth * site.direction(touch)
+
     def pose(self, site: Site, touch: Touch) -> np.ndarray:
         """T_world_tool (4, 4) of a tool that is moved; it faces the tissue whichever way it is moved."""
         assert self.tool is not None
-        tip = self.contact(site, touch).point + touch.depth * site.direction(touch)
-        return self.tool.pose(tip, site.axis, site.right)
+        return self.tool.pose(self.tip(site, touch), site.axis, site.right)
 
     def loads(self, site: Site, touch: Touch, time: float) -> Loads:
         """One load case: the cause of every effect that has one; where none has, time alone goes on."""

@@ -50,22 +50,18 @@ class Way:
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
 
 
-def approach(tools: tuple[Tool, ...], pose: np.ndarray, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Where tools (B, tools, 4, 4) came from along their shafts: just clear of a surface with vertices `points` (n, 3).
+def approach(tool: Tool, pose: np.ndarray, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Where a tool at `pose` (4, 4) came from along its shaft: just clear of a surface with vertices `points` (n, 3).
 
     `reach` (n,) [m] is how far the surface goes on round each vertex. A tool that is clear where it is came from there.
     """
-    out = pose.copy()
-    for k, tool in enumerate(tools):
-        core = core_of(tool)
-        for case in range(len(pose)):
-            shaft = pose[case, k, :3, 2]
-            local = (points - pose[case, k, :3, 3]) @ pose[case, k, :3, :3]
-            aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
-            above = (local[:, 2] + reach)[aside <= core.radius + reach]
-            back, room = max(0.0, float(above.max(initial=0.0))), 0.0
-            for _ in range(MARCH):
-                back = max(0.0, back - room)
-                out[case, k, :3, 3] = pose[case, k, :3, 3] + back * shaft
-                room = max(0.0, float((distances_to(tool, out[case, k], points) - reach).min()))
+    core, out, shaft = core_of(tool), pose.copy(), pose[:3, 2]
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
+    above = (local[:, 2] + reach)[aside <= core.radius + reach]
+    back, room = max(0.0, float(above.max(initial=0.0))), 0.0
+    for _ in range(MARCH):
+        back = max(0.0, back - room)
+        out[:3, 3] = pose[:3, 3] + back * shaft
+        room = max(0.0, float((distances_to(tool, out, points) - reach).min()))
     return out

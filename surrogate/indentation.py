@@ -14,8 +14,6 @@ from sim.loads import Loads, Pushed, Touching
 
 from .patch import Patch
 
-# Held against the patch together.
-BLOCK = 64
 # A middle so near to the surface [m] has the surface's normal.
 ON_IT = 1e-6
 
@@ -39,29 +37,10 @@ def indented(loads: Loads, radius: float, patch: Patch) -> Pushed:
         )
     pose = touching.pose[:, 0]
     middle = pose[:, :3, 3] + radius * pose[:, :3, 2]
-    parts = [middle[first : first + BLOCK] for first in range(0, len(middle), BLOCK)]
-    point = np.concatenate([_nearest(part, patch) for part in parts])
+    point = patch.skin.nearest(middle, np.full(len(middle), np.inf))[0]
     inward, away = patch.normal_near(point), point - middle
     # Positive where the middle is still outside.
     distance = np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, inward))
     near = np.abs(distance) < ON_IT
     direction = np.where(near[:, None], inward, away / np.where(near, 1.0, distance)[:, None])
     return Pushed(point, np.maximum(radius - distance, 0.0)[:, None] * direction, np.full(len(pose), radius))
-
-
-def _nearest(middle: np.ndarray, patch: Patch) -> np.ndarray:
-    """The point (B, 3) [m] of the patch that is nearest to each of (B, 3): on a face, an edge or a corner."""
-    corner = patch.points[patch.triangles]
-    edge = np.roll(corner, -1, axis=1) - corner
-    normal = np.cross(edge[:, 0], edge[:, 1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    height = np.einsum("bsi,si->bs", middle[:, None] - corner[:, 0], normal)
-    on_face = middle[:, None] - height[..., None] * normal
-    aside = np.einsum("bscx,scx->bsc", on_face[:, :, None] - corner, np.cross(normal[:, None], edge))
-    start, along = corner.reshape(-1, 3), edge.reshape(-1, 3)
-    share = np.einsum("bei,ei->be", middle[:, None] - start, along) / np.einsum("ei,ei->e", along, along)
-    on_edge = start + np.clip(share, 0.0, 1.0)[..., None] * along
-    tried = np.concatenate([on_face, on_edge], axis=1)
-    distance = np.linalg.norm(tried - middle[:, None], axis=2)
-    distance[:, : len(corner)][(aside < 0.0).any(axis=2)] = np.inf
-    return tried[np.arange(len(middle)), distance.argmin(axis=1)]

@@ -13,6 +13,7 @@ from ar.screen import read_png
 from scenes import report, report_reference
 from scenes.cli import main
 from scenes.commands import report as command
+from scenes.peak import peak_memory
 from scenes.report import UNBUILT, every, learners, rows, star
 from scenes.report_adapt import debulked, debulked_study, simulate_debulked, simulating_seconds
 from scenes.report_elements import OWN, Elements
@@ -21,7 +22,7 @@ from scenes.report_page import Section, write_report
 from scenes.report_plots import against_time, front
 from scenes.report_reference import beyond_of, reference_of, solve_beyond, solve_reference
 from scenes.report_row import Row, figures_of, row_from_json, row_to_json
-from scenes.report_rows import measured, peak_memory
+from scenes.report_rows import measured
 from scenes.report_series import series_seconds, tabulate_series
 from scenes.report_study import Study
 from sim.accuracy import REFERENCE, TRAIN

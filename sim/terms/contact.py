@@ -1,7 +1,7 @@
 """Frictionless contact of a body's surface with rigid tools that are moved by pose."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache
 
 import numpy as np
 import warp as wp
@@ -16,13 +16,15 @@ from ..loads import Retracted, Touching
 from ..motion import Way, approach
 from ..term import Cases
 from ..tools import Tool, core_of
-from .touch import Tools, kernels_of
+from .touch import Scale, Surface, Tools, kernels_of
 
 # Surfaces are looked at in points; between them they are nearer to a tool by at most this share of the gap, which is
 # added to the tool's radius: no point of a surface is inside.
 SAG = 0.25
 # Triangles may be stretched so many times.
 STRETCH = 1.3
+# Of so many poses it is kept where their tools came from: a solver asks again and again.
+KEPT = 4096
 # Of a triangle cut into smaller ones, the farthest point is so many of their edges from the nearest centre.
 FARTHEST = 2.0 / 3.0
 
@@ -70,14 +72,13 @@ class Contact:
         self._kernels = kernels_of(device, triangles.shape[1])
         cores = [core_of(tool) for tool in tools]
         a, b, c = np.moveaxis(nodes[triangles[:, :3]], 1, 0)
-        longest = np.linalg.norm([b - a, c - b, a - c], axis=2).max(axis=0) * STRETCH
+        longest = STRETCH * _longest_edges(nodes, triangles)
         fine = np.sqrt(2.0 * min(core.radius for core in cores) * SAG * gap) / FARTHEST
-        self._skin = [
-            device.array(nodes, wp.vec3d),
-            device.array(triangles, wp.int32),
-            device.array(np.ceil(longest / fine), wp.int32),
-            device.array(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1), wp.float64),
-        ]
+        self._surface = Surface()
+        self._surface.rest = device.array(nodes, wp.vec3d)
+        self._surface.table = device.array(triangles, wp.int32)
+        self._surface.pieces = device.array(np.ceil(longest / fine), wp.int32)
+        self._surface.area = device.array(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1), wp.float64)
         self._tools = Tools()
         self._tools.centre = device.array(np.array([core.centre for core in cores]), wp.vec3d)
         self._tools.half = device.array(np.array([core.half for core in cores]), wp.vec3d)
@@ -110,7 +111,8 @@ class Contact:
 
     def widen(self, times: float) -> None:
         """The barrier as many times as wide, and as much softer."""
-        self._scale = [wp.float64(times * self._gap), wp.float64(self._shear / (times * self._gap))]
+        self._scale = Scale()
+        self._scale.gap, self._scale.stiffness = times * self._gap, self._shear / (times * self._gap)
 
     def begin(self, cases: Cases) -> None:
         """Put the tools where they are after their share of the way; the gap is its own again."""
@@ -168,8 +170,8 @@ class Contact:
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:
         if self._pose is not None:
-            dim = (len(self._skin[1]), columns)
-            self._device.launch(kernel, dim, [*inputs, *self._skin, self._tools, *self._scale], [out])
+            dim = (len(self._surface.table), columns)
+            self._device.launch(kernel, dim, [*inputs, self._surface, self._tools, self._scale], [out])
 
 
 def contact_of(
@@ -182,7 +184,16 @@ def contact_of(
     triangles = space.surface[~covered[space.mesh.surface].all(axis=1)]
     if not len(triangles):
         raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is held or slides.")
-    clear = partial(approach, tools, points=space.nodes[np.unique(triangles)], reach=_reach(space.nodes, triangles))
+    points, reach = space.nodes[np.unique(triangles)], _reach(space.nodes, triangles)
+
+    @lru_cache(KEPT)
+    def came_from(number: int, pose: bytes) -> np.ndarray:
+        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, reach)
+
+    def clear(pose: np.ndarray) -> np.ndarray:
+        """Where tools (B, tools, 4, 4) came from."""
+        begin = [came_from(number, one.tobytes()) for case in pose for number, one in enumerate(case)]
+        return np.reshape(begin, pose.shape)
 
     def way(cases: Cases) -> Way | None:
         last = cases.past(name, (len(tools), 4, 4)) if name in cases.history else None
@@ -219,8 +230,12 @@ def _begun(
 def _reach(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """How far (n,) [m] each of a surface's own nodes, ascending, is at most from the points that are nearest to it."""
     numbers, table = np.unique(triangles, return_inverse=True)
-    corners = nodes[triangles[:, :3]]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     out = np.zeros(len(numbers))
-    np.maximum.at(out, table.reshape(triangles.shape), longest[:, None])
+    np.maximum.at(out, table.reshape(triangles.shape), _longest_edges(nodes, triangles)[:, None])
     return out / np.sqrt(3.0)
+
+
+def _longest_edges(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Of each triangle (S,) [m], between its corners."""
+    corners = nodes[triangles[:, :3]]
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)

@@ -46,6 +46,39 @@ class Kernels:
     bound_step: wp.Kernel
 
 
+@wp.struct
+class Wall:
+    """Nodes, normals and bends [1/m] of their walls, areas [m^2]; gap and what is felt of it [m], stiffness [Pa/m]."""
+
+    nodes: wp.array(dtype=wp.int32)
+    normal: wp.array(dtype=wp.vec3d)
+    bend: wp.array(dtype=wp.mat33d)
+    area: wp.array(dtype=wp.float64)
+    gap: wp.float64
+    felt: wp.float64
+    stiffness: wp.float64
+
+
+@wp.func
+def distance(wall: Wall, s: int, x: wp.vec3d) -> wp.float64:
+    """d = gap - n . u - u . H u / 2."""
+    return wall.gap - wp.dot(wall.normal[s], x) - wp.float64(0.5) * wp.dot(x, wall.bend[s] * x)
+
+
+@wp.func
+def slope(wall: Wall, s: int, x: wp.vec3d) -> wp.vec3d:
+    """m = n + H u: d falls by m . du."""
+    return wall.normal[s] + wall.bend[s] * x
+
+
+@wp.func
+def block_of(wall: Wall, s: int, x: wp.vec3d) -> wp.mat33d:
+    """w k (b'' m (x) m - b' H): never negative, as H is not."""
+    d, m = distance(wall, s, x), slope(wall, s, x)
+    bent = barrier_slope(d, wall.felt) * wall.bend[s]
+    return wall.area[s] * (wall.stiffness * (barrier_curvature(d, wall.felt) * wp.outer(m, m) - bent))
+
+
 @cache
 def kernels_of(device: Device) -> Kernels:
     """Kernels of a device's scalar type; distances are in double precision."""
@@ -56,125 +89,80 @@ def kernels_of(device: Device) -> Kernels:
         """u_i in double precision."""
         return wp.vec3d(wp.float64(u[3 * i, c]), wp.float64(u[3 * i + 1, c]), wp.float64(u[3 * i + 2, c]))
 
-    @wp.func
-    def distance(x: wp.vec3d, n: wp.vec3d, H: wp.mat33d, gap: wp.float64) -> wp.float64:
-        """d = gap - n . u - u . H u / 2."""
-        return gap - wp.dot(n, x) - wp.float64(0.5) * wp.dot(x, H * x)
-
-    @wp.func
-    def block_of(
-        x: wp.vec3d, n: wp.vec3d, H: wp.mat33d, gap: wp.float64, felt: wp.float64, stiffness: wp.float64
-    ) -> wp.mat33d:
-        """k (b'' m (x) m - b' H), m = n + H u: never negative, as H is not."""
-        d, m = distance(x, n, H, gap), n + H * x
-        return stiffness * (barrier_curvature(d, felt) * wp.outer(m, m) - barrier_slope(d, felt) * H)
-
     @wp.kernel(module="unique")
     def add_energy(
         u: wp.array2d(dtype=scalar),
-        nodes: wp.array(dtype=wp.int32),
-        normal: wp.array(dtype=wp.vec3d),
-        bend: wp.array(dtype=wp.mat33d),
-        weight: wp.array(dtype=wp.float64),
-        gap: wp.float64,
-        felt: wp.float64,
-        stiffness: wp.float64,
+        wall: Wall,
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
         """E += sum over nodes of w k b(d)."""
         s, c = wp.tid()
-        d = distance(motion(u, nodes[s], c), normal[s], bend[s], gap)
-        if d < felt:
-            wp.atomic_add(out, c, stiffness * weight[s] * barrier(d, felt))
+        d = distance(wall, s, motion(u, wall.nodes[s], c))
+        if d < wall.felt:
+            wp.atomic_add(out, c, wall.stiffness * wall.area[s] * barrier(d, wall.felt))
 
     @wp.kernel(module="unique")
     def add_gradient(
         u: wp.array2d(dtype=scalar),
-        nodes: wp.array(dtype=wp.int32),
-        normal: wp.array(dtype=wp.vec3d),
-        bend: wp.array(dtype=wp.mat33d),
-        weight: wp.array(dtype=wp.float64),
-        gap: wp.float64,
-        felt: wp.float64,
-        stiffness: wp.float64,
+        wall: Wall,
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """g -= w k b'(d) m, m = n + H u."""
+        """g -= w k b'(d) m."""
         s, c = wp.tid()
-        x = motion(u, nodes[s], c)
-        f = -stiffness * weight[s] * barrier_slope(distance(x, normal[s], bend[s], gap), felt)
-        m = normal[s] + bend[s] * x
+        x = motion(u, wall.nodes[s], c)
+        f = -wall.stiffness * wall.area[s] * barrier_slope(distance(wall, s, x), wall.felt)
+        m = slope(wall, s, x)
         for k in range(3):
-            out[3 * nodes[s] + k, c] += scalar(f * m[k])
+            out[3 * wall.nodes[s] + k, c] += scalar(f * m[k])
 
     @wp.kernel(module="unique")
     def add_curvature(
         p: wp.array2d(dtype=scalar),
         u: wp.array2d(dtype=scalar),
-        nodes: wp.array(dtype=wp.int32),
-        normal: wp.array(dtype=wp.vec3d),
-        bend: wp.array(dtype=wp.mat33d),
-        weight: wp.array(dtype=wp.float64),
-        gap: wp.float64,
-        felt: wp.float64,
-        stiffness: wp.float64,
+        wall: Wall,
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """f += K_ii p_i."""
         s, c = wp.tid()
-        f = weight[s] * (
-            block_of(motion(u, nodes[s], c), normal[s], bend[s], gap, felt, stiffness) * motion(p, nodes[s], c)
-        )
+        f = block_of(wall, s, motion(u, wall.nodes[s], c)) * motion(p, wall.nodes[s], c)
         for k in range(3):
-            out[3 * nodes[s] + k, c] += scalar(f[k])
+            out[3 * wall.nodes[s] + k, c] += scalar(f[k])
 
     @wp.kernel(module="unique")
     def add_diagonal(
         u: wp.array2d(dtype=scalar),
-        nodes: wp.array(dtype=wp.int32),
-        normal: wp.array(dtype=wp.vec3d),
-        bend: wp.array(dtype=wp.mat33d),
-        weight: wp.array(dtype=wp.float64),
-        gap: wp.float64,
-        felt: wp.float64,
-        stiffness: wp.float64,
+        wall: Wall,
         # outputs
         out: wp.array2d(dtype=mat),
     ):
         """K_ii."""
         s, c = wp.tid()
-        K = weight[s] * block_of(motion(u, nodes[s], c), normal[s], bend[s], gap, felt, stiffness)
+        K = block_of(wall, s, motion(u, wall.nodes[s], c))
         block = mat()
         for row in range(3):
             for column in range(3):
                 block[row, column] = scalar(K[row, column])
-        out[nodes[s], c] += block
+        out[wall.nodes[s], c] += block
 
     @wp.kernel(module="unique")
     def bound_step(
         u: wp.array2d(dtype=scalar),
         du: wp.array2d(dtype=scalar),
-        nodes: wp.array(dtype=wp.int32),
-        normal: wp.array(dtype=wp.vec3d),
-        bend: wp.array(dtype=wp.mat33d),
-        weight: wp.array(dtype=wp.float64),
-        gap: wp.float64,
-        felt: wp.float64,
-        stiffness: wp.float64,
+        wall: Wall,
         # outputs
         out: wp.array(dtype=scalar),
     ):
         """d(u + t du) >= (1 - kept) d: no node that is on its side leaves it at once; d is a falling parabola in t."""
         s, c = wp.tid()
-        x, along = motion(u, nodes[s], c), motion(du, nodes[s], c)
-        d = distance(x, normal[s], bend[s], gap)
-        if d > wp.float64(RELAXED) * felt:
-            slope = wp.dot(normal[s] + bend[s] * x, along)
-            square = wp.float64(2.0) * kept * d * wp.dot(along, bend[s] * along)
-            root = slope + wp.sqrt(slope * slope + square)
+        x, along = motion(u, wall.nodes[s], c), motion(du, wall.nodes[s], c)
+        d = distance(wall, s, x)
+        if d > wp.float64(RELAXED) * wall.felt:
+            falls = wp.dot(slope(wall, s, x), along)
+            square = wp.float64(2.0) * kept * d * wp.dot(along, wall.bend[s] * along)
+            root = falls + wp.sqrt(falls * falls + square)
             if root > wp.float64(2.0) * kept * d:
                 wp.atomic_min(out, c, scalar(wp.float64(2.0) * kept * d / root))
 
@@ -216,12 +204,11 @@ class Skull:
     ):
         self._device, self._kernels, self._nodes = device, kernels_of(device), nodes
         self._gap, self._felt, self._shear = gap, felt, shear
-        self._inputs = [
-            device.array(nodes, wp.int32),
-            device.array(normal, wp.vec3d),
-            device.array(bend, wp.mat33d),
-            device.array(area, wp.float64),
-        ]
+        self._wall = Wall()
+        self._wall.nodes = device.array(nodes, wp.int32)
+        self._wall.normal = device.array(normal, wp.vec3d)
+        self._wall.bend = device.array(bend, wp.mat33d)
+        self._wall.area = device.array(area, wp.float64)
         self.widen(1.0)
         blocks = (HALF_SHUT * shear / felt * area)[:, None, None] * normal[:, :, None] * normal[:, None, :]
         row = (3 * nodes[:, None, None] + np.arange(3)[:, None]).repeat(3, axis=2)
@@ -245,12 +232,9 @@ class Skull:
 
     def widen(self, times: float) -> None:
         """The barrier as many times as wide, and as much softer; the bone steps back by as much."""
-        wider = (times - 1.0) * self._felt
-        self._scale = [
-            wp.float64(self._gap + wider),
-            wp.float64(times * self._felt),
-            wp.float64(self._shear / (times * self._felt)),
-        ]
+        self._wall.gap = self._gap + (times - 1.0) * self._felt
+        self._wall.felt = times * self._felt
+        self._wall.stiffness = self._shear / (times * self._felt)
 
     def reaction(self, u: wp.array) -> np.ndarray:
         """Nobody holds the skull: no tools."""
@@ -295,7 +279,7 @@ class Skull:
         """The skull remembers nothing."""
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array) -> None:
-        self._device.launch(kernel, (len(self._nodes), out.shape[-1]), [*inputs, *self._inputs, *self._scale], [out])
+        self._device.launch(kernel, (len(self._nodes), out.shape[-1]), [*inputs, self._wall], [out])
 
 
 def skull_of(effect: SkullContact, anatomy: Anatomy, space: Discretisation, shear: float, device: Device) -> Skull:

@@ -38,6 +38,24 @@ class Tools:
 
 
 @wp.struct
+class Surface:
+    """Surface triangles: their nodes' places at rest and numbers, areas, and into how many parts an edge is cut."""
+
+    rest: wp.array(dtype=wp.vec3d)
+    table: wp.array2d(dtype=wp.int32)
+    pieces: wp.array(dtype=wp.int32)
+    area: wp.array(dtype=wp.float64)
+
+
+@wp.struct
+class Scale:
+    """How wide the barrier is [m], and how stiff [Pa/m]."""
+
+    gap: wp.float64
+    stiffness: wp.float64
+
+
+@wp.struct
 class Touch:
     """Distance to a tool [m], its gradient, and its second derivative [1/m]."""
 
@@ -99,16 +117,34 @@ def kernels_of(device: Device, size: int) -> Kernels:
         return out
 
     @wp.func
-    def nodes_of(
-        rest: wp.array(dtype=wp.vec3d), table: wp.array2d(dtype=wp.int32), u: wp.array2d(dtype=scalar), s: int, c: int
-    ) -> forces:
-        """Where a triangle's nodes are (size, 3)."""
+    def motion_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
+        """How far a triangle's nodes go (size, 3)."""
         out = forces()
         for a in range(size):
-            i = table[s, a]
             for k in range(3):
-                out[a, k] = rest[i][k] + wp.float64(u[3 * i + k, c])
+                out[a, k] = wp.float64(u[3 * surface.table[s, a] + k, c])
         return out
+
+    @wp.func
+    def nodes_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
+        """Where they are (size, 3)."""
+        out = motion_of(surface, u, s, c)
+        for a in range(size):
+            for k in range(3):
+                out[a, k] += surface.rest[surface.table[s, a]][k]
+        return out
+
+    @wp.func
+    def spread(surface: Surface, total: forces, s: int, c: int, out: wp.array2d(dtype=scalar)):
+        """f_a += total_a."""
+        for a in range(size):
+            for k in range(3):
+                wp.atomic_add(out, 3 * surface.table[s, a] + k, c, scalar(total[a, k]))
+
+    @wp.func
+    def weight_of(surface: Surface, scale: Scale, s: int) -> wp.float64:
+        """Stiffness times the area that each point of a triangle stands for [N/m]."""
+        return scale.stiffness * surface.area[s] / wp.float64(surface.pieces[s] * surface.pieces[s])
 
     @wp.func
     def is_near(at: forces, tools: Tools, gap: wp.float64, k: int, c: int) -> bool:
@@ -124,58 +160,46 @@ def kernels_of(device: Device, size: int) -> Kernels:
     @wp.kernel(module="unique")
     def add_energy(
         u: wp.array2d(dtype=scalar),
-        rest: wp.array(dtype=wp.vec3d),
-        table: wp.array2d(dtype=wp.int32),
-        pieces: wp.array(dtype=wp.int32),
-        area: wp.array(dtype=wp.float64),
+        surface: Surface,
         tools: Tools,
-        gap: wp.float64,
-        stiffness: wp.float64,
+        scale: Scale,
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
         """E += sum over points of w k b(d)."""
         s, c = wp.tid()
-        at, n = nodes_of(rest, table, u, s, c), pieces[s]
-        weight = stiffness * area[s] / wp.float64(n * n)
+        at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, gap, k, c):
+            if is_near(at, tools, scale.gap, k, c):
                 total = wp.float64(0.0)
                 for i in range(n):
                     for j in range(2 * (n - i) - 1):
                         N = shape_of(i, j, n)
-                        total += barrier(touch_of(N * at, tools, k, c).distance, gap)
+                        total += barrier(touch_of(N * at, tools, k, c).distance, scale.gap)
                 wp.atomic_add(out, c, weight * total)
 
     @wp.kernel(module="unique")
     def add_gradient(
         u: wp.array2d(dtype=scalar),
-        rest: wp.array(dtype=wp.vec3d),
-        table: wp.array2d(dtype=wp.int32),
-        pieces: wp.array(dtype=wp.int32),
-        area: wp.array(dtype=wp.float64),
+        surface: Surface,
         tools: Tools,
-        gap: wp.float64,
-        stiffness: wp.float64,
+        scale: Scale,
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """g_a += sum over points of w k b'(d) n N_a."""
         s, c = wp.tid()
-        at, n = nodes_of(rest, table, u, s, c), pieces[s]
-        weight = stiffness * area[s] / wp.float64(n * n)
+        at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, gap, k, c):
+            if is_near(at, tools, scale.gap, k, c):
                 total = forces()
                 for i in range(n):
                     for j in range(2 * (n - i) - 1):
                         N = shape_of(i, j, n)
                         touch = touch_of(N * at, tools, k, c)
-                        if touch.distance < gap:
-                            total += wp.outer(N, weight * barrier_slope(touch.distance, gap) * touch.normal)
-                for a in range(size):
-                    for i in range(3):
-                        wp.atomic_add(out, 3 * table[s, a] + i, c, scalar(total[a, i]))
+                        if touch.distance < scale.gap:
+                            total += wp.outer(N, weight * barrier_slope(touch.distance, scale.gap) * touch.normal)
+                spread(surface, total, s, c, out)
 
     @wp.func
     def curvature_at(touch: Touch, gap: wp.float64, definite: int) -> wp.mat33d:
@@ -190,93 +214,73 @@ def kernels_of(device: Device, size: int) -> Kernels:
         p: wp.array2d(dtype=scalar),
         u: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
-        rest: wp.array(dtype=wp.vec3d),
-        table: wp.array2d(dtype=wp.int32),
-        pieces: wp.array(dtype=wp.int32),
-        area: wp.array(dtype=wp.float64),
+        surface: Surface,
         tools: Tools,
-        gap: wp.float64,
-        stiffness: wp.float64,
+        scale: Scale,
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """f_a += sum over points of w k H N_a sum over nodes of N_b p_b."""
         s, c = wp.tid()
-        at, n = nodes_of(rest, table, u, s, c), pieces[s]
-        weight = stiffness * area[s] / wp.float64(n * n)
+        at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, gap, k, c):
-                along, total = forces(), forces()
-                for a in range(size):
-                    for i in range(3):
-                        along[a, i] = wp.float64(p[3 * table[s, a] + i, c])
+            if is_near(at, tools, scale.gap, k, c):
+                along, total = motion_of(surface, p, s, c), forces()
                 for i in range(n):
                     for j in range(2 * (n - i) - 1):
                         N = shape_of(i, j, n)
                         touch = touch_of(N * at, tools, k, c)
-                        if touch.distance < gap:
-                            total += wp.outer(N, weight * (curvature_at(touch, gap, definite[c]) * (N * along)))
-                for a in range(size):
-                    for i in range(3):
-                        wp.atomic_add(out, 3 * table[s, a] + i, c, scalar(total[a, i]))
+                        if touch.distance < scale.gap:
+                            total += wp.outer(N, weight * (curvature_at(touch, scale.gap, definite[c]) * (N * along)))
+                spread(surface, total, s, c, out)
 
     @wp.kernel(module="unique")
     def add_diagonal(
         u: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
-        rest: wp.array(dtype=wp.vec3d),
-        table: wp.array2d(dtype=wp.int32),
-        pieces: wp.array(dtype=wp.int32),
-        area: wp.array(dtype=wp.float64),
+        surface: Surface,
         tools: Tools,
-        gap: wp.float64,
-        stiffness: wp.float64,
+        scale: Scale,
         # outputs
         out: wp.array2d(dtype=mat),
     ):
         """K_aa += sum over points of w k H N_a^2."""
         s, c = wp.tid()
-        at, n = nodes_of(rest, table, u, s, c), pieces[s]
-        weight = stiffness * area[s] / wp.float64(n * n)
+        at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, gap, k, c):
+            if is_near(at, tools, scale.gap, k, c):
                 for i in range(n):
                     for j in range(2 * (n - i) - 1):
                         N = shape_of(i, j, n)
                         touch = touch_of(N * at, tools, k, c)
-                        if touch.distance < gap:
-                            H = weight * curvature_at(touch, gap, definite[c])
+                        if touch.distance < scale.gap:
+                            H = weight * curvature_at(touch, scale.gap, definite[c])
                             for a in range(size):
                                 block = mat()
                                 for row in range(3):
                                     for column in range(3):
                                         block[row, column] = scalar(N[a] * N[a] * H[row, column])
-                                wp.atomic_add(out, table[s, a], c, block)
+                                wp.atomic_add(out, surface.table[s, a], c, block)
 
     @wp.kernel(module="unique")
     def add_reaction(
         u: wp.array2d(dtype=scalar),
-        rest: wp.array(dtype=wp.vec3d),
-        table: wp.array2d(dtype=wp.int32),
-        pieces: wp.array(dtype=wp.int32),
-        area: wp.array(dtype=wp.float64),
+        surface: Surface,
         tools: Tools,
-        gap: wp.float64,
-        stiffness: wp.float64,
+        scale: Scale,
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
         """Force and moment about each tool's origin, as the tool exerts them: sums of -w k b'(d) n and its moments."""
         s, c = wp.tid()
-        at, n = nodes_of(rest, table, u, s, c), pieces[s]
-        weight = stiffness * area[s] / wp.float64(n * n)
+        at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, gap, k, c):
+            if is_near(at, tools, scale.gap, k, c):
                 for i in range(n):
                     for j in range(2 * (n - i) - 1):
                         x = shape_of(i, j, n) * at
                         touch = touch_of(x, tools, k, c)
-                        force = -weight * barrier_slope(touch.distance, gap) * touch.normal
+                        force = -weight * barrier_slope(touch.distance, scale.gap) * touch.normal
                         moment = wp.cross(x - tools.origin[k, c], force)
                         for row in range(3):
                             wp.atomic_add(out, c, k, row, force[row])
@@ -286,23 +290,17 @@ def kernels_of(device: Device, size: int) -> Kernels:
     def bound_step(
         u: wp.array2d(dtype=scalar),
         du: wp.array2d(dtype=scalar),
-        rest: wp.array(dtype=wp.vec3d),
-        table: wp.array2d(dtype=wp.int32),
-        pieces: wp.array(dtype=wp.int32),
-        area: wp.array(dtype=wp.float64),
+        surface: Surface,
         tools: Tools,
-        gap: wp.float64,
-        stiffness: wp.float64,
+        scale: Scale,
         # outputs
         out: wp.array(dtype=scalar),
     ):
         """t <= kept (d + r) / |dx|: no point goes as far as the middle of a tool, and out at its other side."""
         s, c = wp.tid()
-        at, n = nodes_of(rest, table, u, s, c), pieces[s]
-        along, farthest = forces(), wp.float64(0.0)
+        at, n, along = nodes_of(surface, u, s, c), surface.pieces[s], motion_of(surface, du, s, c)
+        farthest = wp.float64(0.0)
         for a in range(size):
-            for i in range(3):
-                along[a, i] = wp.float64(du[3 * table[s, a] + i, c])
             farthest = wp.max(farthest, wp.length(along[a]))
         for k in range(tools.radius.shape[0]):
             if is_near(at, tools, bulge * farthest / kept, k, c):
