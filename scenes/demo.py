@@ -15,6 +15,7 @@ from sim.effects import Elasticity, Held, Slide
 from .ablation import without
 from .paths import AIR, Touch
 from .play import Frame, Player
+from .reel import Session
 from .referee import Referee, Truth
 from .scene import Scene
 from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR, Stage
@@ -58,13 +59,16 @@ class Wish:
         with self.lock:
             self.off = self.off - {effect} if on else self.off | {effect}
 
-    def next(self, frames: int) -> tuple[int, str, Touch | None]:
-        """Frame number, deformer and hand-set touch (None: the script's) of the next frame; playing goes on by one."""
+    def now(self) -> tuple[int, str, Touch | None, frozenset[str]]:
+        """Frame number, deformer, hand-set touch (None: the script's) and effects that are off."""
         with self.lock:
-            now = self.number, self.deformer, self.touch if self.tool == HAND else None
-            if self.plays:
-                self.number = (self.number + 1) % frames
-            return now
+            return self.number, self.deformer, self.touch if self.tool == HAND else None, self.off
+
+    def go_on(self, number: int, frames: int) -> None:
+        """A frame was shown: playing goes on to the next, unless a visitor has sought another meanwhile."""
+        with self.lock:
+            if self.plays and self.number == number:
+                self.number = (number + 1) % frames
 
 
 class Demo:
@@ -73,7 +77,8 @@ class Demo:
     def __init__(self, theatre: Theatre, scene: Scene, deformer: str, host: str, port: int) -> None:
         self.stage = Stage(scene, theatre.site, theatre.intensity)
         self.theatre = theatre
-        self.players = {(deformer, frozenset[str]()): Player(self.stage, theatre.deformer(deformer, scene))}
+        player = Player(self.stage, theatre.deformer(deformer, scene))
+        self.sessions = {(deformer, frozenset[str]()): Session(player)}
         self.wish = Wish(deformer, Touch(force=0.15, depth=2e-3))
         self.browser = Browser(
             self._bodies(),
@@ -96,32 +101,38 @@ class Demo:
     def run(self, seconds: float = float("inf")) -> int:
         """Play until the time is over; returns the frames drawn."""
         scene, drawn = self.stage.scene, 0
-        previous: tuple[str, frozenset[str]] | None = None
         frame: Frame | None = None
+        own: Truth | None = None
         end = clock.perf_counter() + seconds
         shown: tuple | None = None
         judged: tuple | None = None
         verdict = "error: the finite elements are being prepared"
         while clock.perf_counter() < end:
             begun = clock.perf_counter()
-            number, name, touch = self.wish.next(len(scene.times))
-            off = self.wish.off
+            number, name, touch, off = asked = self.wish.now()
             name = "fem" if off else name  # nobody else was taught without
-            asked = (number, name, touch, off)
+            session = self._session(name, off)
+            player = session.player
             if asked != shown or frame is None:
-                time = float(scene.times[number])
-                touch = scene.path(time) if touch is None else touch
-                last = frame.deformation if frame is not None else None
-                frame = self._player(name, off).draw(number, time, touch, last if (name, off) == previous else None)
-                previous, shown = (name, off), asked
+                reached, answer = session.towards(number, touch)
+                if reached != number:
+                    self.browser.report(f"frame {number} depends on those before it: {reached} of them are done")
+                    continue
+                loads, hand = player.loads(number, touch), touch or player.touch(number)
+                frame, shown = player.drawn(number, hand, loads, answer, clock.perf_counter() - begun), asked
+                self.wish.go_on(number, len(scene.times))
+                own = None
+                if name == "fem" and not off:
+                    own = Truth(number, loads, answer, frame.seconds["deform"])
+                else:
+                    self.referee.ask(number, touch)
                 if not off:
-                    self.tally.took(name, frame.deformation.cost.total)
-                self.referee.ask(number, scene.loads(self.stage.site, touch, time))
-                self._show(frame, self._player(name, off))
+                    self.tally.took(name, answer.cost.total)
+                self._show(frame, player)
                 drawn += 1
-            truth = self.referee.truth
+            truth = own or self.referee.truth
             if truth is not None and (truth, name, off) != judged and (not off or truth.number == frame.number):
-                self._wire(truth, self._player(name, off))
+                self._wire(truth, player)
                 verdict = changed(self.stage, truth, frame, off) if off else self._judge(truth, name)
                 judged = (truth, name, off)
             if self.referee.failure is not None:
@@ -135,16 +146,16 @@ class Demo:
         self.browser.close()
         self.referee.close()
 
-    def _player(self, name: str, off: frozenset[str] = frozenset()) -> Player:
-        """Who plays the scene without some effects, of the tissue that it has with them."""
-        if (name, off) not in self.players:
+    def _session(self, name: str, off: frozenset[str] = frozenset()) -> Session:
+        """Of who plays the scene without some effects, of the tissue that it has with them."""
+        if (name, off) not in self.sessions:
             scene, theatre = self.stage.scene, self.theatre
             for effect in scene.effects_on(theatre.anatomy) if off else ():
                 scene = without(scene, effect) if type(effect).__name__ in off else scene
             knowing = theatre if theatre.knowing(self.stage.scene) else replace(theatre, models={})
             stage = replace(self.stage, scene=scene) if off else self.stage
-            self.players[name, off] = Player(stage, knowing.deformer(name, scene))
-        return self.players[name, off]
+            self.sessions[name, off] = Session(Player(stage, knowing.deformer(name, scene)))
+        return self.sessions[name, off]
 
     def _controls(self) -> list[Slider | Choice | Toggle]:
         wish, names = self.wish, self.theatre.names(self.stage.scene)
@@ -223,7 +234,7 @@ class Demo:
 
     def _judge(self, truth: Truth, name: str) -> str:
         """Say how far off a deformer is under the loads that the finite elements answered."""
-        player = self._player(name)
+        player = self._session(name).player
         nodes = self.stage.at(truth.loads).anatomy.tumour_nodes
         right = truth.deformation.at(nodes).displacement[0]
         said = "this is the finite elements' own answer"

@@ -15,8 +15,8 @@ from ar.hud import panel
 from ar.layer import Layer
 from ar.overlay import Gauge, Style, composite
 from ar.view import Picture, render
-from sim.deformation import Deformation, Deformer, guess
-from sim.effects import Inertia
+from sim.deformation import Deformation, Deformer
+from sim.effects import remember
 from sim.loads import Loads
 from surrogate.learned import Learned
 
@@ -97,17 +97,36 @@ class Player:
         """The scene's camera."""
         return self.scene.viewpoint.camera(self.site)
 
+    @cached_property
+    def remembers(self) -> bool:
+        """Whether an answer depends on the one before it."""
+        return not isinstance(self.deformer, Learned) and remember(self.scene.effects_on(self.site.anatomy))
+
+    def touch(self, number: int) -> Touch:
+        """What the script's hand asks for in a frame."""
+        return self.scene.path(float(self.scene.times[number]))
+
+    def loads(self, number: int, touch: Touch | None = None) -> Loads:
+        """What acts in a frame; `touch` in place of the script's."""
+        return self.scene.loads(self.site, touch or self.touch(number), float(self.scene.times[number]))
+
+    def answer(self, loads: Loads, last: Deformation | None = None) -> Deformation:
+        """The deformer's answer, from the last one: a learnt model's at the drawn vertices, which are all it knows."""
+        if isinstance(self.deformer, Learned):
+            return self.deformer.deform(loads, at=self.stage.nodes)
+        return self.deformer.deform(loads, start=last)
+
     def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
-        """The frame of a touch at a time [s]; the deformer starts as `start_of` has it."""
+        """The frame of a touch at a time [s]; the deformer starts from the last answer."""
         begun = clock.perf_counter()
         loads = self.scene.loads(self.site, touch, time)
-        # A learnt model knows the drawn vertices alone; the finite elements start from their whole last answer.
-        if isinstance(self.deformer, Learned):
-            deformation = self.deformer.deform(loads, at=self.stage.nodes)
-            margin = self._margin(self.deformer, deformation)
-        else:
-            margin, deformation = 0.0, self.deformer.deform(loads, start=start_of(self.scene, last, time))
-        solved = clock.perf_counter()
+        deformation = self.answer(loads, last)
+        return self.drawn(number, touch, loads, deformation, clock.perf_counter() - begun)
+
+    def drawn(self, number: int, touch: Touch, loads: Loads, deformation: Deformation, seconds: float) -> Frame:
+        """The frame of an answer to loads, which took so many seconds."""
+        begun = clock.perf_counter()
+        margin = self._margin(self.deformer, deformation) if isinstance(self.deformer, Learned) else 0.0
         positions = self.positions(deformation)
         tip, pose = (None, None) if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
         stage = self.stage.at(loads)
@@ -116,11 +135,12 @@ class Player:
         tumour, rest = (stage.tumour(at) for at in (positions, self.site.anatomy.mesh.nodes))
         gauge = None if tip is None else gauged(tip, tumour)
         over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin=margin, gauge=gauge)
+        spent = seconds, rendered - begun, clock.perf_counter() - rendered
         return Frame(
-            number, time, touch, loads, deformation, self.camera, pose, tip, picture, over.colour,
+            number, float(loads.times[0]), touch, loads, deformation, self.camera, pose, tip, picture, over.colour,
             None if gauge is None else gauge.distance,
             float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()),
-            dict(zip(STAGES, np.diff([begun, solved, rendered, clock.perf_counter()]).tolist(), strict=True)),
+            dict(zip(STAGES, spent, strict=True)),
         )  # fmt: skip
 
     def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
@@ -155,17 +175,6 @@ class Player:
         lift = AIR * max(0.0, 1.0 - touch.force / 0.02)
         tip = self.scene.contact(self.site, touch).carried(positions) - lift * inward
         return tip, tool.pose(tip, inward, self.site.right)
-
-
-def start_of(scene: Scene, last: Deformation | None, time: float) -> Deformation | None:
-    """What the frame of a time [s] starts from: the last answer; of a later one its shape as a first guess.
-
-    What tissue remembers of a later time is not undone. Tissue that keeps its velocity begins at rest, at once.
-    """
-    if last is None or last.time[0] <= time:
-        return last
-    keeps = any(isinstance(effect, Inertia) for effect in scene.effects)
-    return None if keeps else guess(last.displacement)
 
 
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:

@@ -1,4 +1,4 @@
-"""The finite elements behind a page: a thread that answers the newest loads, to hold a live prediction against."""
+"""The finite elements behind a page: a thread that answers the newest frame, to hold a live prediction against."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from sim.deformation import Deformation
 from sim.loads import Loads
 
-from .play import start_of
+from .paths import Touch
+from .reel import Session
 from .scene import Scene
 from .theatre import Theatre
 
@@ -25,13 +26,14 @@ class Truth:
 
 
 class Referee:
-    """A thread that answers the newest loads by finite elements; older ones that it did not reach are dropped.
+    """A thread that answers the newest frame by finite elements; older ones that it did not reach are dropped.
 
-    Where the finite elements fail, `failure` says why, and no further loads are answered.
+    Frames on the way to it that what went before is known from are answered too. Where the finite elements fail,
+    `failure` says why, and no further frames are answered.
     """
 
     def __init__(self, theatre: Theatre, scene: Scene) -> None:
-        self.newest: tuple[int, Loads] | None = None
+        self.newest: tuple[int, Touch | None] | None = None
         self.truth: Truth | None = None
         self.failure: Exception | None = None
         self.closed = threading.Event()
@@ -39,10 +41,10 @@ class Referee:
         self.thread = threading.Thread(target=self._serve, args=(theatre, scene), name="fem", daemon=True)
         self.thread.start()
 
-    def ask(self, number: int, loads: Loads) -> None:
-        """Replace the question that waits."""
+    def ask(self, number: int, touch: Touch | None) -> None:
+        """Replace the question that waits; `touch` is the hand's, if it has the tool."""
         with self.wake:
-            self.newest = number, loads
+            self.newest = number, touch
             self.wake.notify()
 
     def close(self) -> None:
@@ -60,13 +62,16 @@ class Referee:
             raise
 
     def _judge(self, theatre: Theatre, scene: Scene) -> None:
-        deformer, last = theatre.deformer("fem", scene), None
+        session = Session(theatre.player("fem", scene))
         while True:
             with self.wake:
                 self.wake.wait_for(lambda: self.closed.is_set() or self.newest is not None)
                 if self.closed.is_set() or self.newest is None:
                     return
-                (number, loads), self.newest = self.newest, None
-            begun = clock.perf_counter()
-            last = deformer.deform(loads, start=start_of(scene, last, loads.times[0]))
-            self.truth = Truth(number, loads, last, clock.perf_counter() - begun)
+                question = self.newest
+            begun, (asked, touch) = clock.perf_counter(), question
+            number, answer = session.towards(asked, touch)
+            self.truth = Truth(number, session.player.loads(number, touch), answer, clock.perf_counter() - begun)
+            with self.wake:
+                if self.newest is question and number == asked:
+                    self.newest = None

@@ -337,3 +337,13 @@ def pushed_effects(anatomy: Anatomy, tissue: Tissue) -> tuple[Effect, ...]:
     """What a tool that pushes on a body of this tissue calls for; sliding where the anatomy has it."""
     slide = (Slide(),) if anatomy.slide_normal.any() else ()
     return (Elasticity(tissue), Held(), *slide, ToolForce())
+
+
+def remember(effects: Iterable[Effect]) -> bool:
+    """Whether an answer depends on the one before: where tools were, velocities, stress that fades, what was cut."""
+    kinds = (Inertia, ToolContact, Retraction, Resection)
+    return any(isinstance(effect, kinds) or (isinstance(effect, Elasticity) and _relaxes(effect)) for effect in effects)
+
+
+def _relaxes(effect: Elasticity) -> bool:
+    return any(tissue.prony for tissue in (effect.default, *effect.regions.values()) if tissue is not None)

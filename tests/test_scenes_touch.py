@@ -7,15 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from theatres import player, theatre_of
-from visitor import wait_for
 
 from scenes.paths import AIR, Touch
-from scenes.play import start_of
-from scenes.referee import Referee
 from scenes.scene import Scene, Viewpoint, find_scene
 from scenes.told import told
 from scenes.truth import truth_of
-from sim.effects import Held, Inertia, Pulsation
+from sim.effects import Held, Pulsation
 from sim.errors import InputError
 from sim.loads import Retracted, Touching
 from sim.tools import distances_to
@@ -88,23 +85,6 @@ class TestRetract:
         held = np.array([frame.time for frame in frames]) >= 1.5
         assert (np.diff(reads[held]) < 0.0).all() and reads[-1] < 0.9 * reads[held][0]
         assert reads[0] == 0.0 and all(frame.deformation.outcome[0].good for frame in frames)
-
-    def test_time_goes_back_where_the_script_begins_again(self, theatre):
-        """What tissue remembers is not undone: a frame before the last one forgets it, on the page and behind it."""
-        scene = small("retract")
-        again = player(theatre, scene, "fem")
-        late, early = (float(time) for time in scene.times[[20, 18]])
-        last = again.draw(20, late, scene.path(late)).deformation
-        back, fresh = (again.draw(18, early, scene.path(early), start).deformation for start in (last, None))
-        assert back.outcome[0].good and np.abs(back.displacement - fresh.displacement).max() < 5e-5
-        assert start_of(replace(scene, effects=(*scene.effects, Inertia())), last, early) is None
-        referee = Referee(theatre, scene)
-        for number in (20, 18):
-            time = float(scene.times[number])
-            referee.ask(number, scene.loads(theatre.site, scene.path(time), time))
-            assert wait_for(lambda number=number: referee.truth is not None and referee.truth.number == number)
-        referee.close()
-        assert referee.failure is None
 
 
 class TestPulsation:

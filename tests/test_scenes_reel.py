@@ -1,0 +1,234 @@
+"""Whatever a visitor does, a frame of the script is that of the straight run; plain statics need no run."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+from theatres import sinking
+from visitor import free_port
+
+from scenes.ablation import without
+from scenes.demo import HAND, SCRIPT, Demo
+from scenes.lying import drained
+from scenes.paths import Touch, lay, press
+from scenes.play import Player
+from scenes.reel import Reel, Session
+from scenes.referee import Referee
+from scenes.scene import SCENES, Scene, Viewpoint, find_scene
+from scenes.surgery import Debulking
+from scenes.theatre import Theatre
+from sim.deformation import Deformation
+from sim.effects import Elasticity, Gravity, Held, Inertia, remember
+from sim.material import Material
+
+FEW = 4
+# Forward, back, round, again, and far.
+ASKED = (0, 1, 5, 4, 12, 0, 7, 7, 3)
+
+
+@pytest.fixture(scope="module")
+def theatre() -> Theatre:
+    """A coarse box: a frame takes milliseconds."""
+    return Theatre(make_box(cells=(6, 6, 4), spacing=12e-3), None, {}, "cpu")
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    """Thirteen frames are less than is kept."""
+    monkeypatch.setattr("scenes.reel.KEPT", FEW)
+
+
+def hasty(name: str, **values: object) -> Scene:
+    """Thirteen frames of a built-in scene, its tool soon 2 mm deep, on few pixels and linear elements."""
+    values = {"path": lay(depth=2e-3, rise=0.2), "duration": 0.4, "element": None} | values
+    return replace(find_scene(name), viewpoint=Viewpoint(width=64, height=48), **values)
+
+
+REMEMBERING = {
+    "tissue that relaxes under a blade": hasty("retract"),
+    "mass under a ball": hasty("palpate", effects=(*find_scene("palpate").effects, Inertia())),
+    "cuts": hasty("resection", surgery=Debulking(times=(0.1, 0.15, 0.2)), lying=drained(0.3)),
+}
+
+
+def same(one: Deformation, other: Deformation) -> bool:
+    """Bit for bit, what is remembered too."""
+    assert set(one.history) == set(other.history)
+    pairs = [(one.displacement, other.displacement), (one.time, other.time)]
+    pairs += [(np.asarray(one.history[name]), np.asarray(other.history[name])) for name in one.history]
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
+def straight(player: Player) -> list[Deformation]:
+    """The answers of the frames one after the other."""
+    last, found = None, []
+    for number in range(len(player.scene.times)):
+        last = player.answer(player.loads(number), last)
+        assert last.outcome[0].good
+        found.append(last)
+    return found
+
+
+def answer(session: Session, number: int, touch: Touch | None = None) -> Deformation:
+    """What it comes to, step by step."""
+    reached, found = session.towards(number, touch)
+    while reached < number:
+        reached, found = session.towards(number, touch)
+    assert reached == number
+    return found
+
+
+class TestReel:
+    def test_a_frame_is_the_sum_of_its_past_and_little_is_run_again(self) -> None:
+        ran: Counter[int] = Counter()
+
+        def step(number: int, before: tuple[int, ...] | None) -> tuple[int, ...]:
+            ran[number] += 1
+            return (*(before or ()), number)
+
+        reel = Reel(100, step)
+        for number in (99, *np.random.default_rng(0).integers(0, 100, 300).tolist()):
+            before, reached = ran.total(), -1
+            while reached != number:
+                reached, found = reel.towards(number)
+                assert found == tuple(range(reached + 1)) and reached <= number
+            assert ran.total() - before < (101 if number == 99 else -(-100 // FEW))
+        assert len(ran) == 100 and len(reel._kept) <= FEW
+
+    def test_one_call_takes_one_step_at_most(self) -> None:
+        ran: list[int] = []
+        reel = Reel(50, lambda number, before: ran.append(number))
+        for calls in range(1, 20):
+            assert reel.towards(40)[0] == calls - 1 and ran == list(range(calls))
+
+
+@pytest.mark.parametrize("name", REMEMBERING)
+def test_frames_in_any_order_are_those_of_the_straight_run(theatre, name):
+    """Of two visitors' sessions in turns, with one solver, a hand in between."""
+    player = theatre.player("fem", REMEMBERING[name])
+    assert player.remembers
+    run = straight(player)
+    one, other = Session(player), Session(player)
+    for number in ASKED:
+        for session, wanted in ((one, number), (other, 12 - number)):
+            assert same(answer(session, wanted), run[wanted])
+        if player.scene.tool is not None:
+            answer(one, number, Touch(0.003, 0.0, depth=2e-3))
+    assert np.abs(run[12].displacement).max() > 1e-4
+
+
+def test_what_went_before_counts(theatre):
+    """Else nothing above would say anything: from rest, or from a later frame's shape, it is another answer."""
+    player = theatre.player("fem", REMEMBERING["tissue that relaxes under a blade"])
+    run = straight(player)
+    alone = player.answer(player.loads(12))
+    assert np.abs(alone.reaction - run[12].reaction)[0, 0, 2] > 0.015 * np.abs(run[12].reaction[0, 0, 2])
+
+
+def test_a_hand_goes_on_from_the_last_answer_a_frame_later(theatre):
+    """Whichever frame its number says: held where it is, tissue goes on relaxing under the tool, and never back."""
+    player = theatre.player("fem", REMEMBERING["tissue that relaxes under a blade"])
+    session = Session(player)
+    run = answer(session, 12)
+    held, reads = player.touch(12), [np.linalg.norm(run.reaction[0, 0, :3])]
+    for number in (12, 12, 3, 0, 9):
+        found = answer(session, number, held)
+        assert found.outcome[0].good
+        reads.append(np.linalg.norm(found.reaction[0, 0, :3]))
+    assert (np.diff(reads) < 0.0).all()
+    once = replace(run, time=run.time - 1.0 / player.scene.frames_per_second)
+    assert same(answer(Session(player), 12), run)
+    first = player.answer(player.loads(12, held), once)
+    assert np.linalg.norm(first.reaction[0, 0, :3]) == reads[1]
+
+
+def test_plain_statics_are_not_run_again(theatre, monkeypatch):
+    """One solve a frame, from whatever was shown last."""
+    player = theatre.player("fem", hasty("press", path=press(0.2, rise=0.2, hold=0.1)))
+    asked: list[Deformation | None] = []
+    solve = player.deformer.deform
+    monkeypatch.setattr(player.deformer, "deform", lambda loads, start=None: asked.append(start) or solve(loads, start))
+    session, last = Session(player), None
+    assert not player.remembers
+    for number in ASKED:
+        reached, found = session.towards(number)
+        assert reached == number and asked[-1] is last and found.outcome[0].good
+        last = found
+    assert len(asked) == len(ASKED)
+
+
+def test_which_scenes_remember() -> None:
+    found = {name: remember(find_scene(name).effects) or bool(find_scene(name).surgery) for name in SCENES}
+    assert {name for name, does in found.items() if does} == {"palpate", "retract", "resection", "pulsation"}
+    relaxing = Material("neo-hookean", 3000.0, 0.45, prony=((0.4, 1.0),))
+    assert remember((Elasticity(None, {1: relaxing}), Held())) and not remember((Elasticity(None), Held()))
+    assert not remember(sinking().effects)
+
+
+class TestPages:
+    @pytest.fixture
+    def pages(self, theatre):
+        effects = (*find_scene("retract").effects, Gravity())
+        scene = hasty("retract", effects=effects, lying=drained(0.3))
+        pages = [Demo(theatre, scene, "fem", "127.0.0.1", free_port()) for _ in range(2)]
+        for page in pages:
+            page.wish.set(plays=False)
+        yield pages
+        for page in pages:
+            page.close()
+
+    def test_two_pages_scrub_switch_and_play_and_show_the_straight_run(self, theatre, pages, monkeypatch):
+        scene = pages[0].stage.scene
+        full = straight(theatre.player("fem", scene))
+        less = straight(theatre.player("fem", without(scene, Gravity())))
+        assert not same(full[6], less[6])
+        shown: dict[Demo, list] = {page: [] for page in pages}
+        show = Demo._show
+        monkeypatch.setattr(Demo, "_show", lambda page, frame, by: shown[page].append(frame) or show(page, frame, by))
+
+        def seen(page: Demo, **wishes: object) -> Deformation:
+            before = len(shown[page])
+            page.wish.set(**wishes)
+            while len(shown[page]) == before:
+                page.run(0.05)
+            return shown[page][-1].deformation
+
+        first, second = pages
+        for number in (5, 2, 12, 0):
+            assert same(seen(first, number=number), full[number])
+            assert same(seen(second, number=12 - number, off=frozenset({"Gravity"})), less[12 - number])
+        seen(first, touch=Touch(depth=3e-3), tool=HAND)
+        assert same(seen(first, tool=SCRIPT, number=6), full[6])
+        assert same(seen(second, number=9, off=frozenset()), full[9])
+        shown[first].clear()
+        first.wish.set(plays=True)
+        while len(shown[first]) < 20:
+            first.run(0.1)
+        assert all(same(frame.deformation, full[frame.number]) for frame in shown[first])
+        assert [frame.number for frame in shown[first][:9]] == [6, 7, 8, 9, 10, 11, 12, 0, 1]
+
+    def test_the_way_is_told(self, pages, monkeypatch):
+        said: list[str] = []
+        monkeypatch.setattr(pages[0].browser, "report", said.append)
+        pages[0].wish.set(number=12)
+        while not said or "converged" not in said[-1]:
+            pages[0].run(0.1)
+        assert "frame 12 depends on those before it: 11 of them are done" in said
+        assert "finite elements' own answer" in said[-1] and "(frame 12, FEM" in said[-1]
+
+
+def test_the_referee_answers_the_straight_run_too(theatre):
+    scene = REMEMBERING["tissue that relaxes under a blade"]
+    full = straight(theatre.player("fem", scene))
+    referee = Referee(theatre, scene)
+    for number in (12, 3, 8):
+        referee.ask(number, None)
+        while referee.truth is None or referee.truth.number != number:
+            assert referee.failure is None and not time.sleep(0.01)
+        assert same(referee.truth.deformation, full[number])
+    referee.close()
