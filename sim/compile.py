@@ -123,7 +123,7 @@ def compile_problem(
                 from .terms.inertia import Inertia as InertiaTerm
                 from .terms.inertia import lumped_mass
 
-                terms.append(InertiaTerm(lumped_mass(effect.density, space), effect.damping, device))
+                terms.append(InertiaTerm(lumped_mass(effect.density, space), effect.damping, space.marks, device))
             case ToolContact() | Retraction():
                 from .terms.contact import contact_of
 

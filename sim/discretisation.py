@@ -56,6 +56,11 @@ class Discretisation:
         """Rest positions (N, 3) [m]."""
         return self.interpolated(self.mesh.nodes)
 
+    @property
+    def marks(self) -> np.ndarray:
+        """What tells each node (N, 2) from all others, whatever is cut: the vertex twice, or the ends of its edge."""
+        return np.concatenate([np.repeat(np.arange(len(self.mesh.nodes))[:, None], 2, axis=1), self.edges])
+
     @cached_property
     def corner_interpolation(self) -> sp.csr_array:
         """(N, C): values at the C nodes that are corners to all nodes, linear along each edge."""

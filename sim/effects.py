@@ -139,8 +139,8 @@ class Resection:
     The wall of the cavity is free surface. What a step loosens (a piece joined by no face to anything held) goes with
     it. `operated.finite_elements` makes what solves it.
 
-    Left out: the stress that the scan's own equilibrium holds, so that without another load nothing moves; terms that
-    remember what elements went through forget it at a cut.
+    What is left remembers what it went through. Left out: the stress that the scan's own equilibrium holds, so that
+    without another load nothing moves.
 
     Parameters
     ----------

@@ -24,8 +24,9 @@ class Elements:
 
     table (T, n) node numbers; gradient (T, q, n, 3) of the shape functions in the rest configuration [1/m];
     weight (T, q) rest volume of each quadrature point [m^3]; nodes, how many nodes the discretisation has;
-    owner (T,) the mesh's tetrahedron whose tissue each element has; size (T,) how many of the n places a row uses,
-    the first ones; None: all.
+    owner (T,) the mesh's tetrahedron whose tissue each element has; marks (T, k) vertices and labels that tell each
+    from all others, whatever is cut from the mesh; size (T,) how many of the n places a row uses, the first ones;
+    None: all.
     """
 
     table: np.ndarray
@@ -33,6 +34,7 @@ class Elements:
     weight: np.ndarray
     nodes: int
     owner: np.ndarray
+    marks: np.ndarray
     size: np.ndarray | None = None
 
     def on(self, nodes: np.ndarray) -> Elements:
@@ -48,7 +50,7 @@ def linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     inverse = np.linalg.inv(jacobian)  # rows: gradients of barycentric coordinates 1, 2, 3
     gradient = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
     weight = mesh.volumes[chosen][:, None]
-    return Elements(tets, gradient[:, None], weight, len(mesh.nodes), np.flatnonzero(chosen))
+    return Elements(tets, gradient[:, None], weight, len(mesh.nodes), np.flatnonzero(chosen), tets)
 
 
 def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> Elements:
@@ -73,7 +75,8 @@ def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray)
             "by its mid-edge nodes: move them towards the middles of their edges."
         )
     gradient = np.einsum("qaj,tqji->tqai", slope, np.linalg.inv(jacobian))
-    return Elements(table, gradient, volume * EIGHT_WEIGHTS / 6.0, len(nodes), np.flatnonzero(chosen))
+    weight = volume * EIGHT_WEIGHTS / 6.0
+    return Elements(table, gradient, weight, len(nodes), np.flatnonzero(chosen), table[:, :4])
 
 
 def quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 
@@ -13,13 +13,15 @@ from .anatomy import Anatomy
 from .deformation import Deformation, joined
 from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
-from .fem import Fem
-from .ladder import LEARNT_KEY
+from .fem import MIDDLES, Fem
 from .loads import Loads, Resected
 from .resection import Remains, bodies
+from .term import Remembering
 
 # The history's key for how many steps (B,) were done.
 DONE = "resection"
+# Shape of a tool's pose.
+POSE = (4, 4)
 # Solvers that are kept.
 KEPT = 4
 
@@ -27,7 +29,8 @@ KEPT = 4
 class Operated:
     """A Deformer: each load case is answered by the finite elements of what is left of the body.
 
-    Vertices of which nothing is left stay where they were in the scan.
+    Vertices of which nothing is left stay where they were in the scan. Histories are those of the whole body, whose
+    elements and nodes that are gone remember nothing.
 
     Parameters
     ----------
@@ -42,6 +45,8 @@ class Operated:
     def __init__(self, bodies: tuple[Remains, ...], make: Callable[[Anatomy], Fem], ahead: bool = False):
         self._bodies = bodies
         self._solver = lru_cache(len(bodies) if ahead else KEPT)(lambda done: make(bodies[done].anatomy))
+        self._marks = lru_cache(None)(lambda done: _marks(self._solver(done)))
+        self._place = lru_cache(None)(lambda done, name: _found(self._marks(0)[name], self._marks(done)[name]))
         for done in range(len(bodies) if ahead else 0):
             self._solver(done)
 
@@ -55,7 +60,7 @@ class Operated:
         return self._bodies[done]
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """As `Fem.deform`; `start` may be an answer after other steps: positions, what nodes remember and tools go on.
+        """As `Fem.deform`; `start` may be an answer after other steps, and what is left goes on from it.
 
         Raises
         ------
@@ -66,36 +71,78 @@ class Operated:
         if (done > most).any():
             raise InputError(f"Resected.done is {done.max()}, but Resection has {most} steps: give at most that.")
         same = np.zeros(len(done), bool) if start is None or DONE not in start.history else start.history[DONE] == done
-        order, parts = [], []
+        order, parts, stages = [], [], []
         for stage, stays in sorted(set(zip(done.tolist(), same.tolist(), strict=True))) or [(most, False)]:
             rows = np.flatnonzero((done == stage) & (same == stays))
-            begun = None if start is None else self._carried(start.rows(rows), stage, stays)
+            begun = None if start is None else self._begun(start.rows(rows), stage, stays)
             answer = self._solver(stage).deform(loads.but(Resected).rows(rows), begun, at)
             order.append(rows)
-            parts.append(self._masked(answer, stage))
-        return _together(parts).rows(np.argsort(np.concatenate(order))) if len(parts) > 1 else parts[0]
+            stages.append(stage)
+            parts.append(self._ended(answer, stage))
+        return self._together(parts, stages).rows(np.argsort(np.concatenate(order))) if len(parts) > 1 else parts[0]
 
     def _done(self, loads: Loads) -> np.ndarray:
         cause = loads.of(Resected)
         return np.full(len(loads), len(self._bodies) - 1) if cause is None else cause.done.astype(int)
 
-    def _carried(self, start: Deformation, stage: int, stays: bool) -> Deformation:
-        """An earlier answer as one of this body: after other steps, what elements remember is another body's."""
-        history = {name: _stripped(value) for name, value in start.history.items() if name != DONE}
-        if not stays:
-            vertex, pose = (len(self.anatomy.mesh.nodes), 3), (4, 4)
-            history = {
-                name: value for name, value in history.items() if value.shape[1:] == vertex or value.shape[2:] == pose
-            }
-        history = {name: value for name, value in history.items() if value.size or not len(start)}
-        return self._masked(replace(start, history=history), stage, marked=False)
+    def _begun(self, start: Deformation, stage: int, stays: bool) -> Deformation:
+        """An answer as one of the body at a stage, which `stays` what it was or was another."""
+        history = dict(start.history) if stays else self._lasting(start.history, stage)
+        history.pop(DONE, None)
+        for name, place in self._places(history, stage).items():
+            if history[name].shape[1] == len(self._marks(0)[name]):  # another body's is refused by who reads it
+                history[name] = history[name][:, place]
+        return replace(start, displacement=self._masked(start, stage), history=history)
 
-    def _masked(self, answer: Deformation, stage: int, marked: bool = True) -> Deformation:
-        """The answer with orphaned vertices at rest; `marked` with the steps that it is of."""
+    def _ended(self, answer: Deformation, stage: int) -> Deformation:
+        """The answer of the body at a stage as one of the whole body, marked with the steps that it is of."""
+        history = {**answer.history, DONE: np.full(len(answer), float(stage))}
+        for name, place in self._places(history, stage).items():
+            own = history[name]
+            history[name] = np.zeros((len(own), len(self._marks(0)[name]), *own.shape[2:]), own.dtype)
+            history[name][:, place] = own
+        return replace(answer, displacement=self._masked(answer, stage), history=history)
+
+    def _masked(self, answer: Deformation, stage: int) -> np.ndarray:
+        """Displacements of an answer with orphaned vertices at rest."""
         orphaned = self._bodies[stage].anatomy.orphaned[answer.nodes]
-        displacement = np.where(orphaned[:, None], 0.0, answer.displacement)
-        history = {**answer.history, DONE: np.full(len(answer), float(stage))} if marked else answer.history
-        return replace(answer, displacement=displacement, history=history)
+        return np.where(orphaned[:, None], 0.0, answer.displacement)
+
+    def _together(self, parts: list[Deformation], stages: list[int]) -> Deformation:
+        """Answers of the bodies at some stages; where one has no such elements at all, they remember nothing."""
+        histories = [self._lasting(part.history, stage) for part, stage in zip(parts, stages, strict=True)]
+        shapes = {name: value.shape[1:] for history in histories for name, value in history.items()}
+        whole = [
+            {name: np.zeros((len(part), *shape)) for name, shape in shapes.items()} | history
+            for part, history in zip(parts, histories, strict=True)
+        ]
+        return joined([replace(part, history=history) for part, history in zip(parts, whole, strict=True)])
+
+    def _lasting(self, history: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
+        """What means the same in another body: memories of elements and nodes, poses of tools, steps done."""
+        marks = self._marks(stage)
+        return {
+            name: value for name, value in history.items() if name in marks or name == DONE or value.shape[2:] == POSE
+        }
+
+    def _places(self, history: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
+        """Of histories of elements and nodes, by name: which rows (n,) of the whole body's are those of a stage's."""
+        marks = self._marks(stage) if stage else {}
+        return {name: self._place(stage, name) for name in history if name in marks}
+
+
+def _marks(fem: Fem) -> dict[str, np.ndarray]:
+    """Of each history whose rows are elements or nodes: what tells them (n, k) from all others, whatever is cut."""
+    terms = fem.problem.terms
+    return {MIDDLES: fem.space.edges} | {term.name: term.marks for term in terms if isinstance(term, Remembering)}
+
+
+def _found(whole: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Where (n,) each of some rows (n, k) is in the whole (m, k)."""
+    _, number = np.unique(np.concatenate([whole, some]), axis=0, return_inverse=True)
+    known, asked = np.split(number.ravel(), [len(whole)])
+    order = np.argsort(known)
+    return order[np.searchsorted(known, asked, sorter=order)]
 
 
 def finite_elements(
@@ -140,32 +187,3 @@ def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effec
         return replace(effect, regions={label: law for label, law in effect.regions.items() if label not in gone})
 
     return tuple(effect for effect in map(kept, effects) if effect is not None)
-
-
-def _together(parts: list[Deformation]) -> Deformation:
-    """Answers of several bodies; what fewer elements remember is filled up to one shape, as `_stripped` takes off."""
-    shapes: dict[str, list[tuple[int, ...]]] = {}
-    for part in parts:
-        for name, value in part.history.items():
-            if not name.startswith(LEARNT_KEY):
-                shapes.setdefault(name, []).append(value.shape[1:])
-
-    def filled(part: Deformation, name: str) -> np.ndarray:
-        whole = np.full((len(part), *np.max(shapes[name], axis=0).astype(int)), np.nan)
-        value = part.history.get(name)
-        if value is not None:
-            whole[tuple(map(slice, value.shape))] = value
-        return whole
-
-    return joined([replace(part, history={name: filled(part, name) for name in shapes}) for part in parts])
-
-
-def _stripped(value: np.ndarray) -> np.ndarray:
-    """History (B, ...) without the rows of each axis but the first that `_together` filled up."""
-    if not np.isnan(value).any():
-        return value
-    known = ~np.isnan(value)
-    for axis in range(1, value.ndim):
-        some = known.any(axis=tuple(other for other in range(value.ndim) if other != axis))
-        value, known = (np.take(array, np.flatnonzero(some), axis=axis) for array in (value, known))
-    return value

@@ -16,19 +16,20 @@ from .mesh import EDGES, TetMesh, row_keys
 
 def edge_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     """One element for each edge and region, over the `chosen` (T,) bool tetrahedra round it."""
-    ends = mesh.tets[chosen][:, EDGES].reshape(-1, 2)
-    return _averaged(mesh, chosen, row_keys(ends).reshape(-1, len(EDGES)))
+    ends = np.sort(mesh.tets[chosen][:, EDGES].reshape(-1, 2))
+    return _averaged(mesh, chosen, row_keys(ends).reshape(-1, len(EDGES)), ends)
 
 
 def node_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     """One element for each node and region, over the `chosen` (T,) bool tetrahedra round it."""
-    return _averaged(mesh, chosen, mesh.tets[chosen].astype(np.int64))
+    corners = mesh.tets[chosen].astype(np.int64)
+    return _averaged(mesh, chosen, corners, corners.reshape(-1, 1))
 
 
-def _averaged(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray) -> Elements:
+def _averaged(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray, vertices: np.ndarray) -> Elements:
     """One element for each distinct number in `key` (T, k), where tetrahedron t lends V_t / k to each of its numbers.
 
-    Regions are never mixed: their tissues differ.
+    `vertices` (T k, n) are those that each number stands for. Regions are never mixed: their tissues differ.
     """
     linear = linear_elements(mesh, chosen)
     count, lent = key.shape
@@ -42,13 +43,13 @@ def _averaged(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray) -> Elements:
     gradient = (share / volume[domain])[:, None, None] * linear.gradient[tet, 0]
     pair, place = np.unique(domain[:, None] * np.int64(linear.nodes) + linear.table[tet], return_inverse=True)
     summed = np.column_stack([np.bincount(place.ravel(), gradient[..., k].ravel()) for k in range(3)])
-    owner, node = divmod(pair, linear.nodes)
-    size = np.bincount(owner)
+    domain, node = divmod(pair, linear.nodes)
+    size = np.bincount(domain)
     column = np.arange(len(pair)) - np.repeat(np.cumsum(size) - size, size)
     table = np.zeros((len(size), size.max(initial=0)), np.int32)
-    table[owner, column] = node
+    table[domain, column] = node
     spread = np.zeros((*table.shape, 3))
-    spread[owner, column] = summed
-    return Elements(
-        table, spread[:, None], volume[:, None], linear.nodes, linear.owner[first // lent], size.astype(np.int32)
-    )
+    spread[domain, column] = summed
+    owner = linear.owner[first // lent]
+    marks = np.column_stack([vertices[first], mesh.region[owner]])
+    return Elements(table, spread[:, None], volume[:, None], linear.nodes, owner, marks, size.astype(np.int32))

@@ -159,6 +159,16 @@ class Paced(Term, Protocol):
         ...
 
 
+@runtime_checkable
+class Remembering(Term, Protocol):
+    """A Term whose history, if it has any, is of elements or nodes: a row (B, n, ...) for each."""
+
+    @property
+    def marks(self) -> np.ndarray:
+        """Vertices and other numbers (n, k) that tell each row from all others, whatever is cut from the mesh."""
+        ...
+
+
 class Barrier(Term, Protocol):
     """A Term of bodies that tissue touches: they keep a gap, which a descent may open first; some move, as tools do."""
 

@@ -102,6 +102,13 @@ class Elasticity:
         self._at: wp.array | None = None
         self._definite: wp.array | None = None
 
+    @property
+    def marks(self) -> np.ndarray:
+        """Of each point (T q, k): its element's, and its number there."""
+        elements = self._rest[0]
+        count, points = elements.weight.shape
+        return np.column_stack([np.repeat(elements.marks, points, axis=0), np.tile(np.arange(points), count)])
+
     def begin(self, cases: Cases) -> None:
         """Take what varies, if anything does."""
         if self._sources:

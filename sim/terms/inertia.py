@@ -108,6 +108,8 @@ class Inertia:
         (N,) [kg].
     damping
         [1/s].
+    marks
+        (N, k) numbers that tell each node from all others, whatever is cut.
     device
         Where its arrays live.
     """
@@ -115,9 +117,9 @@ class Inertia:
     name = "inertia"
     constant, passive, steep = False, False, False
 
-    def __init__(self, mass: np.ndarray, damping: float, device: Device):
+    def __init__(self, mass: np.ndarray, damping: float, marks: np.ndarray, device: Device):
         self._device, self._kernels = device, kernels_of(device)
-        self._damping, self._masses = damping, mass
+        self._damping, self._masses, self.marks = damping, mass, marks
         self._mass = device.array(mass)
         self._weight = Rooms(lambda columns: device.zeros(columns), device)
         self._aim = Rooms(lambda columns: device.zeros(3 * len(mass), columns), device)

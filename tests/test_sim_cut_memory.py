@@ -1,0 +1,115 @@
+"""What is left of a body after a cut goes on remembering what it went through, as if it had always been alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boxes import box, hold, quadratic
+from cuts import BODY, EFFECTS, MESH, STEPS, TIGHT, lying
+
+from sim.deformation import Deformation, guess
+from sim.discretisation import ELEMENTS
+from sim.effects import Elasticity, Gravity, Held, Inertia, Resection
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Prescribed, Resected
+from sim.material import Material
+from sim.operated import finite_elements
+
+RELAXING = Material("neo-hookean", 3000.0, 0.4, prony=((0.5, 0.2), (0.2, 5.0)))
+
+
+@pytest.mark.parametrize("element", ["p1", "p2"])
+def test_batches_after_different_steps_remember_as_each_by_itself(element: str) -> None:
+    """What elements went through is kept case by case: another body's beside it, or another's cut, takes none away."""
+    fem = finite_elements(BODY, (*EFFECTS[1:], Elasticity(RELAXING), Inertia(), STEPS), TIGHT, "cpu", element=element)
+    frames = [(0, 1), (1, 1), (1, 2)]
+
+    def at(frame: int, rows: list[int]) -> Loads:
+        asked = lying([frames[frame][row] for row in rows])
+        return Loads(asked.causes, np.full(len(rows), 0.1 * (frame + 1)))
+
+    whole, alone = None, [None, None]
+    for frame in range(len(frames)):
+        whole = fem.deform(at(frame, [0, 1]), whole)
+        for row in (0, 1):
+            alone[row] = fem.deform(at(frame, [row]), alone[row])
+            assert np.abs(whole.displacement[row] - alone[row].displacement[0]).max() < 1e-9
+    assert np.abs(whole.displacement).max() > 1e-4
+
+
+class TestMemory:
+    """A column in a tube: layers that relax, one that does not, and above a plane that is held what bears nothing."""
+
+    COLUMN = box((1, 1, 4), 0.04)
+    LAYER = (COLUMN.nodes[COLUMN.tets].mean(axis=1)[:, 2] // 0.01).astype(int)
+    FAR = Resection((tuple(np.flatnonzero(LAYER == 3).tolist()),))
+    TIMES = np.array([0.0, 0.05, 0.3, 0.7, 2.0, 9.0])
+
+    def run(self, element: str, regions: dict, cut: int, forgets: bool = False) -> list[Deformation]:
+        """Held stretched by a tenth; before frame number `cut` the far layer is there, and then it is not."""
+        mesh = replace(self.COLUMN, region=np.where(self.LAYER == 1, 2, 1))
+        mesh = quadratic(mesh) if element == "p2" else mesh
+        height = mesh.nodes[:, 2]
+        held = np.column_stack([np.ones((len(height), 2), bool), (height < 1e-9) | (np.abs(height - 0.02) < 1e-9)])
+        effects = (Elasticity(RELAXING, regions), Held(), self.FAR)
+        made = finite_elements(hold(mesh, held), effects, TIGHT, "cpu", element=element)
+        lifted = np.where(height[:, None] > 0.019, [0.0, 0.0, 2e-3], 0.0)[None]
+        found, last = [], None
+        for frame, time in enumerate(self.TIMES):
+            done = np.array([int(frame >= cut)])
+            last = made.deform(Loads((Prescribed(lifted), Resected(done)), np.array([time])), last)
+            assert last.outcome[0].good
+            found.append(last)
+            last = replace(last, history={}) if forgets and frame == cut - 1 else last
+        return found
+
+    @pytest.mark.parametrize("element", ELEMENTS)
+    def test_the_rest_relaxes_on_as_if_nothing_had_been_cut(self, element: str) -> None:
+        """The seam of a layer that relaxes with one that does not creeps; had it forgotten, it would be elsewhere."""
+        regions = {2: Material("neo-hookean", 3000.0, 0.4)}
+        cut, whole, forgetful = (self.run(element, regions, *how) for how in ((3,), (9,), (3, True)))
+        gone = ~cut[-1].displacement[0].any(axis=1) & whole[-1].displacement[0].any(axis=1)
+        crept = np.abs(whole[-1].displacement - whole[0].displacement).max()
+        for frame in range(3, len(self.TIMES)):
+            apart = np.abs(whole[frame].displacement - cut[frame].displacement)[0, ~gone].max()
+            assert apart < 1e-8 * crept
+        assert np.abs(whole[3].displacement - forgetful[3].displacement)[0, ~gone].max() > 0.1 * crept
+        assert crept > 5e-5 and gone.sum() == (18 if element == "p2" else 4)
+
+    @pytest.mark.parametrize("element", ELEMENTS)
+    def test_what_fades_follows_its_series(self, element: str) -> None:
+        """Of a held stretch each part of the stress is g exp(-t / tau) of what it was at once, across the cut."""
+        found = self.run(element, {}, 3)
+        (name,) = (name for name in found[0].history if "visco" in name)
+        at_once = found[0].history[name][0, :, :6]
+        stretched = np.abs(at_once).max(axis=1) > 1.0
+        assert stretched.sum() >= 6
+        for answer, time in zip(found, self.TIMES, strict=True):
+            left = answer.history[name][0, stretched].reshape(stretched.sum(), 3, 6)
+            for part, (share, tau) in enumerate(RELAXING.prony, start=1):
+                expected = share * np.exp(-time / tau) * at_once[stretched]
+                np.testing.assert_allclose(left[:, part], expected, atol=1e-6 * np.abs(at_once).max())
+
+    def test_where_nothing_is_cut_it_is_the_plain_run(self) -> None:
+        """Bit for bit."""
+        effects = (Elasticity(RELAXING), Held(), Gravity(direction=(0.0, 0.0, -1.0)), Inertia())
+        plain, made = Fem(BODY, effects, TIGHT, "cpu"), finite_elements(BODY, (*effects, STEPS), TIGHT, "cpu")
+        one = other = None
+        for time in (0.01, 0.02, 0.05):
+            loads = replace(lying([0]), time=np.array([time]))
+            one, other = plain.deform(loads.but(Resected), one), made.deform(loads, other)
+            np.testing.assert_array_equal(one.displacement, other.displacement)
+            assert {"inertia", "viscoelasticity neo-hookean"} <= set(one.history) == set(other.history) - {"resection"}
+            for name, value in one.history.items():
+                np.testing.assert_array_equal(value, other.history[name])
+
+    def test_a_history_of_another_body_is_a_sentence(self) -> None:
+        made = finite_elements(BODY, (Elasticity(RELAXING), Held(), STEPS), TIGHT, "cpu")
+        strange = replace(
+            guess(np.zeros((1, len(MESH.nodes), 3))), history={"viscoelasticity neo-hookean": np.ones((1, 7, 18))}
+        )
+        with pytest.raises(InputError, match="start from an answer of the same mesh"):
+            made.deform(Loads((Resected(np.array([1])),)), strange)
