@@ -1,0 +1,110 @@
+"""Under loads that stay, with mass, no built-in scene gains energy, be its effects what they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from conftest import make_box
+
+from scenes.scene import SCENES, Scene, find_scene
+from scenes.site import site_of
+from sim.accuracy import Accuracy
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, guess
+from sim.effects import Effect, Elasticity, Held, Inertia, Pulsation, Resection, Wave
+from sim.fem import Fem
+from sim.loads import Loads, Resected
+from sim.resection import bodies
+from sim.term import Cases
+from sim.terms.inertia import lumped_mass
+
+TIGHT = Accuracy(tolerance=1e-10)
+# When the load of each scene is taken that then stays [s]: something acts, and tools are in the tissue.
+TAKEN = {name: 2.0 for name in SCENES} | {"retract": 0.8, "brain_shift": 5.0, "resection": 3.0, "pulsation": 3.0}
+# How swollen tissue is as the pulse stands still: it takes weeks for one beat.
+STILL, LATE = 1e-6, 2.5e5
+STEPS = 12
+
+
+def sliding_box() -> Anatomy:
+    """A coarse box with an opening on top, held below, that slides in its skull."""
+    made = make_box(cells=(6, 6, 4), spacing=12e-3)
+    nodes = made.mesh.nodes
+    low, high = nodes.min(axis=0), nodes.max(axis=0)
+    normal = np.where((nodes[:, 2:] == high[2]) & ~made.craniotomy[:, None], [0.0, 0.0, 1.0], 0.0)
+    for axis in (0, 1):
+        for side, way in ((low, -1.0), (high, 1.0)):
+            normal[nodes[:, axis] == side[axis]] = way * np.eye(3)[axis]
+    floor = nodes[:, 2] == low[2]
+    return replace(made, held=np.repeat(floor[:, None], 3, axis=1), slide_normal=np.where(floor[:, None], 0.0, normal))
+
+
+BODY = sliding_box()
+
+
+def posed(scene: Scene) -> tuple[Anatomy, tuple[Effect, ...], Loads, Deformation]:
+    """The body, what acts without mass, the load that stays, and what the body starts from, at rest."""
+    effects, time = scene.effects_on(BODY), TAKEN[scene.name]
+    site = site_of(BODY)
+    loads = scene.loads(site, scene.path(time), time)
+    body, start = BODY, guess(np.zeros((1, len(BODY.mesh.nodes), 3)))
+    if scene.surgery is not None:  # as it was before the last cut
+        stages, done = bodies(BODY, effects), scene.surgery.done(time)
+        effects = (*(effect for effect in effects if not isinstance(effect, Held | Resection)), Held())
+        loads, body = loads.but(Resected), stages[done].anatomy
+        before = Fem(stages[done - 1].anatomy, effects, TIGHT, "cpu").deform(loads)
+        start = guess(np.where(body.orphaned[:, None], 0.0, before.displacement))
+    if any(isinstance(effect, Pulsation) for effect in effects):
+        start = replace(start, time=np.array([LATE]))
+    return body, tuple(map(stilled, effects)), loads, start
+
+
+def stilled(effect: Effect) -> Effect:
+    """An effect whose doings depend on the time, with the same doings at any time."""
+    if not isinstance(effect, Pulsation):
+        return effect
+    return replace(effect, cardiac=Wave(STILL, effect.cardiac.amplitude), respiratory=Wave(STILL, 1e-3))
+
+
+def potential(fem: Fem, loads: Loads, answer: Deformation) -> float:
+    """What is stored [J]: of tissue, barriers and the loads' work, of relaxing tissue as its small-strain model has it.
+
+    Springs of moduli g_i mu beside a spring: e:e mu (1 - sum g) + sum mu g_i |e - a_i|^2, with 2 mu e = S and
+    2 mu g_i (e - a_i) = H_i; all but sum mu g_i |a_i|^2 is the problem's own energy where no time passes.
+    """
+    now = Cases(Loads(loads.causes, answer.time), answer.time, answer.history, answer.displacement)
+    fem.problem.begin(now)
+    out = wp.zeros(1, dtype=wp.float64, device="cpu")
+    for term in fem.problem.terms:
+        if term.name != "inertia":
+            term.energy(fem.problem.device.array(answer.displacement.reshape(-1, 1)), out)
+    stored = float(out.numpy()[0])
+    tissue = next(effect.default for effect in fem.effects if isinstance(effect, Elasticity))
+    assert tissue is not None
+    for name in (name for name in answer.history if name.startswith("visco")):
+        S, *H = np.moveaxis(answer.history[name][0].reshape(-1, 1 + len(tissue.prony), 6), 1, 0)
+        for (share, _), left in zip(tissue.prony, H, strict=True):
+            square = (left - share * S) ** 2 @ [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]
+            stored += float(square @ BODY.mesh.volumes) / (4.0 * share * tissue.lame[0])
+    return stored
+
+
+@pytest.mark.parametrize(("step", "damping"), [(1e-3, 0.0), (1e-2, 0.0), (1e-2, 5.0)])
+@pytest.mark.parametrize("name", SCENES)
+def test_energy_does_not_grow(name: str, step: float, damping: float) -> None:
+    scene = find_scene(name)
+    body, effects, loads, answer = posed(scene)
+    fem = Fem(body, (*effects, Inertia(damping=damping)), TIGHT, "cpu", element=scene.element)
+    mass, begun = lumped_mass(Inertia().density, fem.space), answer.time
+    kinetic, stored = [], []
+    for number in range(1, STEPS + 1):
+        answer = fem.deform(Loads(loads.causes, begun + number * step), answer)
+        assert answer.outcome[0].good
+        kinetic.append(0.5 * float((mass[:, None] * answer.history["inertia"][0] ** 2).sum()))
+        stored.append(potential(fem, loads, answer))
+    total = np.add(kinetic, stored)
+    span = total[0] - total[-1]
+    assert np.diff(total).max() < 1e-7 * span and span > 1e-8 and max(kinetic) > 0.1 * span
