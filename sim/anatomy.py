@@ -108,6 +108,12 @@ class Anatomy:
         return surface[self.craniotomy[surface].all(axis=1)]
 
     @cached_property
+    def bare(self) -> np.ndarray:
+        """(S,) bool: the surface's triangles that are neither held nor slide whole: tools may touch them."""
+        covered = np.logical_or(self.held.any(axis=1), self.slide_normal.any(axis=1))
+        return np.logical_not(covered[self.mesh.surface].all(axis=1))
+
+    @cached_property
     def digest(self) -> str:
         """Hash of the mesh and its boundary conditions."""
         return digest_of(*self.mesh.arrays, self.held, self.slide_normal, self.craniotomy)

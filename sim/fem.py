@@ -251,7 +251,7 @@ class Fem:
             on_device = device.array(force)
             self.problem.constraint.project(on_device)
             answers[some] = self._at_rest(on_device).numpy().T
-        return Reading.through(answers, device)
+        return Reading(answers, device)
 
     def series(self, loads: Loads, orders: int, reading: Reading, sizes: int = 1) -> np.ndarray:
         """Power series (G, terms, r) of what is read of the answers, in the sizes of the loads, as far as it converges.

@@ -8,7 +8,7 @@ of m loads order k is a form of degree k, told by as many directions (s_1 ... s_
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -91,27 +91,28 @@ class Reading:
 
     Parameters
     ----------
-    count
-        r.
-    times
-        From forces (3N, b) [N] to the shares (r, b) of the motions that the stiffness at rest answers with.
+    answers
+        (r, 3N): motions that the stiffness at rest, which is symmetric, answers with to the shares taken for forces.
     device
         Where the forces are.
     """
 
-    count: int
-    times: Callable[[wp.array, wp.array], None]
+    answers: np.ndarray
     device: Device
 
-    @classmethod
-    def through(cls, answers: np.ndarray, device: Device) -> "Reading":
-        """Of `answers` (r, 3N) of the stiffness at rest, which is symmetric, to the shares taken for forces."""
-        return cls(len(answers), product_with(answers, device), device)
+    @property
+    def count(self) -> int:
+        """r."""
+        return len(self.answers)
+
+    @cached_property
+    def _times(self) -> Callable[[wp.array, wp.array], None]:
+        return product_with(self.answers, self.device)
 
     def of(self, force: wp.array) -> np.ndarray:
         """Shares (b, r) of the answers to forces (3N, b) [N]."""
         out = self.device.zeros(self.count, force.shape[1])
-        self.times(force, out)
+        self._times(force, out)
         return out.numpy().T
 
 

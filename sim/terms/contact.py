@@ -180,8 +180,7 @@ def contact_of(
     """The term of an effect on tissue with a shear modulus [Pa]."""
     contact = isinstance(effect, ToolContact)
     name, tools = ("tool contact", effect.tools) if contact else ("retraction", (effect.blade,))
-    covered = np.logical_or(anatomy.held.any(axis=1), anatomy.slide_normal.any(axis=1))
-    triangles = space.surface[~covered[space.mesh.surface].all(axis=1)]
+    triangles = space.surface[anatomy.bare]
     if not len(triangles):
         raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is held or slides.")
     points, reach = space.nodes[np.unique(triangles)], _reach(space.nodes, triangles)
