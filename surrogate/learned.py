@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from sim.anatomy import Anatomy
 from sim.deformation import Cost, Deformation, Outcome
@@ -158,6 +159,12 @@ class Learned:
             displacement, excess, promised = self._swift.answer(pushed)
             return predicted(displacement, nodes, loads, (excess > 0.0,), begun, promised)
         self._demand_known(nodes)
+        # Threads of BLAS wait for one another, ages where something else runs on their cores.
+        with blas().limit(limits=1 if len(loads) == 1 else None, user_api="blas"):
+            return self._summed(loads, pushed, nodes, begun)
+
+    def _summed(self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float) -> Deformation:
+        """The sum of the parts, asked at `begun` [s]."""
         magnitude, direction = directions(pushed)
         # Beyond the taught forces the response stays what it was at the nearest of them.
         within = np.clip(magnitude, *self.envelope.force)
@@ -206,6 +213,12 @@ class Learned:
         if self.bounds is None:
             raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
         return answer.bound[0][:, None] * self.bounds.profile
+
+
+@cache
+def blas() -> ThreadpoolController:
+    """Of the libraries that are loaded: to look for them takes a millisecond."""
+    return ThreadpoolController()
 
 
 def predicted(

@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from sim.accuracy import REFERENCE
 from sim.effects import pushed_effects
@@ -19,8 +18,10 @@ from sim.loads import Pushed
 from sim.material import tissue_from_json
 
 from .ann import Ann
+from .condense import condensed, side_by_side
+from .contact import Contact
 from .dataset import Dataset
-from .encode import ENCODERS, Basis, directions, reduce
+from .encode import ENCODERS, Basis, directions, reduce, tool_features
 from .gp import Gp
 from .learned import Part, only_pushed
 from .linear import Linear
@@ -40,8 +41,10 @@ LEARNT: dict[str, tuple[str, Callable[[], Regressor]]] = {
     "gp": ("tool", Gp),
     "residual": ("tool", Ann),
 }
-# Those that poses teach: where the ball is stands for what it presses with, and there is no compliance to add to.
+# Those that poses teach: where the ball is stands for what it presses with.
 POSED = ("gp", "ann", "svr")
+# The same, of those that ask the finite elements how linear tissue gives; the second learns what that leaves.
+TOUCHED = ("contact", "contact-gp")
 # Those that ask the finite elements for their series, of which the second learns what it leaves.
 EXPANDED = ("series", "series-gp")
 # Share of the responses that a learner's basis may lose, and its most modes; the same of the tables, and of the series.
@@ -71,7 +74,7 @@ class Lesson:
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """What a data set's finite elements say without learning: compliance, and power series; made once, when asked for.
+    """What a data set's finite elements say without learning: compliance, power series, contact; made when asked for.
 
     The series is tabulated in wide bases, of what all loads do, that the basis of any lesson nearly lies in: what a
     table holds does not depend on the lesson, and grows neither with the tumour nor with the cortex.
@@ -149,6 +152,17 @@ class Expansion:
             found.append(Series.restored(exact.state()))  # what is used is what can be stored
         return found
 
+    @cached_property
+    def contact(self) -> tuple[Contact, list[Basis]]:
+        """The ball on linear tissue, and the bases of tumour and cortex whose coefficients it answers with.
+
+        Raises
+        ------
+        InputError
+            Data that do not say what tissue they are of.
+        """
+        return condensed(self._fem(), [some for some in (self.tumour, self.cortex) if len(some)])
+
     def _compliance(self, nodes: np.ndarray) -> Part:
         """The compliance table of some vertices, from the unit responses, in as many modes as it needs."""
         response = self.data.unit_response(nodes)
@@ -170,8 +184,8 @@ class Expansion:
                 modes = [file[f"arr_{k}"] for k in range(1, len(nodes) + 1)]
                 return [Basis(*each) for each in zip(nodes, modes, strict=True)], file["arr_0"]
         fem, wide = self._fem(), self._wide()
-        modes = np.asarray(block_diag(*(basis.modes for basis in wide))).reshape(-1, sum(map(len, nodes)), 3)
-        reading = fem.reading(np.concatenate(nodes), modes)
+        whole = side_by_side(wide)
+        reading = fem.reading(whole.nodes, whole.modes.reshape(len(whole.modes), -1, 3))
         table = tabulated(fem, self.patch, self._radii, reading, self.progress)
         if self.kept is not None:
             with written_whole(self.kept, ".npz") as partial:
@@ -193,8 +207,8 @@ class Expansion:
         said = self.data.provenance
         if "tissue" not in said:
             raise InputError(
-                f"{self.data.path}: does not say what tissue it is of, so no series can be had of it: choose other "
-                "learners, or simulate anew."
+                f"{self.data.path}: does not say what tissue it is of, so no series or contact can be had of it: "
+                "choose other learners, or simulate anew."
             )
         effects = pushed_effects(self.data.anatomy, tissue_from_json(said["tissue"]))
         return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=said.get("element"))
@@ -239,6 +253,11 @@ def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
         return (tumour, learnt, *cortex, left)
     if name == "linear":
         return (known.table, *known.cortex_table)
+    if name in TOUCHED:
+        contact, left = _touched(known, lesson)
+        if name == "contact":
+            return (contact,)
+        return (contact, *(_taught(LEARNT["gp"], (), *each[:1], known.patch, lesson.loads, each[1]) for each in left))
     if known.data.ball is not None:
         both = ((known.tumour, lesson.tumour), (known.cortex, lesson.cortex))
         return tuple(
@@ -247,6 +266,18 @@ def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
     before = (known.table,) if name == "residual" else ()
     learnt = _taught(LEARNT[name], before, known.tumour, known.patch, lesson.loads, lesson.tumour)
     return (*before, learnt, *known.cortex_table)
+
+
+def _touched(known: Expansion, lesson: Lesson) -> tuple[Part, list[tuple[np.ndarray, np.ndarray]]]:
+    """The ball on tissue that stiffens as a lesson has it, and what that leaves of it: vertices, and (B, n, 3) [m]."""
+    contact, bases = known.contact
+    features, size = tool_features(known.patch, lesson.loads), directions(lesson.loads)[0][:, None, None]
+    truth = [lesson.tumour, lesson.cortex][: len(bases)]
+    coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
+    alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
+    part = Part("tool", contact.taught(features, coefficients, alike), side_by_side(bases))
+    answered = np.split(size * part.response(features), [len(known.tumour)], axis=1)
+    return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
 
 
 def _taught(

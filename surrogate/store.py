@@ -20,6 +20,7 @@ from sim.mesh import digest_of
 from .ann import Ann
 from .bayesian import Bayesian
 from .bound import Bound
+from .contact import Contact
 from .encode import Basis
 from .envelope import Envelope
 from .gp import Gp
@@ -40,8 +41,8 @@ REGRESSORS: dict[str, type[Regressor]] = {
     "gp": Gp,
     "bayesian": Bayesian,
 }
-# These two know the tool's features, and their meaning.
-FITTED: dict[str, type[Fitted]] = {**REGRESSORS, "series": Series, "remainder": Remainder}
+# These know the tool's features, and their meaning.
+FITTED: dict[str, type[Fitted]] = {**REGRESSORS, "series": Series, "remainder": Remainder, "contact": Contact}
 
 
 def save(path: str | Path, models: Mapping[str, Learned]) -> None:

@@ -18,12 +18,12 @@ from .encode import directions
 from .envelope import Envelope, envelope_of, measured
 from .indentation import indented
 from .learned import Learned, only_pushed
-from .parts import EXPANDED, LEARNT, POSED, Classroom, Expansion, Lesson, parts_of
+from .parts import EXPANDED, LEARNT, POSED, TOUCHED, Classroom, Expansion, Lesson, parts_of
 from .patch import Patch, nearest
 from .score import Score, errors, score
 from .split import APART, MOST_APART, Split, leave_discs_out
 
-LEARNERS = ("linear", *LEARNT, *EXPANDED)
+LEARNERS = ("linear", *LEARNT, *EXPANDED, *TOUCHED)
 # Fewer could not promise 95 in 100.
 FEWEST_APART = 19
 
@@ -48,10 +48,9 @@ class Trained:
 
 
 def learners_for(data: Dataset) -> tuple[str, ...]:
-    """All that a data set can teach: series need finite elements, of a tissue that the data names, and forces."""
-    if data.ball is not None:
-        return POSED
-    return tuple(name for name in LEARNERS if name not in EXPANDED or "tissue" in data.provenance)
+    """All that a data set can teach: series and contact need finite elements, of a tissue that the data names."""
+    told = "tissue" in data.provenance
+    return tuple(name for name in _kinds(data) if told or name not in (*EXPANDED, *TOUCHED))
 
 
 def train(
@@ -84,17 +83,19 @@ def train(
     Raises
     ------
     InputError
-        Unknown learners, or such as poses do not teach, nothing to teach, data with other causes than `Pushed` or the
-        `Touching` of a ball, an anatomy without tumour, too few loads, or unit responses that did not converge.
+        Unknown learners, or such as loads of the data's kind do not teach, nothing to teach, data with other causes
+        than `Pushed` or the `Touching` of a ball, an anatomy without tumour, too few loads, or unit responses that did
+        not converge.
     """
     wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
     unknown = [name for name in wanted if name not in LEARNERS]
     if unknown or not wanted:
         raise InputError(f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {', '.join(LEARNERS)}.")
-    strange = [name for name in wanted if data.ball is not None and name not in POSED]
+    strange = [name for name in wanted if name not in _kinds(data)]
     if strange:
         raise InputError(
-            f"{data.path}: holds poses, of which {', '.join(strange)} cannot be had: choose from {', '.join(POSED)}."
+            f"{data.path}: holds {'pushes' if data.ball is None else 'poses'}, of which {', '.join(strange)} cannot be "
+            f"had: choose from {', '.join(_kinds(data))}."
         )
     if most is not None and most < 1:
         raise InputError(f"{most} loads teach nothing: give at least 1.")
@@ -158,6 +159,11 @@ def train(
         progress(name)
     motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
     return Trained(models, tuple(scores), split, motion, int(apart.sum()), len(lessons[-1].loads.point), left_out)
+
+
+def _kinds(data: Dataset) -> tuple[str, ...]:
+    """Those that loads of the data's kind can teach."""
+    return ("linear", *LEARNT, *EXPANDED) if data.ball is None else (*TOUCHED, *POSED)
 
 
 def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> Learned:

@@ -203,7 +203,9 @@ def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(train
 
 
 def test_what_poses_cannot_teach_is_refused(data: Dataset, box: Anatomy) -> None:
-    with pytest.raises(InputError, match="holds poses, of which linear, series cannot be had: choose from gp"):
+    with pytest.raises(
+        InputError, match="poses, of which linear, series cannot be had: choose from contact, contact-gp, gp"
+    ):
         train(data, ["linear", "gp", "series"])
     with pytest.raises(InputError, match="no ball stands for the preset spatula: choose one of palpation"):
         draw_poses("spatula", box, 2, 0)

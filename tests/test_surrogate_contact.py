@@ -1,0 +1,221 @@
+"""A ball on condensed linear tissue: what it must obey, whatever else answers the same, and what is learnt on top."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim.accuracy import REFERENCE
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, Outcome
+from sim.effects import Elasticity, Held, NodalForce, ToolContact, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Nodal
+from sim.material import Material, tissue_to_json
+from surrogate.condense import condensed, unit_responses
+from surrogate.contact import THICKER, Contact, nearest_shares
+from surrogate.dataset import Dataset, read_dataset
+from surrogate.encode import Basis, tool_features
+from surrogate.indentation import indented
+from surrogate.parts import TOUCHED
+from surrogate.patch import barycentric_lattice, open_patch
+from surrogate.poses import ball_of, draw_poses
+from surrogate.score import errors
+from surrogate.simulate import simulate
+from surrogate.store import load, save
+from surrogate.train import Trained, learners_for, train
+
+BALL = ball_of("palpation")
+SOFT = Material("linear", 3000.0, 0.45)
+# What the pretender's forces do far away: at no depth, and more by so much a radius of depth.
+LINE = (0.97, 0.3)
+
+
+def features(anatomy: Anatomy, loads: Loads) -> np.ndarray:
+    patch = open_patch(anatomy)
+    return tool_features(patch, indented(loads, BALL.radius, patch))
+
+
+def bodily(anatomy: Anatomy, tissue: Material) -> Fem:
+    return Fem(anatomy, pushed_effects(anatomy, tissue), REFERENCE, "cpu")
+
+
+@pytest.fixture(scope="module")
+def pressed(box: Anatomy) -> tuple[Contact, list[Basis]]:
+    return condensed(bodily(box, SOFT), [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)])
+
+
+def test_the_nearest_place_on_a_triangle_is_nearest() -> None:
+    """Against a fine lattice on random triangles, needles among them: nothing is nearer, and something is as near."""
+    rng = np.random.default_rng(0)
+    corners = rng.normal(size=(200, 3, 3)) * rng.uniform(0.02, 1.0, (200, 1, 3))
+    point = np.array([0.3, -0.2, 0.1])
+    share = nearest_shares(corners, point)
+    assert share.min() >= 0.0
+    np.testing.assert_allclose(share.sum(axis=1), 1.0, atol=1e-12)
+    far = np.linalg.norm(np.einsum("sc,sci->si", share, corners) - point, axis=1)
+    lattice = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60.0
+    best = np.linalg.norm(np.einsum("qc,sci->sqi", lattice, corners) - point, axis=2).min(axis=1)
+    assert (far <= best + 1e-12).all()
+    assert (best - far).max() < 0.05
+
+
+def test_the_ball_enters_no_facet_and_pulls_nothing(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> None:
+    """Signorini's conditions: a dense lattice of every facet is outside, and every force goes away from the middle.
+
+    Forces through the middle have no moment about it; those of bent facets alone are at their nodes, which are told
+    apart by it.
+    """
+    contact, loads = pressed[0], draw_poses("palpation", box, 30, 2)
+    X = features(box, loads)
+    force = contact.force(X)
+    moved = contact.points + (force @ contact.compliance.astype(np.float64).T).reshape(len(X), -1, 3)
+    middle = X[:, :3] + (X[:, 6] - X[:, 7])[:, None] * X[:, 3:6]
+    arm, force = moved - middle[:, None], force.reshape(moved.shape)
+    facets = np.einsum("qc,bsci->bsqi", barycentric_lattice(12), arm[:, contact.triangles])
+    nearest = np.linalg.norm(facets, axis=3).min(axis=(1, 2))
+    assert (nearest > BALL.radius + THICKER - 2e-6).all()
+    assert (nearest < BALL.radius + THICKER + 1e-4).all()
+    assert (np.einsum("bi,bi->b", force.sum(axis=1), X[:, 3:6]) > 0.0).all()
+    moment = np.linalg.norm(np.cross(arm, force).sum(axis=1), axis=1)
+    size = np.linalg.norm(force.sum(axis=1), axis=1) * BALL.radius
+    assert (moment < 1e-3 * size).all()
+    # What is far from the ball bears nothing.
+    idle = np.linalg.norm(arm, axis=2) > BALL.radius + 9e-3
+    assert not force[idle].any()
+
+
+def test_it_answers_as_finite_elements_of_linear_tissue_do(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> None:
+    """The same body, condensed or not, deep and oblique: what differs is how the barrier keeps its gap."""
+    contact, bases = pressed
+    fem = Fem(box, [Elasticity(SOFT), Held(), ToolContact((BALL,))], device="cpu", batch=1)
+    loads, cortex = draw_poses("palpation", box, 8, 5), bases[1].nodes
+    truth, X = fem.deform(loads), features(box, loads)
+    assert all(outcome.good for outcome in truth.outcome)
+    answered = contact.predict(X) * X[:, 6:7]
+    split = len(bases[0].modes)
+    found = bases[0].decode(answered[:, :split]), bases[1].decode(answered[:, split:])
+    for nodes, ours in ((box.tumour_nodes, found[0]), (cortex, found[1])):
+        theirs = truth.at(nodes).displacement
+        off = np.linalg.norm(ours - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
+        assert off.mean() < 0.03
+        assert off.max() < 0.06
+    bears = contact.force(X).reshape(len(X), -1, 3).sum(axis=1)
+    reads = truth.reaction[:, 0, :3]
+    assert (np.linalg.norm(bears - reads, axis=1) < 0.05 * np.linalg.norm(reads, axis=1)).all()
+
+
+def test_how_stiff_tissue_is_does_not_matter(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> None:
+    soft = pressed[0]
+    stiff = condensed(bodily(box, replace(SOFT, young=7500.0)), [box.tumour_nodes])[0]
+    X = features(box, draw_poses("palpation", box, 10, 3))
+    force, more = soft.force(X), stiff.force(X)
+    np.testing.assert_allclose(2.5 * force, more, atol=1e-3 * np.abs(more).max())
+    moved, again = force @ soft.compliance.T, more @ stiff.compliance.T
+    np.testing.assert_allclose(moved, again, atol=2e-6)
+    air = X.copy()
+    air[:, 6] = 0.0
+    assert not soft.predict(air).any()
+
+
+def test_unit_responses_are_those_of_small_forces(box: Anatomy) -> None:
+    """Against solves under nodal forces."""
+    nodes, at = open_patch(box).nodes[[3, 20]], box.tumour_nodes[:9]
+    found = unit_responses(bodily(box, SOFT), nodes, at)
+    force = np.zeros((6, len(box.mesh.nodes), 3))
+    force[np.arange(6), np.repeat(nodes, 3), np.tile(np.arange(3), 2)] = 1e-4
+    truth = Fem(box, [Elasticity(SOFT), Held(), NodalForce()], REFERENCE, "cpu").deform(Loads((Nodal(force),)))
+    np.testing.assert_allclose(found, 1e4 * truth.at(at).displacement, atol=1e-5 * np.abs(found).max())
+
+
+@dataclass(frozen=True)
+class Stiffening:
+    """Answers poses as the ball on linear tissue does, whose forces grow with depth, and with place a little."""
+
+    anatomy: Anatomy
+    contact: Contact
+    bases: list[Basis]
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        X = features(self.anatomy, loads)
+        answered = self.contact.linear(X) * X[:, 6:7]
+        answered *= (LINE[0] + LINE[1] * X[:, 6:7] / X[:, 7:8]) * (1.0 + 0.1 * np.sin(100.0 * X[:, :1]))
+        split, displacement = len(self.bases[0].modes), np.zeros((len(loads), len(self.anatomy.mesh.nodes), 3))
+        for basis, coefficients in zip(self.bases, (answered[:, :split], answered[:, split:]), strict=True):
+            displacement[:, basis.nodes] = basis.decode(coefficients)
+        count = len(loads)
+        answer = Deformation(
+            displacement,
+            np.arange(len(self.anatomy.mesh.nodes)),
+            (Outcome.CONVERGED,) * count,
+            np.zeros(count, int),
+            np.zeros(count),
+            loads.times,
+            np.zeros((count, 0, 6)),
+        )
+        return answer if at is None else answer.at(at)
+
+
+@pytest.fixture(scope="module")
+def teacher(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> Stiffening:
+    return Stiffening(box, *pressed)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory, teacher: Stiffening) -> Dataset:
+    path = tmp_path_factory.mktemp("touched") / "data.h5"
+    said = {"ball": repr(BALL.radius), "tissue": tissue_to_json(SOFT), "effects": "as told"}
+    simulate(path, teacher, draw_poses("palpation", teacher.anatomy, 160, 0), said)
+    return read_dataset(path)
+
+
+@pytest.fixture(scope="module")
+def trained(data: Dataset) -> Trained:
+    return train(data, TOUCHED)
+
+
+def test_contact_learns_how_forces_grow_and_a_process_the_rest(
+    trained: Trained, teacher: Stiffening, box: Anatomy
+) -> None:
+    """On discs left out and on fresh poses; and bounds hold about as often as they say."""
+    contact, both = (trained.models[name] for name in TOUCHED)
+    regressor = contact.parts[0].regressor
+    assert isinstance(regressor, Contact)
+    np.testing.assert_allclose(regressor.line[:, 0], LINE, atol=0.1)
+    scores = {row.name: row.mean_percent for row in trained.scores}
+    assert scores["contact"] < 9.0
+    assert scores["contact-gp"] < 0.7 * scores["contact"]
+    fresh, nodes = draw_poses("palpation", box, 60, 77), box.tumour_nodes
+    truth = teacher.deform(fresh, at=nodes).displacement
+    error, found = errors(both, fresh, truth, nodes), both.deform(fresh, at=nodes)
+    assert error.mean() < 0.02 * np.linalg.norm(truth, axis=2).mean()
+    assert (error.max(axis=1) <= found.bound[0]).mean() > 0.8
+    assert (errors(contact, fresh, truth, nodes).max(axis=1) <= contact.deform(fresh, at=nodes).bound[0]).mean() > 0.8
+    cortex = open_patch(box).nodes
+    exact = teacher.deform(fresh, at=cortex).displacement
+    assert np.linalg.norm(both.deform(fresh, at=cortex).displacement - exact) < 0.05 * np.linalg.norm(exact)
+
+
+def test_it_is_stored_and_answers_alone_as_in_company(tmp_path: Path, trained: Trained, box: Anatomy) -> None:
+    save(tmp_path / "model.npz", trained.models)
+    again, fresh = load(tmp_path / "model.npz", box), draw_poses("palpation", box, 6, 1)
+    for name in TOUCHED:
+        together = trained.models[name].deform(fresh).displacement
+        np.testing.assert_array_equal(again[name].deform(fresh).displacement, together)
+        alone = [again[name].deform(fresh.rows(slice(row, row + 1))).displacement[0] for row in range(6)]
+        np.testing.assert_allclose(alone, together, atol=1e-8)
+
+
+def test_what_contact_needs_is_said(data: Dataset) -> None:
+    assert set(TOUCHED) < set(learners_for(data))
+    untold = replace(data, provenance={"ball": repr(BALL.radius)})
+    assert not set(TOUCHED) & set(learners_for(untold))
+    with pytest.raises(InputError, match="does not say what tissue it is of, so no series or contact can be had"):
+        train(untold, ["contact"])
+    pushes = replace(data, provenance={name: said for name, said in data.provenance.items() if name != "ball"})
+    with pytest.raises(InputError, match="holds pushes, of which contact-gp cannot be had: choose from linear"):
+        train(pushes, ["contact-gp"])
