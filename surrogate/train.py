@@ -23,7 +23,9 @@ from .patch import Patch, nearest
 from .score import Score, errors, score
 from .split import APART, MOST_APART, Split, leave_discs_out
 
-LEARNERS = ("linear", *LEARNT, *EXPANDED, *TOUCHED)
+# Of pushes, and of poses.
+LEARNERS = ("linear", *LEARNT, *EXPANDED)
+OF_POSES = (*TOUCHED, *POSED)
 # Fewer could not promise 95 in 100.
 FEWEST_APART = 19
 
@@ -50,7 +52,7 @@ class Trained:
 def learners_for(data: Dataset) -> tuple[str, ...]:
     """All that a data set can teach: series and contact need finite elements, of a tissue that the data names."""
     told = "tissue" in data.provenance
-    return tuple(name for name in _kinds(data) if told or name not in (*EXPANDED, *TOUCHED))
+    return tuple(name for name in _kinds(data)[0] if told or name not in (*EXPANDED, *TOUCHED))
 
 
 def train(
@@ -88,14 +90,14 @@ def train(
         not converge.
     """
     wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
-    unknown = [name for name in wanted if name not in LEARNERS]
+    kinds, others, held = _kinds(data)
+    unknown = [name for name in wanted if name not in (*kinds, *others)]
     if unknown or not wanted:
-        raise InputError(f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {', '.join(LEARNERS)}.")
-    strange = [name for name in wanted if name not in _kinds(data)]
+        raise InputError(f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {', '.join(kinds)}.")
+    strange = [name for name in wanted if name not in kinds]
     if strange:
         raise InputError(
-            f"{data.path}: holds {'pushes' if data.ball is None else 'poses'}, of which {', '.join(strange)} cannot be "
-            f"had: choose from {', '.join(_kinds(data))}."
+            f"{data.path}: holds {held}, of which {', '.join(strange)} cannot be had: choose from {', '.join(kinds)}."
         )
     if most is not None and most < 1:
         raise InputError(f"{most} loads teach nothing: give at least 1.")
@@ -161,9 +163,9 @@ def train(
     return Trained(models, tuple(scores), split, motion, int(apart.sum()), len(lessons[-1].loads.point), left_out)
 
 
-def _kinds(data: Dataset) -> tuple[str, ...]:
-    """Those that loads of the data's kind can teach."""
-    return ("linear", *LEARNT, *EXPANDED) if data.ball is None else (*TOUCHED, *POSED)
+def _kinds(data: Dataset) -> tuple[tuple[str, ...], tuple[str, ...], str]:
+    """Learners that loads of the data's kind can teach, those of the other kind, and what the kind is called."""
+    return (LEARNERS, OF_POSES, "pushes") if data.ball is None else (OF_POSES, LEARNERS, "poses")
 
 
 def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> Learned:

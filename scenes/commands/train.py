@@ -16,7 +16,7 @@ from surrogate.dataset import read_dataset
 from surrogate.parts import Expansion
 from surrogate.score import table, winner
 from surrogate.store import save
-from surrogate.train import LEARNERS, Trained, learners_for, train
+from surrogate.train import LEARNERS, OF_POSES, Trained, learners_for, train
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("data", metavar="DATA.h5", help="from `sulcus simulate`; nothing else is needed")
     parser.add_argument("--out", required=True, metavar="MODEL.npz", help="the models, all in one file")
     parser.add_argument(
-        "--learners", help=f"which of {', '.join(LEARNERS)}, separated by commas (default: all that the data can teach)"
+        "--learners",
+        help=f"which of {', '.join(LEARNERS)}, or of poses {', '.join(OF_POSES)}, separated by commas (default: "
+        "all that the data can teach)",
     )
     parser.add_argument("--most", type=int, metavar="LOADS", help="teach at most so many of the loads (default: all)")
     parser.add_argument(
