@@ -99,8 +99,8 @@ class Stage:
     def visible(self, positions: np.ndarray) -> Layer:
         """The open cortex, and what lies just under the edge of the bone: it comes to light where the brain shifts.
 
-        Where the brain comes off the skull, what is beyond the drape's hole is drawn below it: in the body nothing bars
-        open cortex that slides under bone.
+        Where the brain comes off the skull, what is beyond the drape's hole is drawn below it: the drape lies on the
+        scan, and a bump that slides by millimetres would come through where there was none.
         """
         layer = self._visible.at(positions)
         if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):

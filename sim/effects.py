@@ -295,8 +295,9 @@ class SkullContact:
     """The skull holds the brain on its side without friction, and lets go of it: where `Slide` would keep it on.
 
     Nodes with a normal in `Anatomy.slide_normal` stay on their side of a wall across it that bends as the normals round
-    them do, `gap` [m] above where they are at rest; they feel it in the last tenth of a millimetre. The body needs what
-    `Held` holds: bone alone only bars its way.
+    them do, `gap` [m] above where they are at rest; they feel it in the last tenth of a millimetre. Nodes of the
+    craniotomy rise in it freely, but meet bone beyond its edge, which is as round as the mesh is coarse there. The body
+    needs what `Held` holds: bone alone only bars its way.
 
     Raises
     ------

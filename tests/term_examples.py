@@ -11,6 +11,7 @@ from boxes import base_held, box
 from oracle import EVERY_LAW, tissue
 from tiny_terms import Spring, Wall
 
+from sim.bone import Bone
 from sim.compile import compile_problem
 from sim.device import Device
 from sim.discretisation import discretise
@@ -99,14 +100,18 @@ def of_law(law: str, element: str = "p1", part: int = 0) -> Example:
 
 
 def skull() -> Example:
-    """A round wall about the top of the box, that some of its nodes feel and some do not."""
+    """A round wall about the top of the box, that some of its nodes feel and some do not; it ends among them."""
     top = np.flatnonzero(MESH.nodes[:, 2] > MESH.nodes[:, 2].max() - 1e-9)
     normal = MESH.nodes[top] - [0.05, 0.05, -0.02]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     bend = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / 0.12
 
+    way = np.linspace(-1.0, 1.0, len(top))[:, None] * [0.8, 0.6, 0.0]
+    felt, area = np.linspace(5e-3, 7e-3, len(top)), np.linspace(1e-3, 2e-3, len(top))
+    bone = Bone(top, normal, bend, np.linspace(-8e-3, 1e-3, len(top)), way, felt, area, gap=6e-3, edge=5e-3)
+
     def build(device: Device) -> Term:
-        return Skull(top, normal, bend, np.linspace(1e-3, 2e-3, len(top)), ROWS // 3, 6e-3, 6e-3, 1000.0, device)
+        return Skull(bone, ROWS // 3, 1000.0, device)
 
     return Example(build, Cases(Loads((), np.zeros(3)), np.zeros(3)), noise=1e-3, walled=True)
 

@@ -10,6 +10,7 @@ from boxes import box, hold, top_forces
 
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
+from sim.bone import FELT, Bone, bend_of
 from sim.deformation import Deformation
 from sim.device import find_device
 from sim.effects import Effect, Elasticity, Held, NodalForce, SkullContact, Slide
@@ -17,7 +18,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.terms.skull_contact import FELT, Skull, bend_of
+from sim.terms.skull_contact import Skull
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 MESH = box((4, 4, 4), 0.05)
@@ -106,7 +107,10 @@ def test_a_body_that_turns_slides_along_a_round_skull() -> None:
     round_wall = (np.eye(3) - np.outer(n, n)) / R
 
     def force(bend: np.ndarray, at: np.ndarray) -> np.ndarray:
-        skull = Skull(np.array([0]), n[None], bend[None], np.array([1e-4]), 1, 5e-5, 5e-5, 1000.0, device)
+        one, none = np.ones(1), np.zeros((1, 3))
+        skull = Skull(
+            Bone(np.array([0]), n[None], bend[None], -one, none, 5e-5 * one, 1e-4 * one, 5e-5, 0.0), 1, 1000.0, device
+        )
         out = device.zeros(3, 1)
         skull.add_gradient(device.array(at[:, None]), out)
         return out.numpy()[:, 0]
