@@ -153,6 +153,20 @@ def test_a_pulled_block_creeps_to_what_is_left_of_its_stiffness(element: str) ->
     assert (np.diff(track) > -1e-9 * track[-1]).all() and track[-1] > 2.0 * track[0]
 
 
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_one_step_may_be_as_long_as_a_day(precision: str) -> None:
+    """It ends near what is left of the stiffness, and no number overflows."""
+    pull = (Nodal(top_forces(MESH, np.array([1e-4, 0.0, 0.0]))),)
+    accuracy = replace(TIGHT, tolerance=1e-4, precision=precision)
+    fem = Fem(base_held(MESH), [Elasticity(relaxing("neo-hookean")), Held(), NodalForce()], accuracy, "cpu")
+    rest = fem.deform(Loads(pull))
+    once = fem.deform(Loads(pull, np.array([86400.0])), rest)
+    again = fem.deform(Loads(pull, np.array([2.0 * 86400.0])), once)
+    assert once.outcome[0].good and again.outcome[0].good
+    left = np.abs(again.displacement).max() / np.abs(rest.displacement).max()
+    assert left == pytest.approx(1.0 / modulus(np.inf), rel=0.2)
+
+
 def test_a_run_may_be_cut_and_tissues_mixed() -> None:
     """Another solver goes on as if it had been there from the start; regions that do not relax have no history."""
     halves = TetMesh(MESH.nodes, MESH.tets, np.arange(len(MESH.tets)) % 2)

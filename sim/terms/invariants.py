@@ -63,6 +63,8 @@ def green_strain(H: Any):
 
 @wp.func
 def exp_less_one(t: Any):
-    """exp(t) - 1 = 2 sinh(t/2) exp(t/2)."""
+    """exp(t) - 1 = 2 sinh(t/2) exp(t/2); far below zero the first of these is too large for its number."""
+    if t < type(t)(-1.0):
+        return wp.exp(t) - type(t)(1.0)
     half = t / type(t)(2.0)
     return type(t)(2.0) * wp.sinh(half) * wp.exp(half)
