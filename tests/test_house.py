@@ -33,7 +33,7 @@ TIERS = (
         "following",
     },
     {"fem"},
-    {"operated"},
+    {"operated", "pressure"},
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""
 OWNERS = {

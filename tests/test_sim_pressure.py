@@ -1,0 +1,74 @@
+"""How hard tools press: a plate evenly, by force over area; a blade the most under its lower end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from boxes import base_held, box
+from scipy.spatial.transform import Rotation
+
+from sim.accuracy import Accuracy
+from sim.effects import Effect, Elasticity, Held, NodalForce, Retraction, ToolContact
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Retracted, Touching
+from sim.material import Material
+from sim.pressure import pressure
+from sim.tools import Ball, Spatula
+
+SIDE, HEIGHT = 0.06, 0.03
+BLOCK = base_held(box((6, 6, 3), SIDE))
+TOP = BLOCK.mesh.nodes[:, 2] > HEIGHT - 1e-9
+
+
+def at(*place: float, tip: float = 0.0) -> np.ndarray:
+    """T_world_tool (4, 4) at a place [m], its end towards -y lower by an angle [degrees]."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("x", tip, degrees=True).as_matrix(), place
+    return T
+
+
+@pytest.mark.parametrize("element", ["p1", "smoothed"])
+def test_a_plate_presses_evenly_by_force_over_area(element: str) -> None:
+    """Tissue that does not widen: E times how far it is squeezed, at every vertex that the plate's edge is far from."""
+    plate = Spatula(0.1, 0.1, 5e-3)
+    effects = (Elasticity(Material("linear", 3000.0, 0.0)), Held(), ToolContact((plate,)))
+    fem = Fem(BLOCK, effects, Accuracy(tolerance=1e-9), "cpu", element=element)
+    poses = np.stack([at(0.03, 0.03, HEIGHT - depth)[None] for depth in (1e-3, 3e-3)])
+    loads = Loads((Touching(poses),))
+    answer = fem.deform(loads)
+    found = pressure(fem, loads, answer)
+    inner = TOP & ((BLOCK.mesh.nodes[:, :2] > 1e-9) & (BLOCK.mesh.nodes[:, :2] < SIDE - 1e-9)).all(axis=1)
+    squeezed = -answer.displacement[:, inner, 2].mean(axis=1) / HEIGHT
+    np.testing.assert_allclose(found[:, inner], np.repeat(3000.0 * squeezed[:, None], inner.sum(), axis=1), rtol=1e-4)
+    np.testing.assert_allclose(found[:, inner].mean(axis=1), -answer.reaction[:, 0, 2] / SIDE**2, rtol=2e-2)
+    assert not found[:, ~TOP & (BLOCK.mesh.nodes[:, 2] < HEIGHT - 0.011)].any()
+
+
+def test_a_blade_presses_hardest_under_its_lower_end() -> None:
+    fem = Fem(BLOCK, (Elasticity(), Held(), Retraction(Spatula(0.015, 0.03, 2e-3))), Accuracy(), "cpu")
+    laid, moved = at(0.03, 0.03, HEIGHT + 5e-3, tip=12.0), np.array([[0.0, 0.0, -8e-3]])
+    loads = Loads((Retracted(laid[None], moved),))
+    answer = fem.deform(loads)
+    found = pressure(fem, loads, answer)[0]
+    assert answer.outcome[0].good
+    along = BLOCK.mesh.nodes[:, 1] - 0.03
+    ends = [found[TOP & (along * way > 4e-3)].max() for way in (-1.0, 1.0)]
+    assert ends[0] > 3.0 * ends[1] and 200.0 < ends[0] < 5000.0
+
+
+def test_where_nothing_touches_it_presses_nowhere() -> None:
+    fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu")
+    loads = Loads((Touching(at(0.03, 0.03, HEIGHT + 1e-3)[None, None]),))
+    assert not pressure(fem, loads, fem.deform(loads)).any()
+
+
+@pytest.mark.parametrize(
+    ("effect", "element", "sentence"),
+    [(NodalForce(), "p1", "nothing touches this body: add ToolContact"), (ToolContact((Ball(5e-3),)), "p2", "with p1")],
+)
+def test_what_has_no_pressure_is_a_sentence(effect: Effect, element: str, sentence: str) -> None:
+    fem = Fem(BLOCK, (Elasticity(), Held(), effect), Accuracy(), "cpu", element=element)
+    loads = Loads((), np.zeros(1))
+    with pytest.raises(InputError, match=sentence):
+        pressure(fem, loads, fem.deform(loads))
