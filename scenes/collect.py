@@ -6,7 +6,7 @@ Patient space is RAS [m]; the camera frame is OpenCV's (x right, y down, z forwa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -33,6 +33,7 @@ UNITS = {
     "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
     "direction": "1", "csf_level": "m", "share": "1", "done": "1",
     "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "bound": "m", "seconds": "s",
+    "reaction_fem": "N, N m",
     "depth": f"{DEPTH_SCALE:g} m (PNG, 16 bit)",
 }  # fmt: skip
 
@@ -118,8 +119,10 @@ def write_motion(file: h5py.File, player: Player, rows: list[dict], truth: Defor
     nodes = player.site.anatomy.tumour_nodes
     rest = player.site.anatomy.mesh.nodes[nodes]
     outcomes = [outcome.name for outcome in truth.outcome]
-    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    columns: dict[str, Sequence | np.ndarray] = {name: [row[name] for row in rows] for name in rows[0]}
     columns |= {"tumour_fem": rest + truth.at(nodes).displacement, "outcome_fem": outcomes}
+    if truth.reaction.shape[1]:
+        columns["reaction_fem"] = truth.reaction
     for name, values in columns.items():
         text = h5py.string_dtype() if isinstance(values[0], str) else None
         file.create_dataset(name, data=np.asarray(values, text), compression="gzip")

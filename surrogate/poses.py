@@ -18,20 +18,20 @@ ROUND = ("palpation", "bipolar", "dissector")
 SHALLOW, DEEP = 0.05, 0.9
 
 
-def ball_of(preset: str) -> Ball:
-    """The ball that stands for a round tool, of the middle of its radii.
+def ball_of(preset: str, radius: float | None = None) -> Ball:
+    """The ball that stands for a round tool: of a radius [m], or of the middle of the tool's own.
 
     Raises
     ------
     InputError
-        A preset that is not one round tool.
+        A preset that is not one round tool, or a radius that is not positive.
     """
     if preset not in ROUND:
         raise InputError(f"no ball stands for the preset {preset}: choose one of {', '.join(ROUND)}.")
-    return Ball(0.5 * sum(TOOLS[preset].footprint))
+    return Ball(0.5 * sum(TOOLS[preset].footprint) if radius is None else radius)
 
 
-def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
+def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, radius: float | None = None) -> Loads:
     """Draw `count` poses of the preset's ball, pressed into the open cortex; load i depends as in `sampling.draw`.
 
     Places and directions are those of the preset's forces: uniform by area, its footprint inside the rim, within the
@@ -40,9 +40,9 @@ def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     Raises
     ------
     InputError
-        As `draw`, and a preset that is not one round tool.
+        As `draw` and `ball_of`.
     """
-    ball, patch = ball_of(preset), open_patch(anatomy)
+    ball, patch = ball_of(preset, radius), open_patch(anatomy)
     pushed = draw(preset, anatomy, count, seed).of(Pushed)
     assert pushed is not None
     deepest = min(DEEP * ball.radius, TOOLS[preset].depth)

@@ -101,6 +101,7 @@ class TestEpisode:
         truth = file["tumour_fem"][3] - rest
         assert np.linalg.norm(alone, axis=1).mean() > 3e-4
         assert np.linalg.norm(truth - alone, axis=1).max() < 2e-5
+        np.testing.assert_allclose(file["reaction_fem"][:, 0, :3], file["force"][:], atol=1e-12)
         assert file["seconds"].shape == (7, len(file["seconds"].attrs["stages"]))
 
     def test_everything_says_what_it_is(self, episode, theatre):
@@ -109,6 +110,7 @@ class TestEpisode:
         assert units == {
             "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
             "tumour_predicted": "m", "tumour_fem": "m", "seconds": "s", "tumour_rest": "m", "bound": "m",
+            "reaction_fem": "N, N m",
         }  # fmt: skip
         assert "1e-05 m" in file["pictures/depth"].attrs["unit"]
         assert file.attrs["anatomy"] == theatre.anatomy.digest and file.attrs["deformer"] == "linear"

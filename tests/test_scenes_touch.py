@@ -9,13 +9,23 @@ import pytest
 from theatres import player, theatre_of
 
 from scenes.paths import AIR, Touch
+from scenes.play import Player
 from scenes.scene import Scene, Viewpoint, find_scene
 from scenes.told import told
 from scenes.truth import truth_of
-from sim.effects import Held, Pulsation
+from sim.accuracy import REFERENCE
+from sim.anatomy import Anatomy
+from sim.effects import Elasticity, Held, Pulsation, Slide, ToolContact
 from sim.errors import InputError
+from sim.fem import Fem
 from sim.loads import Retracted, Touching
-from sim.tools import distances_to
+from sim.material import Material
+from sim.tools import Ball, distances_to
+from surrogate.condense import condensed, side_by_side
+from surrogate.envelope import Envelope
+from surrogate.learned import Learned, Part
+from surrogate.patch import open_patch
+from surrogate.taught import refusal
 
 SMALL = Viewpoint(width=160, height=120)
 
@@ -33,6 +43,18 @@ def theatre(box):
 @pytest.fixture(scope="module")
 def palpated(theatre):
     return list(player(theatre, small("palpate"), "fem").frames(10))
+
+
+def untaught(anatomy: Anatomy, scene: Scene) -> Learned:
+    """What linear tissue says to the poses of a scene's ball, as a model that takes any of them."""
+    (ball,) = (tool for effect in scene.effects if isinstance(effect, ToolContact) for tool in effect.tools)
+    assert isinstance(ball, Ball)
+    patch = open_patch(anatomy)
+    fem = Fem(anatomy, (Elasticity(Material("linear", 5000.0, 0.45)), Held(), Slide()), REFERENCE, "cpu")
+    contact, bases = condensed(fem, [anatomy.tumour_nodes, np.setdiff1d(patch.nodes, anatomy.tumour_nodes)])
+    envelope = Envelope(patch.points, 1.0, 1.0, np.pi, (1e-6, 1.0), (ball.radius, ball.radius), np.inf)
+    said = {"effects": repr(scene.effects)}
+    return Learned(anatomy, (Part("tool", contact, side_by_side(bases)),), envelope, training=said, ball=ball.radius)
 
 
 class TestPalpate:
@@ -69,6 +91,21 @@ class TestPalpate:
         """Taught where a ball is, it answers without the force that it takes."""
         frame = palpated[6]
         assert told(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6)))) == ""
+
+    def test_linear_contact_plays_it_untaught(self, theatre, palpated):
+        """Nearly as finite elements of softer tissue that stiffens do, on tumour and cortex."""
+        scene, anatomy = small("palpate"), theatre.anatomy
+        model = untaught(anatomy, scene)
+        assert refusal(model, scene.effects) is None
+        drawn = Player(player(theatre, scene, "fem").stage, model)
+        pressed = [frame for frame in palpated if frame.touch.depth > 1e-3]
+        assert len(pressed) > 3
+        for frame in pressed:
+            answer = drawn.draw(frame.number, frame.time, frame.touch).deformation
+            for nodes, most in ((anatomy.tumour_nodes, 0.15), (open_patch(anatomy).nodes, 0.2)):
+                theirs = frame.deformation.at(nodes).displacement
+                off = np.linalg.norm(answer.at(nodes).displacement - theirs)
+                assert off < most * np.linalg.norm(theirs)
 
     def test_learnt_models_of_pushes_do_not_know_it(self, theatre):
         with pytest.raises(InputError, match="palpate"):

@@ -209,20 +209,27 @@ def test_what_poses_cannot_teach_is_refused(data: Dataset, box: Anatomy) -> None
         train(data, ["linear", "gp", "series"])
     with pytest.raises(InputError, match="no ball stands for the preset spatula: choose one of palpation"):
         draw_poses("spatula", box, 2, 0)
+    with pytest.raises(InputError, match=r"Ball.radius is -0.001 m: give a positive number"):
+        draw_poses("palpation", box, 2, 0, -1e-3)
     with pytest.raises(InputError, match="holds other loads than `Pushed`"):
         train(replace(data, provenance={}), ["gp"])
 
 
-def test_the_command_makes_poses_that_finite_elements_answer(tmp_path: Path, box: Anatomy) -> None:
+def test_the_command_makes_poses_that_finite_elements_answer(
+    tmp_path: Path, box: Anatomy, capsys: pytest.CaptureFixture[str]
+) -> None:
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
-    wanted = ["simulate", str(mesh), "--out", str(out), "--poses", "--count", "3", "--json"]
-    assert main(wanted) == 0
+    wanted = ["simulate", str(mesh), "--out", str(out), "--count", "3", "--json"]
+    assert main([*wanted, "--ball", "7"]) == 2
+    assert "--ball is the radius of a ball moved by pose" in capsys.readouterr().err
+    assert main([*wanted, "--poses", "--ball", "7"]) == 0
+    ball = Ball(7e-3)
     data = read_dataset(out)
     assert data.good.all()
-    assert data.ball == BALL.radius
+    assert data.ball == ball.radius
     assert "NodalForce" not in data.provenance["effects"]
-    fem = Fem(read_anatomy(mesh), EFFECTS, device="cpu", batch=1)
+    fem = Fem(read_anatomy(mesh), (Elasticity(), Held(), ToolContact((ball,))), device="cpu", batch=1)
     truth = fem.deform(data.loads)
     stored = data.displacement(np.arange(len(box.mesh.nodes)))
     assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)

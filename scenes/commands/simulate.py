@@ -12,14 +12,18 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.accuracy import Accuracy
+from sim.anatomy import Anatomy
 from sim.deformation import Outcome
 from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effects
+from sim.errors import InputError
 from sim.fem import Fem
 from sim.files import check_output
+from sim.loads import Loads
 from sim.material import tissue_to_json
 from sim.memory import WIDEST, WIDEST_ON_CUDA
 from sim.meshfile import read_anatomy
 from sim.stages import stage
+from sim.tools import Ball
 from surrogate.dataset import read_outcomes
 from surrogate.poses import ball_of, draw_poses
 from surrogate.sampling import PRESETS, draw
@@ -44,6 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="a rigid ball of the tool's middle radius, moved by pose, instead of a force on its footprint",
     )
+    parser.add_argument(
+        "--ball",
+        type=float,
+        metavar="MM",
+        help="with --poses: radius of that ball [mm] (in the scene palpate 7)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
     add_tissue_arguments(parser)
     add_element_argument(parser)
@@ -60,11 +70,10 @@ def run(args: argparse.Namespace) -> int:
     out = check_output(args.out, ".h5")
     with stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
-        loads = (draw_poses if args.poses else draw)(args.preset, anatomy, args.count, args.seed)
+        ball, loads = _drawn(args, anatomy)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
     tissue = tissue_of(args)
     effects: tuple[Effect, ...] = (*pushed_effects(anatomy, tissue), NodalForce())
-    ball = ball_of(args.preset) if args.poses else None
     if ball is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
         effects = (*passive, ToolContact((ball,)))
@@ -94,6 +103,16 @@ def run(args: argparse.Namespace) -> int:
             return INTERRUPTED
     _report(args, len(loads), solved)
     return 0
+
+
+def _drawn(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Ball | None, Loads]:
+    """The ball whose poses were asked for, if they were, and the loads."""
+    if not args.poses:
+        if args.ball is not None:
+            raise InputError("--ball is the radius of a ball moved by pose: give --poses too, or leave it out.")
+        return None, draw(args.preset, anatomy, args.count, args.seed)
+    radius = None if args.ball is None else 1e-3 * args.ball
+    return ball_of(args.preset, radius), draw_poses(args.preset, anatomy, args.count, args.seed, radius)
 
 
 def _report(args: argparse.Namespace, asked: int, solved: Solved) -> None:
