@@ -134,7 +134,7 @@ def relaxing(law: str, element: str = "p1", *effects: object) -> Example:
         return compile_problem((Elasticity(tissues), Held(), *effects), ANATOMY, device, space).terms[0]  # pyright: ignore
 
     cases = Cases(Loads((), np.array([0.0, 1.7, 3.1])), np.array([0.0, 1.0, 3.099]), {name: past})
-    return Example(build, cases, True, space.nodes, 1e-3 if element == "p2" else 4e-3)
+    return Example(build, cases, law in LOGARITHMIC, space.nodes, 1e-3 if element == "p2" else 4e-3)
 
 
 def swelling(law: str, element: str = "p1", part: int = 0) -> Example:

@@ -56,7 +56,9 @@ OF_LAW = {
     "stable-neo-hookean": cost("stable_neo_hookean"),
     "ogden": cost("ogden spectral"),
     "prony": cost(
-        "neo_hookean viscoelastic", "loops:measure loops:spread viscoelastic:advance viscoelastic:fade", "Prony Kernels"
+        "neo_hookean split viscoelastic",
+        "loops:measure loops:spread viscoelastic:advance viscoelastic:fade",
+        "Prony Kernels Split",
     ),
 }
 # What a solver may do of any energy, as the load needs it.

@@ -13,9 +13,9 @@ from sim.accuracy import Accuracy
 from sim.compile import compile_problem
 from sim.device import find_device
 from sim.discretisation import ELEMENTS, discretise
-from sim.effects import Elasticity, Held, NodalForce
+from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.fem import Fem
-from sim.loads import Loads, Nodal
+from sim.loads import Loads, Nodal, push
 from sim.material import HYPERELASTIC, Material, Ogden, Tissue
 from sim.mesh import TetMesh
 from sim.problem import Problem
@@ -210,3 +210,54 @@ def test_crushed_tissue_pushes_back_however_long_it_relaxes(law: str) -> None:
     path = -height[:, None, None] * np.diag([0.0, 0.0, 1.0])
     found = stresses(problem, nodes, path, times)[:, 2, 2]
     assert (found[1:] < -100.0).all()
+
+
+def softened(left: float, poisson: float = 0.45) -> Material:
+    """Stable neo-Hookean tissue of 3 kPa with a share of its shear modulus, and its bulk modulus as it was."""
+    mu, lam = Material("stable-neo-hookean", 3000.0, poisson).lame
+    bulk = lam + 2.0 * mu / 3.0
+    young = 9.0 * bulk * left * mu / (3.0 * bulk + left * mu)
+    return Material("stable-neo-hookean", young, (3.0 * bulk - 2.0 * left * mu) / (6.0 * bulk + 2.0 * left * mu))
+
+
+def test_the_stable_law_held_at_any_strain_is_itself_with_less_stiffness() -> None:
+    """At every moment, sheared, squashed and inside out."""
+    soft = replace(softened(1.0), prony=SERIES)
+    path = np.array([[[0.2, 0.5, 0.0], [-0.1, -0.3, 0.2], [0.0, 0.1, 0.4]], np.diag([-0.7, 0.5, -0.6])])
+    path = np.concatenate([path, np.diag([0.1, -1.3, 0.2])[None]])
+    times = np.array([0.0, 0.02, 0.5, 3.0, 40.0])
+    for H in path:
+        problem, nodes = posed(soft)
+        found = stresses(problem, nodes, np.repeat(H[None], len(times), axis=0), times)
+        for one, left in zip(found, modulus(times), strict=True):
+            still, _ = posed(softened(float(left)))
+            expected = stresses(still, nodes, H[None], np.zeros(1))[0]
+            np.testing.assert_allclose(one, expected, atol=1e-9 * np.abs(found).max())
+
+
+@pytest.mark.parametrize(("force", "element"), [(0.3, "p1"), (0.8, "p1"), (0.3, "p2")])
+def test_the_stable_law_bears_what_it_bears_relaxed(force: float, element: str) -> None:
+    """A push that sinks half as deep as the block is high, held until nothing fades any more."""
+    anatomy, effects = base_held(box((4, 4, 3), 0.05)), (Held(), ToolForce())
+    pushed = push(np.array([0.026, 0.024, 0.0375]), np.array([0.01, 0.0, -force]), 7e-3)
+    tight = Accuracy(tolerance=1e-8)
+    elastic = Fem(anatomy, [Elasticity(softened(float(modulus(np.inf)))), *effects], tight, "cpu", element=element)
+    fem = Fem(anatomy, [Elasticity(replace(softened(1.0), prony=SERIES)), *effects], tight, "cpu", element=element)
+    answer = None
+    for time in (0.1, 0.5, 2.0, 8.0, 1000.0):
+        answer = fem.deform(replace(pushed, time=np.array([time])), answer)
+        assert answer.outcome[0].good
+    assert answer is not None
+    still = elastic.deform(pushed).displacement
+    np.testing.assert_allclose(answer.displacement, still, atol=1e-5 * np.abs(still).max())
+
+
+def test_tissue_that_relaxed_stands_a_push_that_folds_it() -> None:
+    """The default law by its other name: where its elastic self is in equilibrium, if inside out, so is it."""
+    anatomy = base_held(box((5, 5, 3), 0.05))
+    fem = Fem(anatomy, [Elasticity(replace(softened(1.0), prony=SERIES)), Held(), ToolForce()], Accuracy(), "cpu")
+    pushed = push(np.array([0.026, 0.024, 0.03]), np.array([0.01, 0.0, -1.3]), 7e-3)
+    answer = None
+    for time in (0.5, 1.0, 10.0, 50.0, 1000.0):
+        answer = fem.deform(replace(pushed, time=np.array([time])), answer)
+        assert answer.outcome[0].good

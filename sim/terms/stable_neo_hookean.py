@@ -43,4 +43,12 @@ def stress_change(H: Any, D: Any, c: Any):
     return mu * D + (lam + mu) * wp.ddot(cof, D) * cof + ((lam + mu) * volume_change(H) - mu) * change
 
 
-LAW = Law("stable-neo-hookean", energy, stress, stress_change)
+@wp.func
+def of_shape(c: Any):
+    """Lame's constants of bulk modulus 0: the rest of psi is K/2 (J - 1)^2, K = lambda + 2/3 mu."""
+    k = c
+    k[1] = -type(c[0])(2.0) / type(c[0])(3.0) * c[0]
+    return k
+
+
+LAW = Law("stable-neo-hookean", energy, stress, stress_change, of_shape=of_shape)

@@ -1,4 +1,4 @@
-"""Viscoelasticity in shape: any law's isochoric stress relaxes in a Prony series, a step at a time.
+"""Viscoelasticity in shape: any law's stress of shape relaxes in a Prony series, a step at a time.
 
 Simo 1987, "On a fully three-dimensional finite-strain viscoelastic damage model", Comput. Methods Appl. Mech. Eng.
 60:153-173; Simo, Hughes 1998, "Computational Inelasticity", section 10.3; Holzapfel 2000, "Nonlinear Solid Mechanics",
@@ -10,12 +10,16 @@ section 6.10. The step is the derivative of an incremental potential: with Fb = 
 S the deviatoric stress of the law itself, pulled back by the last step's Fb, and H_i the parts of it that fade. Where a
 law parts shape from volume, as Ogden's, psi(F) - psi(J^(1/3) I) is psi(Fb), and this is what the papers have. Of the
 others psi(Fb) must not be taken away from psi(F): it outgrows it where tissue is crushed, which then collapses.
+
+The stable neo-Hookean law is finite where J = 0, and Cb is not: whatever pulls on Cb makes it collapse. It is parted in
+its own way (`split.own_split`): mu relaxes and K does not, the step's potential is psi - (1 - f) psi_shape + C : A / 2,
+and S pulls on C = F^T F, as in finite linear viscoelasticity (Christensen 1980, "A Nonlinear Theory of Viscoelasticity
+for Application to Elastomers", J. Appl. Mech. 47:762-768).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -23,47 +27,21 @@ import warp as wp
 from ..device import Device
 from ..material import Pairs
 from ..term import Cases
-from .invariants import (
-    cofactor_change,
-    cofactor_excess,
-    exp_less_one,
-    green_strain,
-    log_one_plus,
-    volume_change,
-)
+from .invariants import exp_less_one
 from .law import Law
+from .split import split_of
 
 # A symmetric tensor's components.
 SIX = 6
-
-
-@wp.func
-def isochoric(H: Any):
-    """Fb - I = J^(-1/3) (I + H) - I, exact at small strain."""
-    k = exp_less_one(-log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
-    return H + k * (wp.identity(n=3, dtype=type(k)) + H)
-
-
-@wp.func
-def dilated(H: Any):
-    """J^(1/3) I - I."""
-    k = exp_less_one(log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
-    return k * wp.identity(n=3, dtype=type(k))
-
-
-@wp.func
-def inverse_transpose(H: Any):
-    """(I + H)^-T."""
-    J = type(H[0, 0])(1.0) + volume_change(H)
-    return (wp.identity(n=3, dtype=type(J)) + cofactor_excess(H)) / J
 
 
 @cache
 def relaxing(law: Law, device: Device, count: int) -> Law:
     """The law on `count` numbers that also takes f - 1 and the components xx, yy, zz, yz, zx, xy of A [Pa]."""
     scalar, mat = device.scalar, device.matrix
+    parts = split_of(law, device)
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1 + SIX))
-    own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
+    own_energy, own_stress, own_change = parts.energy, parts.stress, parts.stress_change
 
     @wp.func
     def of_law(c: whole):
@@ -88,45 +66,18 @@ def relaxing(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def energy(H: mat, c: whole):
-        """f psi(F) + (1 - f) psi(J^(1/3) I) + (Cb - I) : A / 2 [Pa]; +inf where J <= 0."""
-        if volume_change(H) <= scalar(-1.0):
-            return scalar(wp.inf)
-        k, less = of_law(c), c[count]
-        own = own_energy(H, k) + less * (own_energy(H, k) - own_energy(dilated(H), k))
-        return own + wp.ddot(green_strain(isochoric(H)), pull(c))
+        """psi + (f - 1) psi_shape + A : E [Pa]."""
+        return own_energy(H, of_law(c), c[count], pull(c))
 
     @wp.func
     def stress(H: mat, c: whole):
-        """f P(F) + (1 - f) p J^(1/3) F^-T + J^(-1/3) (Q - (Q : F) F^-T / 3), p I = P(J^(1/3) I), Q = Fb A."""
-        F, k, A, less = wp.identity(n=3, dtype=scalar) + H, of_law(c), pull(c), c[count]
-        Q, G = A + isochoric(H) * A, inverse_transpose(H)
-        V = dilated(H)
-        wide = scalar(1.0) + V[0, 0]
-        p = own_stress(V, k)[0, 0]
-        level = less * p * wide + wp.ddot(Q, F) / (scalar(3.0) * wide)
-        return (scalar(1.0) + less) * own_stress(H, k) + Q / wide - level * G
+        """P + (f - 1) P_shape + the derivative of A : E."""
+        return own_stress(H, of_law(c), c[count], pull(c))
 
     @wp.func
     def stress_change(H: mat, D: mat, c: whole):
-        """dP for dF = D: the derivative of `stress`, factor by factor."""
-        three = scalar(3.0)
-        identity = wp.identity(n=3, dtype=scalar)
-        F, k, A, less = identity + H, of_law(c), pull(c), c[count]
-        J = scalar(1.0) + volume_change(H)
-        V = dilated(H)
-        wide = scalar(1.0) + V[0, 0]
-        G = inverse_transpose(H)
-        swelling = wp.ddot(G, D)
-        widening = wide * swelling / three
-        dG = cofactor_change(F, D) / J - swelling * G
-        Q = A + isochoric(H) * A
-        dQ = (D - swelling / three * F) * A / wide
-        p, dp = own_stress(V, k)[0, 0], own_change(V, widening * identity, k)[0, 0]
-        level = less * p * wide + wp.ddot(Q, F) / (three * wide)
-        pulled = (wp.ddot(dQ, F) + wp.ddot(Q, D) - swelling / three * wp.ddot(Q, F)) / (three * wide)
-        rise = less * (dp * wide + p * widening) + pulled
-        own = (scalar(1.0) + less) * own_change(H, D, k)
-        return own + (dQ - swelling / three * Q) / wide - rise * G - level * dG
+        """dP for dF = D: the derivative of `stress`."""
+        return own_change(H, D, of_law(c), c[count], pull(c))
 
     @wp.func
     def at_rest(c: whole):
@@ -136,7 +87,7 @@ def relaxing(law: Law, device: Device, count: int) -> Law:
             k[i] = scalar(0.0)
         return k
 
-    return Law(f"viscoelastic {law.name}", energy, stress, stress_change, needs_positive_volume=True, at_rest=at_rest)
+    return Law(f"viscoelastic {law.name}", energy, stress, stress_change, parts.needs_positive_volume, at_rest)
 
 
 @dataclass(frozen=True)
@@ -152,7 +103,7 @@ def kernels_of(law: Law, device: Device, count: int) -> Kernels:
     """Kernels for a law of `count` coefficients; each launches over (element, point, column)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
-    own_stress = law.stress
+    overstress = split_of(law, device).overstress
     six = SIX
 
     @wp.kernel(module="unique")
@@ -179,14 +130,6 @@ def kernels_of(law: Law, device: Device, count: int) -> Kernels:
                 pull += half * (half * past[c, p, six * (i + 1) + k] - share[e, i] * past[c, p, k])
             out[e, q, first + 1 + k, c] = pull
 
-    @wp.func
-    def pulled_back(H: mat, k: constants):
-        """S = Fb^-1 dev(P F^T) Fb^-T = J^(1/3) Fb^-1 (P - (P : Fb) Fb^-T / 3)."""
-        Hb, P = isochoric(H), own_stress(H, k)
-        identity = wp.identity(n=3, dtype=scalar)
-        G, wide = identity + cofactor_excess(Hb), scalar(1.0) + dilated(H)[0, 0]
-        return wide * (wp.transpose(G) * (P - wp.ddot(P, identity + Hb) / scalar(3.0) * G))
-
     @wp.kernel(module="unique")
     def advance(
         share: wp.array2d(dtype=scalar),
@@ -201,7 +144,7 @@ def kernels_of(law: Law, device: Device, count: int) -> Kernels:
         """S at H, and H_i <- exp(-dt / tau) H_i + g exp(-dt / (2 tau)) (S - its last value)."""
         e, q, c = wp.tid()
         p = e * strain.shape[1] + q
-        S = pulled_back(strain[e, q, c], coefficients[e])
+        S = overstress(strain[e, q, c], coefficients[e])
         low, high = vec(S[0, 0], S[1, 1], S[2, 2]), vec(S[1, 2], S[2, 0], S[0, 1])
         for k in range(six):
             now = wp.where(k < 3, low[k % 3], high[k % 3])
