@@ -29,8 +29,8 @@ from .footprint import Skin
 from .frame import Frame
 from .heading import moved_on, pushes_of, way_of
 from .inversion import Inversion
-from .ladder import FEWEST, LEARNT_KEY, Answer, Ladder, shortfall
-from .lbfgs import TAUGHT
+from .ladder import FEWEST, Answer, Ladder, shortfall
+from .lbfgs import LEARNT_KEY, TAUGHT
 from .linear import Preconditioner, conjugate_gradients
 from .loads import Displaced, Loads, Nodal, Pushed
 from .memory import check_fits, fitting_batch

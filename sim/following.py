@@ -17,8 +17,7 @@ from .deformation import Cost, Deformation, Outcome
 from .frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, Frame
 from .heading import BEFORE, PUSHES, knows, pushes_of, shares, way_of
 from .inversion import Inversion
-from .ladder import LEARNT_KEY, learnt_from
-from .lbfgs import LEARNT, rows_first
+from .lbfgs import LEARNT, LEARNT_KEY, learnt_from, rows_first
 from .loads import Loads
 from .problem import Problem
 from .room import State

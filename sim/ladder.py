@@ -11,20 +11,21 @@ import numpy as np
 import warp as wp
 
 from .accuracy import Accuracy
-from .balance import constants_of
 from .columns import gathered, scattered
 from .deformation import Outcome
 from .device import Device
 from .direction import NewtonCG
 from .elimination import Elimination
 from .inversion import Inversion
-from .lbfgs import LEARNT, Lbfgs
+from .lbfgs import LEARNT_KEY, Lbfgs, learnt_from
 from .linear import Preconditioner
 from .newton import find_equilibrium
 from .patching import NODES, Patching
 from .problem import Problem
-from .steering import BROKEN, DONE, PAIRS
+from .proximal import Proximal, proximal
+from .steering import BROKEN, DONE
 from .term import Cases
+from .touched import Touched
 from .vicinity import Vicinity
 
 # L-BFGS has so many turns; what it does not bring to its end is left to Newton. On CUDA, where few columns cost hardly
@@ -34,8 +35,6 @@ QUICK, QUICK_ON_CUDA = 60, 800
 FEWEST = 10
 # So many load cases are worth the set-up of a near part, and teach nothing.
 WORTH = 16
-# Begins the history's keys of what L-BFGS has learnt.
-LEARNT_KEY = "l-bfgs "
 NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
 # Load steps as shares of the load: the first, the least, and what is left of one that failed.
 FIRST_STEP, LEAST_STEP, CUT = 1.0 / 4.0, 1.0 / 64.0, 1.0 / 4.0
@@ -46,6 +45,8 @@ STEP_OUTER, MOST_STEP_OUTER = 8, 15
 WIDE_ENOUGH, CLOSING, OPEN_TOLERANCE = 8.0, 4.0, 0.05
 # A step that failed is tried again, shorter, from a gap so many times as wide.
 WIDER = 16.0
+# What touches is settled in so many steps first; where that ends so near, Newton goes on in as many.
+SETTLING, NEARLY = 16, 0.1
 # Load steps end when the batch has spent so many times the linear iterations that one outer step may take.
 PATIENCE = 4
 
@@ -111,6 +112,16 @@ class Ladder:
     def _lbfgs(self) -> Lbfgs:
         return Lbfgs(self.problem, self.preconditioner)
 
+    @cached_property
+    def _proximal(self) -> Proximal | None:
+        return proximal(self.problem, self.preconditioner)
+
+    @cached_property
+    def _touched(self) -> Preconditioner:
+        """The preconditioner that knows contact, where there is one."""
+        touch = self._proximal
+        return Touched(self.preconditioner, touch.compliance, touch.barrier) if touch else self.preconditioner
+
     @property
     def held(self) -> int:
         """Bytes that L-BFGS keeps for the next batch to stand in."""
@@ -154,10 +165,10 @@ class Ladder:
     def _acts(self, count: int) -> np.ndarray:
         """Which cases (b,) of the batch that has begun any force or imposed motion acts on at rest."""
         rest = self.problem.device.zeros(self.problem.rows, count)
-        if self.problem.plain:
-            _, loud = constants_of(self.problem, rest)
-        else:
-            loud = self.problem.gradient(rest)
+        loud = wp.zeros_like(rest)
+        for term in self.problem.terms:
+            if not term.passive:
+                term.add_gradient(rest, loud)
         acts = (loud.numpy() != 0.0).any(axis=0)
         if not acts.all():
             acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.barriers)])
@@ -196,12 +207,12 @@ class Ladder:
         # Rest satisfies whatever the batch does not move.
         imposed = problem.constraint.imposes or (start is not None and problem.gap(start)[1].any())
         start = device.zeros(problem.rows, count) if start is None else start
-        if problem.barriers:
-            return self._moved(cases, start)
-        if imposed or problem.steep or self.accuracy.outer < FEWEST:
-            return self._thorough(start, self.accuracy.outer)
         if problem.paced:  # the next frame's step may be another, and so its curvature
             learnt = None
+        if problem.barriers:
+            return self._moved(cases, start, learnt)
+        if imposed or problem.steep or self.accuracy.outer < FEWEST:
+            return self._thorough(start, self.accuracy.outer)
         descents: list[tuple[Elimination | Patching | Vicinity | Lbfgs, Mapping[str, np.ndarray] | None]] = [
             (self._lbfgs, learnt)
         ]
@@ -230,6 +241,25 @@ class Ladder:
             answer.put(index, self._thorough(start, self.accuracy.outer), device)
         return replace(answer, learnt=taught)
 
+    def _touching(
+        self, cases: Cases, start: wp.array, outer: int, gaps: float, learnt: Mapping[str, np.ndarray] | None
+    ) -> Answer:
+        """Of cases whose tools have gone so many times their gap: what touches and what gives apart, then Newton."""
+        problem, touch = self.problem, self._proximal
+        problem.begin(cases)
+        if touch is None or len(cases.loads) > 1 or problem.constraint.imposes or problem.gap(start)[1].any():
+            return self._closed(cases, start, outer, gaps)
+        start = self._rested(start)
+        found = touch.descend(start, np.array([self.accuracy.tolerance]), min(SETTLING, outer), learnt)
+        if found.status[0] == DONE:
+            outcome = np.full(1, Outcome.CONVERGED, object)
+            return replace(self._answer(found.u, outcome, found.steps, found.residual, 0), learnt=found.learnt)
+        if found.residual[0] <= NEARLY:
+            answer = self._thorough(found.u, min(SETTLING, outer))
+            if answer.good.all():
+                return replace(answer, iterations=answer.iterations + found.steps, learnt=found.learnt)
+        return self._closed(cases, start, outer, gaps)
+
     def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
         """Newton, of cases whose tools have gone so many times their gap: it is opened first, and closed step by step.
 
@@ -250,7 +280,7 @@ class Ladder:
 
     def _thorough(self, start: wp.array, outer: int, tolerance: float | None = None) -> Answer:
         """Newton, in at most so many outer steps, of a batch that has begun."""
-        newton = NewtonCG(self.preconditioner, self.accuracy.inner)
+        newton = NewtonCG(self._touched, self.accuracy.inner)
         accuracy = replace(self.accuracy, outer=outer, tolerance=tolerance or self.accuracy.tolerance)
         found = find_equilibrium(self.problem, newton, start, accuracy)
         return self._answer(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
@@ -281,7 +311,7 @@ class Ladder:
         found.residual[none], found.reached[none] = failed.residual[index[none]], failed.reached[index[none]]
         return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
-    def _moved(self, cases: Cases, start: wp.array) -> Answer:
+    def _moved(self, cases: Cases, start: wp.array, learnt: Mapping[str, np.ndarray] | None) -> Answer:
         """From start (3N, b), where the tools were, as far as they may go at once again and again.
 
         A body at rest on which nothing acts where they end is there, whatever they met on their way.
@@ -290,49 +320,58 @@ class Ladder:
         def moved(part: Cases, share: np.ndarray) -> Cases:
             return replace(part, share=share)
 
-        device, count = self.problem.device, len(cases.loads)
+        device, count, most = self.problem.device, len(cases.loads), self.accuracy.steps
         acting = np.flatnonzero(self._acts(count))
         if len(acting) == count:
-            return self._by_steps(cases, start, moved, 1.0, self.accuracy.steps)
+            return self._by_steps(cases, start, moved, 1.0, most, learnt)
         at_rest, none = device.zeros(*start.shape), np.zeros(count, int)
         every = np.full(count, Outcome.CONVERGED, object)
         answer = Answer(at_rest, every, none, np.zeros(count), np.ones(count), none.copy(), 0)
         if len(acting):
             part = gathered(device, start, acting)
-            answer.put(acting, self._by_steps(cases.rows(acting), part, moved, 1.0, self.accuracy.steps), device)
+            answer.put(acting, self._by_steps(cases.rows(acting), part, moved, 1.0, most), device)
         return answer
 
     def _by_steps(
-        self, cases: Cases, start: wp.array, aimed: Callable[[Cases, np.ndarray], Cases], first: float, most: int
+        self,
+        cases: Cases,
+        start: wp.array,
+        aimed: Callable[[Cases, np.ndarray], Cases],
+        first: float,
+        most: int,
+        learnt: Mapping[str, np.ndarray] | None = None,
     ) -> Answer:
         """From start (3N, b), cases at growing shares: the equilibrium at the largest share found.
 
-        `aimed` makes cases at shares (b,); the `first` step is so long, and none longer than tools may go at once. Each
-        that these ask for is one more than the `most` steps. Outcomes are good where the share is 1.
+        `aimed` makes cases at shares (b,); the `first` step is so long, and none longer than tools may go at once:
+        those that are as long do not count among the `most`. Outcomes are good where the share is 1; on the way
+        round-off will do.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
-        longest = np.minimum.reduce([np.ones(count), *(term.stride(cases) for term in problem.barriers)])
         gaps = np.maximum.reduce([np.zeros(count), *(term.gaps(cases) for term in problem.barriers)])
-        asked = int(np.ceil(1.0 / longest.min(initial=1.0)))
-        u, step, spent = wp.clone(start), np.minimum(first, longest), 0
-        least = LEAST_STEP * np.minimum(1.0, 4.0 * longest)
+        u, step, left, spent, done = wp.clone(start), np.full(count, first), most, 0, 1
         reached, iterations, residual = np.zeros(count), np.zeros(count, int), np.full(count, np.inf)
         outcome = np.full(count, Outcome.BUDGET, object)
         lets = outer = self.accuracy.outer
         if not problem.barriers:
             lets, outer = STEP_OUTER, min(MOST_STEP_OUTER, outer)
-        for _ in range(most + asked):
-            live = np.flatnonzero((reached < 1.0) & (step >= least))
-            if len(live) == 0 or spent > PATIENCE * self.accuracy.inner * asked:
+        while left >= 0:
+            strides = [term.stride(aimed(cases, reached), u) for term in problem.barriers]
+            longest = np.minimum.reduce([np.ones(count), *strides])
+            step = np.minimum(step, longest)
+            live = np.flatnonzero((reached < 1.0) & (step >= LEAST_STEP * np.minimum(1.0, 4.0 * longest)))
+            if len(live) == 0 or spent > PATIENCE * self.accuracy.inner * done:
                 break
             aim = np.minimum(reached[live] + step[live], 1.0)
             gone = float(((aim - reached[live]) * gaps[live]).max())
-            found = self._closed(aimed(cases.rows(live), aim), gathered(device, u, live), outer, gone)
-            good, spent = found.good, spent + found.linear_iterations
+            left -= int((step < longest)[live].any())
+            found = self._touching(aimed(cases.rows(live), aim), gathered(device, u, live), outer, gone, learnt)
+            learnt, spent = found.learnt or learnt, spent + found.linear_iterations
+            good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
+            done += int(good.any())
             iterations[live] += found.iterations
             gaps[live] *= np.where(good, 1.0, WIDER)
             step[live] *= np.where(good, np.clip(lets / np.maximum(found.iterations, 1), 0.5, 2.0), CUT)
-            step = np.minimum(step, longest)
             scattered(device, gathered(device, found.u, np.flatnonzero(good)), live[good], u)
             reached[live[good]], residual[live[good]] = aim[good], found.residual[good]
             outcome[live] = found.outcome
@@ -345,18 +384,8 @@ class Ladder:
         if len(short):
             problem.begin(cases.rows(short))
             residual[short] = shortfall(problem, gathered(device, u, short))
-        return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent)
-
-
-def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
-    """What an earlier descent on as many rows = 3N left in the history; nothing if that does not fit these cases."""
-    if any(LEARNT_KEY + name not in cases.history for name in LEARNT):
-        return {}
-    found = {name: np.asarray(cases.history[LEARNT_KEY + name]) for name in LEARNT}
-    shape = {"s": (PAIRS, rows), "w": (PAIRS, rows), "sy": (PAIRS, PAIRS), "yw": (PAIRS, PAIRS)}
-    fits = all(array.shape == (len(cases.loads), *shape.get(name, ())) for name, array in found.items())
-    most = {"head": PAIRS - 1, "known": PAIRS}
-    return found if fits and all(((found[name] >= 0) & (found[name] <= most[name])).all() for name in most) else {}
+        taught = {LEARNT_KEY + name: array for name, array in (learnt or NOTHING).items()}
+        return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent, taught)
 
 
 def shortfall(problem: Problem, u: wp.array) -> np.ndarray:

@@ -17,13 +17,16 @@ from .columns import EXACT, WIDTHS, gathered, scattered
 from .linear import Preconditioner
 from .problem import Problem
 from .room import Room, ground_of
-from .steering import LEFT, LIVE
+from .steering import LEFT, LIVE, PAIRS
+from .term import Cases
 
 # On CUDA the host looks after so many turns; it moves what is live to a room of at most such a share of the width.
 TURNS_ON_CUDA, SMALLER_ON_CUDA, SMALLER = 2, 0.75, 0.85
 # What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
 # the newest pair and how many there are (b,).
 LEARNT = ("s", "w", "sy", "yw", "head", "known")
+# Begins the history's keys of these.
+LEARNT_KEY = "l-bfgs "
 # Learnt curvature travels with the answers of so few load cases: a larger batch has no next frame.
 TAUGHT = EXACT
 
@@ -138,3 +141,14 @@ class Lbfgs:
 def rows_first(array: wp.array) -> np.ndarray:
     """A copy (b, ...) on the host of an array (..., b) in a room."""
     return np.moveaxis(array.numpy(), -1, 0).copy()  # what stands in a room is written over
+
+
+def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
+    """What an earlier descent on as many rows = 3N left in the history; nothing if that does not fit these cases."""
+    if any(LEARNT_KEY + name not in cases.history for name in LEARNT):
+        return {}
+    found = {name: np.asarray(cases.history[LEARNT_KEY + name]) for name in LEARNT}
+    shape = {"s": (PAIRS, rows), "w": (PAIRS, rows), "sy": (PAIRS, PAIRS), "yw": (PAIRS, PAIRS)}
+    fits = all(array.shape == (len(cases.loads), *shape.get(name, ())) for name, array in found.items())
+    most = {"head": PAIRS - 1, "known": PAIRS}
+    return found if fits and all(((found[name] >= 0) & (found[name] <= most[name])).all() for name in most) else {}

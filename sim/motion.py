@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from .tools import Tool, core_of, distances_to
 
-# A step moves no point of a tool farther than this share of its radius: tissue never comes out at its other side.
+# A step moves no point of a tool farther into tissue than this share of its radius: none comes out at its other side.
 STRIDE = 0.5
 # Most steps of a tool's way through the air, each as far as nothing can be touched.
 MARCH = 40
@@ -44,9 +44,9 @@ class Way:
         extent = np.array([core_of(tool).extent for tool in tools])
         return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
 
-    def stride(self, tools: tuple[Tool, ...]) -> np.ndarray:
-        """The longest shares (B,), at most 1, of the way that the tools may go at once."""
-        most = STRIDE * np.array([core_of(tool).radius for tool in tools])
+    def stride(self, tools: tuple[Tool, ...], clear: np.ndarray) -> np.ndarray:
+        """The longest shares (B,), at most 1, of the way that tools may go at once that are `clear` (B, tools) [m]."""
+        most = clear + STRIDE * np.array([core_of(tool).radius for tool in tools])
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
 
 

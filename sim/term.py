@@ -32,6 +32,11 @@ class Cases:
     anew: np.ndarray | None = None
 
     @property
+    def gone(self) -> np.ndarray:
+        """Shares (B,) of their way that tools have gone."""
+        return np.ones(len(self.loads)) if self.share is None else self.share
+
+    @property
     def steps(self) -> np.ndarray:
         """How much time (B,) [s] has passed since the start.
 
@@ -172,8 +177,8 @@ class Remembering(Term, Protocol):
 class Barrier(Term, Protocol):
     """A Term of bodies that tissue touches: they keep a gap, which a descent may open first; some move, as tools do."""
 
-    def stride(self, cases: Cases) -> np.ndarray:
-        """The longest share (B,), at most 1, of their way that the tools may go at once."""
+    def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
+        """The longest share (B,), at most 1, of their way that the tools may go at once, the body at u (3N, B) [m]."""
         ...
 
     def gaps(self, cases: Cases) -> np.ndarray:
@@ -190,6 +195,43 @@ class Barrier(Term, Protocol):
 
     def reaction(self, u: wp.array) -> np.ndarray:
         """(b, tools, 6): force [N] and moment about its origin [N m] that each tool exerts at u (3N, b) [m]."""
+        ...
+
+
+class Reduction(Protocol):
+    """A Barrier of one column on the n nodes that can be touched: a function of where they go, w (3n,) [m]."""
+
+    def slope(self, w: np.ndarray) -> np.ndarray:
+        """Its gradient (3n,) [N]."""
+        ...
+
+    def curvature(self, w: np.ndarray, some: np.ndarray, definite: bool) -> np.ndarray:
+        """Its curvature (3a, 3a) [N/m] between `some` (a,) of the n nodes; positive semi-definite if `definite`."""
+        ...
+
+    def longest_step(self, w: np.ndarray, dw: np.ndarray) -> float:
+        """The longest fraction, at most 1, of dw (3n,) [m] that stays inside the domain."""
+        ...
+
+
+@runtime_checkable
+class Local(Barrier, Protocol):
+    """A Barrier that only some nodes can ever feel."""
+
+    @property
+    def touchable(self) -> np.ndarray:
+        """These nodes (n,), ascending."""
+        ...
+
+    def reduced(self) -> Reduction | None:
+        """On these nodes alone, of a batch of one column, as it stands now; None where there is nothing to touch."""
+        ...
+
+    def pressed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which (a,) of these n nodes feel it at the last linearisation, of one column, and its curvature there.
+
+        (3a, 3a) [N/m], positive semi-definite.
+        """
         ...
 
 

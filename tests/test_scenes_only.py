@@ -45,8 +45,8 @@ OF_EFFECT = {
     "Inertia": cost("inertia", "inertia:add_force", "Inertia Kernels"),
     "Pulsation": cost("swelling", "swelling:fill loops:spread", "Swelling"),
     "Resection": cost(),
-    "ToolContact": cost("barrier contact touch", "touch:add_gradient touch:add_reaction", "Contact"),
-    "Retraction": cost("barrier contact touch", "touch:add_gradient touch:add_reaction", "Contact"),
+    "ToolContact": cost("barrier contact reduced touch", "touch:add_gradient touch:add_reaction", "Contact Reduced"),
+    "Retraction": cost("barrier contact reduced touch", "touch:add_gradient touch:add_reaction", "Contact Reduced"),
     "SkullContact": cost("barrier skull_contact", "skull_contact:add_gradient", "Skull"),
 }
 OF_LAW = {
@@ -66,6 +66,7 @@ ANY = {f"loops:{name}" for name in ("add_energy", "add_curvature", "add_diagonal
     "dead_force:subtract_work",
     "inertia:add_energy",
     "inertia:add_blocks",
+    "touch:add_matrix",
     *(f"{name}:{kernel}" for name in ("touch", "skull_contact") for kernel in ("add_curvature", "bound_step")),
 }
 

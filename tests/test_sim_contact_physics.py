@@ -69,7 +69,7 @@ def touching(*poses: np.ndarray) -> Loads:
 def force_on(anatomy: Anatomy, tool: Tool, depth: float, gap: float) -> float:
     """What the tool presses the whole of a quartered block with [N], so deep."""
     effects = [Elasticity(ROCK), Held(), ToolContact((tool,), gap)]
-    fem = Fem(anatomy, effects, Accuracy(tolerance=3e-3), "cpu", element="smoothed")
+    fem = Fem(anatomy, effects, Accuracy(tolerance=1e-3), "cpu", element="smoothed")
     found = fem.deform(touching(at(0.0, 0.0, -depth)))
     assert found.outcome[0].good
     return -4.0 * float(found.reaction[0, 0, 2])

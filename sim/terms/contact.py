@@ -1,7 +1,7 @@
 """Frictionless contact of a body's surface with rigid tools that are moved by pose."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import warp as wp
@@ -15,8 +15,9 @@ from ..errors import InputError
 from ..loads import Retracted, Touching
 from ..motion import Way, approach
 from ..term import Cases
-from ..tools import Tool, core_of
-from .touch import Scale, Surface, Tools, kernels_of
+from ..tools import Tool, core_of, distances_to
+from .reduced import HOST, Reduced
+from .touch import BULGE, Scale, Surface, Tools, kernels_of
 
 # Surfaces are looked at in points; between them they are nearer to a tool by at most this share of the gap, which is
 # added to the tool's radius: no point of a surface is inside.
@@ -68,6 +69,7 @@ class Contact:
     ):
         self.name = name
         self._whole, self._corners = (nodes, whole), [core_of(tool).corners for tool in tools]
+        self._triangles = triangles
         self._shapes, self._way, self._device = tools, way, device
         self._kernels = kernels_of(device, triangles.shape[1])
         cores = [core_of(tool) for tool in tools]
@@ -83,14 +85,23 @@ class Contact:
         self._tools.centre = device.array(np.array([core.centre for core in cores]), wp.vec3d)
         self._tools.half = device.array(np.array([core.half for core in cores]), wp.vec3d)
         self._tools.radius = device.array(np.array([core.radius + SAG * gap for core in cores]), wp.float64)
-        self._gap, self._shear = (1.0 - SAG) * gap, shear
+        self._asked, self._gap, self._shear = gap, (1.0 - SAG) * gap, shear
         self.widen(1.0)
         self._pose: np.ndarray | None = None
 
-    def stride(self, cases: Cases) -> np.ndarray:
-        """As `Way.stride`."""
+    def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
+        """As `Way.stride`: through the air a tool goes as far as it can touch nothing."""
         way = self._way(cases)
-        return np.ones(len(cases.loads)) if way is None else way.stride(self._shapes)
+        if way is None:
+            return np.ones(len(cases.loads))
+        corners = (self._whole[0] + u.numpy().T.reshape(len(cases.loads), -1, 3))[:, self._triangles]
+        middle = corners[:, :, :3].mean(axis=2)
+        reach = BULGE * np.linalg.norm(corners - middle[:, :, None], axis=3).max(axis=2)
+        clear = [
+            [(distances_to(tool, at, points) - far).min() for tool, at in zip(self._shapes, pose, strict=True)]
+            for pose, points, far in zip(way.at(cases.gone), middle, reach, strict=True)
+        ]
+        return way.stride(self._shapes, np.maximum(clear, 0.0))
 
     def gaps(self, cases: Cases) -> np.ndarray:
         """As the farthest-moved tool goes."""
@@ -116,8 +127,8 @@ class Contact:
 
     def begin(self, cases: Cases) -> None:
         """Put the tools where they are after their share of the way; the gap is its own again."""
-        way, share = self._way(cases), np.ones(len(cases.loads)) if cases.share is None else cases.share
-        self._stand(None if way is None else way.at(share))
+        way = self._way(cases)
+        self._stand(None if way is None else way.at(cases.gone))
         self.widen(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
@@ -150,6 +161,38 @@ class Contact:
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
         """No point of the surface passes through a tool."""
         self._launch(self._kernels.bound_step, [u, du], out, u.shape[1])
+
+    def add_matrix(self, u: wp.array, place: wp.array, definite: bool, out: wp.array) -> None:
+        """K += K(u) of one column, u (3N, 1), in out (3n, 3n), float64, between nodes of a `place` (N,), not -1."""
+        self._launch(self._kernels.add_matrix, [u, int(definite), place], out, 1)
+
+    @cached_property
+    def touchable(self) -> np.ndarray:
+        """The nodes (n,), ascending, of the surface that tools can touch."""
+        return np.unique(self._triangles)
+
+    @cached_property
+    def _reduced(self) -> Reduced:
+        nodes, own = self._whole[0][self.touchable], np.searchsorted(self.touchable, self._triangles)
+        term = Contact(self.name, self._shapes, self._way, nodes, own, own[:, :3], self._asked, self._shear, HOST)
+        return Reduced(term, len(nodes))
+
+    def reduced(self) -> Reduced | None:
+        """Of a batch of one column, with the tools and the gap as they are now; None where no tool is."""
+        if self._pose is None:
+            return None
+        self._reduced.term._stand(self._pose)
+        self._reduced.term._scale = self._scale
+        return self._reduced
+
+    def pressed(self) -> tuple[np.ndarray, np.ndarray]:
+        """As `Local.pressed`."""
+        barrier = self.reduced()
+        if barrier is None:
+            return np.zeros(0, int), np.zeros((0, 0))
+        w = self._at[0].numpy().reshape(-1, 3)[self.touchable].ravel()
+        nodes = np.flatnonzero(barrier.slope(w).reshape(-1, 3).any(axis=1))
+        return nodes, barrier.curvature(w, nodes, True)
 
     def reaction(self, u: wp.array) -> np.ndarray:
         """(b, tools, 6): force [N] and moment [N m] about its origin that each tool exerts at u (3N, b) [m]."""

@@ -256,7 +256,7 @@ class Skull:
         place = row.ravel(), row.swapaxes(1, 2).ravel()
         self._rest = sp.csc_array(sp.coo_array((blocks.ravel(), place), shape=(3 * count, 3 * count)))
 
-    def stride(self, cases: Cases) -> np.ndarray:
+    def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
         """The skull stays where it is."""
         return np.ones(len(cases.loads))
 

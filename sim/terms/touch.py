@@ -22,6 +22,7 @@ class Kernels:
     add_gradient: wp.Kernel
     add_curvature: wp.Kernel
     add_diagonal: wp.Kernel
+    add_matrix: wp.Kernel
     add_reaction: wp.Kernel
     bound_step: wp.Kernel
 
@@ -263,6 +264,37 @@ def kernels_of(device: Device, size: int) -> Kernels:
                                 wp.atomic_add(out, surface.table[s, a], c, block)
 
     @wp.kernel(module="unique")
+    def add_matrix(
+        u: wp.array2d(dtype=scalar),
+        definite: int,
+        place: wp.array(dtype=wp.int32),
+        surface: Surface,
+        tools: Tools,
+        scale: Scale,
+        # outputs
+        out: wp.array2d(dtype=wp.float64),
+    ):
+        """K_ab += sum over points of w k H N_a N_b, of one column, between the nodes that have a place."""
+        s, c = wp.tid()
+        at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
+        for k in range(tools.radius.shape[0]):
+            if is_near(at, tools, scale.gap, k, c):
+                for i in range(n):
+                    for j in range(2 * (n - i) - 1):
+                        N = shape_of(i, j, n)
+                        touch = touch_of(N * at, tools, k, c)
+                        if touch.distance < scale.gap:
+                            H = weight * curvature_at(touch, scale.gap, definite)
+                            for a in range(size):
+                                for b in range(size):
+                                    first, second = 3 * place[surface.table[s, a]], 3 * place[surface.table[s, b]]
+                                    if first >= 0 and second >= 0:
+                                        for row in range(3):
+                                            for column in range(3):
+                                                share = N[a] * N[b] * H[row, column]
+                                                wp.atomic_add(out, first + row, second + column, share)
+
+    @wp.kernel(module="unique")
     def add_reaction(
         u: wp.array2d(dtype=scalar),
         surface: Surface,
@@ -312,4 +344,4 @@ def kernels_of(device: Device, size: int) -> Kernels:
                         if far > room:
                             wp.atomic_min(out, c, scalar(room / far))
 
-    return Kernels(add_energy, add_gradient, add_curvature, add_diagonal, add_reaction, bound_step)
+    return Kernels(add_energy, add_gradient, add_curvature, add_diagonal, add_matrix, add_reaction, bound_step)

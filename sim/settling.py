@@ -1,0 +1,127 @@
+"""Where the few nodes that tools touch come to rest, while all else follows as a quadratic model has it.
+
+With C (3n, 3n) the compliance of the model at these nodes and w0 where they would go untouched, w minimises
+
+    (w - w0) . C^-1 (w - w0) / 2 + c(w) + d |w - v|^2 / 2 over the touched,
+
+c the barrier of tools and d a drag from where they are, v. It is found by Newton's method for the forces f that tools
+exert, w = w0 - C f: these are none but at touched nodes, and so C is never inverted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+
+from .compliance import Compliance
+from .pairs import Pairs
+from .steering import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
+from .term import Reduction
+
+STEPS, CUTS = 60, 20
+# More touched nodes than these are no few.
+MOST = 300
+# A model that is not convex after so many steps is not going to be.
+LATE = 12
+# A compliance is rounded: this share of its mean makes it definite.
+ROUNDED = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Softness:
+    """C of a model: what a body at rest does, and what was learnt since, at the n nodes of the compliance."""
+
+    rest: Compliance
+    pairs: Pairs
+
+    @cached_property
+    def _learnt(self) -> np.ndarray:
+        return self.pairs.at(self.rest.rows)
+
+    def moved(self, force: np.ndarray) -> np.ndarray:
+        """C force (3n,)."""
+        return self.rest.moved(force) + (self.pairs.middle @ (self._learnt @ force)) @ self._learnt
+
+    def between(self, some: np.ndarray) -> np.ndarray:
+        """C (3a, 3a) between `some` (a,) of the nodes, positive definite."""
+        own, learnt = self.rest.between(some), self._learnt[:, _rows(some)]
+        own = 0.5 * (own + own.T) + learnt.T @ self.pairs.middle @ learnt
+        return own + ROUNDED * np.trace(own) / len(own) * np.eye(len(own))
+
+
+def settled(
+    barrier: Reduction, soft: Softness, here: np.ndarray, free: np.ndarray, tolerance: float, drag: float
+) -> np.ndarray | None:
+    """The forces f (3n,) [N], from where the nodes are, `here` (3n,) [m]; w0 is `free` (3n,) [m].
+
+    They are exact to a `tolerance`, relative. `drag` is d in units of how stiff a touched node is. None where the model
+    is not convex: its tools are sharper than its tissue is stiff, and it would go far astray.
+    """
+    touched = _touched(barrier.slope(here))[:MOST]
+    force, held = np.zeros_like(here), np.zeros_like(here)
+    if len(touched):
+        own, rows = soft.between(touched), _rows(touched)
+        force[rows] = np.linalg.solve(own, (free - here)[rows])
+        held[rows] = drag / np.diag(own).mean()
+
+    def pushed(w: np.ndarray) -> np.ndarray:
+        return barrier.slope(w) + held * (w - here)
+
+    w, convex = free - soft.moved(force), True
+    slope = pushed(w)
+    for step in range(STEPS):
+        left = slope - force
+        if np.linalg.norm(left) <= tolerance * np.linalg.norm(slope):
+            break
+        change, convex = _newton(barrier, soft, w, slope, left, held)
+        if not convex and step >= LATE:
+            return None
+        way = -soft.moved(change)
+        promised, t = -float(left @ way), barrier.longest_step(w, way)
+        slope = pushed(w + t * way)
+        for _ in range(CUTS):
+            ahead = float((slope - force - t * change) @ way)
+            if ahead <= OVERSHOOT * abs(promised):
+                break
+            kept = promised / (promised + ahead) if promised > 0.0 else KEPT
+            t *= float(np.clip(kept, LEAST_KEPT, MOST_KEPT))
+            slope = pushed(w + t * way)
+        force, w = force + t * change, w + t * way
+    return force if convex else None
+
+
+def _newton(
+    barrier: Reduction, soft: Softness, w: np.ndarray, slope: np.ndarray, left: np.ndarray, held: np.ndarray
+) -> tuple[np.ndarray, bool]:
+    """The change (3n,) of the forces that 1 + D C has for what is `left` (3n,), D = c'' at w; whether it is convex.
+
+    Where it is not, D is taken without what bends.
+    """
+    touched, change = _touched(slope), left.copy()
+    if not len(touched):
+        return change, True
+    if len(touched) > MOST:
+        return change, False
+    rows = _rows(touched)
+    root = np.linalg.cholesky(soft.between(touched))
+    along = solve_triangular(root, soft.moved(left)[rows], lower=True)
+    for definite in (False, True):
+        curvature = barrier.curvature(w, touched, definite) + np.diag(held[rows])
+        try:
+            whole = cho_factor(np.eye(len(rows)) + root.T @ curvature @ root, lower=True)
+        except LinAlgError:
+            continue
+        change[rows] -= curvature @ (root @ cho_solve(whole, along))
+        return change, not definite
+    raise LinAlgError("curvature that is positive semi-definite is not")
+
+
+def _touched(slope: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(slope.reshape(-1, 3).any(axis=1))
+
+
+def _rows(nodes: np.ndarray) -> np.ndarray:
+    return (3 * nodes[:, None] + np.arange(3)).ravel()
