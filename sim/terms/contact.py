@@ -163,7 +163,7 @@ class Contact:
         self._launch(self._kernels.bound_step, [u, du], out, u.shape[1])
 
     def add_matrix(self, u: wp.array, place: wp.array, definite: bool, out: wp.array) -> None:
-        """K += K(u) of one column, u (3N, 1), in out (3n, 3n), float64, between nodes of a `place` (N,), not -1."""
+        """As `Dense.add_matrix`."""
         self._launch(self._kernels.add_matrix, [u, int(definite), place], out, 1)
 
     @cached_property
@@ -172,18 +172,20 @@ class Contact:
         return np.unique(self._triangles)
 
     @cached_property
-    def _reduced(self) -> Reduced:
+    def _alone(self) -> "tuple[Contact, Reduced]":
+        """The same on the touchable nodes alone, and as a function of where these go."""
         nodes, own = self._whole[0][self.touchable], np.searchsorted(self.touchable, self._triangles)
         term = Contact(self.name, self._shapes, self._way, nodes, own, own[:, :3], self._asked, self._shear, HOST)
-        return Reduced(term, len(nodes))
+        return term, Reduced(term, len(nodes))
 
     def reduced(self) -> Reduced | None:
         """Of a batch of one column, with the tools and the gap as they are now; None where no tool is."""
         if self._pose is None:
             return None
-        self._reduced.term._stand(self._pose)
-        self._reduced.term._scale = self._scale
-        return self._reduced
+        term, reduced = self._alone
+        term._stand(self._pose)
+        term._scale = self._scale
+        return reduced
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
         """As `Local.pressed`."""
