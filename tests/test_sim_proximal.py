@@ -1,0 +1,218 @@
+"""What touches and what gives, solved apart: each part against the same by other means."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import warp as wp
+from boxes import base_held, box
+
+from sim.accuracy import TRAIN, Accuracy
+from sim.compliance import BLOCK, Compliance
+from sim.effects import Elasticity, Held, ToolContact
+from sim.fem import Fem
+from sim.linear import Preconditioner
+from sim.loads import Loads, Touching
+from sim.material import Material
+from sim.motion import STRIDE, Way
+from sim.pairs import Pairs, pairs_of
+from sim.proximal import Proximal, proximal
+from sim.steering import PAIRS
+from sim.term import Cases
+from sim.tools import Ball
+from sim.touched import Touched
+
+SIDE, HEIGHT, RADIUS = 0.06, 0.03, 6e-3
+BODY = base_held(box((6, 6, 3), SIDE))
+
+
+def at(x: float, y: float, z: float) -> np.ndarray:
+    """T_world_tool (4, 4) of an upright tool at a place [m]."""
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
+def touching(*poses: np.ndarray) -> Loads:
+    """One tool in so many load cases."""
+    return Loads((Touching(np.stack(poses)[:, None]),))
+
+
+DOWN = at(0.031, 0.028, HEIGHT - 3e-3)
+ASIDE = at(0.036, 0.03, HEIGHT - 4e-3)
+
+
+@cache
+def solver(accuracy: Accuracy) -> Fem:
+    effects = [Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), ToolContact((Ball(RADIUS),))]
+    return Fem(BODY, effects, accuracy, "cpu")
+
+
+@cache
+def parts() -> tuple[Fem, Proximal]:
+    """A solver, and its descent."""
+    fem = solver(Accuracy(1e-6))
+    found = proximal(fem.problem, fem._ladder.preconditioner)
+    assert found is not None
+    return fem, found
+
+
+def bfgs(inverse: np.ndarray, steps: np.ndarray, changes: np.ndarray) -> np.ndarray:
+    """Nocedal, Wright 2006, equation 6.17, pair after pair."""
+    for s, y in zip(steps, changes, strict=True):
+        left = np.eye(len(s)) - np.outer(s, y) / (s @ y)
+        inverse = left @ inverse @ left.T + np.outer(s, s) / (s @ y)
+    return inverse
+
+
+def learnt_pairs(count: int) -> tuple[Pairs, np.ndarray, np.ndarray]:
+    """Pairs of random steps (the last PAIRS count), the inverse they began with and the one that BFGS has."""
+    rng, size = np.random.default_rng(5), 30
+    stiffness, change = (matrix @ matrix.T for matrix in rng.normal(size=(2, size, size)))
+    begun = np.linalg.inv(stiffness + size * np.eye(size))
+    steps = rng.normal(size=(count, size))
+    changes = steps @ (stiffness + change)
+    pairs = pairs_of({}, size, "float64")
+    for s, y in zip(steps, changes, strict=True):
+        pairs = pairs.and_one(s, y, begun @ y)
+    return pairs, begun, bfgs(begun, steps[-PAIRS:], changes[-PAIRS:])
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, PAIRS, PAIRS + 3])
+def test_pairs_are_those_of_bfgs(count: int) -> None:
+    pairs, begun, expected = learnt_pairs(count)
+    force = np.random.default_rng(6).normal(size=len(begun))
+    np.testing.assert_allclose(begun @ force + pairs.motion(pairs.weights(force)), expected @ force, rtol=1e-8)
+    some = np.array([3, 7, 8])
+    learnt = pairs.at(some).T @ pairs.middle @ pairs.at(some)
+    np.testing.assert_allclose(begun[np.ix_(some, some)] + learnt, expected[np.ix_(some, some)], atol=1e-10)
+
+
+@pytest.mark.parametrize("count", [0, 3, PAIRS + 3])
+def test_pairs_travel_as_history(count: int) -> None:
+    """In the places that L-BFGS on the device keeps them in, whichever of these is the newest."""
+    pairs, begun, _ = learnt_pairs(count)
+    learnt = pairs.learnt()
+    turned = {name: np.roll(array, 3, axis=1) if name in "sw" else array for name, array in learnt.items()}
+    turned |= {name: np.roll(learnt[name], (3, 3), axis=(1, 2)) for name in ("sy", "yw")}
+    turned["head"] = (learnt["head"] + 3) % PAIRS
+    for told in (learnt, turned):
+        back = pairs_of(told, len(begun), "float64")
+        for name in ("s", "w", "sy", "yw"):
+            np.testing.assert_array_equal(getattr(back, name), getattr(pairs, name))
+
+
+def test_columns_are_what_the_preconditioner_does() -> None:
+    fem, descent = parts()
+    nodes, rng = descent.barrier.touchable, np.random.default_rng(1)
+    soft = descent.compliance
+    force = np.zeros((len(nodes), 3))
+    some = rng.permutation(len(nodes))[:5]
+    force[some] = rng.normal(size=(5, 3))
+    whole = np.zeros((fem.problem.rows, 1))
+    whole[soft.rows, 0] = force.ravel()
+    expected = soft.answered(whole)[:, 0]
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(soft.spread(force.ravel()), expected, atol=1e-6 * size)
+    np.testing.assert_allclose(soft.moved(force.ravel()), expected[soft.rows], atol=1e-6 * size)
+    own = (soft.between(some) @ force[some].ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(own, expected.reshape(-1, 3)[nodes[some]], atol=1e-6 * size)
+
+
+def test_columns_are_the_same_bits_in_whatever_order_they_are_made() -> None:
+    fem, descent = parts()
+    nodes, preconditioner = descent.barrier.touchable, fem._ladder.preconditioner
+    assert len(nodes) > 3 * BLOCK
+    one, other = (Compliance(fem.problem, preconditioner, nodes) for _ in range(2))
+    every, last = np.arange(len(nodes)), np.array([len(nodes) - 1])
+    other.between(last)
+    np.testing.assert_array_equal(one.between(every), other.between(every))
+
+
+@pytest.mark.parametrize("definite", [False, True])
+def test_the_reduced_barrier_is_the_whole_one(definite: bool) -> None:
+    """Its gradient, and its curvature against the term's own product."""
+    fem, descent = parts()
+    problem, term, nodes = fem.problem, descent.barrier, descent.barrier.touchable
+    problem.begin(Cases(touching(DOWN), np.zeros(1)))
+    rng = np.random.default_rng(2)
+    u = 1e-4 * rng.normal(size=(problem.rows, 1))
+    rows, place = descent.compliance.rows, problem.device.array(u)
+    expected = problem.device.zeros(problem.rows, 1)
+    term.add_gradient(place, expected)
+    barrier = term.reduced()
+    assert barrier is not None and np.abs(expected.numpy()).max() > 1e-3
+    np.testing.assert_allclose(barrier.slope(u[rows, 0]), expected.numpy()[rows, 0], rtol=1e-9, atol=1e-12)
+    p, product = rng.normal(size=(problem.rows, 1)), problem.device.zeros(problem.rows, 1)
+    problem.linearise(place, np.array([definite]))
+    term.add_curvature(problem.device.array(p), product)
+    matrix = barrier.curvature(u[rows, 0], np.arange(len(nodes)), definite)
+    np.testing.assert_allclose(
+        matrix @ p[rows, 0], product.numpy()[rows, 0], rtol=1e-8, atol=1e-9 * np.abs(matrix).max()
+    )
+
+
+def test_what_is_touched_is_known_to_the_preconditioner() -> None:
+    """It is the inverse of the rest stiffness and the barrier's curvature: that times it is what it was given."""
+    fem, descent = parts()
+    problem, preconditioner = fem.problem, fem._ladder.preconditioner
+    problem.begin(Cases(touching(DOWN), np.zeros(1)))
+    problem.linearise(problem.device.zeros(problem.rows, 1), np.ones(1, bool))
+    touched = Touched(preconditioner, descent.compliance, descent.barrier)
+    touched.prepare(problem, 1)
+    r = problem.device.array(np.random.default_rng(3).normal(size=(problem.rows, 1)))
+    problem.constraint.project(r)
+
+    def missed(one: Preconditioner) -> float:
+        x, back = wp.zeros_like(r), wp.zeros_like(r)
+        one.apply(r, np.ones(1, bool), x)
+        problem.add_curvature(x, back)  # at rest, elastic tissue has its rest stiffness
+        problem.constraint.project(back)
+        return float(np.linalg.norm(back.numpy() - r.numpy()) / np.linalg.norm(r.numpy()))
+
+    assert missed(touched) < 1e-2  # a factor is kept in single precision
+    assert missed(preconditioner) > 1.0
+
+
+def test_an_answer_alone_is_that_in_a_batch() -> None:
+    """Batches go by Newton alone."""
+    fem = solver(Accuracy(1e-8))
+    alone = fem.deform(touching(ASIDE), fem.deform(touching(DOWN)))
+    batch = fem.deform(touching(ASIDE, ASIDE), fem.deform(touching(DOWN, DOWN)))
+    assert alone.outcome[0].good and batch.outcome[0].good
+    np.testing.assert_allclose(alone.displacement[0], batch.displacement[0], atol=1e-9)
+    np.testing.assert_allclose(alone.reaction[0], batch.reaction[0], rtol=1e-6, atol=1e-9)
+
+
+def test_what_was_asked_before_changes_no_bit() -> None:
+    fem = solver(TRAIN)
+    begun = fem.deform(touching(DOWN))
+    first = fem.deform(touching(ASIDE), begun)
+    fem.deform(touching(at(0.012, 0.045, HEIGHT - 2e-3)))
+    again = fem.deform(touching(ASIDE), begun)
+    np.testing.assert_array_equal(first.displacement, again.displacement)
+    np.testing.assert_array_equal(first.reaction, again.reaction)
+    for name, array in first.history.items():
+        np.testing.assert_array_equal(array, again.history[name])
+
+
+def test_a_way_is_as_long_as_it_is_clear() -> None:
+    tool = Ball(RADIUS)
+    begin, end = at(0.0, 0.0, 0.1)[None, None], at(0.1, 0.0, 0.1)[None, None]
+    way = Way(begin, end)
+    np.testing.assert_allclose(way.stride((tool,), np.zeros((1, 1))), STRIDE * RADIUS / 0.1)
+    np.testing.assert_allclose(way.stride((tool,), np.full((1, 1), 0.04)), (0.04 + STRIDE * RADIUS) / 0.1)
+    np.testing.assert_allclose(way.stride((tool,), np.full((1, 1), 0.2)), 1.0)
+
+
+def test_a_tool_flies_in_few_strides() -> None:
+    """Beside the body, and away from it: from 9 cm off it, seven cm are free whichever way."""
+    fem = solver(TRAIN)
+    term = fem.problem.barriers[0]
+    poses = at(-0.09, 0.03, HEIGHT + 5e-3), at(-0.33, 0.03, HEIGHT + 5e-3)
+    there = fem.deform(touching(poses[0]))
+    cases = Cases(touching(poses[1]), np.zeros(1), there.history, np.zeros((1, len(BODY.mesh.nodes), 3)), np.zeros(1))
+    stride = term.stride(cases, fem.problem.device.zeros(fem.problem.rows, 1))
+    assert stride[0] > 0.07 / 0.24 > 10.0 * STRIDE * RADIUS / 0.24
