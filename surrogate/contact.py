@@ -20,6 +20,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
 from sim.effects import ToolContact
+from sim.threads import one_thread
 from sim.tools import Ball
 
 # Finite elements keep tissue within a gap of the ball [m]: on average half of it.
@@ -28,6 +29,8 @@ THICKER = 0.5 * ToolContact((Ball(1.0),)).gap
 REACH = 1.5
 # A facet entered by less [m], and motions smaller than that, end the search, which so many rounds bound.
 TOLERANCE, MOST = 1e-6, 60
+# Constraints that bear nothing are dropped, which is faster; after so many rounds they stay: nothing goes in circles.
+FORGETFUL = 15
 # Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are told apart.
 APART = 1e-6
 
@@ -71,9 +74,10 @@ class Contact:
     def force(self, X: np.ndarray) -> np.ndarray:
         """What the ball does to linear tissue at the nodes that it may touch (B, 3 k) [N]."""
         out = np.zeros((len(X), len(self.compliance)))
-        for row in np.flatnonzero(X[:, 6] > 0.0):
-            point, direction, depth, radius = X[row, :3], X[row, 3:6], X[row, 6], X[row, 7]
-            out[row] = self._pressed(point + (depth - radius) * direction, radius + THICKER)
+        with one_thread():
+            for row in np.flatnonzero(X[:, 6] > 0.0):
+                point, direction, depth, radius = X[row, :3], X[row, 3:6], X[row, 6], X[row, 7]
+                out[row] = self._pressed(point + (depth - radius) * direction, radius + THICKER)
         return out
 
     def taught(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray) -> Self:
@@ -106,7 +110,7 @@ class Contact:
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
         moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
         facet, share, settled = np.zeros(0, int), np.zeros((0, 3)), True
-        for _ in range(MOST):
+        for turn in range(MOST):
             corners = (self.points[nodes] + moved)[table]
             nearest = nearest_shares(corners, middle)
             entered = np.flatnonzero(distances(corners, nearest, middle)[0] < radius - TOLERANCE)
@@ -120,7 +124,8 @@ class Contact:
             bears = _bearing(lever @ compliance @ lever.T, radius - distance + lever @ moved.ravel())
             force = bears @ lever
             last, moved = moved, (compliance @ force).reshape(-1, 3)
-            facet, share = facet[bears > 0.0], share[bears > 0.0]
+            kept = (bears > 0.0) | (turn >= FORGETFUL)
+            facet, share = facet[kept], share[kept]
             settled = bool(np.abs(moved - last).max() < TOLERANCE)
         out = np.zeros(len(self.compliance))
         out[rows] = force

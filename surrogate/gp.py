@@ -12,6 +12,8 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
+from sim.threads import one_thread
+
 from .regressor import filled, standardisation
 
 # Lengths in standard deviations of a feature, and noise against the variance of an output.
@@ -55,15 +57,16 @@ class Gp:
         loudest = loudest[spread[loudest] > 0.0]
         start = np.log(np.append(np.full(X.shape[1], START_LENGTH), START_NOISE))
         if len(loudest):
-            fitted = minimize(
-                negative_likelihood,
-                start,
-                args=(x[: self.rows], y[: self.rows, loudest] / spread[loudest]),
-                jac=True,
-                method="L-BFGS-B",
-                bounds=[*[tuple(np.log(LENGTHS))] * X.shape[1], tuple(np.log(NOISE))],
-                options={"maxiter": 100},
-            )
+            with one_thread():
+                fitted = minimize(
+                    negative_likelihood,
+                    start,
+                    args=(x[: self.rows], y[: self.rows, loudest] / spread[loudest]),
+                    jac=True,
+                    method="L-BFGS-B",
+                    bounds=[*[tuple(np.log(LENGTHS))] * X.shape[1], tuple(np.log(NOISE))],
+                    options={"maxiter": 100},
+                )
             start = fitted.x
         self.length_, self.noise_ = np.exp(start[:-1]), np.exp(start[-1])
         self.seen_ = x / self.length_

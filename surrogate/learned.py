@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from sim.anatomy import Anatomy
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
+from sim.threads import one_thread
 
 from .bound import Bound, features_of
 from .encode import ENCODERS, Basis, directions
@@ -159,8 +160,7 @@ class Learned:
             displacement, excess, promised = self._swift.answer(pushed)
             return predicted(displacement, nodes, loads, (excess > 0.0,), begun, promised)
         self._demand_known(nodes)
-        # Threads of BLAS wait for one another, ages where something else runs on their cores.
-        with blas().limit(limits=1 if len(loads) == 1 else None, user_api="blas"):
+        with one_thread() if len(loads) == 1 else nullcontext():
             return self._summed(loads, pushed, nodes, begun)
 
     def _summed(self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float) -> Deformation:
@@ -213,12 +213,6 @@ class Learned:
         if self.bounds is None:
             raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
         return answer.bound[0][:, None] * self.bounds.profile
-
-
-@cache
-def blas() -> ThreadpoolController:
-    """Of the libraries that are loaded: to look for them takes a millisecond."""
-    return ThreadpoolController()
 
 
 def predicted(
