@@ -6,7 +6,6 @@ import gc
 import time as clock
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -15,7 +14,6 @@ from sim.deformation import Deformer
 from sim.effects import Effect, Elasticity
 from sim.errors import InputError
 
-from .peak import peak_memory
 from .scene import Scene
 from .site import Site
 from .stage import Stage
@@ -30,28 +28,25 @@ ALL = "all"
 class Run:
     """A scene's frames by finite elements: displacements (F, V, 3) [m], NaN of what was cut out, and what they took.
 
-    milliseconds, median a frame; held, bytes of device arrays; peak, bytes of the process, or of the card's pool, at
-    most, or None where the system does not say.
+    milliseconds, median a frame; held, bytes of the device arrays that are kept from frame to frame.
     """
 
     displacement: np.ndarray
     milliseconds: float
     held: int
-    peak: int | None
 
 
 @dataclass(frozen=True)
 class Row:
     """One effect: the scene with all of them, less the scene without it; `ALL` is the scene itself, less nothing.
 
-    milliseconds a frame; megabytes on the device, and at most; how far the means over the tumour's and the open
+    milliseconds a frame; megabytes that are kept on the device; how far the means over the tumour's and the open
     cortex's vertices move at most [mm]; `refused` says why the scene cannot be without it: then there are no figures.
     """
 
     effect: str
     milliseconds: float | None = None
     held_mb: float | None = None
-    peak_mb: float | None = None
     tumour_mm: float | None = None
     cortex_mm: float | None = None
     refused: str = ""
@@ -74,7 +69,7 @@ def rows(theatre: Theatre, scene: Scene, every: int) -> Iterator[Row]:
     """
     theatre = replace(theatre, models={})  # they would change the tissue where they know what is left
     whole = run(theatre, scene, every)
-    nowhere = replace(whole, displacement=np.zeros_like(whole.displacement), milliseconds=0.0, held=0, peak=0)
+    nowhere = replace(whole, displacement=np.zeros_like(whole.displacement), milliseconds=0.0, held=0)
     yield _row(theatre, ALL, whole, nowhere)
     for effect in scene.effects_on(theatre.anatomy):
         name = type(effect).__name__
@@ -98,14 +93,13 @@ def run(theatre: Theatre, scene: Scene, every: int) -> Run:
         A body that is not held, a frame of which no good answer is found.
     """
     before = device_arrays()  # whoever lets go of them meanwhile, they were not the scene's
-    reset_peak()
     fem = theatre.fem(scene, scene.accuracy, live=True)
     times = scene.times[::every].tolist()
     found, seconds = _solved(fem, scene, theatre.site, times)
     wp.synchronize()
     known = {id(array) for array in before}
     held = sum(array.capacity for array in device_arrays() if id(array) not in known)
-    return Run(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held, peak())
+    return Run(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held)
 
 
 def _solved(fem: Deformer, scene: Scene, site: Site, times: list[float]) -> tuple[list[np.ndarray], list[float]]:
@@ -129,22 +123,6 @@ def device_arrays() -> list[wp.array]:
     return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]
 
 
-def peak() -> int | None:
-    """Most bytes of a graphics card's pool, or of this process, since `reset_peak`; None where nobody says."""
-    if wp.get_preferred_device().is_cuda:
-        return wp.get_mempool_used_mem_high(wp.get_preferred_device())
-    most = peak_memory()
-    return None if most is None else round(most * 2**30)
-
-
-def reset_peak() -> None:
-    """Count peaks from here, where the system allows it."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return
-
-
 def _row(theatre: Theatre, name: str, whole: Run, less: Run) -> Row:
     anatomy = theatre.anatomy
 
@@ -156,7 +134,6 @@ def _row(theatre: Theatre, name: str, whole: Run, less: Run) -> Row:
         name,
         whole.milliseconds - less.milliseconds,
         1e-6 * (whole.held - less.held),
-        None if whole.peak is None or less.peak is None else 1e-6 * (whole.peak - less.peak),
         apart(anatomy.tumour_nodes),
         apart(np.unique(anatomy.open_surface)),
     )

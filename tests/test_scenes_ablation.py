@@ -48,7 +48,12 @@ def test_each_effect_has_its_row(theatre):
     push, weight, whole = found["ToolForce"], found["Gravity"], found[ALL]
     assert push.tumour_mm > 0.1 and weight.tumour_mm > 0.1
     assert max(push.tumour_mm, weight.tumour_mm) < whole.tumour_mm < 1.1 * (push.tumour_mm + weight.tumour_mm)
-    assert whole.milliseconds > 0.0 and whole.held_mb > 0.1 and (whole.peak_mb is None or whole.peak_mb > 50.0)
+    assert whole.milliseconds > 0.0 and whole.held_mb > 0.1
+
+
+def test_bytes_are_the_same_in_every_run(theatre):
+    held = [run(replace(theatre, models={}), sinking(), 3).held for _ in range(3)]
+    assert held[0] == held[1] == held[2] > 100_000
 
 
 def test_the_change_is_that_between_the_answers(theatre):

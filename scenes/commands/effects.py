@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sim.errors import InputError
 
-HEAD = ("effect", "ms a frame", "MB on the device", "MB at most", "tumour mm", "cortex mm", "")
+HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     found = []
     for row in rows(theatre, scene, args.every):
         found.append(row)
-        figures = (row.milliseconds, row.held_mb, row.peak_mb, row.tumour_mm, row.cortex_mm)
+        figures = (row.milliseconds, row.held_mb, row.tumour_mm, row.cortex_mm)
         cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
         print(f"| {' | '.join([row.effect, *cells, row.refused])} |", file=table, flush=True)
     if args.json:

@@ -1,0 +1,89 @@
+"""What a scene keeps on the device is what its effects keep, byte by byte: counted, not sampled."""
+
+from __future__ import annotations
+
+import gc
+from types import FunctionType, ModuleType
+
+import numpy as np
+import pytest
+import warp as wp
+from conftest import make_box
+from witness import slippery
+
+from scenes.ablation import device_arrays, without
+from scenes.scene import SCENES, Scene, find_scene
+from scenes.site import site_of
+from sim.compile import compile_problem
+from sim.device import find_device
+from sim.discretisation import discretise
+from sim.effects import Elasticity, Held, Pulsation, Resection
+from sim.footprint import Skin
+from sim.loads import Resected
+from sim.term import Cases
+
+BODY = slippery(make_box((4, 4, 4), spacing=18e-3, tumour=16e-3, depth=30e-3, opening=26e-3))
+SITE = site_of(BODY)
+
+
+# Effects and the terms that they are; others are constraints, which stand in the same arrays.
+TERMS = {
+    "ToolForce": "tool force",
+    "ToolContact": "tool contact",
+    "Retraction": "retraction",
+    "SkullContact": "skull contact",
+    "Gravity": "gravity",
+}
+
+
+def reached(thing: object, arrays: set[int]) -> set[int]:
+    """Which of some arrays, by id, an object of ours leads to: not through modules, classes and what functions see."""
+    found, seen, ahead = set(), set(), [thing]
+    while ahead:
+        one = ahead.pop()
+        if id(one) in seen or isinstance(one, ModuleType | type | wp.Kernel | wp.Module | wp.Device):
+            continue
+        seen.add(id(one))
+        if id(one) in arrays:
+            found.add(id(one))
+        ahead += [*(one.__closure__ or ())] if isinstance(one, FunctionType) else gc.get_referents(one)
+    return found
+
+
+def kept(scene: Scene) -> dict[str, int]:
+    """Bytes of the arrays that each term of the scene's problem keeps, by name, after one look at a frame."""
+    effects = tuple(effect for effect in scene.effects_on(BODY) if not isinstance(effect, Resection))
+    device, space = find_device("cpu", "float32"), discretise(BODY.mesh, scene.element)
+    skin, time = Skin(space.nodes, space.surface, device), 0.45 * scene.duration
+    loads = scene.loads(SITE, scene.path(time), time).but(Resected)
+    u, out = device.zeros(3 * space.count, 1), device.zeros(3 * space.count, 1)
+    flags = device.array(np.zeros(1), wp.int32)
+    before = {id(array) for array in device_arrays()}
+    problem = compile_problem(effects, BODY, device, space, skin)
+    problem.begin(Cases(loads, np.zeros(1)))
+    problem.energy(u)
+    problem.gradient(u)
+    for term in problem.terms:
+        term.linearise(u, flags)
+    problem.add_curvature(u, out)
+    problem.end(u)
+    new = {id(array): array for array in device_arrays() if id(array) not in before}
+    owned = {term.name: reached(term, set(new)) for term in problem.terms}
+    owned["constraint"] = reached(problem.constraint, set(new))
+    assert sum(map(len, owned.values())) == len(new)  # each is kept by one, and nothing else keeps any
+    return {name: sum(new[one].capacity for one in numbers) for name, numbers in owned.items()}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_without_an_effect_its_own_bytes_are_gone_and_no_others(name):
+    scene = find_scene(name)
+    whole = kept(scene)
+    assert kept(scene) == whole and min(whole.values()) > 1_000
+    for effect in scene.effects:
+        if isinstance(effect, Elasticity | Held):  # a body needs them
+            continue
+        less, own = kept(without(scene, effect)), TERMS.get(type(effect).__name__)
+        if isinstance(effect, Pulsation):  # elasticity swells
+            assert all((size < whole[term]) == ("elasticity" in term) for term, size in less.items())
+            continue
+        assert less == {term: size for term, size in whole.items() if term != own} and (own is None or own in whole)
