@@ -118,8 +118,8 @@ class Ladder:
 
     @cached_property
     def _touched(self) -> Preconditioner:
-        """The preconditioner that knows contact, where there is one."""
-        touch = self._proximal
+        """The preconditioner that knows contact: on CUDA half precision is rougher than contact is stiff."""
+        touch = None if self.problem.device.on_cuda else self._proximal
         return Touched(self.preconditioner, touch.compliance, touch.barrier) if touch else self.preconditioner
 
     @property

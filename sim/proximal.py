@@ -96,17 +96,20 @@ class Proximal:
         status, step, drag, slow = LIVE if now.finite else BROKEN, 0, 0.0, 0
         # Threads of BLAS wait for one another, ages where something else runs on their cores.
         with self._blas.limit(limits=1, user_api="blas"):
-            rest = self._answered(now.smooth)
+            force = self._felt(now)
+            rest = self._answered(now.smooth + self._everywhere(force))
             while status == LIVE:
                 if now.relative <= tolerance[0]:
                     status = DONE
                 if status == DONE or step >= most or slow >= PATIENCE:
                     break
-                aim = self._aimed(now, rest, pairs, max(FORCING * min(now.relative, 1.0), ENOUGH * tolerance[0]), drag)
+                exact = max(FORCING * min(now.relative, 1.0), ENOUGH * tolerance[0])
+                aim = self._aimed(now, force, rest, pairs, exact, drag)
                 if aim is None:
                     break
-                x, drag = aim
-                t, new = self._searched(now, x)
+                before, (force, drag) = force, aim
+                rest = rest + self.compliance.spread(force - before)
+                t, new = self._searched(now, -rest - pairs.motion(pairs.weights(now.smooth + self._everywhere(force))))
                 if not new.finite:
                     break
                 step += 1
@@ -128,28 +131,41 @@ class Proximal:
         return Descended(u, np.array([status]), np.array([step]), np.array([now.relative]), taught)
 
     def _aimed(
-        self, now: State, rest: np.ndarray, pairs: Pairs, tolerance: float, drag: float
+        self, now: State, force: np.ndarray, rest: np.ndarray, pairs: Pairs, tolerance: float, drag: float
     ) -> tuple[np.ndarray, float] | None:
-        """A step (3N,) [m] from a state whose smooth gradient is answered with `rest` (3N,) [m] at rest; and its drag.
+        """The tools' forces (3n,) where the model is in equilibrium, and the drag that this takes.
 
-        None where no drag makes the model convex.
+        `rest` (3N,) [m] is what the body at rest answers the smooth gradient and a `force` (3n,) with. None where no
+        drag makes the model convex.
         """
-        x = -rest - pairs.motion(pairs.weights(now.smooth))
-        barrier = self.barrier.reduced()
+        barrier, rows = self.barrier.reduced(), self.compliance.rows
         if barrier is None:
-            return x, drag
-        rows, soft = self.compliance.rows, Softness(self.compliance, pairs)
+            return np.zeros_like(force), drag
+        free = now.u - rest - pairs.motion(pairs.weights(now.smooth + self._everywhere(force)))
+        soft = Softness(self.compliance, pairs)
         for _ in range(TIMES):
             try:
-                force = settled(barrier, soft, now.u[rows], (now.u + x)[rows], tolerance, drag)
+                found = settled(barrier, soft, now.u[rows], free[rows], force, tolerance, drag)
             except LinAlgError:  # steps so small that what is learnt from them is round-off
                 return None
-            if force is not None:
-                whole = np.zeros_like(x)
-                whole[rows] = force
-                return x - self.compliance.spread(force) - pairs.motion(pairs.weights(whole)), drag
+            if found is not None:
+                return found, drag
             drag = max(DRAG, GROWTH * drag)
         return None
+
+    def _felt(self, now: State) -> np.ndarray:
+        """Forces (3n,) that balance all that is smooth, where tools touch."""
+        barrier, rows = self.barrier.reduced(), self.compliance.rows
+        if barrier is None:
+            return np.zeros(len(rows))
+        touched = barrier.slope(now.u[rows]).reshape(-1, 3).any(axis=1)
+        return np.where(np.repeat(touched, 3), -now.smooth[rows], 0.0)
+
+    def _everywhere(self, force: np.ndarray) -> np.ndarray:
+        """A force (3n,) on the touchable nodes as one (3N,) on all."""
+        whole = np.zeros(self.problem.rows)
+        whole[self.compliance.rows] = force
+        return whole
 
     def _searched(self, now: State, x: np.ndarray) -> tuple[float, State]:
         """How far along a step x (3N,) the energy still falls, or about so, and the state there."""

@@ -5,7 +5,8 @@ With C (3n, 3n) the compliance of the model at these nodes and w0 where they wou
     (w - w0) . C^-1 (w - w0) / 2 + c(w) + d |w - v|^2 / 2 over the touched,
 
 c the barrier of tools and d a drag from where they are, v. It is found by Newton's method for the forces f that tools
-exert, w = w0 - C f: these are none but at touched nodes, and so C is never inverted.
+exert, w = w0 - C f: these are none but at touched nodes, and so C is never inverted. It is told where nodes go under
+forces that are nearly right, w1 = w0 - C f1: of differences little is rounded away.
 """
 
 from __future__ import annotations
@@ -53,24 +54,30 @@ class Softness:
 
 
 def settled(
-    barrier: Reduction, soft: Softness, here: np.ndarray, free: np.ndarray, tolerance: float, drag: float
+    barrier: Reduction,
+    soft: Softness,
+    here: np.ndarray,
+    there: np.ndarray,
+    known: np.ndarray,
+    tolerance: float,
+    drag: float,
 ) -> np.ndarray | None:
-    """The forces f (3n,) [N], from where the nodes are, `here` (3n,) [m]; w0 is `free` (3n,) [m].
+    """The forces f (3n,) [N], from where the nodes are, `here` (3n,) [m]; w1 is `there` and f1 `known` (3n,).
 
     They are exact to a `tolerance`, relative. `drag` is d in units of how stiff a touched node is. None where the model
     is not convex: its tools are sharper than its tissue is stiff, and it would go far astray.
     """
     touched = _touched(barrier.slope(here))[:MOST]
-    force, held = np.zeros_like(here), np.zeros_like(here)
+    force, held = known.copy(), np.zeros_like(here)
     if len(touched):
         own, rows = soft.between(touched), _rows(touched)
-        force[rows] = np.linalg.solve(own, (free - here)[rows])
+        force[rows] += np.linalg.solve(own, (there - here)[rows])
         held[rows] = drag / np.diag(own).mean()
 
     def pushed(w: np.ndarray) -> np.ndarray:
         return barrier.slope(w) + held * (w - here)
 
-    w, convex = free - soft.moved(force), True
+    w, convex = there - soft.moved(force - known), True
     slope = pushed(w)
     for step in range(STEPS):
         left = slope - force
