@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+from scipy.linalg import LinAlgError, cholesky
 
 from .compliance import Compliance
 from .pairs import Pairs
@@ -47,9 +47,9 @@ class Softness:
         return self.rest.moved(force) + (self.pairs.middle @ (self._learnt @ force)) @ self._learnt
 
     def between(self, some: np.ndarray) -> np.ndarray:
-        """C (3a, 3a) between `some` (a,) of the nodes, positive definite."""
-        own, learnt = self.rest.between(some), self._learnt[:, _rows(some)]
-        own = 0.5 * (own + own.T) + learnt.T @ self.pairs.middle @ learnt
+        """C (3a, 3a) between `some` (a,) of the nodes; symmetric but for what the columns were rounded to."""
+        learnt = self._learnt[:, _rows(some)]
+        own = self.rest.between(some).T + learnt.T @ self.pairs.middle @ learnt
         return own + ROUNDED * np.trace(own) / len(own) * np.eye(len(own))
 
 
@@ -113,17 +113,16 @@ def _newton(
     if len(touched) > MOST:
         return change, False
     rows = _rows(touched)
-    root = np.linalg.cholesky(soft.between(touched))
-    along = solve_triangular(root, soft.moved(left)[rows], lower=True)
-    for definite in (False, True):
-        curvature = barrier.curvature(w, touched, definite) + np.diag(held[rows])
-        try:
-            whole = cho_factor(np.eye(len(rows)) + root.T @ curvature @ root, lower=True)
-        except LinAlgError:
-            continue
-        change[rows] -= curvature @ (root @ cho_solve(whole, along))
-        return change, not definite
-    raise LinAlgError("curvature that is positive semi-definite is not")
+    own, along = soft.between(touched), soft.moved(left)[rows]
+    root = np.linalg.cholesky(0.5 * (own + own.T))
+    convex, curvature = True, barrier.curvature(w, touched, False) + np.diag(held[rows])
+    try:
+        cholesky(np.eye(len(rows)) + root.T @ curvature @ root)
+    except LinAlgError:
+        convex, curvature = False, barrier.curvature(w, touched, True) + np.diag(held[rows])
+    # C as it was rounded: D is a thousand times as stiff as the tissue.
+    change[rows] -= curvature @ np.linalg.solve(np.eye(len(rows)) + own @ curvature, along)
+    return change, convex
 
 
 def _touched(slope: np.ndarray) -> np.ndarray:
