@@ -62,11 +62,11 @@ class Session:
 
     def towards(self, number: int, touch: Touch | None = None) -> tuple[int, Deformation]:
         """A frame's answer, or that of one on the way to it, and its number; `touch` where the hand has the tool."""
-        player, loads = self.player, self.player.loads(number, touch)
+        player, last = self.player, self._last
         if player.remembers and touch is None:
             number, self._last = self._reel.towards(number)
             return number, self._last
-        last = self._last
+        loads = player.loads(number, touch)
         if player.remembers and last is not None:
             last = replace(last, time=loads.times - 1.0 / player.scene.frames_per_second)
         self._last = player.answer(loads, last)
