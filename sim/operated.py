@@ -45,8 +45,8 @@ class Operated:
     def __init__(self, bodies: tuple[Remains, ...], make: Callable[[Anatomy], Fem], ahead: bool = False):
         self._bodies = bodies
         self._solver = lru_cache(len(bodies) if ahead else KEPT)(lambda done: make(bodies[done].anatomy))
-        self._marks = lru_cache(None)(lambda done: _marks(self._solver(done)))
-        self._place = lru_cache(None)(lambda done, name: _found(self._marks(0)[name], self._marks(done)[name]))
+        self._rows = lru_cache(None)(lambda done: _rows(self._solver(done)))
+        self._place = lru_cache(None)(lambda done, name: _found(self._rows(0)[name][0], self._rows(done)[name][0]))
         for done in range(len(bodies) if ahead else 0):
             self._solver(done)
 
@@ -90,8 +90,8 @@ class Operated:
         history = dict(start.history) if stays else self._lasting(start.history, stage)
         history.pop(DONE, None)
         for name, place in self._places(history, stage).items():
-            if history[name].shape[1] == len(self._marks(0)[name]):  # another body's is refused by who reads it
-                history[name] = history[name][:, place]
+            if history[name].shape[1:] == self._shape(name):  # another body's is refused by who reads it
+                history[name] = history[name][place]
         return replace(start, displacement=self._masked(start, stage), history=history)
 
     def _ended(self, answer: Deformation, stage: int) -> Deformation:
@@ -99,8 +99,8 @@ class Operated:
         history = {**answer.history, DONE: np.full(len(answer), float(stage))}
         for name, place in self._places(history, stage).items():
             own = history[name]
-            history[name] = np.zeros((len(own), len(self._marks(0)[name]), *own.shape[2:]), own.dtype)
-            history[name][:, place] = own
+            history[name] = np.zeros((len(own), *self._shape(name)), own.dtype)
+            history[name][place] = own
         return replace(answer, displacement=self._masked(answer, stage), history=history)
 
     def _masked(self, answer: Deformation, stage: int) -> np.ndarray:
@@ -120,21 +120,31 @@ class Operated:
 
     def _lasting(self, history: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
         """What means the same in another body: memories of elements and nodes, poses of tools, steps done."""
-        marks = self._marks(stage)
+        rows = self._rows(stage)
         return {
-            name: value for name, value in history.items() if name in marks or name == DONE or value.shape[2:] == POSE
+            name: value for name, value in history.items() if name in rows or name == DONE or value.shape[2:] == POSE
         }
 
-    def _places(self, history: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
-        """Of histories of elements and nodes, by name: which rows (n,) of the whole body's are those of a stage's."""
-        marks = self._marks(stage) if stage else {}
-        return {name: self._place(stage, name) for name in history if name in marks}
+    def _places(self, history: Mapping[str, np.ndarray], stage: int) -> dict[str, tuple[slice, np.ndarray, slice]]:
+        """Of histories of elements and nodes, by name: where in the whole body's those of a stage's are.
+
+        A row is shorter where what is gone relaxed in a longer series.
+        """
+        rows = self._rows(stage) if stage else {}
+        return {
+            name: (slice(None), self._place(stage, name), slice(rows[name][1])) for name in history if name in rows
+        }
+
+    def _shape(self, name: str) -> tuple[int, int]:
+        """Of a history of the whole body's elements or nodes: how many they are, and numbers of each."""
+        marks, width = self._rows(0)[name]
+        return len(marks), width
 
 
-def _marks(fem: Fem) -> dict[str, np.ndarray]:
-    """Of each history whose rows are elements or nodes: what tells them (n, k) from all others, whatever is cut."""
-    terms = fem.problem.terms
-    return {MIDDLES: fem.space.edges} | {term.name: term.marks for term in terms if isinstance(term, Remembering)}
+def _rows(fem: Fem) -> dict[str, tuple[np.ndarray, int]]:
+    """Of each history whose rows are elements or nodes: what tells them (n, k) from all others, and their length."""
+    terms = [term for term in fem.problem.terms if isinstance(term, Remembering)]
+    return {MIDDLES: (fem.space.edges, 3)} | {term.name: (term.marks, term.width) for term in terms}
 
 
 def _found(whole: np.ndarray, some: np.ndarray) -> np.ndarray:

@@ -166,11 +166,16 @@ class Paced(Term, Protocol):
 
 @runtime_checkable
 class Remembering(Term, Protocol):
-    """A Term whose history, if it has any, is of elements or nodes: a row (B, n, ...) for each."""
+    """A Term whose history, if it has any, is of elements or nodes: rows (B, n, width), one for each."""
 
     @property
     def marks(self) -> np.ndarray:
         """Vertices and other numbers (n, k) that tell each row from all others, whatever is cut from the mesh."""
+        ...
+
+    @property
+    def width(self) -> int:
+        """How long a row is."""
         ...
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from boxes import box, hold, quadratic
+from boxes import base_held, box, hold, quadratic
 from cuts import BODY, EFFECTS, MESH, STEPS, TIGHT, lying
 
 from sim.deformation import Deformation, guess
@@ -92,6 +92,21 @@ class TestMemory:
             for part, (share, tau) in enumerate(RELAXING.prony, start=1):
                 expected = share * np.exp(-time / tau) * at_once[stretched]
                 np.testing.assert_allclose(left[:, part], expected, atol=1e-6 * np.abs(at_once).max())
+
+    def test_what_is_cut_may_relax_in_a_longer_series(self) -> None:
+        """A share that is next to nothing changes no answer, one step on and one back, in company too."""
+        cut = np.isin(np.arange(len(MESH.tets)), STEPS.steps[0])
+        body = base_held(replace(MESH, region=np.where(cut, 2, 1)))
+        longer = replace(RELAXING, prony=(*RELAXING.prony, (1e-13, 1.0)))
+        found = []
+        for tissue in (RELAXING, longer):
+            effects = (Elasticity(RELAXING, {2: tissue}), Held(), Gravity(direction=(0.0, 0.0, -1.0)), STEPS)
+            made, last = finite_elements(body, effects, TIGHT, "cpu"), None
+            for frame, done in enumerate(([0, 0], [0, 1], [1, 0], [1, 1])):
+                last = made.deform(replace(lying(done), time=np.full(2, 0.1 * (frame + 1))), last)
+            assert last is not None and all(outcome.good for outcome in last.outcome)
+            found.append(last.displacement)
+        np.testing.assert_allclose(found[1], found[0], atol=1e-8 * np.abs(found[0]).max())
 
     def test_where_nothing_is_cut_it_is_the_plain_run(self) -> None:
         """Bit for bit."""

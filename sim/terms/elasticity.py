@@ -109,6 +109,11 @@ class Elasticity:
         count, points = elements.weight.shape
         return np.column_stack([np.repeat(elements.marks, points, axis=0), np.tile(np.arange(points), count)])
 
+    @property
+    def width(self) -> int:
+        """Of what a source remembers."""
+        return max((source.width for source in self._sources), default=0)
+
     def begin(self, cases: Cases) -> None:
         """Take what varies, if anything does."""
         if self._sources:
@@ -182,7 +187,7 @@ class Elasticity:
 
     def end(self, u: wp.array) -> np.ndarray | None:
         """What a source remembers; elasticity by itself remembers nothing."""
-        if self._cases is None or not any(source.remembers for source in self._sources):
+        if self._cases is None or not self.width:
             return None
         strains = self._strains.of(u.shape[1])
         outputs = [strains[part.first : part.first + part.count] for part in self._parts]

@@ -116,6 +116,7 @@ class Inertia:
 
     name = "inertia"
     constant, passive, steep = False, False, False
+    width = 3
 
     def __init__(self, mass: np.ndarray, damping: float, marks: np.ndarray, device: Device):
         self._device, self._kernels = device, kernels_of(device)

@@ -23,8 +23,8 @@ class Source(Protocol):
         ...
 
     @property
-    def remembers(self) -> bool:
-        """Whether `end` has anything that must travel."""
+    def width(self) -> int:
+        """How many numbers of each point must travel, as `end` has them."""
         ...
 
     def law(self, inner: Law, count: int) -> Law:

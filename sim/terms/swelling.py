@@ -124,7 +124,7 @@ class Swelling:
         Where its arrays live.
     """
 
-    count, remembers = 1, False
+    count, width = 1, 0
 
     def __init__(self, theta: Callable[[np.ndarray], np.ndarray], swells: np.ndarray, device: Device):
         self._theta, self._device = theta, device

@@ -173,7 +173,7 @@ class Prony:
         Where its arrays live.
     """
 
-    count, remembers = 1 + SIX, True
+    count = 1 + SIX
 
     def __init__(
         self, name: str, law: Law, coefficients: np.ndarray, pairs: Sequence[Pairs], points: int, device: Device
@@ -186,10 +186,11 @@ class Prony:
         most = max(map(len, pairs))
         filled = np.array([(*row, *[(0.0, 1.0)] * (most - len(row))) for row in pairs]).reshape(-1, most, 2)
         self._series = [device.array(filled[:, :, 0]), device.array(filled[:, :, 1])]
-        self._points, self._shape = points, (len(coefficients) * points, SIX * (most + 1))
+        self.width = SIX * (most + 1)
+        self._shape = len(coefficients) * points, self.width
 
     def law(self, inner: Law, count: int) -> Law:
-        """The law, and its isochoric part again, which relaxes."""
+        """The law, and its part of shape again, which relaxes."""
         return relaxing(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
