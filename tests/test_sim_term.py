@@ -87,8 +87,7 @@ def test_name_is_a_word(term: Term) -> None:
 
 def test_gradient_is_the_derivative_of_the_energy(term: Term, example: Example, device: Device) -> None:
     h = 1e-6
-    for _ in range(4):
-        p = noise(*example.u.shape)
+    for p in noise(4, *example.u.shape):
         slope = (energy(term, device, example.u + h * p) - energy(term, device, example.u - h * p)) / (2.0 * h)
         exact = (gradient(term, device, example.u) * p).sum(axis=0)
         np.testing.assert_allclose(exact, slope, rtol=1e-6, atol=1e-6)
@@ -97,8 +96,7 @@ def test_gradient_is_the_derivative_of_the_energy(term: Term, example: Example, 
 def test_curvature_is_the_derivative_of_the_gradient(term: Term, example: Example, device: Device) -> None:
     h = 1e-7
     linearise(term, device, example.u)
-    for _ in range(4):
-        p = noise(*example.u.shape)
+    for p in noise(4, *example.u.shape):
         change = (gradient(term, device, example.u + h * p) - gradient(term, device, example.u - h * p)) / (2.0 * h)
         exact = curvature(term, device, p)
         assert np.linalg.norm(exact - change) <= 1e-6 * max(np.linalg.norm(change), 1.0)
