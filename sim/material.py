@@ -34,8 +34,7 @@ class Material:
     poisson
         Poisson's ratio at small strain, -1 < nu < 0.5.
     prony
-        How the resistance to a change of shape relaxes, if it does: E and nu are then instantaneous. Shape is told from
-        volume where J > 0 alone: the stable law then is infinite elsewhere too, and `neo-hookean` goes further.
+        How the resistance to a change of shape relaxes, if it does: E and nu are then instantaneous.
 
     Raises
     ------

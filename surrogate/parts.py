@@ -257,7 +257,7 @@ def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
         contact, left = _touched(known, lesson)
         if name == "contact":
             return (contact,)
-        return (contact, *(_taught(LEARNT["gp"], (), *each[:1], known.patch, lesson.loads, each[1]) for each in left))
+        return (contact, *(_taught(LEARNT["gp"], (), nodes, known.patch, lesson.loads, rest) for nodes, rest in left))
     if known.data.ball is not None:
         both = ((known.tumour, lesson.tumour), (known.cortex, lesson.cortex))
         return tuple(
