@@ -86,7 +86,7 @@ def test_name_is_a_word(term: Term) -> None:
 
 
 def test_gradient_is_the_derivative_of_the_energy(term: Term, example: Example, device: Device) -> None:
-    h = 1e-6
+    h = 2e-7
     for p in noise(4, *example.u.shape):
         slope = (energy(term, device, example.u + h * p) - energy(term, device, example.u - h * p)) / (2.0 * h)
         exact = (gradient(term, device, example.u) * p).sum(axis=0)
