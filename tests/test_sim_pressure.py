@@ -63,6 +63,17 @@ def test_where_nothing_touches_it_presses_nowhere() -> None:
     assert not pressure(fem, loads, fem.deform(loads)).any()
 
 
+def test_it_is_of_the_whole_answer_to_its_loads() -> None:
+    fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu")
+    loads = Loads((Touching(at(0.03, 0.03, HEIGHT + 1e-3)[None, None]),))
+    answer, none = fem.deform(loads), np.zeros(0, int)
+    with pytest.raises(InputError, match="1 load cases at 2 vertices, the loads have 1 and the body 196"):
+        pressure(fem, loads, answer.at(np.arange(2)))
+    with pytest.raises(InputError, match="1 load cases at 196 vertices, the loads have 0"):
+        pressure(fem, loads.rows(none), answer)
+    assert pressure(fem, loads.rows(none), answer.rows(none)).shape == (0, 196)
+
+
 @pytest.mark.parametrize(
     ("effect", "element", "sentence"),
     [(NodalForce(), "p1", "nothing touches this body: add ToolContact"), (ToolContact((Ball(5e-3),)), "p2", "with p1")],
