@@ -131,9 +131,7 @@ class Operated:
         A row is shorter where what is gone relaxed in a longer series.
         """
         rows = self._rows(stage) if stage else {}
-        return {
-            name: (slice(None), self._place(stage, name), slice(rows[name][1])) for name in history if name in rows
-        }
+        return {name: (slice(None), self._place(stage, name), slice(rows[name][1])) for name in history if name in rows}
 
     def _shape(self, name: str) -> tuple[int, int]:
         """Of a history of the whole body's elements or nodes: how many they are, and numbers of each."""

@@ -30,8 +30,8 @@ def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
     count = fem.space.count
     if answer.displacement.shape != (len(loads), count, 3):
         raise InputError(
-            f"the answer has {len(answer)} load cases at {len(answer.nodes)} vertices, the loads have {len(loads)} and the "
-            f"body {count}: give the whole answer to these loads."
+            f"the answer has {len(answer)} load cases at {len(answer.nodes)} vertices, the loads have {len(loads)} and "
+            f"the body {count}: give the whole answer to these loads."
         )
     device, surface = fem.problem.device, fem.space.surface
     fem.problem.begin(Cases(loads, answer.time, answer.history, share=np.zeros(len(answer))))
