@@ -31,6 +31,9 @@ REACH = 1.5
 TOLERANCE, MOST = 1e-6, 60
 # Constraints that bear nothing are dropped, which is faster; after so many rounds they stay: nothing goes in circles.
 FORGETFUL = 15
+# Places that give less than this share of what nodes do on average are bone's, which the ball enters: no force, or one
+# beyond all bounds, would keep it out.
+LEAST = 0.02
 # Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are told apart.
 APART = 1e-6
 
@@ -108,12 +111,16 @@ class Contact:
         )
         rows, table = (3 * nodes[:, None] + np.arange(3)).ravel(), table.reshape(-1, 3)
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
+        own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
+        least = LEAST * np.einsum("nii->", own) / max(3 * len(nodes), 1)
         moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
         facet, share, settled = np.zeros(0, int), np.zeros((0, 3)), True
         for turn in range(MOST):
             corners = (self.points[nodes] + moved)[table]
             nearest = nearest_shares(corners, middle)
-            entered = np.flatnonzero(distances(corners, nearest, middle)[0] < radius - TOLERANCE)
+            distance, normal = distances(corners, nearest, middle)
+            gives = np.einsum("sc,si,scij,sj->s", nearest**2, normal, own[table], normal)
+            entered = np.flatnonzero((distance < radius - TOLERANCE) & (gives > least))
             if settled and not len(entered):
                 break
             facet, share = np.concatenate([facet, entered]), np.concatenate([share, nearest[entered]])

@@ -14,7 +14,7 @@ from sim.deformation import Deformation, Outcome
 from sim.effects import Elasticity, Held, NodalForce, ToolContact, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Loads, Nodal
+from sim.loads import Loads, Nodal, Touching
 from sim.material import Material, tissue_to_json
 from surrogate.condense import condensed, unit_responses
 from surrogate.contact import THICKER, Contact, nearest_shares
@@ -107,6 +107,17 @@ def test_it_answers_as_finite_elements_of_linear_tissue_do(box: Anatomy, pressed
     bears = contact.force(X).reshape(len(X), -1, 3).sum(axis=1)
     reads = truth.reaction[:, 0, :3]
     assert (np.linalg.norm(bears - reads, axis=1) < 0.05 * np.linalg.norm(reads, axis=1)).all()
+
+
+def test_bone_under_the_ball_bears_nothing(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> None:
+    """Over the rim the ball is in what cannot give: what can is pushed away, and no force grows beyond all bounds."""
+    contact, rim = pressed[0], open_patch(box).points
+    middle, pose = 0.5 * (rim.min(axis=0) + rim.max(axis=0)), np.tile(np.eye(4), (8, 1, 1, 1))
+    pose[:, 0, :3, 3] = middle + np.linspace([0.0, 0.0, -4e-3], [1.25 * (rim[:, 0].max() - middle[0]), 0.0, -4e-3], 8)
+    force = contact.force(features(box, Loads((Touching(pose),)))).reshape(8, -1, 3)
+    stiff = np.einsum("nini->n", contact.compliance.reshape(force.shape[1], 3, -1, 3)) == 0.0
+    assert stiff.any() and np.abs(force[-2:]).max() > 0.0
+    assert np.linalg.norm(force.sum(axis=1), axis=1).max() < 20.0
 
 
 def test_how_stiff_tissue_is_does_not_matter(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> None:
