@@ -116,7 +116,7 @@ class Demo:
             if asked != shown or frame is None:
                 reached, answer = session.towards(number, touch)
                 if reached != number:
-                    self.browser.report(f"frame {number} depends on those before it: {reached} of them are done")
+                    self.browser.report(f"frame {number} depends on those before it: {reached + 1} of them are done")
                     continue
                 loads, hand = player.loads(number, touch), touch or player.touch(number)
                 frame, shown = player.drawn(number, hand, loads, answer, clock.perf_counter() - begun), asked
