@@ -116,8 +116,8 @@ def isochoric_split(law: Law, device: Device) -> Split:
 def own_split(law: Law, of_shape: wp.Function, device: Device) -> Split:
     """Shape is the law itself with its coefficients `of_shape`, and E = (F^T F - I) / 2.
 
-    Nothing in it is infinite where the law is not. Tissue that has relaxed to its end obeys the law itself, its shear
-    modulus less and its bulk modulus as it was.
+    The potential is infinite nowhere that the law is not; the overstress is where J is exactly 0. Tissue that has
+    relaxed to its end obeys the law itself, its shear modulus less and its bulk modulus as it was.
     """
     scalar, mat = device.scalar, device.matrix
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
