@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from sim.errors import InputError
+from sim.threads import one_thread
 
 from .growth import watched_card
 from .peak import peak_memory
@@ -43,5 +43,5 @@ def measured(study: Study, spec: Spec, picture: Path) -> Row:
 
 def _on_one_core(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
     """Products this small take longer on several, and say less."""
-    with ThreadpoolController().limit(limits=1, user_api="blas"):
+    with one_thread():
         return measure_learner(study, spec)

@@ -16,13 +16,13 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
-from threadpoolctl import ThreadpoolController
 
 from .accuracy import Precision
 from .device import Device
 from .fronts import Front, fronts_of
 from .problem import Problem
 from .sweep import Sweep, add_lower
+from .threads import one_thread
 from .together import cores, together
 
 potrf, trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
@@ -73,8 +73,8 @@ class Factor:
         order, fronts = fronts_of(free, node, cores(len(node)))
         motions = sp.csc_array(motions[:, order].astype(device.precision))
         self._motions, self._transposed = sp.csr_array(motions), sp.csr_array(motions.T)
-        self._precision, self._blas = precision, ThreadpoolController()
-        with self._blas.limit(limits=1, user_api="blas"):
+        self._precision = precision
+        with one_thread():
             values, self._panels = panels_of(sp.csc_array(free[order][:, order]), fronts, precision)
         self._sweep = Sweep(fronts, values, precision)
 
@@ -115,7 +115,7 @@ class Factor:
                 out[:, strip] = chosen @ _swept(panels, x)
 
         share = cores(len(rows))
-        with self._blas.limit(limits=1, user_api="blas"):
+        with one_thread():
             together([partial(fill, range(STRIP * k, len(rows), STRIP * share)) for k in range(share)])
         return out
 
@@ -123,7 +123,7 @@ class Factor:
         if x.shape[1] <= FEW:
             return self._sweep.solved(x)
         # Threads of BLAS wait for one another at every front, ages where something else runs on their cores.
-        with self._blas.limit(limits=1, user_api="blas"):
+        with one_thread():
             return _swept(self._panels, x)
 
 

@@ -11,7 +11,6 @@ from functools import cache, cached_property, lru_cache, partial
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
-from threadpoolctl import ThreadpoolController
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
@@ -41,6 +40,7 @@ from .problem import Problem
 from .series import Reading, factors, taylor, terms_of
 from .still import Still
 from .term import Cases
+from .threads import one_thread
 from .vicinity import vicinity_of
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
@@ -283,7 +283,7 @@ class Fem:
         edge = float(np.cbrt(self._anatomy.mesh.volumes.mean() * 6.0))
         found = np.empty((len(loads) // sizes, terms_of(sizes, orders), reading.count))
         # Threads of BLAS wait for one another, ages where something else runs on their cores.
-        with ThreadpoolController().limit(limits=1, user_api="blas"):
+        with one_thread():
             for first in range(0, len(found), max(groups, 1)):
                 some = loads.rows(slice(first * sizes, (first + groups) * sizes))
                 self.problem.begin(Cases(some, np.zeros(len(some))))

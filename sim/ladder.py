@@ -198,16 +198,15 @@ class Ladder:
     ) -> Answer:
         """The whole load at once, of a batch that has begun: eliminations, L-BFGS, Newton, each from where one ended.
 
-        From rest without a start; `learnt` on the way to it, if anything was.
-
-        Motions that are imposed are left to Newton: it knows how the free nodes follow them. So are steep terms.
+        From rest without a start; `learnt` on the way to it, if anything was. Motions that are imposed are left
+        to Newton: it knows how the free nodes follow them. So are steep terms.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         most = QUICK_ON_CUDA if device.on_cuda else QUICK
         # Rest satisfies whatever the batch does not move.
         imposed = problem.constraint.imposes or (start is not None and problem.gap(start)[1].any())
         start = device.zeros(problem.rows, count) if start is None else start
-        if problem.paced:  # the next frame's step may be another, and so its curvature
+        if problem.paced or (problem.barriers and count > 1):  # it would teach the next frame nothing
             learnt = None
         if problem.barriers:
             return self._moved(cases, start, learnt)
@@ -220,8 +219,7 @@ class Ladder:
         if near is not None:
             patch = {NODES: cases.history[LEARNT_KEY + NODES]} if LEARNT_KEY + NODES in cases.history else {}
             descents = [(near, patch), (self._lbfgs, None)]
-        index, never = np.arange(count), np.full(count, np.inf)
-        none = np.zeros(count, int)
+        index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
         answer = Answer(
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
         )
@@ -254,11 +252,14 @@ class Ladder:
         if found.status[0] == DONE:
             outcome = np.full(1, Outcome.CONVERGED, object)
             return replace(self._answer(found.u, outcome, found.steps, found.residual, 0), learnt=found.learnt)
+        spent = found.steps
         if found.residual[0] <= NEARLY:
             answer = self._thorough(found.u, min(SETTLING, outer))
+            spent = spent + answer.iterations
             if answer.good.all():
-                return replace(answer, iterations=answer.iterations + found.steps, learnt=found.learnt)
-        return self._closed(cases, start, outer, gaps)
+                return replace(answer, iterations=spent, learnt=found.learnt)
+        closed = self._closed(cases, start, outer, gaps)
+        return replace(closed, iterations=closed.iterations + spent)
 
     def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
         """Newton, of cases whose tools have gone so many times their gap: it is opened first, and closed step by step.

@@ -12,7 +12,6 @@ from functools import partial
 
 import numpy as np
 import warp as wp
-from threadpoolctl import ThreadpoolController
 
 from .balance import State, balance, constants_of
 from .columns import combined
@@ -25,6 +24,7 @@ from .linear import Preconditioner
 from .patch import Patch, patch_of
 from .problem import Problem
 from .steering import BROKEN, DONE, FREE, LIVE, WHOLE
+from .threads import one_thread
 
 # A patch has at most so many nodes, and less where what lies beyond has such a share of the forces.
 LARGEST, NEGLIGIBLE = 550, 0.02
@@ -62,7 +62,6 @@ class Patching:
         self._near, self._table = np.flatnonzero(near), space.table[near]
         self._nodes = np.unique(self._table)
         self._rows = (3 * self._nodes[:, None] + np.arange(3)).ravel()
-        self._blas = ThreadpoolController()
         self._last: tuple[np.ndarray, Patch, np.ndarray] | None = None
         self._compliance = factor.compliance(self._rows)
         # A patch's rows of it, and its own columns of these: the last patch stands there.
@@ -117,7 +116,7 @@ class Patching:
             nodes = self._strained(_norms(ahead.g))
         patch, reach = self._patch(nodes)
         u, g = now.u.numpy()[:, 0], now.g.numpy()[:, 0]
-        with self._blas.limit(limits=1, user_api="blas"):
+        with one_thread():
             e = -(reach @ g[self._rows].astype(reach.dtype)).astype(g.dtype)
             share, own = patch.settled(u[patch.rows], e, force)
         pull = device.array(-share * g[:, None])

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 import warp as wp
-from threadpoolctl import ThreadpoolController
 
 from .device import Device
+from .threads import one_thread
 
 
 def product_with(matrix: np.ndarray, device: Device, rough: bool = False) -> Callable[[wp.array, wp.array], None]:
@@ -17,11 +17,11 @@ def product_with(matrix: np.ndarray, device: Device, rough: bool = False) -> Cal
 
 
 def _on_cpu(matrix: np.ndarray, device: Device) -> Callable[[wp.array, wp.array], None]:
-    kept, blas = matrix.astype(device.precision), ThreadpoolController()
+    kept = matrix.astype(device.precision)
 
     def multiply(x: wp.array, out: wp.array) -> None:
         # Its threads wait for one another, ages where something else runs on their cores.
-        with blas.limit(limits=1, user_api="blas"):
+        with one_thread():
             np.matmul(kept, x.numpy(), out=out.numpy())
 
     return multiply

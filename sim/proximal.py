@@ -19,7 +19,6 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 from scipy.linalg import LinAlgError
-from threadpoolctl import ThreadpoolController
 
 from .compliance import Compliance
 from .lbfgs import Descended
@@ -29,6 +28,7 @@ from .problem import Problem
 from .settling import Softness, settled
 from .steering import BROKEN, DONE, KEPT, LEAST_KEPT, LIVE, MOST_KEPT, OVERSHOOT
 from .term import Local
+from .threads import one_thread
 
 CUTS = 8
 # Tools' forces are exact to a share of the whole residual, or of the tolerance.
@@ -78,10 +78,6 @@ class Proximal:
     barrier: Local
 
     @cached_property
-    def _blas(self) -> ThreadpoolController:
-        return ThreadpoolController()
-
-    @cached_property
     def compliance(self) -> Compliance:
         """At the nodes that can be touched."""
         return Compliance(self.problem, self.preconditioner, self.barrier.touchable)
@@ -95,7 +91,7 @@ class Proximal:
         now = self._judged(start.numpy()[:, 0].astype(np.float64))
         status, step, drag, slow = LIVE if now.finite else BROKEN, 0, 0.0, 0
         # Threads of BLAS wait for one another, ages where something else runs on their cores.
-        with self._blas.limit(limits=1, user_api="blas"):
+        with one_thread():
             force = self._felt(now)
             rest = self._answered(now.smooth + self._everywhere(force))
             while status == LIVE:

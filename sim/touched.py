@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 from scipy.linalg import lu_factor, lu_solve
-from threadpoolctl import ThreadpoolController
 
 from .compliance import Compliance
 from .linear import Preconditioner
 from .problem import Problem
 from .settling import MOST
 from .term import Local
+from .threads import one_thread
 
 
 class Touched:
@@ -37,7 +37,6 @@ class Touched:
     def __init__(self, rest: Preconditioner, compliance: Compliance, barrier: Local):
         self._rest, self._compliance, self._barrier = rest, compliance, barrier
 
-        self._blas = ThreadpoolController()
         self._felt: tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
 
     def prepare(self, problem: Problem, columns: int) -> None:
@@ -48,7 +47,7 @@ class Touched:
             nodes, curvature = self._barrier.pressed()
             if 0 < len(nodes) <= MOST:
                 # Threads of BLAS wait for one another, ages where something else runs on their cores.
-                with self._blas.limit(limits=1, user_api="blas"):
+                with one_thread():
                     whole = np.eye(len(curvature)) + curvature @ self._compliance.between(nodes)
                     self._felt = nodes, curvature, lu_factor(whole)
 
@@ -59,6 +58,6 @@ class Touched:
             z, (nodes, curvature, whole) = out.numpy(), self._felt
             force = np.zeros((len(self._compliance.rows) // 3, 3))
             own = z[self._compliance.rows, 0].reshape(-1, 3)[nodes].ravel()
-            with self._blas.limit(limits=1, user_api="blas"):
+            with one_thread():
                 force[nodes] = lu_solve(whole, curvature @ own).reshape(-1, 3)
                 out.assign(z - self._compliance.spread(force.ravel())[:, None])

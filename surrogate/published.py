@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
+from sim.threads import one_thread
 
 from .bayesian import Bayesian
 from .encode import directions
@@ -152,6 +152,6 @@ def taught(
 
     envelope = envelope_of(open_patch(anatomy), pushed, only_pushed(held_out))
     # Matrices of 61 rows are no work for several cores: their threads would wait for each other, twelve times as long.
-    with ThreadpoolController().limit(limits=1, user_api="blas"), ThreadPoolExecutor() as pool:
+    with one_thread(), ThreadPoolExecutor() as pool:
         machines = pool.map(learn, thirteen(*sites_of(anatomy, nodes), pushed), angular.transpose(1, 0, 2))
         return Published(anatomy, nodes, tuple(machines), envelope)

@@ -186,6 +186,22 @@ def test_an_answer_alone_is_that_in_a_batch() -> None:
     np.testing.assert_allclose(alone.reaction[0], batch.reaction[0], rtol=1e-6, atol=1e-9)
 
 
+def test_a_batch_of_which_one_case_is_slow_goes_on() -> None:
+    """What that one case learns, when it alone is left, is not the batch's."""
+    fem, far = solver(Accuracy(1e-6)), touching(DOWN, at(0.045, 0.04, HEIGHT - 3e-3))
+    second = fem.deform(far, fem.deform(touching(DOWN, DOWN)))
+    assert {len(value) for value in second.history.values()} == {2}
+    third = fem.deform(far, second)
+    assert all(outcome.good for outcome in third.outcome)
+    np.testing.assert_allclose(third.displacement, second.displacement, atol=1e-5)
+
+
+def test_no_poses_no_answers() -> None:
+    fem = solver(Accuracy(1e-6))
+    none = fem.deform(touching(DOWN).rows(np.zeros(0, int)))
+    assert none.displacement.shape == (0, len(BODY.mesh.nodes), 3)
+
+
 def test_what_was_asked_before_changes_no_bit() -> None:
     fem = solver(TRAIN)
     begun = fem.deform(touching(DOWN))

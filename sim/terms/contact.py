@@ -94,14 +94,14 @@ class Contact:
         way = self._way(cases)
         if way is None:
             return np.ones(len(cases.loads))
-        corners = (self._whole[0] + u.numpy().T.reshape(len(cases.loads), -1, 3))[:, self._triangles]
+        corners = (self._whole[0] + u.numpy().T.reshape(-1, *self._whole[0].shape))[:, self._triangles]
         middle = corners[:, :, :3].mean(axis=2)
         reach = BULGE * np.linalg.norm(corners - middle[:, :, None], axis=3).max(axis=2)
         clear = [
             [(distances_to(tool, at, points) - far).min() for tool, at in zip(self._shapes, pose, strict=True)]
             for pose, points, far in zip(way.at(cases.gone), middle, reach, strict=True)
         ]
-        return way.stride(self._shapes, np.maximum(clear, 0.0))
+        return way.stride(self._shapes, np.reshape(clear, way.end.shape[:2]).clip(0.0))
 
     def gaps(self, cases: Cases) -> np.ndarray:
         """As the farthest-moved tool goes."""
