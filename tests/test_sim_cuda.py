@@ -90,11 +90,13 @@ def test_a_batch_of_postures(box, element, precision):
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-@pytest.mark.parametrize("moving", [(), (Inertia(damping=2.0),)])
-def test_steps_in_time(box, moving, element, precision):
+@pytest.mark.parametrize(
+    ("law", "moving"), [("ogden", ()), ("ogden", (Inertia(damping=2.0),)), ("stable-neo-hookean", ())]
+)
+def test_steps_in_time(box, law, moving, element, precision):
     """Tissue that relaxes and swells, with and without mass; steps of two lengths in one batch."""
     accuracy = Accuracy(1e-8) if precision == "float64" else TRAIN
-    made_of = replace(tissue("ogden"), prony=((0.4, 0.5), (0.3, 5.0)))
+    made_of = replace(tissue(law), prony=((0.4, 0.5), (0.3, 5.0)))
     effects = (Elasticity(made_of), Held(), ToolForce(), Pulsation(), *moving)
     step = np.array([0.02, 0.02, 0.02, 0.02, 0.3, 0.3, 0.3])
     answers = []
@@ -107,7 +109,7 @@ def test_steps_in_time(box, moving, element, precision):
     on_cpu, on_cuda = answers
     off = np.abs(on_cpu.displacement - on_cuda.displacement).max()
     assert off <= 3.0 * BOUND[precision] * np.abs(on_cpu.displacement).max()
-    assert set(on_cpu.history) >= {"viscoelasticity ogden" + (" of shape" if element == "smoothed" else "")}
+    assert set(on_cpu.history) >= {f"viscoelasticity {law}" + (" of shape" if element == "smoothed" else "")}
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
@@ -133,6 +135,29 @@ def test_a_batch_of_moved_tools(box, element, precision):
     force = np.abs(on_cpu.reaction).max()
     assert np.abs(on_cpu.reaction - on_cuda.reaction).max() <= 10.0 * BOUND[precision] * force
     assert not on_cuda.displacement[0].any() and force > 0.01
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("element", ["p1", "smoothed"])
+def test_a_tool_moved_alone_frame_after_frame(box, element, precision):
+    """It comes down, slides, and leaves again: what touches and what gives are solved apart."""
+    accuracy = Accuracy(1e-7) if precision == "float64" else TRAIN
+    effects = (Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), ToolContact((Ball(5e-3),)))
+    way = np.array([[0.0, 0.0, -1e-3], [1e-3, 0.0, -2e-3], [3e-3, 1e-3, -2e-3], [3e-3, 1e-3, 2e-3]])
+    answers = {}
+    for name in ("cpu", "cuda"):
+        fem, answer = Fem(box, effects, accuracy, name, element=element), None
+        for number, place in enumerate(way):
+            pose = np.eye(4)
+            pose[:3, 3] = place
+            answer = fem.deform(Loads((Touching(pose[None, None]),)), answer)
+            assert answer.outcome[0].good
+            answers[name, number] = answer
+    for number in range(len(way)):
+        on_cpu, on_cuda = answers["cpu", number], answers["cuda", number]
+        size = np.abs(answers["cpu", 1].displacement).max()
+        assert np.abs(on_cpu.displacement - on_cuda.displacement).max() <= 3.0 * BOUND[precision] * size
+    assert not answers["cuda", len(way) - 1].displacement.any()
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
