@@ -75,12 +75,9 @@ def constants_of(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
     return total, square
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """u (3N, 1) [m], its free gradient g (3N, 1) [N] and that one's 2-norm, and the norm it is measured against."""
+class Measured:
+    """The 2-norm [N] of a free gradient, and the norm [N] that it is measured against."""
 
-    u: wp.array
-    g: wp.array
     free: float
     scale: float
 
@@ -93,3 +90,13 @@ class State:
     def finite(self) -> bool:
         """Whether it is a state at all: forces that overflow have no scale."""
         return bool(np.isfinite(self.free) and np.isfinite(self.scale))
+
+
+@dataclass(frozen=True, eq=False)
+class State(Measured):
+    """u (3N, 1) [m], its free gradient g (3N, 1) [N] and that one's 2-norm, and the norm it is measured against."""
+
+    u: wp.array
+    g: wp.array
+    free: float
+    scale: float

@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 from scipy.linalg import LinAlgError
 
+from .balance import Measured
 from .compliance import Compliance
 from .lbfgs import Descended
 from .linear import BlockJacobi, Preconditioner
@@ -41,7 +42,7 @@ DRAG, GROWTH, TIMES = 0.3, 3.0, 5
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class State(Measured):
     """u (3N,) [m]; the free gradients (3N,) [N] of all that is smooth, and of all; its 2-norm, and its scale."""
 
     u: np.ndarray
@@ -49,16 +50,6 @@ class State:
     whole: np.ndarray
     free: float
     scale: float
-
-    @property
-    def relative(self) -> float:
-        """The relative residual."""
-        return self.free / self.scale if self.free else 0.0
-
-    @property
-    def finite(self) -> bool:
-        """Whether it is a state at all."""
-        return bool(np.isfinite(self.free) and np.isfinite(self.scale))
 
 
 @dataclass(frozen=True, eq=False)
