@@ -12,6 +12,7 @@ from .discretisation import Discretisation
 from .errors import InputError
 from .normals import blurred_normals
 from .opening import about_opening, edge_of, inside_opening, rim_of
+from .triangles import areas
 
 # The skull is felt in the last of the gap: so far [m] from it, or within all of a narrower one.
 FELT = 1e-4
@@ -101,8 +102,7 @@ def bone_of(anatomy: Anatomy, space: Discretisation, gap: float) -> Bone:
 
 def _areas(space: Discretisation) -> np.ndarray:
     """Of the surface, what each node (N,) [m^2] stands for."""
-    a, b, c = np.moveaxis(space.nodes[space.surface[:, :3]], 1, 0)
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = areas(space.nodes[space.surface[:, :3]])
     shares = np.full(3, 1.0 / 3.0) if space.surface.shape[1] == 3 else np.repeat([CORNER, MIDDLE], 3)
     return np.bincount(space.surface.ravel(), (area[:, None] * shares).ravel(), space.count)
 

@@ -8,6 +8,7 @@ from scipy.special import ndtri
 
 from .anatomy import Anatomy
 from .normals import REACH, unit
+from .triangles import edge_lengths
 
 # Blurs from the edge, beyond which too little of it is seen.
 FAR = 2.5
@@ -22,8 +23,7 @@ def rim_of(anatomy: Anatomy) -> np.ndarray:
 
 def edge_of(nodes: np.ndarray, rim: np.ndarray) -> float:
     """How round [m] an edge looks across triangles (R, 3) of nodes (V, 3) [m]: as theirs are long, on average."""
-    corners = nodes[rim]
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+    return float(edge_lengths(nodes[rim]).mean())
 
 
 def inside_opening(

@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.normals import vertex_normals
+from sim.triangles import areas
 
 if TYPE_CHECKING:
     from sim.footprint import Skin
@@ -46,8 +47,7 @@ class Patch:
     @cached_property
     def areas(self) -> np.ndarray:
         """Triangle areas (S,) [m^2]."""
-        a, b, c = (self.points[self.triangles[:, corner]] for corner in range(3))
-        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return areas(self.points[self.triangles])
 
     @cached_property
     def inward(self) -> np.ndarray:

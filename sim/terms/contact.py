@@ -16,6 +16,7 @@ from ..loads import Retracted, Touching
 from ..motion import Way, approach
 from ..term import Cases
 from ..tools import Tool, core_of, distances_to
+from ..triangles import areas, edge_lengths
 from .reduced import HOST, Reduced
 from .touch import BULGE, Scale, Surface, Tools, kernels_of
 
@@ -73,14 +74,14 @@ class Contact:
         self._shapes, self._way, self._device = tools, way, device
         self._kernels = kernels_of(device, triangles.shape[1])
         cores = [core_of(tool) for tool in tools]
-        a, b, c = np.moveaxis(nodes[triangles[:, :3]], 1, 0)
-        longest = STRETCH * _longest_edges(nodes, triangles)
+        corners = nodes[triangles[:, :3]]
+        longest = STRETCH * edge_lengths(corners).max(axis=1)
         fine = np.sqrt(2.0 * min(core.radius for core in cores) * SAG * gap) / FARTHEST
         self._surface = Surface()
         self._surface.rest = device.array(nodes, wp.vec3d)
         self._surface.table = device.array(triangles, wp.int32)
         self._surface.pieces = device.array(np.ceil(longest / fine), wp.int32)
-        self._surface.area = device.array(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1), wp.float64)
+        self._surface.area = device.array(areas(corners), wp.float64)
         self._tools = Tools()
         self._tools.centre = device.array(np.array([core.centre for core in cores]), wp.vec3d)
         self._tools.half = device.array(np.array([core.half for core in cores]), wp.vec3d)
@@ -275,11 +276,5 @@ def _reach(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """How far (n,) [m] each of a surface's own nodes, ascending, is at most from the points that are nearest to it."""
     numbers, table = np.unique(triangles, return_inverse=True)
     out = np.zeros(len(numbers))
-    np.maximum.at(out, table.reshape(triangles.shape), _longest_edges(nodes, triangles)[:, None])
+    np.maximum.at(out, table.reshape(triangles.shape), edge_lengths(nodes[triangles[:, :3]]).max(axis=1)[:, None])
     return out / np.sqrt(3.0)
-
-
-def _longest_edges(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Of each triangle (S,) [m], between its corners."""
-    corners = nodes[triangles[:, :3]]
-    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
