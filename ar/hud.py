@@ -14,7 +14,7 @@ WHITE = (244, 244, 240)
 PAD = 8
 
 
-def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5, ink: Sequence[int] = WHITE) -> None:
+def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5, ink: Sequence[float] = WHITE) -> None:
     """Write one line of ASCII text into the picture (H, W, 3) uint8, its baseline's left end at (column, row).
 
     A dark halo keeps it legible on any ground; the line is moved as far as it takes to lie inside the picture.
@@ -28,6 +28,12 @@ def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5
     halo = cv2.dilate(halo, np.ones((3, 3), np.uint8))[..., None] / 255.0
     colour[box] = colour[box] * (1.0 - halo) + 12.0 * halo
     cv2.putText(colour, text, (column, row), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
+
+
+def millimetres(length: float, error: float | None = None) -> str:
+    """A length [m] as it is read: in millimetres, with what it may be off by [m] where that is known."""
+    beside = "" if error is None else f" +- {max(1e3 * error, 0.1):.1f}"
+    return f"{1e3 * length:.1f}{beside} mm"
 
 
 def panel(colour: np.ndarray, lines: Sequence[str], corner: Corner = "top left", scale: float = 0.45) -> np.ndarray:

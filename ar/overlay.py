@@ -10,12 +10,23 @@ import cv2
 import numpy as np
 
 from .camera import Camera
-from .hud import write
+from .hud import PAD, millimetres, write
 from .layer import Layer, vertex_normals
 from .raster import Fragments, rasterise
 from .view import Picture
 
-Style = Literal["window", "contour", "fill"]
+Style = Literal["window", "contour", "fill", "none"]
+# What may not be relied on is drawn in amber, and broken; what was believed before in grey, and dotted.
+DOUBTFUL = (1.0, 0.68, 0.16)
+BEFORE = (0.86, 0.88, 0.90)
+# Of the outline's brightness: that of the margin round it, which is no place of the surface.
+FAINT = 0.75
+# Lengths of the outlines' strokes and gaps [pixel].
+BROKEN, DASHED, DOTTED = (9, 6), (7, 7), (2, 5)
+# Scale of the number beside the line.
+GAUGE = 0.6
+# A motion of fewer pixels has no arrow.
+LEAST_ARROW = 4.0
 # Light that falls to 1 / e over this depth under the surface [m]: the deeper, the darker.
 FADE = 0.03
 # Room for the window's soft rim round the silhouette [pixel].
@@ -26,16 +37,22 @@ SURROUND = 24
 class Gauge:
     """The number asked for first: how far the tool is from the hidden surface.
 
-    tip, nearest (3,) world points [m]: the tool's tip and the point of the hidden surface that is nearest to it.
+    tip, nearest (3,) world points [m]: the tool's tip and the point of the hidden surface that is nearest to it; error
+    [m]: how far off the number may be, None where nobody knows.
     """
 
     tip: np.ndarray
     nearest: np.ndarray
+    error: float | None = None
 
     @property
     def distance(self) -> float:
         """[m]."""
         return float(np.linalg.norm(np.asarray(self.tip) - self.nearest))
+
+    def __str__(self) -> str:
+        """As it is printed beside the line."""
+        return millimetres(self.distance, self.error)
 
 
 def composite(
@@ -46,6 +63,8 @@ def composite(
     style: Style = "window",
     margin: float | np.ndarray = 0.0,
     gauge: Gauge | None = None,
+    before: Layer | None = None,
+    doubt: str = "",
     device: str = "cpu",
 ) -> Picture:
     """The picture with a hidden surface drawn into it; depth, normals and segmentation stay as they are.
@@ -60,11 +79,17 @@ def composite(
         Ids of the layers (tool, hand) that cover the overlay wherever the picture shows them.
     style
         "contour": the outline. "window": besides, the ground is dimmed round the outline and the surface shows through,
-        shaded, and darker the deeper it lies. "fill": besides the outline, a flat tint.
+        shaded, and darker the deeper it lies. "fill": besides the outline, a flat tint. "none": nothing at all.
     margin
         One number or (V,) [m]: how uncertain the surface is. Where positive, a dashed second outline runs that far out.
     gauge
         Draws the line from the tip to the hidden surface, and its length in millimetres.
+    before
+        Where the hidden surface was before, as in the scan: a dotted grey outline, with an arrow from there to here and
+        the mean motion in millimetres; what that may be off by is the largest margin.
+    doubt
+        Why the surface's place may not be relied on. It is written at the picture's foot, the outline is amber and
+        broken, and nothing is promised: no margin is drawn, and the number beside the line has no error.
 
     Raises
     ------
@@ -76,30 +101,66 @@ def composite(
     if picture.colour.shape[:2] != (camera.height, camera.width):
         raise ValueError(f"the picture is {picture.colour.shape[:2]}, the camera {(camera.height, camera.width)}.")
     out = picture.colour.copy()
+    if style == "none":
+        return replace(picture, colour=out)
+    if doubt:
+        hidden, margin = replace(hidden, colour=DOUBTFUL), 0.0
     grown = hidden.vertices + np.reshape(margin, (-1, 1)) * vertex_normals(hidden.vertices, hidden.triangles)
-    box = box_around(camera, np.concatenate([hidden.vertices, grown]))
+    past = hidden.vertices if before is None else before.vertices
+    box = box_around(camera, np.concatenate([hidden.vertices, grown, past]))
     if box is not None:
         # Everything but the gauge happens in the box, which is small: a view of `out`, a camera that sees just it.
         here, ground = camera.cropped(*box), out[box]
         fragments = rasterise(here, hidden.vertices, hidden.triangles, device=device)
-        tint = tuple((255.0 * np.asarray(hidden.colour, np.float64).mean(axis=0)).tolist())
+        tint = ink_of(hidden.colour)
         if style == "fill":
             ground[fragments.mask] = 0.55 * ground[fragments.mask] + 0.45 * np.array(tint)
         if style == "window":
             draw_window(ground, picture.depth[box], here, hidden, fragments)
+        if before is not None:
+            draw_before(ground, here, before, hidden, device)
         if np.any(np.asarray(margin) > 0.0):
             for outline in outlines(silhouette(here, grown, hidden.triangles, device)):
-                dash(ground, outline, tint)
+                dash(ground, outline, [FAINT * part for part in tint], DASHED)
         for ink, width in (((10.0, 12.0, 12.0), 4), (tint, 2)):
-            cv2.polylines(ground, outlines(fragments.mask), True, ink, width, cv2.LINE_AA)
+            for outline in outlines(fragments.mask):
+                if doubt:
+                    dash(ground, outline, ink, BROKEN, width)
+                else:
+                    cv2.polylines(ground, [outline], True, ink, width, cv2.LINE_AA)
     if gauge is not None:
         draw_line(out, camera, gauge)
     covered = cv2.LUT(picture.segmentation, np.isin(np.arange(256), occluders).astype(np.uint8))
     cv2.copyTo(picture.colour, covered, out)
-    if gauge is not None and box is not None:
-        middle = (box[1].start + box[1].stop) // 2
-        write(out, f"{1e3 * gauge.distance:.1f} mm", (middle - 28, box[0].stop - SURROUND + 24), 0.6)
+    if gauge is not None:
+        write_gauge(out, camera, replace(gauge, error=None) if doubt else gauge)
+    if before is not None and box is not None:
+        motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
+        error = float(np.max(margin)) or None
+        write(out, f"moved {millimetres(motion, error)}", (box[1].start + SURROUND, box[0].stop - PAD), 0.5)
+    if doubt:
+        write(out, doubt, (PAD, camera.height - PAD), 0.5, ink_of(DOUBTFUL))
     return replace(picture, colour=out)
+
+
+def ink_of(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
+    """The mean of colours (3,) or (V, 3), sRGB in [0, 1], as lines are drawn: whole numbers of 0 .. 255."""
+    red, green, blue = np.rint(255.0 * np.asarray(colour, np.float64).reshape(-1, 3).mean(axis=0)).tolist()
+    return red, green, blue
+
+
+def draw_before(ground: np.ndarray, camera: Camera, before: Layer, hidden: Layer, device: str) -> None:
+    """Draw where the hidden surface was, dotted, and an arrow from its middle there to its middle now, in place."""
+    for outline in outlines(silhouette(camera, before.vertices, before.triangles, device)):
+        for ink, width in (((10.0, 12.0, 12.0), 4), (ink_of(BEFORE), 2)):
+            dash(ground, outline, ink, DOTTED, width)
+    ends, depth = camera.project(np.stack([before.vertices.mean(axis=0), hidden.vertices.mean(axis=0)]))
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    if (depth <= 0.0).any() or not length >= LEAST_ARROW:
+        return
+    start, end = (tuple(each) for each in np.clip(ends, -1e4, 1e4).round().astype(int).tolist())
+    for ink, width in (((10.0, 12.0, 12.0), 4), (ink_of(BEFORE), 2)):
+        cv2.arrowedLine(ground, start, end, ink, width, cv2.LINE_AA, tipLength=min(0.5, 6.0 / length))
 
 
 def box_around(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None:
@@ -144,10 +205,11 @@ def draw_window(ground: np.ndarray, depth: np.ndarray, camera: Camera, hidden: L
     ground[:] = np.clip(light, 0.0, 255.0)
 
 
-def dash(out: np.ndarray, outline: np.ndarray, ink: Sequence[float], length: int = 7) -> None:
-    """Draw every second stretch of `length` pixels of an outline (n, 1, 2), in place."""
-    for start in range(0, len(outline), 2 * length):
-        cv2.polylines(out, [outline[start : start + length]], False, ink, 1, cv2.LINE_AA)
+def dash(out: np.ndarray, outline: np.ndarray, ink: Sequence[float], pattern: tuple[int, int], width: int = 1) -> None:
+    """Draw strokes of an outline (n, 1, 2) with gaps, both of so many pixels as `pattern` says, in place."""
+    stroke, gap = pattern
+    for start in range(0, len(outline), stroke + gap):
+        cv2.polylines(out, [outline[start : start + stroke]], False, ink, width, cv2.LINE_AA)
 
 
 def draw_line(out: np.ndarray, camera: Camera, gauge: Gauge) -> None:
@@ -159,3 +221,11 @@ def draw_line(out: np.ndarray, camera: Camera, gauge: Gauge) -> None:
     cv2.line(out, tip, nearest, (12, 14, 16), 3, cv2.LINE_AA)
     cv2.line(out, tip, nearest, (250, 250, 250), 1, cv2.LINE_AA)
     cv2.circle(out, nearest, 3, (250, 250, 250), -1, cv2.LINE_AA)
+
+
+def write_gauge(out: np.ndarray, camera: Camera, gauge: Gauge) -> None:
+    """Write the gauge's number beside the end of its line, in place; nothing when that lies behind the camera."""
+    (end,), (depth,) = camera.project(np.asarray(gauge.nearest)[None])
+    if depth > 0.0:
+        column, row = np.clip(end, -1e4, 1e4).round().astype(int).tolist()
+        write(out, str(gauge), (column + 10, row + 16), GAUGE)

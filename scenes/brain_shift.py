@@ -7,7 +7,6 @@ from sim.effects import Elasticity, Gravity, Held, SkullContact
 from .lying import drained_then_turned
 from .scene import Scene
 
-# On smoothed elements: linear ones lock under a weight that does little but squeeze.
 SCENE = Scene(
     "brain_shift",
     __doc__ or "",
@@ -15,5 +14,4 @@ SCENE = Scene(
     effects=(Elasticity(), Held(), SkullContact(), Gravity()),
     tool=None,
     lying=drained_then_turned(drain=3.0, pause=0.5, turn=2.0, angle=np.radians(30.0), to=0.5),
-    element="smoothed",
 )

@@ -152,9 +152,8 @@ class Demo:
             scene, theatre = self.stage.scene, self.theatre
             for effect in scene.effects_on(theatre.anatomy) if off else ():
                 scene = without(scene, effect) if type(effect).__name__ in off else scene
-            knowing = theatre if theatre.knowing(self.stage.scene) else replace(theatre, models={})
             stage = replace(self.stage, scene=scene) if off else self.stage
-            self.sessions[name, off] = Session(Player(stage, knowing.deformer(name, scene)))
+            self.sessions[name, off] = Session(Player(stage, theatre.deformer(name, scene)))
         return self.sessions[name, off]
 
     def _controls(self) -> list[Slider | Choice | Toggle]:

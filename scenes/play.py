@@ -4,29 +4,34 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import trimesh
 
 from ar.camera import Camera
-from ar.hud import panel
+from ar.hud import PAD, panel, write
 from ar.layer import Layer
 from ar.overlay import Gauge, Style, composite
 from ar.view import Picture, render
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
 from sim.loads import Loads
+from sim.resting import resting_tip
 from surrogate.learned import Learned
 
 from .paths import AIR, Touch
 from .scene import Scene
 from .site import Site
 from .stage import TOOL, Stage
-from .told import told
+from .told import doubt_of, told
 from .tool import Blade, Probe
 
+IN_BONE = "the bone is where this push needs the tool: do not rely on it"
+# Tissue may carry a tool into the bone's edge by so much before it counts [m].
+CARRIED = 0.5e-3
+SMALL = 0.45
 STAGES = ("deform", "render", "overlay")
 """What the time of a frame is spent on."""
 
@@ -50,11 +55,17 @@ class Frame:
     picture
         What the camera sees, without overlay.
     shown
-        The picture with the predicted tumour in it (H, W, 3) uint8.
+        The picture with the predicted tumour in it (H, W, 3) uint8, where the scan had it, and the frame's number.
     distance
         From the tool's tip to the tumour's predicted surface [m]; None without a tool.
+    distance_error
+        How far off that may be [m], as printed; None where nobody knows.
     moved
         Mean distance of the tumour's predicted surface from where the scan has it [m].
+    doubt
+        Why the answer may not be relied on, in the words that are in the picture; empty where it may.
+    remark
+        What else is said in the picture, as of a tool that the bone stops; mostly empty.
     seconds
         Wall time by stage, see `STAGES`.
     """
@@ -70,8 +81,20 @@ class Frame:
     picture: Picture
     shown: np.ndarray
     distance: float | None
+    distance_error: float | None
     moved: float
+    doubt: str
+    remark: str
     seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldTool:
+    """Where a tool is drawn: tip (3,) [m], T_world_tool pose (4, 4), and whether bone is where its load needs it."""
+
+    tip: np.ndarray
+    pose: np.ndarray
+    blocked: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,19 +151,23 @@ class Player:
         begun = clock.perf_counter()
         margin = self._margin(self.deformer, deformation) if isinstance(self.deformer, Learned) else 0.0
         positions = self.positions(deformation)
-        tip, pose = (None, None) if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
+        held = None if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
         stage = self.stage.at(loads)
-        picture = render(self.camera, stage.layers(positions, pose), stage.lamp)
+        picture = render(self.camera, stage.layers(positions, None if held is None else held.pose), stage.lamp)
         rendered = clock.perf_counter()
         tumour, rest = (stage.tumour(at) for at in (positions, self.site.anatomy.mesh.nodes))
-        gauge = None if tip is None else gauged(tip, tumour)
-        over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin=margin, gauge=gauge)
+        doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.blocked else "")
+        gauge = None if held is None else gauged(held.tip, tumour)
+        over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt).colour
+        remark = self.scene.stopped(self.site, touch)
+        annotate(over, number, remark)
         spent = seconds, rendered - begun, clock.perf_counter() - rendered
         return Frame(
-            number, float(loads.times[0]), touch, loads, deformation, self.camera, pose, tip, picture, over.colour,
-            None if gauge is None else gauge.distance,
+            number, float(loads.times[0]), touch, loads, deformation, self.camera,
+            None if held is None else held.pose, None if held is None else held.tip, picture, over,
+            None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
             float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()),
-            dict(zip(STAGES, spent, strict=True)),
+            doubt, remark, dict(zip(STAGES, spent, strict=True)),
         )  # fmt: skip
 
     def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
@@ -164,17 +191,22 @@ class Player:
         positions[deformation.nodes] += deformation.displacement[row]
         return positions
 
-    def tool(self, tool: Probe | Blade, touch: Touch, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Tip (3,) [m] and pose T_world_tool (4, 4).
+    def tool(self, tool: Probe | Blade, touch: Touch, positions: np.ndarray) -> HeldTool:
+        """Where the tool is: of one that pushes, where it comes to rest on the deformed cortex from outside.
 
-        Of a tool that pushes: resting on the deformed surface, lifted off where it is idle.
+        It is lifted off where it is idle. Tissue that is drawn aside may carry it to the bone's edge, which stops it.
         """
         if self.scene.posed:
-            return self.scene.tip(self.site, touch), self.scene.pose(self.site, touch)
-        inward = self.site.direction(replace(touch, tilt=(0.0, 0.0)))
-        lift = AIR * max(0.0, 1.0 - touch.force / 0.02)
-        tip = self.scene.contact(self.site, touch).carried(positions) - lift * inward
-        return tip, tool.pose(tip, inward, self.site.right)
+            return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), False)
+        inward = self.site.axis
+        carried = self.scene.contact(self.site, touch).carried(positions)
+        through = self.site.within(carried, tool.radius)
+        tip = through
+        if isinstance(tool, Probe):
+            tip = resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
+        tip = tip - AIR * max(0.0, 1.0 - touch.force / 0.02) * inward
+        pose = tool.pose(tip, inward, self.site.right)
+        return HeldTool(tip, pose, bool(np.linalg.norm(through - carried) > CARRIED))
 
 
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
@@ -183,18 +215,22 @@ def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
     return Gauge(tip, trimesh.proximity.closest_point_naive(surface, tip[None])[0][0])
 
 
-def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:
-    """The shown picture (H, W, 3) with a panel: deformer, what acts, milliseconds by stage, and error [m] if known.
+def annotate(colour: np.ndarray, number: int, remark: str) -> None:
+    """Write a frame's number at the right of the picture's foot, and a remark above its left, in place."""
+    height, width, _ = colour.shape
+    write(colour, f"frame {number}", (width, height - PAD), SMALL)
+    if remark:
+        write(colour, remark, (PAD, height - 4 * PAD), SMALL)
 
-    An answer that may not be relied on looks like any other, so the panel says it.
-    """
+
+def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:
+    """The shown picture (H, W, 3) with a panel: deformer, what acts, milliseconds by stage, and error [m] if known."""
     stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
     acts = told(frame.loads, frame.deformation)
-    lines = [f"{name}   t {frame.time:.2f} s   tumour moved {1e3 * frame.moved:.2f} mm"]
+    lines = [frame.deformation.source or name, f"t {frame.time:.2f} s   tumour moved {1e3 * frame.moved:.2f} mm"]
     lines += [*([acts] if acts else []), f"ms: {stages}"]
     if error is not None:
         lines.append(f"error against FEM: {1e3 * error:.3f} mm (frame {frame.number})")
-    outcome = frame.deformation.outcome[0]
-    if not outcome.good:
-        lines.append(outcome.value)
+    if not frame.deformation.outcome[0].good:
+        lines.append(frame.deformation.outcome[0].value)
     return panel(frame.shown, lines)

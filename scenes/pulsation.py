@@ -11,5 +11,4 @@ SCENE = Scene(
     lay(depth=0.5e-3, rise=1.0),
     duration=6.0,
     effects=(Elasticity(), Held(), Slide(), Pulsation(), ToolContact((PALPATION.shape,))),
-    element="smoothed",
 )

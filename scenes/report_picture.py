@@ -8,7 +8,7 @@ import numpy as np
 
 from ar.camera import look_at
 from ar.hud import panel
-from ar.overlay import composite, dash, outlines, silhouette
+from ar.overlay import DASHED, composite, dash, outlines, silhouette
 from ar.view import render
 from sim.intensity import read_intensity, sidecar
 from sim.loads import Pushed
@@ -53,7 +53,7 @@ def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
     shown = composite(picture, camera, stage.tumour(predicted), (TOOL,), "window").colour
     reference = stage.tumour(there)
     for outline in outlines(silhouette(camera, reference.vertices, reference.triangles)):
-        dash(shown, outline, YELLOW)
+        dash(shown, outline, YELLOW, DASHED)
     force = float(np.linalg.norm(pushed.force[worst]))
     lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"off by up to {1e3 * distance[worst]:.3f} mm"]
     return panel(shown, lines)

@@ -1,9 +1,11 @@
 """A spatula is laid on the cortex, draws it aside, and is held there while the tissue relaxes under it."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from sim.effects import Elasticity, Held, Retraction, Slide
-from sim.material import Material
+from sim.material import BRAIN
 
 from .paths import lay
 from .scene import Scene
@@ -11,7 +13,7 @@ from .tool import Blade
 
 BLADE = Blade()
 # A Prony series of brain in vitro: Miller, Chinzei 2002, J. Biomech. 35:483-490.
-RELAXING = Material("neo-hookean", 3000.0, 0.45, prony=((0.45, 0.5), (0.365, 50.0)))
+RELAXING = replace(BRAIN, prony=((0.45, 0.5), (0.365, 50.0)))
 
 SCENE = Scene(
     "retract",

@@ -25,6 +25,7 @@ from sim.effects import (
 )
 from sim.errors import InputError
 from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
+from sim.material import Tissue
 
 from .lying import Lie, supine
 from .paths import AIR, Path, Touch, idle
@@ -32,25 +33,29 @@ from .site import Contact, Site
 from .surgery import Debulking
 from .tool import Blade, Probe
 
+# So far under the cortex a camera looks: between the tool and the tumour [m].
+UNDER = 6e-3
+
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera by its place relative to the open cortex.
+    """A camera by its place relative to the open cortex: from the side, for a tool moves a tumour mostly downwards.
 
     distance [m] along the outward normal; tilt [rad] of the line of sight towards the site's `up`; vertical field of
     view [rad]; size of the picture [pixel].
     """
 
     distance: float = 0.20
-    tilt: float = -0.35
-    fov: float = np.radians(22.0)
+    tilt: float = -0.8
+    fov: float = np.radians(16.0)
     width: int = 640
     height: int = 480
 
     def camera(self, site: Site) -> Camera:
         """The camera that looks at a site."""
         outward = -np.cos(self.tilt) * site.axis + np.sin(self.tilt) * site.up
-        return look_at(site.origin + self.distance * outward, site.origin, site.up, self.fov, self.width, self.height)
+        target = site.origin + UNDER * site.axis
+        return look_at(target + self.distance * outward, target, site.up, self.fov, self.width, self.height)
 
 
 @dataclass(frozen=True)
@@ -65,14 +70,19 @@ class Bounds:
         Largest mean distance between the predicted tumour and the finite elements' [m].
     pixels
         Largest difference between our projection and OpenCV's [pixel].
+    drawn
+        How far the outline in the picture may be from where the finite elements have it [pixel].
     """
 
     overlap: float = 0.95
     error: float = 0.3e-3
     pixels: float = 1e-3
+    drawn: float = 2.0
 
 
 PALPATION = Probe()
+# A tool that is stopped by less is where it was asked for [m].
+SHORT = 0.1e-3
 HANDLED = (ToolForce, ToolContact, Retraction)
 """Effects that need a tool in somebody's hand."""
 
@@ -90,8 +100,7 @@ class Scene:
     surgery
         What is cut, if anything.
     element
-        One of `sim.discretisation.ELEMENTS`; None: p1, or p2 on a mesh that brings mid-edge nodes. Learnt models are
-        played and judged with the tissue and the element that they were taught, whatever the scene says.
+        One of `sim.discretisation.ELEMENTS`; None: the one that is recommended for the mesh.
 
     Raises
     ------
@@ -120,6 +129,25 @@ class Scene:
                 f"the scene {self.name} asks for {needs[0]}, but has no tool: give it one, or leave it out."
             )
 
+    def made_of(self, tissue: Tissue | None, element: str | None) -> Scene:
+        """The scene with another tissue, element, or both; tissue that relaxes goes on relaxing by the same series.
+
+        Raises
+        ------
+        InputError
+            A law that cannot relax, in a scene whose tissue does.
+        """
+        if tissue is None:
+            return self if element is None else replace(self, element=element)
+
+        def made(effect: Effect) -> Effect:
+            if not isinstance(effect, Elasticity):
+                return effect
+            relaxes = () if effect.default is None else effect.default.prony
+            return replace(effect, default=replace(tissue, prony=tissue.prony or relaxes))
+
+        return replace(self, effects=tuple(made(effect) for effect in self.effects), element=element or self.element)
+
     @property
     def times(self) -> np.ndarray:
         """Time of every frame (n,) [s]."""
@@ -142,8 +170,20 @@ class Scene:
         return any(isinstance(effect, ToolContact | Retraction) for effect in self.effects)
 
     def tip(self, site: Site, touch: Touch) -> np.ndarray:
-        """Where a tool that is moved would touch first (3,) [m]."""
-        return self.contact(site, touch).point + touch.depth * site.direction(touch)
+        """Where a tool that is moved would touch first (3,) [m]; the bone's edge stops it."""
+        assert self.tool is not None
+        asked = self.contact(site, touch).point + touch.depth * site.direction(touch)
+        return site.within(asked, self.tool.radius)
+
+    def stopped(self, site: Site, touch: Touch) -> str:
+        """Say that the bone's edge stops the tool short of where a touch asks for it; empty where it does not."""
+        if self.tool is None:
+            return ""
+        asked = site.origin + touch.x * site.right + touch.y * site.up
+        if self.posed:
+            asked = asked + touch.depth * site.direction(touch)
+        beyond = float(site.across(asked[None])[0]) - site.reach(self.tool.radius)
+        return f"the bone's edge stops the tool {1e3 * beyond:.1f} mm short" if beyond > SHORT else ""
 
     def pose(self, site: Site, touch: Touch) -> np.ndarray:
         """T_world_tool (4, 4) of a tool that is moved; it faces the tissue whichever way it is moved."""

@@ -14,6 +14,9 @@ from surrogate.patch import open_patch
 
 from .paths import Touch
 
+# Radius of the drape's hole over that of the largest circle of open cortex: its rim hides the mesh's ragged border.
+HOLE = 0.98
+
 
 @dataclass(frozen=True, eq=False)
 class Contact:
@@ -57,6 +60,17 @@ class Site:
         flat = patch.points - np.outer((patch.points - self.origin) @ self.axis, self.axis)
         return float(replace(patch, points=flat).rim_distance(self.origin[None])[0])
 
+    def reach(self, radius: float) -> float:
+        """How far from the line through the origin along the axis the bone lets a tool of this `radius` go [m]."""
+        return max(0.0, HOLE * self.clearance - radius)
+
+    def within(self, point: np.ndarray, radius: float) -> np.ndarray:
+        """The point (3,) [m], brought back across the axis to where the bone stops a tool of this `radius` [m]."""
+        arm = point - self.origin
+        aside = arm - (arm @ self.axis) * self.axis
+        length = float(np.linalg.norm(aside))
+        return point - max(0.0, 1.0 - self.reach(radius) / max(length, np.finfo(float).tiny)) * aside
+
     def across(self, points: np.ndarray) -> np.ndarray:
         """Distance (n,) [m] of points (n, 3) from the line through the origin along the axis."""
         arm = points - self.origin
@@ -67,8 +81,7 @@ class Site:
 
         A tool of this `radius` [m] stays inside the opening: the place is brought back to where the bone stops it.
         """
-        share = max(0.0, self.clearance - radius) / max(float(np.hypot(x, y)), np.finfo(float).tiny)
-        asked = self.origin + min(1.0, share) * (x * self.right + y * self.up)
+        asked = self.within(self.origin + x * self.right + y * self.up, radius)
         point, _, triangle = trimesh.proximity.closest_point_naive(self._surface, asked[None])
         weights = trimesh.triangles.points_to_barycentric(self._surface.triangles[triangle], point)
         return Contact(point[0], self.anatomy.open_surface[triangle[0]], weights[0])

@@ -16,7 +16,7 @@ from sim.loads import Loads, Resected
 from sim.resection import Remains, bodies
 
 from .scene import Scene
-from .site import Site
+from .site import HOLE, Site
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 """Segmentation ids."""
@@ -34,8 +34,6 @@ RIM = 10e-3
 DRAPE_HEIGHT, DRAPE_DEPTH = 3.0e-3, 8.0e-3
 # What is beyond the hole is drawn lower by so many times as far as it is beyond, to the depth of the drape's wall.
 DIP = 3.0
-# Radius of the drape's hole over that of the largest circle of open cortex: its rim hides the mesh's ragged border.
-HOLE = 0.98
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,11 +11,11 @@ from sim.accuracy import LIVE, Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.device import find_device
-from sim.effects import Elasticity
+from sim.discretisation import recommended
+from sim.effects import solver_named
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.intensity import Intensity, read_intensity, sidecar
-from sim.material import tissue_from_json
 from sim.meshfile import read_anatomy
 from sim.operated import Operated, finite_elements
 from surrogate.learned import Learned
@@ -43,11 +43,17 @@ class Theatre:
         """The open cortex."""
         return site_of(self.anatomy)
 
+    def refusals(self, scene: Scene) -> dict[str, str | None]:
+        """Why each learnt model may not answer a scene, by name; None if it may.
+
+        A model answers the effects, the tissue and the element that it learned from, and no others.
+        """
+        effects, element = scene.effects_on(self.anatomy), self._element(scene)
+        return {name: refusal(model, effects, element) for name, model in self.models.items()}
+
     def knowing(self, scene: Scene) -> dict[str, Learned]:
-        """The learnt models that were taught under a scene's effects, by name."""
-        return {
-            name: model for name, model in self.models.items() if refusal(model, scene.effects_on(self.anatomy)) is None
-        }
+        """The learnt models that may answer a scene, by name."""
+        return {name: self.models[name] for name, why in self.refusals(scene).items() if why is None}
 
     def names(self, scene: Scene) -> tuple[str, ...]:
         """Every deformer that can be asked for a scene: the learnt ones that know it, then the finite elements."""
@@ -58,18 +64,19 @@ class Theatre:
         knowing = self.knowing(scene)
         return min(knowing, key=lambda name: knowing[name].bound, default="fem")
 
-    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
-        """Finite elements for a scene's effects, with the tissue and the element that the models here were taught.
+    def described(self, name: str, scene: Scene) -> str:
+        """A deformer by name, in words: what solves, or what it learned from."""
+        if name != "fem":
+            return self.models[name].source
+        return solver_named(self._element(scene), scene.effects)
 
-        Where no model knows the scene, or none says, tissue and element are the scene's; `live` as `Fem` has it.
-        """
-        taught = next((model.training for model in self.knowing(scene).values()), {})
-        effects = scene.effects_on(self.anatomy)
-        if "tissue" in taught:
-            elasticity = Elasticity(tissue_from_json(taught["tissue"]))
-            effects = tuple(elasticity if isinstance(effect, Elasticity) else effect for effect in effects)
-        element = taught.get("element", scene.element)
+    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
+        """Finite elements for a scene's effects, tissue and element; `live` as `Fem` has it."""
+        effects, element = scene.effects_on(self.anatomy), self._element(scene)
         return finite_elements(self.anatomy, effects, accuracy, self.device, batch, element, live)
+
+    def _element(self, scene: Scene) -> str:
+        return scene.element or recommended(self.anatomy.mesh)
 
     def deformer(self, name: str, scene: Scene) -> Deformer:
         """A deformer by name; "fem" is made for the scene's accuracy.
@@ -77,7 +84,7 @@ class Theatre:
         Raises
         ------
         InputError
-            A name that this theatre does not know; a model that was not taught under the scene's effects.
+            A name that this theatre does not know; a model that learned from other effects, tissue or element.
         """
         if name == "fem":
             return self.fem(scene, scene.accuracy, live=True)
@@ -86,7 +93,7 @@ class Theatre:
             raise InputError(
                 f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the learnt ones."
             )
-        why = refusal(self.models[name], scene.effects_on(self.anatomy))
+        why = self.refusals(scene)[name]
         if why is not None:
             raise InputError(f"{name} does not know the scene {scene.name}: {why}. Choose one of {allowed}.")
         return self.models[name]

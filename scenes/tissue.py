@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 
-from sim.discretisation import ELEMENTS
+from sim.discretisation import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
 
@@ -34,14 +34,13 @@ def add_tissue_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bulk", type=float, metavar="K", help="bulk modulus of --material ogden [Pa]")
 
 
-def add_element_argument(parser: argparse.ArgumentParser, default: str | None = None) -> None:
-    """Declare --element; without a default, the mesh decides."""
-    meant = default or "p1, or p2 where the mesh brings mid-edge nodes of its own"
+def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMENDED) -> None:
+    """Declare --element; None is what is `meant` in words, or p2 where the mesh brings mid-edge nodes of its own."""
     parser.add_argument(
         "--element",
         choices=ELEMENTS,
-        default=default,
-        help="; ".join(f"{name}, {text}" for name, text in ELEMENTS.items()) + f" (default {meant})",
+        help="; ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
+        + f" (default {meant}; p2 where the mesh brings mid-edge nodes of its own)",
     )
 
 
@@ -77,6 +76,13 @@ def tissue_of(args: argparse.Namespace) -> Tissue:
         base.young if args.young is None else args.young,
         base.poisson if args.poisson is None else args.poisson,
     )
+
+
+def tissue_asked(args: argparse.Namespace) -> Tissue | None:
+    """The tissue asked for, or None where no option of it is given."""
+    constants = (args.young, args.poisson, args.ogden, args.bulk)
+    given = args.material != "default" or any(value is not None for value in constants)
+    return tissue_of(args) if given else None
 
 
 def refuse(given: Mapping[str, object], material: str, owner: str) -> None:

@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.deformation import Deformation
+from sim.deformation import Deformation, Outcome
 from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touching
 
 # Sides of the body along the axes of RAS, and against them.
 SIDES = ("RL", "AP", "SI")
 # Components of a unit vector under this are not told.
 TOLD = 0.05
+
+
+# What is written into a picture whose answer may not be relied on.
+DOUBTS = {
+    Outcome.EXTRAPOLATED: "outside what the model learned: do not rely on it",
+    Outcome.PIERCED: "the tool came to be inside the tissue: do not rely on it",
+    Outcome.GUESSED: "nothing was solved: do not rely on it",
+}
+
+
+def doubt_of(outcome: Outcome) -> str:
+    """Why an answer may not be relied on, in a few words for the picture; empty where it may."""
+    return "" if outcome.good else DOUBTS.get(outcome, "not solved to the end: do not rely on it")
 
 
 def told(loads: Loads, answer: Deformation) -> str:

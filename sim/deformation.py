@@ -84,6 +84,8 @@ class Deformation:
     bound
         (2, B) [m]: with probability 0.95, and 0.99, no tumour vertex is farther off what the deformer was taught; NaN
         from one that promises nothing.
+    source
+        Who answered, in words: finite elements of which kind and tissue, or what learned from them.
     """
 
     displacement: np.ndarray
@@ -98,6 +100,7 @@ class Deformation:
     reached: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     inverted: np.ndarray = field(default_factory=lambda: np.array(-1))
     bound: np.ndarray = field(default_factory=lambda: np.array(np.nan))
+    source: str = ""
 
     def __post_init__(self) -> None:
         count = len(self.displacement)
@@ -169,6 +172,7 @@ def joined(parts: Sequence[Deformation]) -> Deformation:
         reached=stacked("reached"),
         inverted=stacked("inverted"),
         bound=np.concatenate([part.bound for part in parts], axis=1),
+        source=parts[0].source,
     )
 
 

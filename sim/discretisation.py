@@ -19,6 +19,8 @@ ELEMENTS = {
     "p2": "quadratic tetrahedra: the most accurate, seven times as many nodes",
     "smoothed": "linear tetrahedra with strains averaged over edges and nodes: nearly as accurate as p2 on p1's nodes",
 }
+RECOMMENDED = "smoothed"
+"""The element of every scene and command that names none, on meshes of linear tetrahedra."""
 
 
 # The least cosine between slide normals that agree, and between a wall's triangles and one that is theirs: less than
@@ -145,18 +147,22 @@ class Discretisation:
         return np.concatenate([field, field[..., self.edges, :].mean(axis=-2)], axis=-2)
 
 
+def recommended(mesh: TetMesh) -> str:
+    """The element of who names none: `RECOMMENDED`, or p2 on a mesh that brings mid-edge nodes of its own."""
+    return RECOMMENDED if mesh.middles is None else "p2"
+
+
 def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
     """The nodes and elements of type `element`, one of `ELEMENTS`, over a mesh.
 
-    None: p1, or p2 on a mesh that brings mid-edge nodes of its own.
+    None: the `recommended` one.
 
     Raises
     ------
     InputError
         An unknown type; a linear type on a mesh that brings mid-edge nodes of its own.
     """
-    if element is None:
-        element = "p1" if mesh.middles is None else "p2"
+    element = element or recommended(mesh)
     if element not in ELEMENTS:
         raise InputError(f"no element is called {element!r}: choose one of {', '.join(ELEMENTS)}.")
     none = np.zeros((0, 2), np.int32)

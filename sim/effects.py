@@ -29,6 +29,11 @@ class Elasticity:
     default: Tissue | None = BRAIN
     regions: Mapping[int, Tissue] = field(default_factory=dict)
 
+    def __str__(self) -> str:
+        """The tissues as they are named beside every answer."""
+        named = [] if self.default is None else [str(self.default)]
+        return "; ".join([*named, *(f"region {label}: {tissue}" for label, tissue in self.regions.items())])
+
 
 @dataclass(frozen=True)
 class Held:
@@ -348,3 +353,9 @@ def remember(effects: Iterable[Effect]) -> bool:
 
 def _relaxes(effect: Elasticity) -> bool:
     return any(tissue.prony for tissue in (effect.default, *effect.regions.values()) if tissue is not None)
+
+
+def solver_named(element: str, effects: Iterable[Effect]) -> str:
+    """Finite elements in words: their element and tissue, as every answer, picture and file names them."""
+    tissue = next((str(effect) for effect in effects if isinstance(effect, Elasticity)), "no elasticity")
+    return f"finite elements ({element}; {tissue})"

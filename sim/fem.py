@@ -20,7 +20,7 @@ from .correction import step_from
 from .deformation import Cost, Deformation, joined
 from .device import find_device
 from .discretisation import discretise
-from .effects import Effect
+from .effects import Effect, solver_named
 from .elimination import eliminating
 from .errors import InputError
 from .following import Following
@@ -69,7 +69,7 @@ class Fem:
         Most load cases that are solved together; None: as many as are worth it on this device. Quadratic elements with
         levels go one by one on the CPU.
     element
-        One of `discretisation.ELEMENTS`; None: p1, or p2 on a mesh that brings mid-edge nodes of its own.
+        One of `discretisation.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
     live
         Loads will be asked for one at a time: on the CPU it takes a second more to set up, and each load half as long.
 
@@ -109,6 +109,11 @@ class Fem:
         inversion = Inversion(self.space, problem.device)
         self._ladder = Ladder(problem, preconditioner, inversion, accuracy, near, vicinity or patch)
         self._paced = lru_cache(KEPT)(self._ladder_over)
+
+    @cached_property
+    def description(self) -> str:
+        """Element and tissue in words: every answer carries them."""
+        return solver_named(self.space.element, self.effects)
 
     @property
     def problem(self) -> Problem:
@@ -178,7 +183,7 @@ class Fem:
             return None
         ladder = self._ladder
         frame = Frame(self.problem, ladder.preconditioner, ladder.inversion, self._skin, self.accuracy.tolerance)
-        return Following(self.problem, ladder.inversion, frame)
+        return Following(self.problem, ladder.inversion, frame, self.description)
 
     def _check_vertices(self, at: np.ndarray | None) -> None:
         count = len(self._anatomy.mesh.nodes)
@@ -377,6 +382,7 @@ class Fem:
             cost=Cost({**seconds, "reactions": time.perf_counter() - solved}),
             reached=found.reached,
             inverted=found.inverted,
+            source=self.description,
         )
 
     def _reaction(self, loads: Loads, on_footprint: np.ndarray | None) -> np.ndarray:

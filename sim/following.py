@@ -64,10 +64,12 @@ class Following:
         What the frame solves, and who counts its tetrahedra.
     frame
         Where that is done.
+    source
+        What the answers call their solver.
     """
 
-    def __init__(self, problem: Problem, inversion: Inversion, frame: Frame):
-        self._problem, self._inversion, self._frame = problem, inversion, frame
+    def __init__(self, problem: Problem, inversion: Inversion, frame: Frame, source: str = ""):
+        self._problem, self._inversion, self._frame, self._source = problem, inversion, frame, source
         self._nodes = np.arange(problem.rows // 3)
         self._last: Callable[[], Deformation | None] = _gone
         # Histories whose pairs stand where the frame ended, and where it began.
@@ -114,6 +116,7 @@ class Following:
             cost=Cost({"equilibrium": time.perf_counter() - clock}),
             reached=np.ones(1),
             inverted=np.zeros(1, int),
+            source=self._source,
         )
         self._last, self._here = ref(answer), ref(history)
         return answer

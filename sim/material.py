@@ -61,6 +61,10 @@ class Material:
             )
         check_prony(self.prony, self.law)
 
+    def __str__(self) -> str:
+        """The tissue as it is named beside every answer."""
+        return f"{self.law}, E {1e-3 * self.young:g} kPa, nu {self.poisson:g}{', relaxing' if self.prony else ''}"
+
     @property
     def lame(self) -> tuple[float, float]:
         """Lamé's (mu, lambda) [Pa]: mu = E / (2 (1 + nu)), lambda = E nu / ((1 + nu)(1 - 2 nu))."""
@@ -117,6 +121,11 @@ class Ogden:
         if not (np.isfinite(self.bulk) and self.bulk > 0.0):
             raise InputError(f"the bulk modulus is {self.bulk} Pa: give a positive number.")
         check_prony(self.prony, self.law)
+
+    def __str__(self) -> str:
+        """The tissue as it is named beside every answer."""
+        terms = "; ".join(f"{c:g},{m:g}" for c, m in self.terms)
+        return f"{self.law} {terms} Pa, K {1e-3 * self.bulk:g} kPa{', relaxing' if self.prony else ''}"
 
     @property
     def lame(self) -> tuple[float, float]:
@@ -211,8 +220,8 @@ def coefficients_of(tissues: Sequence[Tissue], carries: str = "whole") -> np.nda
     return np.array([row + (0.0, 1.0) * ((longest - len(row)) // 2) for row in rows])
 
 
-BRAIN = Material("stable-neo-hookean", 3000.0, 0.45)
-"""The default tissue: stable under every load, and linear tetrahedra lock little at nu = 0.45."""
+BRAIN = Material("neo-hookean", 3000.0, 0.45)
+"""The recommended tissue, of every scene and command; the recommended element is `discretisation.RECOMMENDED`."""
 
 
 @dataclass(frozen=True)
@@ -225,7 +234,9 @@ class MaterialSet:
 
 
 MATERIALS = {
-    "default": MaterialSet(BRAIN, "seconds", "`seconds` with a Poisson's ratio at which linear tetrahedra lock little"),
+    "default": MaterialSet(
+        BRAIN, "seconds", "recommended: `seconds`, at a Poisson's ratio that every element can take"
+    ),
     "seed": MaterialSet(
         Material("neo-hookean", 3330.0, 0.4945),
         "seconds",

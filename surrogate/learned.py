@@ -15,6 +15,7 @@ from sim.anatomy import Anatomy
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
+from sim.material import tissue_from_json
 from sim.threads import one_thread
 
 from .bound import Bound, features_of
@@ -85,6 +86,13 @@ class Learned:
     bounds: Bound | None = None
     training: Mapping[str, str] = field(default_factory=dict)
     ball: float | None = None
+
+    @cached_property
+    def source(self) -> str:
+        """Its learner, and what it learned from, in words: every answer carries them."""
+        told = self.training
+        tissue = str(tissue_from_json(told["tissue"])) if "tissue" in told else "tissue not stated"
+        return f"{told.get('learner', 'learned')}, from finite elements ({told.get('element', 'not stated')}; {tissue})"
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -158,7 +166,7 @@ class Learned:
         nodes = self.nodes if at is None else np.asarray(at)
         if len(loads) == 1 and np.array_equal(nodes, self.anatomy.tumour_nodes) and self._swift is not None:
             displacement, excess, promised = self._swift.answer(pushed)
-            return predicted(displacement, nodes, loads, (excess > 0.0,), begun, promised)
+            return predicted(displacement, nodes, loads, (excess > 0.0,), begun, promised, self.source)
         self._demand_known(nodes)
         with one_thread() if len(loads) == 1 else nullcontext():
             return self._summed(loads, pushed, nodes, begun)
@@ -188,7 +196,7 @@ class Learned:
             weaker = np.minimum(magnitude / self.envelope.force[0], 1.0)
             told = features_of(pushed, known._replace(magnitude=within))
             promised = np.where(weaker > 0.0, self.bounds.of(told, magnitude, excess), 0.0) * weaker
-        return predicted(displacement, nodes, loads, excess > 0.0, begun, promised)
+        return predicted(displacement, nodes, loads, excess > 0.0, begun, promised, self.source)
 
     def asked(self, loads: Loads) -> Pushed:
         """What the model is asked: pushes, or the poses of its ball as `indentation.indented` has them.
@@ -222,10 +230,11 @@ def predicted(
     outside: Iterable[bool],
     begun: float,
     bound: np.ndarray,
+    source: str,
 ) -> Deformation:
     """What a learnt model, asked at `begun` [s], answers loads with; `outside` (B,) of what it was taught or not.
 
-    displacement (B, n, 3) [m] of `nodes` (n,); bound as in `Deformation`.
+    displacement (B, n, 3) [m] of `nodes` (n,); bound and source as in `Deformation`.
     """
     count = len(loads)
     pushed, unknown = loads.of(Pushed), np.full(count, np.nan)
@@ -244,6 +253,7 @@ def predicted(
         reached=unknown,
         inverted=np.full(count, -1),
         bound=bound,
+        source=source,
     )
 
 

@@ -79,7 +79,7 @@ class Published:
         angular = [machine.predict(X) for machine, X in zip(self.machines, features, strict=True)]
         displacement = from_angles(np.stack(angular, axis=1).astype(np.float64))
         outside = ~self.envelope.holds(self._patch, pushed)
-        answer = predicted(displacement, self.nodes, loads, outside, begun, np.array(np.nan))
+        answer = predicted(displacement, self.nodes, loads, outside, begun, np.array(np.nan), "published protocol")
         return answer if at is None else answer.at(np.asarray(at))
 
 

@@ -16,6 +16,7 @@ from sim.effects import (
     ToolDisplacement,
     ToolForce,
 )
+from sim.material import tissue_from_json
 from sim.tools import Ball
 
 from .learned import Learned
@@ -36,11 +37,12 @@ def taught_effects(model: Learned) -> frozenset[str]:
     return frozenset()
 
 
-def refusal(model: Learned, effects: Iterable[Effect]) -> str | None:
-    """Why a model may not answer under these effects, or None if it may.
+def refusal(model: Learned, effects: Iterable[Effect], element: str | None = None) -> str | None:
+    """Why a model may not answer under these effects, on this element, or None if it may.
 
     A model of poses answers where its ball touches, one of pushes where a tool's force acts. Where nothing slides in
-    its anatomy it is all one whether `Slide` is asked for.
+    its anatomy it is all one whether `Slide` is asked for. Tissue and element must be those that it learned from; an
+    `element` of None is not compared, nor what the model's file does not state.
     """
     effects = tuple(effects)
     taught, asked = taught_effects(model), frozenset(type(effect).__name__ for effect in effects)
@@ -55,7 +57,19 @@ def refusal(model: Learned, effects: Iterable[Effect]) -> str | None:
     idle = set() if model.anatomy.slide_normal.any() else {"Slide"}
     strange, missing = asked - taught - idle, taught - asked - ON_CALL - idle
     if not strange and not missing:
-        return None
+        return _other_body(model, effects, element)
     differences = [f"not under {', '.join(sorted(strange))}"] * bool(strange)
     differences += [f"never without {', '.join(sorted(missing))}"] * bool(missing)
     return f"it was taught under {', '.join(sorted(taught))}, {' and '.join(differences)}"
+
+
+def _other_body(model: Learned, effects: tuple[Effect, ...], element: str | None) -> str | None:
+    """Why a model's finite elements are others than these: tissue, or element."""
+    told, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
+    if "tissue" in told and here is not None:
+        taught = Elasticity(tissue_from_json(told["tissue"]))
+        if taught != here:
+            return f"it learned from the tissue {taught}, and here it is {here}"
+    if element is not None and told.get("element", element) != element:
+        return f"it learned from {told['element']} elements, and here they are {element}"
+    return None

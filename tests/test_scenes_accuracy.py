@@ -19,7 +19,7 @@ def press():
     scene, theatre = find_scene("press"), open_theatre()
     times = (0.3, 0.6, 0.9, 1.2, 1.8, 2.6)
     loads = stacked([scene.loads(theatre.site, scene.path(time), time) for time in times])
-    converged = Fem(theatre.anatomy, scene.effects, Accuracy(1e-7), "cpu").deform(loads)
+    converged = Fem(theatre.anatomy, scene.effects, Accuracy(1e-7), "cpu", element="p1").deform(loads)
     assert all(outcome.good for outcome in converged.outcome)
     return theatre.anatomy, scene.effects, loads, converged.displacement
 
@@ -28,13 +28,13 @@ def press():
 def test_a_preset_keeps_its_promise(press, name):
     anatomy, effects, loads, converged = press
     accuracy, bound = PROMISED[name]
-    answer = Fem(anatomy, effects, accuracy, "cpu").deform(loads).displacement
+    answer = Fem(anatomy, effects, accuracy, "cpu", element="p1").deform(loads).displacement
     assert np.linalg.norm(answer - converged, axis=2).max() <= bound
 
 
 def test_warm_starts_keep_the_live_promise(press):
     anatomy, effects, loads, converged = press
-    fem, last = Fem(anatomy, effects, LIVE, "cpu"), None
+    fem, last = Fem(anatomy, effects, LIVE, "cpu", element="p1"), None
     for row in range(len(loads)):
         last = fem.deform(loads.rows(np.array([row])), start=last)
         assert np.linalg.norm(last.displacement[0] - converged[row], axis=1).max() <= PROMISED["live"][1]

@@ -7,18 +7,28 @@ import numpy as np
 import pytest
 from theatres import PUSHING, player, put, small, theatre_of
 
+from ar.hud import millimetres
+from ar.overlay import composite
 from scenes.check import Figures, measure
 from scenes.cli import main
-from scenes.scene import SCENES, Bounds
+from scenes.paths import press
+from scenes.play import annotate, gauged
+from scenes.scene import SCENES, Bounds, find_scene
+from scenes.stage import TOOL
 from scenes.truth import truth_of
 from sim.deformation import Outcome
 
-GOOD = Figures(overlap=0.99, error_mm=0.1, motion_mm=1.0, pixels=1e-9, finite=True, answered=True, in_step=True)
+GOOD = Figures(
+    overlap=0.99, error_mm=0.1, motion_mm=1.0, pixels=1e-9, drawn=0.5, printed=True, finite=True, answered=True,
+    in_step=True,
+)  # fmt: skip
 SENTENCES = {
     "overlap": (0.90, "overlap 0.9000 is below 0.95"),
     "error_mm": (0.31, "error 0.3100 mm is above 0.3 mm"),
     "motion_mm": (0.0, "never moves"),
     "pixels": (0.01, "0.01 pixels off"),
+    "drawn": (2.5, "the drawn outline is 2.5 pixels off, more than 2"),
+    "printed": (False, "does not say its frame's number"),
     "finite": (False, "not finite"),
     "answered": (False, "answer is not good"),
     "in_step": (False, "another moment"),
@@ -32,7 +42,8 @@ def theatre(box):
 
 @pytest.fixture(scope="module", params=["linear", "fem"])
 def play(request, theatre):
-    return player(theatre, small(), request.param)
+    near = replace(find_scene("press").viewpoint, width=480, height=360)
+    return player(theatre, replace(small(path=press(0.2, hold=0.5)), viewpoint=near), request.param)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +77,8 @@ def test_every_bound_has_its_sentence():
     for name, (value, words) in SENTENCES.items():
         (sentence,) = replace(GOOD, **{name: value}).broken(Bounds())
         assert words in sentence
-    assert len(replace(GOOD, overlap=np.nan, error_mm=np.nan, pixels=np.nan).broken(Bounds())) == 3
+    unknown = replace(GOOD, overlap=np.nan, error_mm=np.nan, pixels=np.nan, drawn=np.nan)
+    assert len(unknown.broken(Bounds())) == 4
     assert json.loads(json.dumps(GOOD.row())) == GOOD.row()
 
 
@@ -74,7 +86,75 @@ def test_what_was_not_perturbed_passes(play, frames, truth):
     sentences, figures = broken(play, frames, truth)
     assert not sentences
     assert figures.overlap > 0.97 and figures.pixels < 1e-9 and figures.motion_mm > 0.5
-    assert figures.error_mm < 0.05
+    assert figures.error_mm < 0.05 and figures.drawn < 1.5 and figures.printed
+
+
+def drawn(play, frame, positions, camera=None, tip=None):
+    """A frame whose picture was drawn from other positions, by another camera, or with another tip."""
+    stage, at = play.stage, frame.tip if tip is None else tip
+    tumour, rest = (stage.tumour(each) for each in (positions, play.site.anatomy.mesh.nodes))
+    shown = composite(
+        frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauged(at, tumour), before=rest
+    ).colour
+    annotate(shown, frame.number, frame.remark)
+    return replace(frame, shown=shown)
+
+
+def off_by(camera, columns, rows):
+    """A camera with its principal point elsewhere [pixel]."""
+    shift = np.zeros((3, 3))
+    shift[:2, 2] = columns, rows
+    return replace(camera, K=camera.K + shift)
+
+
+class TestThePictureItself:
+    """What was answered is right; what was drawn is not."""
+
+    def pixels(self, play, frames, truth, wrong):
+        """Sentences and figures where the middle frame's picture is another."""
+        sentences, figures = broken(play, [frames[0], frames[1], wrong, *frames[3:]], truth)
+        return sentences, figures
+
+    def test_drawn_again_as_it_was_it_passes(self, play, frames, truth):
+        again = drawn(play, frames[2], play.positions(frames[2].deformation))
+        assert not self.pixels(play, frames, truth, again)[0]
+
+    def test_of_the_undeformed_tumour_it_fails(self, play, frames, truth):
+        wrong = drawn(play, frames[2], play.site.anatomy.mesh.nodes)
+        sentences, figures = self.pixels(play, frames, truth, wrong)
+        assert about(sentences, "outline") and figures.drawn > 2.0
+
+    def test_of_an_earlier_frame_it_fails(self, play, frames, truth):
+        late = replace(frames[2], shown=frames[1].shown)
+        assert about(self.pixels(play, frames, truth, late)[0], "does not say")
+        wrong = drawn(play, frames[2], play.positions(frames[0].deformation))
+        assert about(self.pixels(play, frames, truth, wrong)[0], "outline")
+
+    @pytest.mark.parametrize("off", [(3.0, 0.0), (0.0, 8.0), (60.0, 40.0)])
+    def test_shifted_it_fails(self, play, frames, truth, off):
+        camera = off_by(play.camera, *off)
+        wrong = drawn(play, frames[2], play.positions(frames[2].deformation), camera)
+        sentences, figures = self.pixels(play, frames, truth, wrong)
+        assert about(sentences, "outline") and figures.drawn > 2.0
+
+    def test_without_an_overlay_it_fails(self, play, frames, truth):
+        bare = replace(frames[2], shown=frames[2].picture.colour)
+        sentences, figures = self.pixels(play, frames, truth, bare)
+        assert about(sentences, "outline") and about(sentences, "does not say") and figures.drawn == np.inf
+
+    def test_with_another_number_it_fails(self, play, frames, truth):
+        deep = frames[2].tip + 0.4e-3 * play.site.axis
+        wrong = drawn(play, frames[2], play.positions(frames[2].deformation), tip=deep)
+        assert about(self.pixels(play, frames, truth, wrong)[0], "does not say")
+
+    def test_with_a_number_ten_times_too_large_it_fails(self, play, frames, truth, monkeypatch):
+        monkeypatch.setattr("ar.overlay.millimetres", lambda length, error=None: millimetres(10.0 * length, error))
+        wrong = drawn(play, frames[2], play.positions(frames[2].deformation))
+        assert about(self.pixels(play, frames, truth, wrong)[0], "does not say")
+
+    def test_with_another_frame_s_number_it_fails(self, play, frames, truth):
+        wrong = drawn(play, replace(frames[2], number=59), play.positions(frames[2].deformation))
+        assert about(self.pixels(play, frames, truth, replace(wrong, number=60))[0], "does not say")
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
@@ -157,7 +237,9 @@ class TestCommand:
     def test_one_scene_by_finite_elements(self, anatomy, capsys):
         words = ["check", "draw", "--anatomy", str(anatomy), "--every", "40", "--deformer", "fem", "--device", "cpu"]
         assert main(words) == 0
-        assert capsys.readouterr().out.split()[:2] == ["draw", "passes"]
+        solver, verdict = capsys.readouterr().out.splitlines()[:2]
+        assert solver == "draw by finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.45)"
+        assert verdict.split()[:2] == ["draw", "passes"]
 
     def test_a_wrong_model_fails_with_its_figures(self, theatre, anatomy, tmp_path, capsys):
         linear = theatre.models["linear"]

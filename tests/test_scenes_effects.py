@@ -17,15 +17,18 @@ from scenes.demo import Demo
 from scenes.lying import SUPINE, Lying, drained_then_turned, supine
 from scenes.paths import Touch
 from scenes.play import labelled
+from scenes.retract import RELAXING
 from scenes.scene import Bounds, find_scene
-from scenes.stage import CORTEX, HOLE, TOOL, Stage
+from scenes.site import HOLE
+from scenes.stage import CORTEX, TOOL, Stage
 from scenes.told import told
 from scenes.truth import truth_of
-from sim.accuracy import TRAIN
+from sim.accuracy import LIVE, TRAIN
 from sim.deformation import guess
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, posture, stacked
+from sim.material import Material, tissue_to_json
 from surrogate.taught import refusal, taught_effects
 
 EFFECTS = (Elasticity(), Held(), Slide())
@@ -131,11 +134,36 @@ class TestLearnt:
         why = refusal(model, (Elasticity(), Held(), ToolForce()))
         assert why is not None and "never without Slide" in why
 
-    def test_scenes_that_no_model_knows_keep_their_own_tissue(self, theatre):
-        other = replace(theatre, models={"linear": replace(theatre.models["linear"], training={"element": "smoothed"})})
-        scene = replace(sinking(), element="p1")
-        assert other.fem(scene, scene.accuracy).space.element == "p1"
-        assert other.fem(short(), scene.accuracy).space.element == "smoothed"
+    def test_models_beside_an_anatomy_do_not_change_its_physics(self, theatre):
+        taught = {"element": "p1", "tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}
+        other = replace(theatre, models={"linear": replace(theatre.models["linear"], training=taught)})
+        assert other.fem(short(), LIVE).description == "finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.45)"
+        for scene in (short(), sinking()):
+            found, alone = (each.fem(scene, LIVE) for each in (other, replace(theatre, models={})))
+            assert (found.space.element, found.effects) == (alone.space.element, alone.effects)
+
+    @pytest.mark.parametrize(
+        ("training", "reason"),
+        [
+            ({"element": "p1"}, "learned from p1 elements, and here they are smoothed"),
+            ({"tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}, "E 9 kPa, nu 0.3, and here it is .*E 3"),
+        ],
+    )
+    def test_a_model_of_another_body_is_refused(self, theatre, training, reason):
+        model = replace(theatre.models["linear"], training=training)
+        other = replace(theatre, models={"linear": model})
+        assert other.names(short()) == ("fem",)
+        with pytest.raises(InputError, match=reason):
+            other.deformer("linear", short())
+        tissue, element = (Material("neo-hookean", 9000.0, 0.3), None) if "tissue" in training else (None, "p1")
+        assert other.deformer("linear", short().made_of(tissue, element)) is model
+
+    def test_another_tissue_goes_on_relaxing(self):
+        scene = find_scene("retract").made_of(Material("neo-hookean", 9000.0, 0.3), "p2")
+        (effect,) = (each for each in scene.effects if isinstance(each, Elasticity))
+        assert scene.element == "p2" and effect.default == Material("neo-hookean", 9000.0, 0.3, RELAXING.prony)
+        with pytest.raises(InputError, match="cannot relax"):
+            find_scene("retract").made_of(Material("linear", 9000.0, 0.3), None)
 
 
 class TestWithoutATool:

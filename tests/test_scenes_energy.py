@@ -55,7 +55,7 @@ def posed(scene: Scene) -> tuple[Anatomy, tuple[Effect, ...], Loads, Deformation
         stages, done = bodies(BODY, effects), scene.surgery.done(time)
         effects = (*(effect for effect in effects if not isinstance(effect, Held | Resection)), Held())
         loads, body = loads.but(Resected), stages[done].anatomy
-        before = Fem(stages[done - 1].anatomy, effects, TIGHT, "cpu").deform(loads)
+        before = Fem(stages[done - 1].anatomy, effects, TIGHT, "cpu", element="p1").deform(loads)
         start = guess(np.where(body.orphaned[:, None], 0.0, before.displacement))
     if any(isinstance(effect, Pulsation) for effect in effects):
         start = replace(start, time=np.array([LATE]))

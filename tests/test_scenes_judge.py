@@ -19,6 +19,7 @@ from scenes.theatre import Theatre, open_theatre
 from scenes.truth import truth_of
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
+from sim.discretisation import RECOMMENDED
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.fem import Fem
@@ -74,7 +75,7 @@ def test_simulate_takes_quadratic_anatomies_as_they_are(body, tmp_path, capsys) 
 
 @pytest.mark.parametrize(
     ("words", "told"),
-    [((), ("neo-hookean", "smoothed")), (("--element", "p2", "--material", "corotational"), ("corotational", "p2"))],
+    [((), (BRAIN.law, None)), (("--element", "p2", "--material", "corotational"), ("corotational", "p2"))],
 )
 def test_a_patient_hands_tissue_and_element_on(tmp_path, monkeypatch, words, told) -> None:
     steps: list[list[str]] = []
@@ -82,7 +83,8 @@ def test_a_patient_hands_tissue_and_element_on(tmp_path, monkeypatch, words, tol
     labels = ["labels.nii.gz", "--brain", "1", "--tumour", "2"]
     assert main(["patient", *labels, "--out", str(tmp_path / "me.vtu"), "--device", "cpu", *words]) == 0
     assert [step[0] for step in steps] == ["anatomy", "simulate", "train"]
-    assert steps[1][-4:] == ["--material", told[0], "--element", told[1]]
+    element = [] if told[1] is None else ["--element", told[1]]
+    assert steps[1][steps[1].index("--material") :] == ["--material", told[0], *element]
     assert steps[2][-4:] == ["--learners", "linear,series-gp", "--device", "cpu"]
 
 
@@ -103,8 +105,10 @@ def test_models_are_judged_with_what_they_were_taught(box, body, tmp_path) -> No
     write_anatomy(tmp_path / "box.vtu", box)
     save(tmp_path / "box.model.npz", taught)
     theatre = open_theatre(tmp_path / "box.vtu", device="cpu")
-    assert physics(theatre, small()) == ("smoothed", STIFF)
-    scene = small()
+    assert physics(theatre, small()) == ("smoothed", BRAIN)
+    assert theatre.names(small()) == ("fem",)
+    scene = small().made_of(STIFF, "smoothed")
+    assert physics(theatre, scene) == ("smoothed", STIFF) and theatre.names(scene) == (*taught, "fem")
     loads = [scene.loads(site_of(box), scene.path(1.0), 1.0)]
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Elasticity))
     right = Fem(box, (Elasticity(STIFF), *others), TRAIN, "cpu", element="smoothed").deform(loads[0])
@@ -112,11 +116,10 @@ def test_models_are_judged_with_what_they_were_taught(box, body, tmp_path) -> No
     assert np.array_equal(found.displacement, right.displacement) and found.displacement.any()
 
 
-def test_without_models_that_say_so_the_scene_names_tissue_and_element(box) -> None:
-    theatre = theatre_of(box)
-    assert physics(theatre, small()) == ("p1", BRAIN)
-    bare = replace(theatre, models={})
-    assert physics(bare, replace(small(), element="smoothed")) == ("smoothed", BRAIN)
+def test_the_scene_names_tissue_and_element(box) -> None:
+    bare = replace(theatre_of(box), models={})
+    assert physics(bare, small()) == (RECOMMENDED, BRAIN)
+    assert physics(bare, replace(small(), element="p1")) == ("p1", BRAIN)
 
 
 def test_a_tissue_that_cannot_be_read_is_a_sentence(box) -> None:
@@ -125,4 +128,4 @@ def test_a_tissue_that_cannot_be_read_is_a_sentence(box) -> None:
     for text in ("jelly", "{}", json.dumps({"law": "linear", "young": -1.0, "poisson": 0.3})):
         broken = replace(theatre, models={"linear": replace(model, training={"tissue": text})})
         with pytest.raises(InputError, match="is no tissue that this version knows"):
-            broken.deformer("fem", small())
+            broken.deformer("linear", small())

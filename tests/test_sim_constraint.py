@@ -158,7 +158,7 @@ def test_a_node_that_slides_and_is_partly_held_obeys_both(law: str) -> None:
     anatomy = hold(MESH, held, np.where(TOP[:, None], normal, 0.0))
     value = np.zeros((1, COUNT, 3))
     value[0, TOP, 0] = 2e-3
-    found = Fem(anatomy, [Elasticity(Material(law, 3000.0, 0.4)), Held(), Slide()], TIGHT, "cpu")
+    found = Fem(anatomy, [Elasticity(Material(law, 3000.0, 0.4)), Held(), Slide()], TIGHT, "cpu", element="p1")
     u = found.deform(Loads((Prescribed(value),))).displacement[0]
     np.testing.assert_allclose(u[TOP, 0], 2e-3, atol=1e-15)
     np.testing.assert_allclose(u[TOP] @ normal, 0.0, atol=1e-15)
@@ -214,14 +214,14 @@ def test_reaction_carries_the_moment_about_the_tool_point() -> None:
 
 
 def test_a_footprint_that_is_held_cannot_be_moved() -> None:
-    fem = Fem(hold(MESH, BASE | TOP), [SOFT, Held(), ToolDisplacement()], TIGHT, "cpu")
+    fem = Fem(hold(MESH, BASE | TOP), [SOFT, Held(), ToolDisplacement()], TIGHT, "cpu", element="p1")
     with pytest.raises(InputError, match="held"):
         fem.deform(Loads((Displaced(POINT[:1], MOTION[:1], RADIUS[:1]),)))
 
 
 def test_a_footprint_that_only_slides_cannot_be_moved_off_its_plane() -> None:
     anatomy = hold(MESH, BASE, np.where(TOP[:, None], [0.0, 0.0, 1.0], 0.0))
-    fem = Fem(anatomy, [SOFT, Held(), Slide(), ToolDisplacement()], TIGHT, "cpu")
+    fem = Fem(anatomy, [SOFT, Held(), Slide(), ToolDisplacement()], TIGHT, "cpu", element="p1")
     with pytest.raises(InputError, match="held"):
         fem.deform(Loads((Displaced(POINT[:1], MOTION[:1], RADIUS[:1]),)))
 
@@ -236,7 +236,7 @@ def test_a_footprint_that_only_slides_cannot_be_moved_off_its_plane() -> None:
 )
 def test_a_body_that_can_move_rigidly_is_refused(held: np.ndarray, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Fem(hold(MESH, held), [SOFT, Held(), NodalForce()], TIGHT, "cpu")
+        Fem(hold(MESH, held), [SOFT, Held(), NodalForce()], TIGHT, "cpu", element="p1")
 
 
 def test_walls_alone_hold_a_body() -> None:
@@ -249,7 +249,7 @@ def test_walls_alone_hold_a_body() -> None:
         anatomy = hold(MESH, np.zeros(COUNT, bool), normal)
         if free:
             with pytest.raises(InputError, match=f"{free} of 6"):
-                Fem(anatomy, [SOFT, Held(), Slide(), NodalForce()], TIGHT, "cpu")
+                Fem(anatomy, [SOFT, Held(), Slide(), NodalForce()], TIGHT, "cpu", element="p1")
             continue
         force = np.zeros((1, COUNT, 3))
         force[0, TOP, 2] = -0.01
@@ -268,7 +268,7 @@ def test_six_components_are_enough_to_hold_a_body() -> None:
     force = np.zeros((1, COUNT, 3))
     force[0, TOP, 2], force[0, BASE, 2] = 0.3 / TOP.sum(), -0.3 / BASE.sum()
     anatomy = hold(MESH, held)
-    fem = Fem(anatomy, [SOFT, Held(), NodalForce()], TIGHT, "cpu")
+    fem = Fem(anatomy, [SOFT, Held(), NodalForce()], TIGHT, "cpu", element="p1")
     found = fem.deform(Loads((Nodal(force),)))
     assert found.outcome[0].good
     assert found.displacement[0, TOP, 2].mean() > 1e-4

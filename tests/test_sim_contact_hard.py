@@ -185,7 +185,9 @@ def test_without_touching_loads_no_tool_is_there() -> None:
 
 
 def test_a_retractor_laid_and_lifted_leaves_nothing() -> None:
-    fem = Fem(BLOCK, [Elasticity(SOFT), Held(), Retraction(Spatula(0.012, 0.02, 1.5e-3))], Accuracy(1e-6), "cpu")
+    fem = Fem(
+        BLOCK, [Elasticity(SOFT), Held(), Retraction(Spatula(0.012, 0.02, 1.5e-3))], Accuracy(1e-6), "cpu", element="p1"
+    )
     laid = at(0.03, 0.03, HEIGHT + 1e-3)[None]
     drawn = fem.deform(Loads((Retracted(laid, np.array([[0.0, 0.0, -3e-3]])),)))
     assert drawn.reaction[0, 0, 2] < 0.0
@@ -210,7 +212,7 @@ def skewed() -> np.ndarray:
         (lambda: solver(Hard(())).deform(touching(DOWN, DOWN)), "poses of 2 tools, but ToolContact has 1"),
         (lambda: solver(Hard((), (BALL, BALL))).deform(touching(DOWN)), "poses of 1 tools, but ToolContact has 2"),
         (
-            lambda: Fem(BLOCK, [Elasticity(SOFT), Held()], TRAIN, "cpu").deform(touching(DOWN)),
+            lambda: Fem(BLOCK, [Elasticity(SOFT), Held()], TRAIN, "cpu", element="p1").deform(touching(DOWN)),
             "loads hold Touching, which nothing answers: add the effect ToolContact",
         ),
         (
@@ -219,6 +221,7 @@ def skewed() -> np.ndarray:
                 [Elasticity(SOFT), Held(), ToolContact((BALL,))],
                 TRAIN,
                 "cpu",
+                element="p1",
             ),
             "finds no surface to touch: all of it is held or slides",
         ),

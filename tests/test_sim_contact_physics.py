@@ -159,7 +159,11 @@ def test_a_ball_feels_no_moment_about_its_middle() -> None:
 def test_where_the_tool_is_how_stiff_tissue_is_does_not_matter() -> None:
     """Twice as stiff it moves as far, and bears twice as much."""
     stiff = Fem(
-        BLOCK, [Elasticity(replace(SOFT, young=2.0 * SOFT.young)), Held(), ToolContact((BALL,))], TIGHT, "cpu"
+        BLOCK,
+        [Elasticity(replace(SOFT, young=2.0 * SOFT.young)), Held(), ToolContact((BALL,))],
+        TIGHT,
+        "cpu",
+        element="p1",
     ).deform(touching(BESIDE))
     found = body((BALL,)).deform(touching(BESIDE))
     np.testing.assert_allclose(stiff.displacement, found.displacement, atol=1e-7 * np.abs(found.displacement).max())
@@ -184,7 +188,7 @@ def test_no_force_on_tissue_pulls() -> None:
 
 def test_tools_far_from_each_other_add_up() -> None:
     """In small motions of a linear body: forces and displacements of both are those of each."""
-    rock = Fem(BLOCK, [Elasticity(ROCK), Held(), ToolContact((BALL, BLADE), 2e-5)], TIGHT, "cpu")
+    rock = Fem(BLOCK, [Elasticity(ROCK), Held(), ToolContact((BALL, BLADE), 2e-5)], TIGHT, "cpu", element="p1")
     off = at(0.0, 0.0, 10.0 * HEIGHT)
     left, right = at(0.01, 0.03, HEIGHT - 1e-4), at(0.05, 0.03, HEIGHT - 1e-4)
     both, one, other = (rock.deform(touching(*poses)) for poses in ((left, right), (left, off), (off, right)))
@@ -199,7 +203,7 @@ def test_tools_far_from_each_other_add_up() -> None:
 def test_a_tool_that_touches_nothing_moves_nothing(precision: str) -> None:
     """From rest, and lifted again from where it pressed: exactly zero."""
     accuracy = Accuracy(tolerance=1e-4, precision=precision)  # pyright: ignore[reportArgumentType]
-    fem = Fem(BLOCK, [Elasticity(SOFT), Held(), ToolContact((BALL,))], accuracy, "cpu")
+    fem = Fem(BLOCK, [Elasticity(SOFT), Held(), ToolContact((BALL,))], accuracy, "cpu", element="p1")
     clear = touching(at(0.03, 0.03, HEIGHT + 1.01e-4))
     assert not fem.deform(clear).displacement.any()
     pressed = fem.deform(touching(BESIDE))
@@ -212,7 +216,7 @@ def test_a_tool_that_touches_nothing_moves_nothing(precision: str) -> None:
 
 def test_a_retractor_is_a_tool_that_was_laid_on_and_moved() -> None:
     laid, drawn = at(0.03, 0.03, HEIGHT + 1e-3), np.array([2e-3, 0.0, -4e-3])
-    retractor = Fem(BLOCK, [Elasticity(SOFT), Held(), Retraction(BLADE)], TIGHT, "cpu")
+    retractor = Fem(BLOCK, [Elasticity(SOFT), Held(), Retraction(BLADE)], TIGHT, "cpu", element="p1")
     held = retractor.deform(Loads((Retracted(laid[None], drawn[None]),)))
     moved = laid.copy()
     moved[:3, 3] += drawn

@@ -180,9 +180,9 @@ def test_a_skull_that_lets_go(box, element, precision):
 
 
 def test_block_jacobi_reaches_what_the_inverse_reaches(box):
-    fem = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8), "cuda")
+    fem = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8), "cuda", element="p1")
     reference = fem.deform(pushes()).displacement
-    plain = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8, inner=4000), "cuda")
+    plain = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8, inner=4000), "cuda", element="p1")
     plain._ladder = replace(plain._ladder, preconditioner=BlockJacobi(plain.problem.device), near=lambda: None)
     np.testing.assert_allclose(plain.deform(pushes()).displacement, reference, atol=1e-6 * np.abs(reference).max())
 
@@ -191,7 +191,7 @@ def test_a_near_part_is_solved_by_itself_and_the_batch_ends_where_the_whole_does
     """More columns than one room has, so that rooms change."""
     anatomy = read_anatomy(template_path())
     effects, loads = (Elasticity(), Held(), Slide(), ToolForce()), draw("mixed", anatomy, 150, 3)
-    fem = Fem(anatomy, effects, TRAIN, "cuda")
+    fem = Fem(anatomy, effects, TRAIN, "cuda", element="p1")
     found = fem.deform(loads)
     assert fem._ladder.near() is not None and all(outcome.good for outcome in found.outcome)
     assert (fem.residual(loads, found) <= 1.5 * TRAIN.tolerance).all()
@@ -206,7 +206,7 @@ def test_frames_stay_on_the_card(box):
     """As on the CPU, and an older frame leads where it led before: what it knew has been brought away in time."""
     effects = (Elasticity(), Held(), ToolForce())
     loads = [push(np.array([x, 0.0, 0.0]), np.array([0.0, 0.05, -0.4]), 7e-3) for x in np.linspace(-4e-3, 4e-3, 8)]
-    fem, host = Fem(box, effects, LIVE, "cuda"), Fem(box, effects, LIVE, "cpu")
+    fem, host = Fem(box, effects, LIVE, "cuda", element="p1"), Fem(box, effects, LIVE, "cpu", element="p1")
     answers, other = [fem.deform(loads[0])], host.deform(loads[0])
     for load in loads[1:]:
         answers.append(fem.deform(load, answers[-1]))

@@ -111,7 +111,10 @@ class TestMemory:
     def test_where_nothing_is_cut_it_is_the_plain_run(self) -> None:
         """Bit for bit."""
         effects = (Elasticity(RELAXING), Held(), Gravity(direction=(0.0, 0.0, -1.0)), Inertia())
-        plain, made = Fem(BODY, effects, TIGHT, "cpu"), finite_elements(BODY, (*effects, STEPS), TIGHT, "cpu")
+        plain, made = (
+            Fem(BODY, effects, TIGHT, "cpu", element="p1"),
+            finite_elements(BODY, (*effects, STEPS), TIGHT, "cpu"),
+        )
         one = other = None
         for time in (0.01, 0.02, 0.05):
             loads = replace(lying([0]), time=np.array([time]))

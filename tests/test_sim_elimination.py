@@ -42,7 +42,7 @@ def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
 def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
     anatomy = read_anatomy(template_path())
     effects = (Elasticity(), Held(), Slide(), ToolForce())
-    fem, loads = Fem(anatomy, effects, TRAIN, "cpu"), draw("spatula", anatomy, 3, 1)
+    fem, loads = Fem(anatomy, effects, TRAIN, "cpu", element="p1"), draw("spatula", anatomy, 3, 1)
     near = eliminating(fem.problem, rest_solver(fem.problem), effects, fem.space)
     assert near is not None and 0.1 < len(near.rows) / fem.problem.rows < 0.3
     fem.problem.begin(Cases(loads, np.zeros(3)))
@@ -154,7 +154,7 @@ def test_a_body_without_a_small_opening_has_no_near_part() -> None:
 def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
     anatomy, space = body()
     effects = (Elasticity(tissue("stable-neo-hookean")), *EFFECTS)
-    fem = Fem(anatomy, effects, Accuracy(tolerance=FINE), "cpu")
+    fem = Fem(anatomy, effects, Accuracy(tolerance=FINE), "cpu", element="p1")
     many = np.repeat(TOTAL, 4, axis=0)
     fem._ladder = replace(fem._ladder, near=lambda: None)
     plain = fem.deform(loads_of(many))

@@ -59,7 +59,12 @@ def learned(learner: str) -> Callable[[], Deformer]:
         force = random.normal(size=(60, 3)) * random.uniform(0.02, 1.0, (60, 1))
         with TemporaryDirectory() as folder:
             path = Path(folder) / "data.h5"
-            simulate(path, Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu"), push(point, force, 0.02), {})
+            simulate(
+                path,
+                Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu", element="p1"),
+                push(point, force, 0.02),
+                {},
+            )
             return replace(train(read_dataset(path), [learner]).models[learner], anatomy=ANATOMY)
 
     return build
@@ -214,7 +219,7 @@ class TestEveryDeformer:
 @pytest.mark.parametrize("size", [1, 2, 5, 64])
 def test_batches_split_as_asked_give_the_same(size: int) -> None:
     whole = built("fem float64").deform(loads(time=1.0))
-    split = Fem(ANATOMY, EFFECTS, REFERENCE, "cpu", batch=size).deform(loads(time=1.0))
+    split = Fem(ANATOMY, EFFECTS, REFERENCE, "cpu", batch=size, element="p1").deform(loads(time=1.0))
     np.testing.assert_allclose(split.displacement, whole.displacement, atol=1e-9)
     np.testing.assert_allclose(split.reaction, whole.reaction, atol=1e-12)
     np.testing.assert_array_equal(split.iterations, whole.iterations)
@@ -224,18 +229,20 @@ def test_batches_split_as_asked_give_the_same(size: int) -> None:
 
 def test_several_causes_act_together() -> None:
     """A push beside nodal forces is the sum of both as nodal forces."""
-    both = Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu")
+    both = Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu", element="p1")
     top = top_forces(MESH, FORCE / 3.0)
     found = both.deform(Loads((*loads().causes, Nodal(top)))).displacement
     share = footprint_weights(MESH.nodes, MESH.surface, POINT, np.full(5, 0.02)).toarray()
     pushed = share[:, :, None] * FORCE[:, None]
-    alone = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], REFERENCE, "cpu").deform(Loads((Nodal(top + pushed),)))
+    alone = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], REFERENCE, "cpu", element="p1").deform(
+        Loads((Nodal(top + pushed),))
+    )
     np.testing.assert_allclose(found, alone.displacement, atol=1e-8)
 
 
 def test_a_tool_displacement_is_never_drowned_in_a_batch() -> None:
     """Columns of very different size, in single precision: each reaches its own."""
-    body = Fem(ANATOMY, [Elasticity(), Held(), ToolDisplacement()], TRAIN, "cpu")
+    body = Fem(ANATOMY, [Elasticity(), Held(), ToolDisplacement()], TRAIN, "cpu", element="p1")
     motion = np.array([[0.0, 0.0, -1e-6], [0.0, 0.0, -1e-2], [1e-4, 0.0, 0.0]])
     found = body.deform(Loads((Displaced(POINT[:3], motion, np.full(3, 0.03)),)))
     assert all(outcome.good for outcome in found.outcome)
@@ -254,9 +261,11 @@ def stubborn() -> tuple[Anatomy, Loads]:
 def test_load_steps_rescue_what_newton_fails_on() -> None:
     anatomy, asked = stubborn()
     effects = Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held()
-    patient = Fem(anatomy, effects, Accuracy(tolerance=1e-8), "cpu").deform(asked)
+    patient = Fem(anatomy, effects, Accuracy(tolerance=1e-8), "cpu", element="p1").deform(asked)
     assert patient.outcome == (Outcome.CONVERGED,)
-    hasty = Fem(anatomy, effects, Accuracy(tolerance=1e-8, outer=int(patient.iterations[0]) - 2), "cpu").deform(asked)
+    hasty = Fem(
+        anatomy, effects, Accuracy(tolerance=1e-8, outer=int(patient.iterations[0]) - 2), "cpu", element="p1"
+    ).deform(asked)
     assert hasty.outcome == (Outcome.CONVERGED_IN_STEPS,)
     assert hasty.outcome[0].good
     assert hasty.iterations[0] > patient.iterations[0]
@@ -270,7 +279,7 @@ def test_a_rescue_leaves_the_other_rows_alone() -> None:
     value = asked.of(Prescribed)
     assert value is not None
     three = Loads((Prescribed(value.displacement * np.array([0.01, 1.0, 0.02])[:, None, None]),))
-    body = Fem(anatomy, effects, Accuracy(tolerance=1e-8, outer=8), "cpu")
+    body = Fem(anatomy, effects, Accuracy(tolerance=1e-8, outer=8), "cpu", element="p1")
     found = body.deform(three)
     assert found.outcome[0] is found.outcome[2] is Outcome.CONVERGED
     assert found.outcome[1] is Outcome.CONVERGED_IN_STEPS
@@ -287,6 +296,7 @@ def test_a_hopeless_case_returns_its_last_accepted_state(law: str) -> None:
         [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()],
         Accuracy(tolerance=1e-8, outer=2),
         "cpu",
+        element="p1",
     )
     force = top_forces(MESH, np.array([[0.0, 0.0, -50.0], [0.0, 0.0, -1e-5]]))
     found = body.deform(Loads((Nodal(force),)))
@@ -309,7 +319,7 @@ def test_a_load_that_is_too_large_stops_at_the_share_that_has_an_equilibrium() -
     value = np.where(top[:, None], [0.0, 0.0, -0.11], 0.0)
     material = Material("neo-hookean", 3000.0, 0.45)
     held = (mesh.nodes[:, 2] < 1e-9) | top
-    body = Fem(hold(mesh, held), [Elasticity(material), Held()], Accuracy(tolerance=1e-8), "cpu")
+    body = Fem(hold(mesh, held), [Elasticity(material), Held()], Accuracy(tolerance=1e-8), "cpu", element="p1")
     found = body.deform(Loads((Prescribed(value[None]),)))
     assert not found.outcome[0].good
     assert 0.7 < found.reached[0] < 10.0 / 11.0
@@ -321,13 +331,13 @@ def test_a_load_that_is_too_large_stops_at_the_share_that_has_an_equilibrium() -
 
 
 def test_drafts_do_not_pay_for_load_steps() -> None:
-    found = Fem(ANATOMY, EFFECTS, DRAFT, "cpu").deform(loads(scale=10.0))
+    found = Fem(ANATOMY, EFFECTS, DRAFT, "cpu", element="p1").deform(loads(scale=10.0))
     assert max(found.iterations) == DRAFT.outer
     assert not all(outcome.good for outcome in found.outcome)
 
 
 def test_numbers_that_overflow_are_an_outcome_not_an_answer() -> None:
-    body = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], REFERENCE, "cpu")
+    body = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], REFERENCE, "cpu", element="p1")
     found = body.deform(Loads((Nodal(top_forces(MESH, np.array([[0.0, 0.0, -1e300], [0.0, 0.0, -0.1]]))),)))
     assert found.outcome == (Outcome.NOT_FINITE, Outcome.CONVERGED)
     assert np.isfinite(found.displacement).all()
@@ -336,7 +346,9 @@ def test_numbers_that_overflow_are_an_outcome_not_an_answer() -> None:
 @pytest.mark.parametrize("law", ["corotational", "neo-hookean", "stable-neo-hookean"])
 def test_brutal_loads_converge(law: str) -> None:
     """10 N on a 10 cm box of 3 kPa: strains of several hundred per cent."""
-    body = Fem(ANATOMY, [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()], Accuracy(1e-6), "cpu")
+    body = Fem(
+        ANATOMY, [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()], Accuracy(1e-6), "cpu", element="p1"
+    )
     force = top_forces(MESH, np.array([[3.0, 2.0, -9.0], [0.0, 0.0, 10.0], [10.0, 0.0, 0.0]]))
     found = body.deform(Loads((Nodal(force),)))
     assert all(outcome.good for outcome in found.outcome)
@@ -344,7 +356,13 @@ def test_brutal_loads_converge(law: str) -> None:
 
 @pytest.mark.parametrize("poisson", [0.0, 0.49, 0.499, -0.4])
 def test_poissons_ratios(poisson: float) -> None:
-    body = Fem(ANATOMY, [Elasticity(Material("neo-hookean", 3000.0, poisson)), Held(), ToolForce()], REFERENCE, "cpu")
+    body = Fem(
+        ANATOMY,
+        [Elasticity(Material("neo-hookean", 3000.0, poisson)), Held(), ToolForce()],
+        REFERENCE,
+        "cpu",
+        element="p1",
+    )
     assert all(outcome.good for outcome in body.deform(loads()).outcome)
 
 
@@ -353,7 +371,7 @@ def test_a_thousandfold_contrast() -> None:
     mesh = TetMesh(MESH.nodes, MESH.tets, inner.astype(int))
     for young in (3.0, 3e6):
         regions = {1: Material("stable-neo-hookean", young, 0.45)}
-        body = Fem(base_held(mesh), [Elasticity(regions=regions), Held(), ToolForce()], REFERENCE, "cpu")
+        body = Fem(base_held(mesh), [Elasticity(regions=regions), Held(), ToolForce()], REFERENCE, "cpu", element="p1")
         assert all(outcome.good for outcome in body.deform(loads()).outcome)
 
 
@@ -362,7 +380,7 @@ def test_presets_hold_their_promise() -> None:
     exact = built("fem float64").deform(loads()).displacement
     errors = []
     for accuracy in (TRAIN, LIVE, DRAFT):
-        found = Fem(ANATOMY, EFFECTS, replace(accuracy, outer=60), "cpu").deform(loads()).displacement
+        found = Fem(ANATOMY, EFFECTS, replace(accuracy, outer=60), "cpu", element="p1").deform(loads()).displacement
         errors.append(np.linalg.norm(found - exact) / np.linalg.norm(exact))
     assert errors[0] < 1e-3
     assert errors[1] < 1e-2
@@ -384,4 +402,4 @@ def test_deformations_never_hold_what_is_not_finite() -> None:
 
 def test_an_unknown_device_is_refused() -> None:
     with pytest.raises(InputError, match="no device 'abacus'"):
-        Fem(ANATOMY, EFFECTS, device="abacus")
+        Fem(ANATOMY, EFFECTS, device="abacus", element="p1")

@@ -25,7 +25,7 @@ EFFECTS = (Elasticity(), Held(), ToolForce())
 
 def follower(accuracy: Accuracy = LIVE) -> Fem:
     """On the CPU, which by itself would not follow."""
-    fem = Fem(BODY, EFFECTS, accuracy, "cpu")
+    fem = Fem(BODY, EFFECTS, accuracy, "cpu", element="p1")
     assert fem._following is None
     fem._following = fem._follower()
     return fem
@@ -56,7 +56,7 @@ def same(one: Deformation, other: Deformation) -> bool:
 
 
 def test_frames_are_those_of_the_ladder(fem):
-    plain = Fem(BODY, EFFECTS, LIVE, "cpu")
+    plain = Fem(BODY, EFFECTS, LIVE, "cpu", element="p1")
     for own, other in zip(ride(fem)[1:], ride(plain)[1:], strict=True):
         assert isinstance(own.history, Kept) and own.outcome == other.outcome == (Outcome.CONVERGED,)
         assert own.iterations[0] == other.iterations[0]
@@ -144,7 +144,7 @@ def test_vertices_are_picked_from_the_same_answer(fem):
 
 
 def test_a_body_of_another_element_or_a_small_budget_is_not_followed():
-    assert Fem(BODY, EFFECTS, replace(LIVE, outer=5), "cpu")._follower() is None
+    assert Fem(BODY, EFFECTS, replace(LIVE, outer=5), "cpu", element="p1")._follower() is None
     assert Fem(BODY, EFFECTS, LIVE, "cpu", element="p2")._follower() is None
     assert MOST > 20
 

@@ -150,7 +150,7 @@ def test_the_posture_of_the_scan_moves_nothing(precision: str) -> None:
     accuracy = Accuracy(tolerance=1e-4, precision=precision)  # pyright: ignore[reportArgumentType]
     scan = Gravity(direction=(0.0, -3.0, -4.0), csf_level=0.043)
     for effect, level in ((scan, scan.csf_level), (Gravity(direction=scan.direction), 0.2)):
-        fem = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), effect], accuracy, "cpu")
+        fem = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), effect], accuracy, "cpu", element="p1")
         same = posture(0.5 * np.array(scan.direction), level)
         assert not fem.deform(same).displacement.any()
         elsewhere = fem.deform(posture(DOWN, 0.0))
@@ -170,7 +170,7 @@ def test_a_share_of_the_load_is_a_share_of_the_change() -> None:
 
 def test_a_tool_in_a_drained_head_and_batches() -> None:
     """Postures and pushes add up in small motions, and a batch answers as its cases do one by one."""
-    fem = Fem(base_held(box((2, 2, 2))), [Elasticity(ROCK), Held(), ToolForce(), UPRIGHT], TIGHT, "cpu")
+    fem = Fem(base_held(box((2, 2, 2))), [Elasticity(ROCK), Held(), ToolForce(), UPRIGHT], TIGHT, "cpu", element="p1")
     drained = posture(DOWN, [0.0, 0.03, 0.07])
     pushed = push(
         np.full((3, 3), [0.05, 0.05, 0.1]), np.array([[0.1, 0.0, -0.3], [0.0, 0.2, 0.0], [0.0, 0.0, -1.0]]), 0.02
@@ -207,6 +207,6 @@ def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: s
 
 
 def test_a_posture_without_gravity_is_refused() -> None:
-    fem = Fem(base_held(box((1, 1, 1))), [Elasticity(), Held()], TIGHT, "cpu")
+    fem = Fem(base_held(box((1, 1, 1))), [Elasticity(), Held()], TIGHT, "cpu", element="p1")
     with pytest.raises(InputError, match="loads hold Posture, which nothing answers: add the effect Gravity"):
         fem.deform(posture(DOWN, 0.0))

@@ -275,7 +275,7 @@ def test_slivers_are_as_thin_as_they_say() -> None:
 
 
 def fem(anatomy: Anatomy, material: Tissue | None = SOFT, accuracy: Accuracy = TRAIN, batch: int = 64) -> Fem:
-    return Fem(anatomy, [Elasticity(material), Held(), NodalForce()], accuracy, "cpu", batch)
+    return Fem(anatomy, [Elasticity(material), Held(), NodalForce()], accuracy, "cpu", batch, element="p1")
 
 
 def loose() -> Anatomy:

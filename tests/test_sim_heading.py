@@ -76,8 +76,8 @@ def test_the_start_lies_on_the_line_through_two_answers_for_each_load_by_itself(
 
 
 def test_frames_of_a_moving_tool_take_fewer_steps_to_the_same_answers(body):
-    fem = Fem(body, EFFECTS, LIVE, "cpu")
-    exact = Fem(body, EFFECTS, replace(LIVE, tolerance=1e-4), "cpu")
+    fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
+    exact = Fem(body, EFFECTS, replace(LIVE, tolerance=1e-4), "cpu", element="p1")
     steps, last, plain = np.zeros(2, int), None, None
     for x in np.linspace(0.0, 10e-3, 12):
         load = pushed(x, 2.0)
@@ -90,7 +90,7 @@ def test_frames_of_a_moving_tool_take_fewer_steps_to_the_same_answers(body):
 
 
 def test_a_start_that_would_turn_inside_out_is_not_moved_on(body):
-    fem = Fem(body, EFFECTS, LIVE, "cpu")
+    fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     first = fem.deform(pushed(0.0))
     last = fem.deform(pushed(1e-3), first)
     torn = last.history[BEFORE] + np.random.default_rng(1).normal(0.0, 0.1, last.history[BEFORE].shape)
@@ -99,7 +99,7 @@ def test_a_start_that_would_turn_inside_out_is_not_moved_on(body):
 
 
 def test_a_foreign_start_tells_no_way(body):
-    fem = Fem(body, EFFECTS, LIVE, "cpu")
+    fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     first = fem.deform(pushed(0.0))
     assert BEFORE not in first.history
     second = fem.deform(pushed(1e-3), guess(first.displacement))
@@ -109,7 +109,7 @@ def test_a_foreign_start_tells_no_way(body):
 
 @pytest.mark.parametrize("spoilt", [PUSHES, "l-bfgs s", "l-bfgs known", "l-bfgs head"])
 def test_a_history_that_does_not_fit_is_none(body, spoilt):
-    fem = Fem(body, EFFECTS, LIVE, "cpu")
+    fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     last = fem.deform(pushed(1e-3), fem.deform(pushed(0.0)))
     lacking = {name: value for name, value in last.history.items() if name != spoilt}
     strange = {**last.history, spoilt: 99 * np.ones((1, 3), int)}

@@ -88,7 +88,7 @@ def mode(problem: Problem, mass: np.ndarray) -> tuple[float, np.ndarray]:
 def test_a_mode_decays_as_the_scheme_has_it(damping: float) -> None:
     """Backward Euler of q'' + c q' + w^2 q = 0, for steps of very different lengths in one batch."""
     effects = [Elasticity(Material("linear", YOUNG, 0.3)), Held(), Inertia(DENSITY, damping)]
-    fem = Fem(BLOCK, effects, TIGHT, "cpu", batch=2)
+    fem = Fem(BLOCK, effects, TIGHT, "cpu", batch=2, element="p1")
     frequency, motion = mode(fem.problem, lumped_mass(DENSITY, fem.space))
     steps = np.array([1e-4, 0.01, 1.1e-4, 1.0, 0.012])
     answer = guess(np.repeat(motion[None], len(steps), axis=0))
@@ -103,7 +103,7 @@ def test_a_mode_decays_as_the_scheme_has_it(damping: float) -> None:
 def test_damping_is_the_exponential_of_a_free_flight() -> None:
     """Fast against any stiffness, velocity decays with exp(-c t), at first order in the step."""
     soft = Elasticity(Material("linear", 0.1, 0.0))
-    fem = Fem(BLOCK, [soft, Held(), Inertia(DENSITY, 5.0)], TIGHT, "cpu")
+    fem = Fem(BLOCK, [soft, Held(), Inertia(DENSITY, 5.0)], TIGHT, "cpu", element="p1")
     errors = []
     for steps in (10, 20):
         velocity = np.where(BLOCK.held, 0.0, 1.0)[None]
@@ -119,9 +119,9 @@ def plucked(poisson: float = 0.45) -> tuple[Fem, Deformation]:
     """A block that swings, and how it stands, 15 % aside, as it is let go."""
     effects = [Elasticity(Material("neo-hookean", YOUNG, poisson)), Held(), NodalForce()]
     pull = Loads((Nodal(top_forces(BLOCK.mesh, np.array([1.0, 0.0, 0.5]))),))
-    aside = Fem(BLOCK, effects, TIGHT, "cpu").deform(pull)
+    aside = Fem(BLOCK, effects, TIGHT, "cpu", element="p1").deform(pull)
     assert 0.01 < np.abs(aside.displacement).max() < 0.05
-    return Fem(BLOCK, [*effects, Inertia(DENSITY)], TIGHT, "cpu"), guess(aside.displacement)
+    return Fem(BLOCK, [*effects, Inertia(DENSITY)], TIGHT, "cpu", element="p1"), guess(aside.displacement)
 
 
 def test_first_order_in_the_step() -> None:
@@ -222,7 +222,7 @@ def dynamic(**given: float) -> Callable[[], object]:
 
 
 def asked(start: Deformation | None, time: float) -> Callable[[], object]:
-    fem = Fem(BLOCK, [Elasticity(), Held(), Inertia()], TIGHT, "cpu")
+    fem = Fem(BLOCK, [Elasticity(), Held(), Inertia()], TIGHT, "cpu", element="p1")
     return lambda: fem.deform(at(time), start)
 
 
@@ -248,7 +248,7 @@ def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: s
 
 def test_the_preconditioner_knows_the_mass() -> None:
     """At a short step its inverse is nearly exact: a step from rest takes hardly any turns."""
-    fem = Fem(BLOCK, [Elasticity(), Held(), NodalForce(), Inertia()], TIGHT, "cpu")
+    fem = Fem(BLOCK, [Elasticity(), Held(), NodalForce(), Inertia()], TIGHT, "cpu", element="p1")
     force = top_forces(BLOCK.mesh, np.array([0.1, 0.0, 0.0]))
     assert after(fem, None, 1, 2.0**-13, force).iterations[0] <= 4
     device = find_device("cpu", "float64")
@@ -256,14 +256,14 @@ def test_the_preconditioner_knows_the_mass() -> None:
 
 
 def test_no_cases_have_no_answers() -> None:
-    fem = Fem(BLOCK, (Elasticity(), Held(), Inertia()), TIGHT, "cpu")
+    fem = Fem(BLOCK, (Elasticity(), Held(), Inertia()), TIGHT, "cpu", element="p1")
     assert fem.deform(at()).displacement.shape == (0, len(BLOCK.mesh.nodes), 3)
 
 
 def test_where_no_time_passes_tools_stay_where_they_are() -> None:
     """A tool that came through a body that cannot move would be inside it, and push as nothing does."""
     ball = Ball(0.02)
-    fem = Fem(BLOCK, (Elasticity(), Held(), Inertia(), ToolContact((ball,))), Accuracy(), "cpu")
+    fem = Fem(BLOCK, (Elasticity(), Held(), Inertia(), ToolContact((ball,))), Accuracy(), "cpu", element="p1")
 
     def pressed(height: float, time: float) -> Loads:
         pose = np.eye(4)
@@ -284,7 +284,7 @@ def test_where_no_time_passes_tools_stay_where_they_are() -> None:
 
 
 def test_a_step_in_time_is_not_held_against_an_equilibrium() -> None:
-    fem = Fem(BLOCK, (Elasticity(), Held(), Inertia()), TIGHT, "cpu")
+    fem = Fem(BLOCK, (Elasticity(), Held(), Inertia()), TIGHT, "cpu", element="p1")
     answer = fem.deform(at(0.1))
     for judged in (lambda: fem.residual(at(0.1), answer), lambda: fem.corrected(at(0.1), answer, np.zeros(1, int))):
         with pytest.raises(InputError, match="answers under Inertia are steps in time"):

@@ -29,7 +29,7 @@ CRUSHED = np.where(FREE, MESH.nodes * [0.0, 0.0, -1.5], 0.0)
 
 
 def fem(accuracy: Accuracy = ACCURACY, law: str = "stable-neo-hookean") -> Fem:
-    return Fem(ANATOMY, [Elasticity(tissue(law)), Held(), NodalForce()], accuracy, "cpu")
+    return Fem(ANATOMY, [Elasticity(tissue(law)), Held(), NodalForce()], accuracy, "cpu", element="p1")
 
 
 def loads(total: np.ndarray = TOTAL) -> Loads:

@@ -48,7 +48,7 @@ def test_bad_numbers_are_refused(build: Callable[[], Loads], sentence: str) -> N
 
 
 def test_a_whole_field_of_another_mesh_is_refused() -> None:
-    body = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), NodalForce()], TRAIN, "cpu")
+    body = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), NodalForce()], TRAIN, "cpu", element="p1")
     with pytest.raises(InputError, match=rf"Nodal.force has 8 vertices, but the mesh has {COUNT}"):
         body.deform(Loads((Nodal(np.zeros((1, 8, 3))),)))
     with pytest.raises(InputError, match=r"Prescribed\.displacement has 8 vertices"):
@@ -59,7 +59,7 @@ def test_time_alone_is_a_load() -> None:
     later = Loads((), np.array([0.1, 0.2]))
     both = stacked([later, later.rows(np.array([1])).scaled(0.5)])
     np.testing.assert_array_equal(both.times, [0.1, 0.2, 0.2])
-    body = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), NodalForce()], TRAIN, "cpu")
+    body = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), NodalForce()], TRAIN, "cpu", element="p1")
     np.testing.assert_array_equal(body.deform(both).displacement, 0.0)
 
 

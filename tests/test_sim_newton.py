@@ -113,7 +113,7 @@ def test_history_arrives_in_its_rows(problem: Problem, batch: Found, device: Dev
 
 def test_history_travels_through_the_deformer() -> None:
     """Spring that creeps: with each call the body sinks further, as the same steps one by one in a batch of its own."""
-    fem = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TIGHT, "cpu", batch=2)
+    fem = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TIGHT, "cpu", batch=2, element="p1")
     terms = (*fem.problem.terms, Spring(fem.problem.device, ROWS, 40.0))
     fem._ladder = replace(fem._ladder, problem=Problem(terms, fem.problem.constraint, fem.problem.device))
     total = np.array([[0.0, 0.0, -0.1], [0.05, 0.0, 0.02], [0.0, 0.0, -0.3]])
@@ -175,7 +175,7 @@ def test_converged_means_converged_by_an_independent_residual(law: str) -> None:
     precisions: list[tuple[Precision, float]] = [("float64", 1e-4), ("float64", 1e-9), ("float32", 1e-3)]
     for precision, tolerance in precisions:
         accuracy = Accuracy(tolerance=tolerance, precision=precision)
-        found = Fem(ANATOMY, [Elasticity(material), Held(), NodalForce()], accuracy, "cpu").deform(
+        found = Fem(ANATOMY, [Elasticity(material), Held(), NodalForce()], accuracy, "cpu", element="p1").deform(
             Loads((Nodal(force),))
         )
         assert all(outcome.good for outcome in found.outcome)
@@ -196,8 +196,8 @@ def test_single_precision_agrees_with_double(law: str) -> None:
     """Within 1e-3 of the largest motion at a tolerance of 1e-4: a factor ten for the condition of the box."""
     effects = Elasticity(tissue(law)), Held(), NodalForce()
     loads = Loads((Nodal(top_forces(MESH, TOTAL[1:])),))
-    exact = Fem(ANATOMY, effects, TIGHT, "cpu").deform(loads).displacement
-    single = Fem(ANATOMY, effects, Accuracy(1e-4, precision="float32"), "cpu").deform(loads).displacement
+    exact = Fem(ANATOMY, effects, TIGHT, "cpu", element="p1").deform(loads).displacement
+    single = Fem(ANATOMY, effects, Accuracy(1e-4, precision="float32"), "cpu", element="p1").deform(loads).displacement
     largest = np.abs(exact).max(axis=(1, 2), keepdims=True)
     assert (np.abs(single - exact) / largest).max() < 1e-3
 
@@ -209,7 +209,9 @@ def compressed() -> tuple[Fem, Loads]:
     value = np.where(top[:, None], [0.0, 0.0, -0.03], 0.0)
     force = np.zeros_like(value)
     force[~top & ~base, 0] = 1e-6
-    fem = Fem(hold(mesh, top | base), [Elasticity(), Held(), NodalForce()], Accuracy(tolerance=1e-9), "cpu")
+    fem = Fem(
+        hold(mesh, top | base), [Elasticity(), Held(), NodalForce()], Accuracy(tolerance=1e-9), "cpu", element="p1"
+    )
     return fem, Loads((Prescribed(value[None]), Nodal(force[None])))
 
 
@@ -330,8 +332,10 @@ def test_round_off_is_told_and_ends_the_iteration() -> None:
     mesh = TetMesh(MESH.nodes, MESH.tets, core.astype(int))
     effects = Elasticity(tissue("stable-neo-hookean"), {1: tissue("stable-neo-hookean", 3e7)}), Held(), NodalForce()
     loads = Loads((Nodal(top_forces(MESH, TOTAL[2:5])),))
-    single = Fem(base_held(mesh), effects, Accuracy(tolerance=2e-5, precision="float32"), "cpu").deform(loads)
-    double = Fem(base_held(mesh), effects, Accuracy(tolerance=2e-5), "cpu").deform(loads)
+    single = Fem(base_held(mesh), effects, Accuracy(tolerance=2e-5, precision="float32"), "cpu", element="p1").deform(
+        loads
+    )
+    double = Fem(base_held(mesh), effects, Accuracy(tolerance=2e-5), "cpu", element="p1").deform(loads)
     assert all(outcome is Outcome.ROUND_OFF for outcome in single.outcome)
     assert (single.residual > 2e-5).all()
     assert (single.iterations < 80).all()  # of 260, and no load steps

@@ -103,7 +103,11 @@ def test_the_opening_lets_the_brain_rise() -> None:
     push = Loads((Nodal((OPEN[:, None] * [0.2, 0.0, 0.6] / OPEN.sum())[None]),))
 
     def moved(*effects: SkullContact) -> np.ndarray:
-        return Fem(half_open(), [tissue, Held(), NodalForce(), *effects], REFERENCE, "cpu").deform(push).displacement[0]
+        return (
+            Fem(half_open(), [tissue, Held(), NodalForce(), *effects], REFERENCE, "cpu", element="p1")
+            .deform(push)
+            .displacement[0]
+        )
 
     far = OPEN & (MESH.nodes[:, 0] > 0.04)
     barred, free = moved(SkullContact(GAP)), moved()

@@ -38,7 +38,7 @@ def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
 def test_on_a_brain_hard_pushes_take_few_looks_at_the_whole() -> None:
     anatomy = read_anatomy(template_path())
     effects, loads = (Elasticity(), Held(), Slide(), ToolForce()), draw("spatula", anatomy, 2, 1)
-    whole, live = (Fem(anatomy, effects, TRAIN, "cpu", batch=1, live=live) for live in (False, True))
+    whole, live = (Fem(anatomy, effects, TRAIN, "cpu", batch=1, live=live, element="p1") for live in (False, True))
     expected, found = whole.deform(loads), live.deform(loads)
     assert set(found.outcome) == {Outcome.CONVERGED} and (found.iterations <= 0.5 * expected.iterations).all()
     moved = np.abs(expected.displacement).max()
@@ -121,7 +121,13 @@ def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
 def test_where_it_would_not_serve_there_is_none(kind: str) -> None:
     law = "stable-neo-hookean"
     if kind == "wide":
-        fem = Fem(base_held(box((3, 3, 3), 0.1)), (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(), "cpu")
+        fem = Fem(
+            base_held(box((3, 3, 3), 0.1)),
+            (Elasticity(tissue(law)), Held(), ToolForce()),
+            Accuracy(),
+            "cpu",
+            element="p1",
+        )
         found = patching(fem.problem, rest_solver(fem.problem), fem.effects, fem.space)
     else:
         problem, space = begun(law)

@@ -46,7 +46,7 @@ def test_a_plate_presses_evenly_by_force_over_area(element: str) -> None:
 
 
 def test_a_blade_presses_hardest_under_its_lower_end() -> None:
-    fem = Fem(BLOCK, (Elasticity(), Held(), Retraction(Spatula(0.015, 0.03, 2e-3))), Accuracy(), "cpu")
+    fem = Fem(BLOCK, (Elasticity(), Held(), Retraction(Spatula(0.015, 0.03, 2e-3))), Accuracy(), "cpu", element="p1")
     laid, moved = at(0.03, 0.03, HEIGHT + 5e-3, tip=12.0), np.array([[0.0, 0.0, -8e-3]])
     loads = Loads((Retracted(laid[None], moved),))
     answer = fem.deform(loads)
@@ -58,13 +58,13 @@ def test_a_blade_presses_hardest_under_its_lower_end() -> None:
 
 
 def test_where_nothing_touches_it_presses_nowhere() -> None:
-    fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu")
+    fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu", element="p1")
     loads = Loads((Touching(at(0.03, 0.03, HEIGHT + 1e-3)[None, None]),))
     assert not pressure(fem, loads, fem.deform(loads)).any()
 
 
 def test_it_is_of_the_whole_answer_to_its_loads() -> None:
-    fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu")
+    fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu", element="p1")
     loads = Loads((Touching(at(0.03, 0.03, HEIGHT + 1e-3)[None, None]),))
     answer, none = fem.deform(loads), np.zeros(0, int)
     with pytest.raises(InputError, match="1 load cases at 2 vertices, the loads have 1 and the body 196"):

@@ -54,7 +54,7 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 def test_sixty_four_loads_launch_as_many_kernels_as_a_few(launches: list[str], precision: Precision) -> None:
     """Identical loads take the same iterations, so that the whole solves can be compared launch by launch."""
     accuracy = Accuracy(tolerance=1e-4, precision=precision)
-    fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce(), NodalForce()], accuracy, "cpu", batch=64)
+    fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce(), NodalForce()], accuracy, "cpu", batch=64, element="p1")
 
     def solved(count: int) -> tuple[list[str], np.ndarray]:
         launches.clear()
@@ -107,7 +107,7 @@ def test_only_what_is_asked_for_is_imported() -> None:
 
 
 def test_an_effect_that_is_not_asked_for_is_not_launched(launches: list[str]) -> None:
-    fem = Fem(ANATOMY, [Elasticity(), Held()], TIGHT, "cpu")
+    fem = Fem(ANATOMY, [Elasticity(), Held()], TIGHT, "cpu", element="p1")
     value = np.where(ANATOMY.held, 1e-3, 0.0)[None]
     fem.deform(Loads((Prescribed(value),)))
     names = {name.split("__")[0] for name in launches}
@@ -118,7 +118,7 @@ def test_an_effect_that_is_not_asked_for_is_not_launched(launches: list[str]) ->
 
 def test_a_cause_that_does_not_act_is_not_launched(launches: list[str]) -> None:
     """Both effects are asked for, nodal forces alone act: no tool is integrated, and no force is subtracted twice."""
-    fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce(), NodalForce()], TIGHT, "cpu")
+    fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce(), NodalForce()], TIGHT, "cpu", element="p1")
     launches.clear()
     fem.problem.begin(Cases(Loads((Nodal(top_forces(MESH, np.array([[0.1, 0.0, 0.0]]))),)), np.zeros(1)))
     fem.problem.gradient(fem.problem.device.zeros(fem.problem.rows, 1))
@@ -172,7 +172,7 @@ def test_the_potential_is_the_sum_of_its_terms(device: Device) -> None:
 
 def test_a_solve_integrates_its_tools_once(launches: list[str]) -> None:
     """It begins, begins again for the reactions, and needs their moments."""
-    fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce()], TIGHT, "cpu")
+    fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce()], TIGHT, "cpu", element="p1")
     launches.clear()
     fem.deform(Loads((Pushed(np.array([[0.03, 0.03, 0.1]]), np.array([[0.0, 0.0, -0.1]]), np.array([0.02])),)))
     assert launches.count("_press") == 1

@@ -47,7 +47,7 @@ ASIDE = at(0.036, 0.03, HEIGHT - 4e-3)
 @cache
 def solver(accuracy: Accuracy) -> Fem:
     effects = [Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), ToolContact((Ball(RADIUS),))]
-    return Fem(BODY, effects, accuracy, "cpu")
+    return Fem(BODY, effects, accuracy, "cpu", element="p1")
 
 
 @cache

@@ -92,7 +92,13 @@ def test_between_walls_it_presses_with_the_bulk_modulus(element: str, made_of: T
 
 def test_times() -> None:
     """Nothing at t = 0; heart and breath add up, and come back after the periods that both have."""
-    fem = Fem(base_held(MESH), [Elasticity(), Held(), Pulsation(Wave(1.0, 0.01), Wave(0.25, 0.02))], TIGHT, "cpu")
+    fem = Fem(
+        base_held(MESH),
+        [Elasticity(), Held(), Pulsation(Wave(1.0, 0.01), Wave(0.25, 0.02))],
+        TIGHT,
+        "cpu",
+        element="p1",
+    )
     answer = fem.deform(at(0.0, 0.3, 1.3, 4.3))
     assert not answer.displacement[0].any()
     assert all(outcome.good for outcome in answer.outcome)
@@ -111,7 +117,9 @@ def test_only_what_is_named_swells() -> None:
     waves = Wave(1.0, 0.1), STILL
     swollen = []
     for regions in (None, (0,), (1,)):
-        fem = Fem(anatomy, [Elasticity(tissue("linear")), Held(), Pulsation(*waves, regions)], TIGHT, "cpu")
+        fem = Fem(
+            anatomy, [Elasticity(tissue("linear")), Held(), Pulsation(*waves, regions)], TIGHT, "cpu", element="p1"
+        )
         moved = mesh.nodes + fem.deform(at(0.25)).displacement[0]
         corners = moved[mesh.tets]
         volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
@@ -138,7 +146,7 @@ def test_an_opened_brain_bulges_as_much_as_is_observed() -> None:
     anatomy = read_anatomy(TEMPLATE)
     swings = []
     for body in (anatomy, closed(anatomy)):
-        fem = Fem(body, [Elasticity(), Held(), Slide(), Pulsation()], TRAIN, "cpu")
+        fem = Fem(body, [Elasticity(), Held(), Slide(), Pulsation()], TRAIN, "cpu", element="p1")
         times = np.array([1.25, 3.75])  # where heart and breath are both at their utmost
         answer = fem.deform(Loads((), times))
         assert all(outcome.good for outcome in answer.outcome)
@@ -150,7 +158,7 @@ def test_an_opened_brain_bulges_as_much_as_is_observed() -> None:
 
 
 def absent() -> object:
-    return Fem(base_held(MESH), [Elasticity(), Held(), Pulsation(regions=(0, 7))], TIGHT, "cpu")
+    return Fem(base_held(MESH), [Elasticity(), Held(), Pulsation(regions=(0, 7))], TIGHT, "cpu", element="p1")
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ class Reference:
     def solve(self, accuracy: Accuracy) -> Deformation:
         stiff = {1: Material(self.law, 10.0 * YOUNG, POISSON)} if self.mesh.region.any() else {}
         effects = Elasticity(Material(self.law, YOUNG, POISSON), stiff), Held(), NodalForce()
-        fem = Fem(hold(self.mesh, self.held), effects, accuracy, "cpu")
+        fem = Fem(hold(self.mesh, self.held), effects, accuracy, "cpu", element="p1")
         return fem.deform(Loads((Nodal(self.force[None]),)))
 
     def error(self, deformation: Deformation) -> float:

@@ -78,7 +78,7 @@ def test_a_mesh_with_middles_of_its_own_loses_them_too() -> None:
     made = finite_elements(body, (*effects, Resection((within((1, 1, 1), (2, 2, 2), curved),))), TIGHT, "cpu")
     assert isinstance(made, Operated)
     left, used = compact(made.remains(1).anatomy)
-    alone = Fem(left, effects, TIGHT, "cpu").deform(posture(DOWN, -1.0))
+    alone = Fem(left, effects, TIGHT, "cpu", element="p1").deform(posture(DOWN, -1.0))
     answer = made.deform(posture(DOWN, -1.0))
     assert 0 < len(used) < len(curved.nodes)
     np.testing.assert_allclose(
@@ -93,7 +93,7 @@ def test_without_a_cause_all_steps_are_done(operated: Operated) -> None:
 
 
 def test_no_step_is_the_whole_body(operated: Operated) -> None:
-    plain = Fem(BODY, EFFECTS, TIGHT, "cpu").deform(posture(DOWN, -1.0))
+    plain = Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(posture(DOWN, -1.0))
     np.testing.assert_array_equal(operated.deform(lying([0])).displacement, plain.displacement)
 
 
@@ -296,7 +296,7 @@ class TestHardCases:
         with pytest.raises(InputError, match="asked for 2 times"):
             finite_elements(BODY, (*EFFECTS, STEPS, STEPS))
         with pytest.raises(InputError, match="Resected, which nothing answers: add the effect Resection"):
-            Fem(BODY, EFFECTS, TIGHT, "cpu").deform(lying([1]))
+            Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(lying([1]))
 
     def test_without_a_resection_it_is_the_plain_solver(self) -> None:
         assert isinstance(finite_elements(BODY, EFFECTS, TIGHT, "cpu"), Fem)

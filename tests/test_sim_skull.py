@@ -130,18 +130,23 @@ def test_a_body_that_turns_slides_along_a_round_skull() -> None:
 )
 def test_contradictions_are_sentences(effects: tuple[Effect, ...], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Fem(LID, [Elasticity(), Held(), *effects], REFERENCE, "cpu")
+        Fem(LID, [Elasticity(), Held(), *effects], REFERENCE, "cpu", element="p1")
 
 
 def test_a_skull_that_touches_nothing_is_pointless() -> None:
     bare = Anatomy(MESH, LID.held, np.zeros_like(LID.slide_normal), LID.craniotomy)
     with pytest.raises(InputError, match="SkullContact finds no node"):
-        Fem(bare, [Elasticity(), Held(), SkullContact()], REFERENCE, "cpu")
+        Fem(bare, [Elasticity(), Held(), SkullContact()], REFERENCE, "cpu", element="p1")
 
 
 def test_bone_alone_holds_no_body() -> None:
     with pytest.raises(InputError, match="hold at least three nodes"):
-        Fem(hold(MESH, np.zeros(len(TOP), bool), LID.slide_normal), [Elasticity(), Held(), SkullContact()], REFERENCE)
+        Fem(
+            hold(MESH, np.zeros(len(TOP), bool), LID.slide_normal),
+            [Elasticity(), Held(), SkullContact()],
+            REFERENCE,
+            element="p1",
+        )
 
 
 def test_gaps_are_positive() -> None:

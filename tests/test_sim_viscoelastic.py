@@ -158,7 +158,9 @@ def test_one_step_may_be_as_long_as_a_day(precision: str) -> None:
     """It ends near what is left of the stiffness, and no number overflows."""
     pull = (Nodal(top_forces(MESH, np.array([1e-4, 0.0, 0.0]))),)
     accuracy = replace(TIGHT, tolerance=1e-4, precision=precision)
-    fem = Fem(base_held(MESH), [Elasticity(relaxing("neo-hookean")), Held(), NodalForce()], accuracy, "cpu")
+    fem = Fem(
+        base_held(MESH), [Elasticity(relaxing("neo-hookean")), Held(), NodalForce()], accuracy, "cpu", element="p1"
+    )
     rest = fem.deform(Loads(pull))
     once = fem.deform(Loads(pull, np.array([86400.0])), rest)
     again = fem.deform(Loads(pull, np.array([2.0 * 86400.0])), once)
@@ -179,7 +181,7 @@ def test_a_run_may_be_cut_and_tissues_mixed() -> None:
             start = fem.deform(Loads((force,), np.array([time, 2.0 * time])), start)  # pyright: ignore
         return start
 
-    one, other = (Fem(anatomy, [tissues, Held(), NodalForce()], TIGHT, "cpu") for _ in range(2))
+    one, other = (Fem(anatomy, [tissues, Held(), NodalForce()], TIGHT, "cpu", element="p1") for _ in range(2))
     straight = run(one, None, (0.0, 0.1, 0.4, 2.0))
     begun = run(one, None, (0.0, 0.1))
     run(other, None, (0.7,))
@@ -194,7 +196,7 @@ def test_a_run_may_be_cut_and_tissues_mixed() -> None:
 def test_held_all_round_it_needs_no_solver() -> None:
     """A series of one pair in a body that cannot move: nothing acts, nothing is remembered but zeros."""
     anatomy = hold(MESH, np.ones(len(MESH.nodes), bool))
-    fem = Fem(anatomy, [Elasticity(relaxing("ogden", SERIES[:1])), Held()], TIGHT, "cpu")
+    fem = Fem(anatomy, [Elasticity(relaxing("ogden", SERIES[:1])), Held()], TIGHT, "cpu", element="p1")
     answer = fem.deform(Loads((), np.array([3.0])))
     assert not answer.displacement.any()
     assert not answer.history["viscoelasticity ogden"].any()
@@ -255,7 +257,13 @@ def test_the_stable_law_bears_what_it_bears_relaxed(force: float, element: str) 
 def test_tissue_that_relaxed_stands_a_push_that_folds_it() -> None:
     """The default law by its other name: where its elastic self is in equilibrium, if inside out, so is it."""
     anatomy = base_held(box((5, 5, 3), 0.05))
-    fem = Fem(anatomy, [Elasticity(replace(softened(1.0), prony=SERIES)), Held(), ToolForce()], Accuracy(), "cpu")
+    fem = Fem(
+        anatomy,
+        [Elasticity(replace(softened(1.0), prony=SERIES)), Held(), ToolForce()],
+        Accuracy(),
+        "cpu",
+        element="p1",
+    )
     pushed = push(np.array([0.026, 0.024, 0.03]), np.array([0.01, 0.0, -1.3]), 7e-3)
     answer = None
     for time in (0.5, 1.0, 10.0, 50.0, 1000.0):

@@ -22,7 +22,7 @@ FINE = Accuracy(1e-6)
 
 @pytest.fixture(scope="module")
 def fem(box):
-    return Fem(box, EFFECTS, FINE, "cpu")
+    return Fem(box, EFFECTS, FINE, "cpu", element="p1")
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_loads_that_two_steps_do_not_settle_are_not_sound(fem, loads, box):
 
 
 def test_one_load_alone_says_the_same_as_in_a_batch(box, loads, predicted, fem):
-    alone, row = Fem(box, EFFECTS, FINE, "cpu", live=True), np.array([4])
+    alone, row = Fem(box, EFFECTS, FINE, "cpu", live=True, element="p1"), np.array([4])
     together = certify(fem, loads, predicted)
     for solver in (fem, alone):
         single = certify(solver, loads.rows(row), predicted.rows(row))
@@ -117,7 +117,7 @@ def test_without_a_part_to_settle_the_linear_solves_do_it_alone(box):
     """An opening of half the surface is no small place."""
     free = box.mesh.nodes[:, 2] > -30e-3
     body = replace(box, held=box.held & ~free[:, None])
-    fem, load = Fem(body, EFFECTS, FINE, "cpu"), push([0, 0, 0], [0.01, 0, -0.1], 8e-3)
+    fem, load = Fem(body, EFFECTS, FINE, "cpu", element="p1"), push([0, 0, 0], [0.01, 0, -0.1], 8e-3)
     truth = fem.deform(load)
     found = certify(fem, load, replace(truth, displacement=1.05 * truth.displacement))
     assert found.estimate == pytest.approx(0.05 * largest(truth.displacement, box.tumour_nodes), rel=0.05)

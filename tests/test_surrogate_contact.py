@@ -41,7 +41,7 @@ def features(anatomy: Anatomy, loads: Loads) -> np.ndarray:
 
 
 def bodily(anatomy: Anatomy, tissue: Material) -> Fem:
-    return Fem(anatomy, pushed_effects(anatomy, tissue), REFERENCE, "cpu")
+    return Fem(anatomy, pushed_effects(anatomy, tissue), REFERENCE, "cpu", element="p1")
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_the_ball_enters_no_facet_and_pulls_nothing(box: Anatomy, pressed: tuple
 def test_it_answers_as_finite_elements_of_linear_tissue_do(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> None:
     """The same body, condensed or not, deep and oblique: what differs is how the barrier keeps its gap."""
     contact, bases = pressed
-    fem = Fem(box, [Elasticity(SOFT), Held(), ToolContact((BALL,))], device="cpu", batch=1)
+    fem = Fem(box, [Elasticity(SOFT), Held(), ToolContact((BALL,))], device="cpu", batch=1, element="p1")
     loads, cortex = draw_poses("palpation", box, 8, 5), bases[1].nodes
     truth, X = fem.deform(loads), features(box, loads)
     assert all(outcome.good for outcome in truth.outcome)
@@ -139,7 +139,9 @@ def test_unit_responses_are_those_of_small_forces(box: Anatomy) -> None:
     found = unit_responses(bodily(box, SOFT), nodes, at)
     force = np.zeros((6, len(box.mesh.nodes), 3))
     force[np.arange(6), np.repeat(nodes, 3), np.tile(np.arange(3), 2)] = 1e-4
-    truth = Fem(box, [Elasticity(SOFT), Held(), NodalForce()], REFERENCE, "cpu").deform(Loads((Nodal(force),)))
+    truth = Fem(box, [Elasticity(SOFT), Held(), NodalForce()], REFERENCE, "cpu", element="p1").deform(
+        Loads((Nodal(force),))
+    )
     np.testing.assert_allclose(found, 1e4 * truth.at(at).displacement, atol=1e-5 * np.abs(found).max())
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from sim.discretisation import ELEMENTS
+from sim.discretisation import ELEMENTS, RECOMMENDED
 from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.meshfile import read_anatomy
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--checked", type=int, default=20, help="frames held against the converged solution (default %(default)s)"
     )
     add_tissue_arguments(parser)
-    parser.add_argument("--element", choices=ELEMENTS, default="p1", help="(default %(default)s)")
+    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="(default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 

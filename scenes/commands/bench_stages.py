@@ -9,7 +9,7 @@ from dataclasses import asdict
 
 from sim.errors import InputError
 
-from .demo import add_theatre, deformer_name
+from .demo import add_theatre, deformer_name, scene_asked
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.batch < 1:
         raise InputError(f"--batch {args.batch} solves nothing: give a whole number from 1 up.")
-    scene = find_scene(args.scene)
+    scene = scene_asked(args, args.scene)
     if not any(isinstance(effect, ToolForce) for effect in scene.effects):
         pushing = ", ".join(name for name in SCENES if ToolForce() in find_scene(name).effects)
         raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TextIO
 from sim.accuracy import TRAIN
 from sim.errors import InputError
 
-from .demo import add_theatre, deformer_name
+from .demo import add_theatre, deformer_name, scene_asked
 
 if TYPE_CHECKING:
     from sim.deformation import Deformation
@@ -36,23 +36,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check scene by scene. 1: a bound was not kept."""
     from ..check import measure
-    from ..scene import SCENES, find_scene
+    from ..scene import SCENES
     from ..theatre import open_theatre
     from ..truth import truth_of
 
     if args.every < 1:
         raise InputError(f"--every {args.every}: give a whole number from 1 up.")
-    scenes = [find_scene(name) for name in args.scenes or SCENES]
+    scenes = [scene_asked(args, name) for name in args.scenes or SCENES]
     theatre = open_theatre(args.anatomy, args.model, args.device)
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
         name = deformer_name(args, theatre, scene)
+        print(f"{scene.name} by {theatre.described(name, scene)}", file=table)
         player = theatre.player(name, scene)
         frames = list(player.frames(args.every))
         truth = truth_of(theatre, scene, [frame.loads for frame in frames])
         figures = measure(player, player.camera, frames, truth)
         broken = figures.broken(scene.bounds)
-        rows.append({"scene": scene.name, "deformer": name, "frames": len(frames), **figures.row(), "broken": broken})
+        played = {"scene": scene.name, "deformer": name, "solver": theatre.described(name, scene)}
+        rows.append({**played, "frames": len(frames), **figures.row(), "broken": broken})
         print(
             f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}  overlap {figures.overlap:.4f}  "
             f"error {figures.error_mm:.3f} mm of {figures.motion_mm:.2f} mm  projection {figures.pixels:.1e} px",

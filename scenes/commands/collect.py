@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sim.files import check_output
 
-from .demo import add_theatre, deformer_name
+from .demo import add_theatre, deformer_name, scene_asked
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,10 +25,9 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..collect import collect
-    from ..scene import find_scene
     from ..theatre import open_theatre
 
-    scene = find_scene(args.scene)
+    scene = scene_asked(args, args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
+from ..tissue import add_element_argument, add_tissue_arguments, tissue_asked
+
 if TYPE_CHECKING:
     from ..scene import Scene
     from ..theatre import Theatre
@@ -26,7 +28,22 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     budget = parser.add_argument_group("a budget, in place of a deformer; the error is what each states")
     budget.add_argument("--within-mm", type=float, metavar="MM", help="the fastest that is off by no more")
     budget.add_argument("--within-ms", type=float, metavar="MS", help="the most accurate that takes no longer a frame")
+    add_tissue_arguments(parser)
+    add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+
+
+def scene_asked(args: argparse.Namespace, name: str) -> Scene:
+    """A scene by name, of the tissue and on the element that `add_theatre`'s arguments ask for, if they ask for any.
+
+    Raises
+    ------
+    InputError
+        As `find_scene`, `tissue_of` and `Scene.made_of`.
+    """
+    from ..scene import find_scene
+
+    return find_scene(name).made_of(tissue_asked(args), args.element)
 
 
 def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> str:
@@ -39,6 +56,9 @@ def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> s
     """
     budget = args.within_mm, args.within_ms
     if args.deformer != "auto" and budget == (None, None):
+        why = next(iter(theatre.refusals(scene).values()), "none lies beside this anatomy; `sulcus train` makes them")
+        if args.deformer is None and not theatre.knowing(scene):
+            print(f"sulcus {args.command}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
         return args.deformer or theatre.best(scene)
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
@@ -65,7 +85,6 @@ def run(args: argparse.Namespace) -> int:
     from ar.browser import check_address
 
     from ..demo import Demo
-    from ..scene import find_scene
     from ..theatre import open_theatre
 
     if not args.seconds > 0.0:
@@ -74,15 +93,12 @@ def run(args: argparse.Namespace) -> int:
         check_address(args.host, args.port)
     except (OSError, ValueError) as error:
         raise InputError(f"no page on host {args.host}, port {args.port} ({error}): choose others.") from error
-    scene = find_scene(args.scene)
+    scene = scene_asked(args, args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = deformer_name(args, theatre, scene)
     demo = Demo(theatre, scene, name, args.host, args.port)
     print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
-    if not theatre.models:
-        print("no learnt model lies beside this anatomy: the finite elements play alone; see `sulcus train`")
-    elif not theatre.knowing(scene):
-        print("no learnt model here was taught under this scene's effects: the finite elements play alone")
+    print(f"{scene.name} by {theatre.described(name, scene)}")
     try:
         demo.run(args.seconds)
     except KeyboardInterrupt:

@@ -10,6 +10,9 @@ from pathlib import Path
 
 from sim.errors import InputError
 
+from ..tissue import add_element_argument, add_tissue_arguments
+from .demo import scene_asked
+
 HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")
 
 
@@ -18,6 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`")
     parser.add_argument("--every", type=int, default=5, help="solve every so many frames (default %(default)s)")
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    add_tissue_arguments(parser)
+    add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
@@ -25,15 +30,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Solve the scene with and without each."""
     from ..ablation import rows
-    from ..scene import find_scene
     from ..theatre import open_theatre
 
     if args.every < 1:
         raise InputError(f"--every {args.every}: give a whole number from 1 up.")
-    scene = find_scene(args.scene)
+    scene = scene_asked(args, args.scene)
     theatre = open_theatre(args.anatomy, device=args.device)
     table = sys.stderr if args.json else sys.stdout
-    print(f"{scene.name}: all effects together, then what each adds to the others\n", file=table)
+    who = theatre.described("fem", scene)
+    print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
     print(f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}", file=table)
     found = []
     for row in rows(theatre, scene, args.every):
@@ -42,5 +47,5 @@ def run(args: argparse.Namespace) -> int:
         cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
         print(f"| {' | '.join([row.effect, *cells, row.refused])} |", file=table, flush=True)
     if args.json:
-        print(json.dumps({"scene": scene.name, "effects": [asdict(row) for row in found]}))
+        print(json.dumps({"scene": scene.name, "solver": who, "effects": [asdict(row) for row in found]}))
     return 0

@@ -12,7 +12,7 @@ from sim.accuracy import TRAIN
 from sim.device import find_device
 from sim.errors import InputError
 from sim.files import check_output
-from sim.material import LAWS
+from sim.material import BRAIN, LAWS
 from sim.stages import listened
 from surrogate.sampling import PRESETS
 from surrogate.split import APART, FEWEST
@@ -31,8 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--craniotomy", type=float, default=50.0, help="diameter [mm] (default %(default)s)")
     parser.add_argument("--count", type=int, default=1000, help="loads to simulate (default %(default)s)")
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
-    parser.add_argument("--material", choices=LAWS, default="neo-hookean", help="tissue law (default %(default)s)")
-    add_element_argument(parser, "smoothed")
+    parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law (default %(default)s)")
+    add_element_argument(parser)
     parser.add_argument(
         "--learners", default="linear,series-gp", help="as `sulcus train` has them (default %(default)s)"
     )
@@ -56,7 +56,8 @@ def run(args: argparse.Namespace) -> int:
         ["anatomy", "--labels", str(args.labels), "--brain", args.brain, "--tumour", args.tumour, *t1,
          "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), "--out", str(args.out)],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--preset", args.preset,
-         "--device", args.device, "--material", args.material, "--element", args.element],
+         "--device", args.device, "--material", args.material,
+         *([] if args.element is None else ["--element", args.element])],
         ["train", str(data), "--out", str(model), "--learners", args.learners, "--device", args.device],
     ]  # fmt: skip
     began = time.perf_counter()

@@ -11,7 +11,7 @@ from ar.screen import Film, read_png, write_film
 from sim.errors import InputError
 from sim.files import check_output
 
-from .demo import add_theatre, deformer_name
+from .demo import add_theatre, deformer_name, scene_asked
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,10 +30,9 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..play import labelled
-    from ..scene import find_scene
     from ..theatre import open_theatre
 
-    scene = find_scene(args.scene)
+    scene = scene_asked(args, args.scene)
     if args.every < 1:
         raise InputError(f"--every {args.every}: give a whole number from 1 up.")
     if args.out.exists() and not args.out.is_dir():
@@ -56,6 +55,14 @@ def run(args: argparse.Namespace) -> int:
             write_film(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
     except OSError as error:
         raise InputError(f"{args.out}: the frames cannot be written ({error}). Choose another folder.") from error
-    report = {"scene": scene.name, "deformer": name, "frames": len(written), "not_good": bad, "out": str(args.out)}
-    print(json.dumps(report) if args.json else f"{len(written)} frames by {name} in {args.out}; {bad} not good")
+    who = theatre.described(name, scene)
+    report = {
+        "scene": scene.name,
+        "deformer": name,
+        "solver": who,
+        "frames": len(written),
+        "not_good": bad,
+        "out": str(args.out),
+    }
+    print(json.dumps(report) if args.json else f"{len(written)} frames by {who} in {args.out}; {bad} not good")
     return 1 if bad else 0

@@ -35,7 +35,9 @@ def run(args: argparse.Namespace) -> int:
         scene = find_scene(name)
         names = [type(effect).__name__ for effect in scene.effects_on(theatre.anatomy)]
         known = {"scene": name, "title": scene.title, "effects": names, "deformers": list(theatre.names(scene))}
-        print(f"{name}: {scene.title}\n  {', '.join(names)}; played by {', '.join(theatre.names(scene))}", file=lines)
+        known["solver"] = theatre.described("fem", scene)
+        print(f"{name}: {scene.title}", file=lines)
+        print(f"  {', '.join(names)}; played by {', '.join(theatre.names(scene))}\n  {known['solver']}", file=lines)
         if args.out is not None:
             best = theatre.best(scene)
             found = thumbnail(theatre.player(best, scene), best)

@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             print(f"stopped; the same command goes on from {args.out}.partial", file=sys.stderr)
             return INTERRUPTED
-    _report(args, len(loads), solved)
+    _report(args, fem.description, len(loads), solved)
     return 0
 
 
@@ -115,7 +115,7 @@ def _drawn(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Ball | None, Loa
     return ball_of(args.preset, radius), draw_poses(args.preset, anatomy, args.count, args.seed, radius)
 
 
-def _report(args: argparse.Namespace, asked: int, solved: Solved) -> None:
+def _report(args: argparse.Namespace, solver: str, asked: int, solved: Solved) -> None:
     with h5py.File(args.out, "r") as file:
         outcomes, units = read_outcomes(file, "answers"), len(read_outcomes(file, "unit"))
     counts = {outcome.name.lower(): outcomes.count(outcome) for outcome in Outcome if outcome in outcomes}
@@ -124,6 +124,7 @@ def _report(args: argparse.Namespace, asked: int, solved: Solved) -> None:
     if args.json:
         said = {
             "out": args.out,
+            "solver": solver,
             "loads": len(outcomes),
             "unit": units,
             "solved_now": solved.rows,
@@ -141,6 +142,7 @@ def _report(args: argparse.Namespace, asked: int, solved: Solved) -> None:
         )
     listed = ", ".join(f"{number} {name}" for name, number in counts.items())
     print(f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved.rows} solved now.")
+    print(f"Solved by {solver}.")
     if rate is not None:
         print(f"{rate:.4g} loads a second, from their footprints to the file.")
     if failed:

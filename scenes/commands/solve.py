@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "nodes as any other: held only where `fixed` says so",
     )
     add_tissue_arguments(parser)
-    add_element_argument(parser)
+    add_element_argument(parser, "p1, the file's linear tetrahedra as every other program takes them")
     parser.add_argument(
         "--region",
         action="append",
@@ -64,7 +64,9 @@ def run(args: argparse.Namespace) -> int:
     effects: list[Effect] = [Elasticity(tissue, regions), Held(), NodalForce()]
     if anatomy.slide_normal.any():
         effects.append(Slide())
-    fem = Fem(anatomy, effects, accuracy, args.device, element=args.element)
+    # The file's own elements: who compares with another program means the same discretisation.
+    element = args.element or ("p1" if anatomy.mesh.middles is None else "p2")
+    fem = Fem(anatomy, effects, accuracy, args.device, element=element)
     deformation = fem.deform(loads, start_of(file, args.mesh, UNITS[args.unit]))
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
@@ -82,6 +84,7 @@ def run(args: argparse.Namespace) -> int:
         "residual": residual if np.isfinite(residual) else None,  # JSON knows no infinity
         "load_fraction": reached,
         "element": fem.space.element,
+        "tissue": str(effects[0]),
         "nodes": fem.space.count,
         "seconds": round(seconds, 4),
         "inverted_tetrahedra": inverted,

@@ -1,0 +1,69 @@
+"""What stands in a picture, found again from its pixels alone: an outline by its colour, a line of text by its ink."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from .hud import FONT, WHITE
+from .overlay import outlines
+
+# Middles of lines have their ink's very colour, within rounding.
+SAME = 2
+# Of an outline's pixels this share must be near: corners and crossings of lines are the rest [%].
+SHARE = 95.0
+# So near to what covers it or to the picture's border an outline may be cut [pixel].
+CUT = 5
+# Room round a line of text that holds nothing of its ink: else "1.5" would be found in "11.5" [pixel].
+APART = 8
+
+
+def outline_gap(colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray) -> float:
+    """How far the outline drawn in a picture is from the one that should be there [pixel].
+
+    The larger of two 95th percentiles: from pixels of the ink to the true outline, and from the true outline to them.
+    0 where nothing of the outline can be seen and nothing is drawn, infinite where only one of the two is there.
+
+    Parameters
+    ----------
+    colour, ink
+        The picture (H, W, 3) uint8, and the colour (3,) in 0 .. 255 that outlines are drawn in.
+    mask
+        (H, W) bool: the true silhouette.
+    covered
+        (H, W) bool: what lies in front of the overlay.
+    """
+    found = np.abs(colour.astype(int) - np.rint(ink).astype(int)).max(axis=2) <= SAME
+    true = np.zeros(mask.shape, np.uint8)
+    for outline in outlines(mask):
+        cv2.polylines(true, [outline], True, (1,))
+    shut = cv2.dilate(np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT + 1,) * 2, np.uint8))
+    seen = shut[1:-1, 1:-1] == 0
+    wanted = (true > 0) & seen
+    if not wanted.any() or not (found & seen).any():
+        return 0.0 if not wanted.any() and not (found & seen).any() else np.inf
+    astray, missing = _distance(true > 0)[found & seen], _distance(found)[wanted]
+    return float(max(np.percentile(astray, SHARE), np.percentile(missing, SHARE)))
+
+
+def _distance(mask: np.ndarray) -> np.ndarray:
+    """How far each pixel is from the nearest of a mask (H, W) [pixel]."""
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+
+def stands(colour: np.ndarray, text: str, scale: float, ink: Sequence[float] = WHITE) -> bool:
+    """Whether `hud.write` wrote just this line of text at this scale into the picture (H, W, 3) uint8, anywhere."""
+    (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
+    blank = np.zeros((above + below + 2, width + 2 * APART, 3), np.uint8)
+    cv2.putText(blank, text, (APART, above + 1), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
+    shape = (blank == ink).all(axis=2).astype(np.float32)
+    here = np.pad((colour == np.asarray(ink, np.uint8)).all(axis=2), APART).astype(np.float32)
+    if shape.shape[0] > here.shape[0] or shape.shape[1] > here.shape[1]:
+        return False
+    right = cv2.matchTemplate(here, shape, cv2.TM_CCORR)
+    every = cv2.matchTemplate(here, np.ones_like(shape), cv2.TM_CCORR)
+    count = shape.sum()
+    # All of the text's pixels, and no other of its ink between them.
+    return bool(((right > count - 0.5) & (every < count + 0.5)).any())
