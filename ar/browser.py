@@ -1,4 +1,4 @@
-"""The page: the camera picture, a 3-D view beside it, playback, controls and a report; the only file that knows viser.
+"""The page: the camera picture, a 3-D view beside it, playback, controls and a report, made with viser.
 
 The overlay is composited into the picture before it comes here, and the picture is shown whole, as an image of its own:
 no window shape and no client can bring the two out of register. The 3-D view follows by sending vertices alone.
@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import viser
+
+from .guard import bracketed, open_server
 
 # A client that decodes more slowly than pictures arrive shows none at all.
 PICTURES_PER_SECOND = 15.0
@@ -118,9 +120,11 @@ class Browser:
             A port that is none.
         OSError
             A host that is not this machine.
+        UnguardedError
+            A viser that serves otherwise than `ar.guard` knows.
         """
         check_address(host, port)
-        self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        self.server, self.token = open_server(host, port, title)
         self.dress(title, viewpoint)
         gui = self.server.gui
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
@@ -138,10 +142,10 @@ class Browser:
 
     @property
     def address(self) -> str:
-        """Where the page is, as this machine reaches it."""
+        """Where the page is, as this machine reaches it, with the token that others than this machine need."""
         host = self.server.get_host()
-        name = "localhost" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
-        return f"http://{name}:{self.server.get_port()}"
+        name = "localhost" if host in EVERYWHERE else bracketed(host)
+        return f"http://{name}:{self.server.get_port()}" + (f"/?token={self.token}" if self.token else "")
 
     @property
     def visitors(self) -> int:

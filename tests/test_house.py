@@ -57,7 +57,7 @@ OWNERS = {
     "sklearn": {"surrogate/svr.py"},
     "trimesh": {"scenes/play.py", "scenes/site.py", "scenes/tool.py"},
     "meshio": {"sim/meshfile.py"},
-    "viser": {"ar/browser.py"},
+    "viser": {"ar/browser.py", "ar/guard.py", "ar/messages.py"},
     "nilearn": {"sim/template.py"},
     "onnx": {"surrogate/exchange.py", "surrogate/wire.py"},
     "pyamg": {"sim/amg.py"},

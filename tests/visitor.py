@@ -4,10 +4,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import msgspec
 import viser
 from viser import _messages
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from ar.browser import Browser
@@ -42,8 +44,9 @@ class Visitor:
         )
 
     def listen(self) -> None:
-        for message in self.wire:
-            self.received += len(message)
+        with suppress(ConnectionClosed):
+            for message in self.wire:
+                self.received += len(message)
 
     def say(self, message: _messages.Message) -> None:
         self.wire.send(msgspec.msgpack.encode(message.as_serializable_dict()))

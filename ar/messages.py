@@ -1,0 +1,110 @@
+"""What a visitor may say to the page: where its camera is, and a control's new value within that control's range.
+
+Messages come from outside. What is passed on is written anew from what was checked: nothing else gets through.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated
+
+import msgspec
+import viser
+
+# A longer message is none of a visitor's: camera and value take some 300 bytes.
+LARGEST = 65536
+# Share of a slider's range by which a browser's own rounding may leave it.
+ROUNDING = 1e-6
+
+Pixels = Annotated[float, msgspec.Meta(ge=0.0, le=65536.0)]
+Coordinate = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+
+
+class MessageError(ValueError):
+    """A message that is not passed on; `malformed` where its sender is no page of ours."""
+
+    def __init__(self, reason: str, malformed: bool = False) -> None:
+        super().__init__(reason)
+        self.malformed = malformed
+
+
+class Camera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
+    """Where a visitor looks from, as viser's page says it."""
+
+    wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+    position: Vector
+    fov: Annotated[float, msgspec.Meta(gt=0.0, lt=math.pi)]
+    near: Coordinate
+    far: Coordinate
+    image_height: Pixels
+    image_width: Pixels
+    look_at: Vector
+    up_direction: Vector
+
+    def __post_init__(self) -> None:
+        """Refuse a camera that looks nowhere."""
+        if math.dist(self.position, self.look_at) < 1e-9 or not any(self.up_direction) or not any(self.wxyz):
+            raise ValueError("It looks nowhere.")
+
+
+class Value(msgspec.Struct, forbid_unknown_fields=True):
+    """The one property of a control that a visitor may change."""
+
+    value: bool | int | float | str
+
+
+class Setting(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
+    """A control that a visitor set, as viser's page says it."""
+
+    uuid: str
+    updates: Value
+
+
+DECODER = msgspec.msgpack.Decoder(Camera | Setting)
+
+
+def checked(message: str | bytes, control: Callable[[str], object]) -> bytes:
+    """Return the message as it may be passed on; `control` finds what a visitor can set, by its identifier.
+
+    Raises
+    ------
+    MessageError
+        Anything but a camera, or a value in the range of a control that is there.
+    """
+    if isinstance(message, str):
+        raise MessageError("it is text", malformed=True)
+    try:
+        said = DECODER.decode(message)
+    except msgspec.ValidationError as error:
+        raise MessageError("it is none that a visitor may send") from error
+    except (ValueError, RecursionError) as error:
+        raise MessageError("it cannot be read", malformed=True) from error
+    if isinstance(said, Setting):
+        said.updates.value = ranged(control(said.uuid), said.updates.value)
+    return msgspec.msgpack.encode(said)
+
+
+def ranged(control: object, value: bool | int | float | str) -> bool | int | float | str:
+    """Return the value that a control takes.
+
+    Raises
+    ------
+    MessageError
+        A value of another kind, outside the control's range or not among its options; a control that is not there.
+    """
+    if isinstance(control, viser.GuiButtonHandle | viser.GuiCheckboxHandle) and isinstance(value, bool):
+        return value
+    if isinstance(control, viser.GuiDropdownHandle | viser.GuiButtonGroupHandle) and value in control.options:
+        return value
+    if isinstance(control, viser.GuiSliderHandle) and isinstance(value, int | float) and not isinstance(value, bool):
+        low, high = control.min, control.max
+        slack = ROUNDING * (high - low)
+        whole = isinstance(control.value, int)
+        # A comparison with NaN is false: it ends below.
+        if low - slack <= value <= high + slack and (not whole or value == int(value)):
+            return int(value) if whole else float(min(max(value, low), high))
+    raise MessageError(
+        "it sets a control to what that cannot be" if control is not None else "it sets a control that is not there"
+    )
