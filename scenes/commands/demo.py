@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,17 +77,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
     add_theatre(parser)
-    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default %(default)s)")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to serve on (default %(default)s); one that other machines reach asks visitors for a token",
+    )
     parser.add_argument("--port", type=int, default=8080, help="port, or the next free one (default %(default)s)")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long (default: never)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until interrupted."""
+    """Serve until the time is over, Ctrl-C (exit code 0) or SIGTERM (143)."""
     from ar.browser import check_address
 
-    from ..demo import Demo
-    from ..theatre import open_theatre
+    from ..interrupt import until_ended
 
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
@@ -93,16 +98,27 @@ def run(args: argparse.Namespace) -> int:
         check_address(args.host, args.port)
     except (OSError, ValueError) as error:
         raise InputError(f"no page on host {args.host}, port {args.port} ({error}): choose others.") from error
+    return until_ended(partial(play, args))
+
+
+def play(args: argparse.Namespace, closing: ExitStack) -> int:
+    """Open the page and play; `closing` closes it."""
+    from ar.guard import UnguardedError
+
+    from ..demo import Demo
+    from ..theatre import open_theatre
+
     scene = scene_asked(args, args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = deformer_name(args, theatre, scene)
-    demo = Demo(theatre, scene, name, args.host, args.port)
-    print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
-    print(f"{scene.name} by {theatre.described(name, scene)}")
     try:
-        demo.run(args.seconds)
-    except KeyboardInterrupt:
-        print()
-    finally:
-        demo.close()
+        demo = Demo(theatre, scene, name, args.host, args.port)
+    except UnguardedError as error:
+        raise InputError(str(error)) from error
+    closing.callback(demo.close)
+    print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
+    if demo.browser.token is not None:
+        print("others than this machine reach the page by its name or address in place of localhost, with this token")
+    print(f"{scene.name} by {theatre.described(name, scene)}")
+    demo.run(args.seconds)
     return 0

@@ -1,0 +1,82 @@
+"""A command that serves ends when it is asked to, whatever it computes just then."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import ExitStack
+from types import FrameType
+
+# What Ctrl-C and SIGTERM make of a command's exit code: a visit's ordinary end, and the shell's word for the other.
+CODES = {signal.SIGINT: 0, signal.SIGTERM: 128 + signal.SIGTERM}
+# How long cleaning up may take after a signal [s].
+PATIENCE = 0.3
+# How often the main thread looks for a signal [s]: the system may give one to another thread, which does not wake it.
+POLL = 0.1
+
+
+class Ended(BaseException):
+    """The main thread's word that a signal came."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.code = CODES[signal.Signals(number)]
+
+
+def until_ended(work: Callable[[ExitStack], int]) -> int:
+    """Return what `work` returns, once it has cleaned up; at a signal, clean up and leave the process at once.
+
+    A thread of its own does the work: the main thread, which alone hears signals, is free to hear them while the work
+    is in a long call. What is computed at a signal is dropped with the process: no file is open for writing here.
+
+    Parameters
+    ----------
+    work
+        Puts what closes it on the stack it is given.
+    """
+    closing = ExitStack()
+    if threading.current_thread() is not threading.main_thread():
+        with closing:
+            return work(closing)
+    result: Future[int] = Future()
+    before = {number: signal.getsignal(number) for number in CODES}
+    try:
+        for number in CODES:
+            signal.signal(number, leave)
+        worker = threading.Thread(target=fulfil, args=(result, work, closing), name="work", daemon=True)
+        worker.start()
+        while worker.is_alive():
+            worker.join(POLL)
+        return result.result()
+    except Ended as ended:
+        for number in CODES:
+            signal.signal(number, signal.SIG_IGN)
+        cleaner = threading.Thread(target=closing.close, name="closing", daemon=True)
+        cleaner.start()
+        cleaner.join(PATIENCE)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(ended.code)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def leave(number: int, frame: FrameType | None) -> None:
+    """Wake the main thread, at a signal."""
+    raise Ended(number)
+
+
+def fulfil(result: Future[int], work: Callable[[ExitStack], int], closing: ExitStack) -> None:
+    """Do the work, close, and note what came of it."""
+    try:
+        with closing:
+            code = work(closing)
+    except BaseException as error:
+        result.set_exception(error)
+    else:
+        result.set_result(code)

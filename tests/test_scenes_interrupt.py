@@ -1,0 +1,87 @@
+"""`sulcus demo` ends at a signal, however long what it computes takes."""
+
+import signal
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from scenes.interrupt import until_ended
+
+COMMAND = """
+import argparse, sys, threading, time
+from types import SimpleNamespace as Names
+
+class Demo:
+    def __init__(self, *words):
+        self.browser = Names(address="here", token=None)
+        self.solve = threading.Thread(target=time.sleep, args=(100.0,), daemon=True)
+        self.solve.start()
+
+    def run(self, seconds):
+        print("playing", flush=True)
+        getattr(self, sys.argv[1])()
+
+    def computing(self):
+        self.solve.join()
+
+    def ending(self):
+        self.solve = threading.Thread(target=print)
+        self.solve.start()
+
+    def close(self):
+        print("page closed", flush=True)
+        self.solve.join()
+        print("all closed", flush=True)
+
+theatre = Names(models={"linear"}, best=lambda scene: "linear", knowing=lambda scene: True)
+sys.modules["scenes.demo"] = Names(Demo=Demo)
+sys.modules["scenes.scene"] = Names(find_scene=lambda name: None)
+sys.modules["scenes.theatre"] = Names(open_theatre=lambda *words: theatre)
+from scenes.commands.demo import add_arguments, run
+parser = argparse.ArgumentParser()
+add_arguments(parser)
+sys.exit(run(parser.parse_args(["--port", "0"])))
+"""
+
+
+def started(what):
+    command = [sys.executable, "-c", COMMAND, what]
+    root = Path(__file__).parents[1]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=root)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_a_signal_closes_the_page_and_waits_for_no_solve(number, code):
+    """Page's loop and referee are in a solve of 100 s; the limit on this test is far below, and far above a second."""
+    process = started("computing")
+    try:
+        assert process.stdout is not None and any("playing" in line for line in process.stdout)
+        process.send_signal(number)
+        out, error = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert process.returncode == code
+    assert "page closed" in out and "all closed" not in out and error == ""
+
+
+def test_at_its_own_end_everything_is_closed():
+    out, error = (process := started("ending")).communicate(timeout=60)
+    assert process.returncode == 0 and "all closed" in out and error == ""
+
+
+def test_what_goes_wrong_is_told_and_handlers_are_given_back():
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    closed = []
+
+    def work(closing: ExitStack) -> int:
+        closing.callback(closed.append, True)
+        raise TimeoutError("too late")
+
+    with pytest.raises(TimeoutError, match="too late"):
+        until_ended(work)
+    assert closed == [True]
+    assert until_ended(lambda closing: 7) == 7
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
