@@ -82,6 +82,14 @@ class Playback:
     sought: Callable[[int], None]
 
 
+@dataclass(frozen=True)
+class Deed:
+    """What a visitor set last: the visitor's number, from 1, and the label of the control."""
+
+    visitor: int
+    label: str
+
+
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
     """Where the 3-D view starts: eye, target and up direction, (3,) [m]."""
@@ -134,7 +142,11 @@ class Browser:
         self.inputs = {control.label: self.add_control(control) for control in controls}
         gui.add_markdown(caption)
         self.meshes = {body.name: self.add_body(body) for body in bodies}
-        self.newest: dict[str, Callable[[], None]] = {}
+        # What the newest message did, as the `changed` that it calls may ask.
+        self.deed: Deed | None = None
+        # The line that each visitor alone reads, by viser's identifier.
+        self.lines: dict[int, viser.GuiMarkdownHandle] = {}
+        self.newest: dict[str, Callable[[], object]] = {}
         self.lock = threading.Lock()
         self.closed = threading.Event()
         self.sender = threading.Thread(target=self.send, name="page", daemon=True)
@@ -151,6 +163,11 @@ class Browser:
     def visitors(self) -> int:
         """How many browsers look at the page now."""
         return len(self.server.get_clients())
+
+    @property
+    def here(self) -> set[int]:
+        """Numbers of the visitors who look at the page now, from 1 in the order that they came."""
+        return {identifier + 1 for identifier in self.server.get_clients()}
 
     def show(self, number: int, colour: np.ndarray) -> None:
         """Show the picture (H, W, 3) uint8 of frame `number`, and put the playback slider there."""
@@ -176,6 +193,22 @@ class Browser:
         """Show Markdown text between playback and controls."""
         self.note("report", lambda: setattr(self.text, "content", markdown))
 
+    def tell(self, line: Callable[[int], str]) -> None:
+        """Show each visitor a line of Markdown of its own under the report: `line` takes the visitor's number."""
+
+        def send() -> None:
+            clients = {} if self.closed.is_set() else self.server.get_clients()
+            self.lines = {identifier: text for identifier, text in self.lines.items() if identifier in clients}
+            for identifier, client in clients.items():
+                if identifier not in self.lines:
+                    self.lines[identifier] = client.gui.add_markdown("", order=self.text.order + 0.5)
+                content = line(identifier + 1)
+                if self.lines[identifier].content != content:
+                    self.lines[identifier].content = content
+
+        # There, no visitor leaves meanwhile.
+        self.note("lines", lambda: self.server.get_event_loop().call_soon_threadsafe(send))
+
     def put(self, label: str, value: float | str) -> None:
         """Set a control without calling its `changed`, as when a script moves the tool."""
         control = self.inputs[label]
@@ -187,7 +220,7 @@ class Browser:
         self.sender.join()
         self.server.stop()
 
-    def note(self, key: str, send: Callable[[], None]) -> None:
+    def note(self, key: str, send: Callable[[], object]) -> None:
         """Keep the newest thing to send of each kind."""
         with self.lock:
             self.newest[key] = send
@@ -245,7 +278,8 @@ class Browser:
             button.icon = viser.Icon.PLAYER_PAUSE if plays else viser.Icon.PLAYER_PLAY
             playback.played(plays)
 
-        self.hear(self.frame, playback.sought)
+        # The slider of a single frame has a second place: it must have a length.
+        self.hear(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
 
     def add_control(self, control: Slider | Choice | Toggle) -> viser.GuiInputHandle:
         """A slider, a list or a box to tick."""
@@ -269,6 +303,7 @@ class Browser:
         async def update(event: viser.GuiEvent) -> None:
             # The page's own updates come through here too, without a client.
             if event.client is not None:
+                self.deed = Deed(event.client.client_id + 1, control.label)
                 changed(control.value)
 
     def add_body(self, body: Body) -> viser.MeshHandle:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time as clock
+import traceback
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -11,8 +13,10 @@ import numpy as np
 
 from ar.browser import Body, Browser, Choice, Playback, Slider, Toggle, Viewpoint
 from sim.effects import Elasticity, Held, Slide
+from sim.errors import InputError
 
 from .ablation import without
+from .holding import holding
 from .paths import AIR, Touch
 from .play import Frame, Player
 from .reel import Session
@@ -27,6 +31,8 @@ SCRIPT, HAND = "script", "hand"
 FEM_COLOUR = (0.95, 0.35, 0.75)
 CAPTION = """Left: the camera picture with the predicted tumour in register. Right: the same in 3-D, the tumour of the
 finite elements as a pink wire. Research only."""
+# How long a page that plays shows why a frame is left out [s].
+READING = 2.0
 HANDS = "Moving a slider takes the tool over; **tool: script** gives it back."
 
 
@@ -37,6 +43,7 @@ class Wish:
     deformer: str
     touch: Touch
     tool: str = SCRIPT
+    holder: int | None = None
     plays: bool = True
     number: int = 0
     off: frozenset[str] = frozenset()
@@ -97,10 +104,37 @@ class Demo:
         )
         self.referee = Referee(theatre, scene)
         self.tally = Tally()
+        self.asked, self.drawn = self.wish.now(), 0
 
     def run(self, seconds: float = float("inf")) -> int:
-        """Play until the time is over; returns the frames drawn."""
-        scene, drawn = self.stage.scene, 0
+        """Play until the time is over; returns the frames drawn. What fails is said on the page, and is left out."""
+        self.drawn, end = 0, clock.perf_counter() + seconds
+        while (left := end - clock.perf_counter()) > 0.0:
+            try:
+                self._play(left)
+            except Exception as error:
+                self._leave_out(error, end)
+        return self.drawn
+
+    def _leave_out(self, error: Exception, end: float) -> None:
+        """Say why a frame is not shown, until there is time to read it or a visitor asks for another; then go on."""
+        said = str(error)
+        if not isinstance(error, InputError):
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            said = f"a defect: {type(error).__name__}, {error}"
+            print(f"sulcus demo: {said} (line {place.lineno} of {place.filename})", file=sys.stderr)
+        self.browser.report(f"error: this frame is left out ({said})")
+        self._tell()
+        until = min(end, clock.perf_counter() + READING)
+        while self.wish.now() == self.asked and (clock.perf_counter() < until or not self.wish.plays):
+            if clock.perf_counter() >= end:
+                return
+            clock.sleep(1.0 / self.stage.scene.frames_per_second)
+        self.wish.go_on(self.asked[0], len(self.stage.scene.times))
+
+    def _play(self, seconds: float) -> None:
+        """Play until the time is over or something fails."""
+        scene = self.stage.scene
         frame: Frame | None = None
         own: Truth | None = None
         end = clock.perf_counter() + seconds
@@ -109,7 +143,7 @@ class Demo:
         verdict = "error: the finite elements are being prepared"
         while clock.perf_counter() < end:
             begun = clock.perf_counter()
-            number, name, touch, off = asked = self.wish.now()
+            number, name, touch, off = asked = self.asked = self.wish.now()
             name = "fem" if off else name  # nobody else was taught without
             session = self._session(name, off)
             player = session.player
@@ -129,17 +163,24 @@ class Demo:
                 if not off:
                     self.tally.took(name, answer.cost.total)
                 self._show(frame, player)
-                drawn += 1
+                self.drawn += 1
             truth = own or self.referee.truth
             if truth is not None and (truth, name, off) != judged and (not off or truth.number == frame.number):
                 self._wire(truth, player)
                 verdict = changed(self.stage, truth, frame, off) if off else self._judge(truth, name)
                 judged = (truth, name, off)
             if self.referee.failure is not None:
-                verdict = f"error: the finite elements do not answer any more ({self.referee.failure})"
+                what = "this" if self.referee.thread.is_alive() else "any more"
+                verdict = f"error: the finite elements do not answer {what} ({self.referee.failure})"
             self.browser.report(self._report(frame, name, verdict))
+            self._tell()
             clock.sleep(max(0.0, 1.0 / scene.frames_per_second - (clock.perf_counter() - begun)))
-        return drawn
+
+    def _tell(self) -> None:
+        """Tell each visitor who has the tool."""
+        if self.stage.scene.tool is not None:
+            holder, here = self.wish.holder, self.browser.here
+            self.browser.tell(lambda visitor: holding(visitor, holder, here))
 
     def close(self) -> None:
         """Stop the page and the referee."""
@@ -190,14 +231,19 @@ class Demo:
 
     def _give(self, tool: str, **wishes: int) -> None:
         """The menu, or the frame slider, gave the tool away; the menu says so after whatever is on its way to it."""
-        self.wish.set(tool=tool, **wishes)
+        self.wish.set(tool=tool, holder=self._visitor() if tool == HAND else None, **wishes)
         if self.stage.scene.tool is not None:
             self.browser.put("tool", tool)
 
     def _take(self, **values: float) -> None:
         """A slider was moved: the tool is in the visitor's hand."""
+        self.wish.set(holder=self._visitor())
         self.wish.hand(**values)
         self.browser.put("tool", HAND)
+
+    def _visitor(self) -> int | None:
+        """Who set what is heard now."""
+        return None if self.browser.deed is None else self.browser.deed.visitor
 
     def _bodies(self) -> list[Body]:
         positions = self.stage.site.anatomy.mesh.nodes

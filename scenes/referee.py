@@ -7,6 +7,7 @@ import time as clock
 from dataclasses import dataclass
 
 from sim.deformation import Deformation
+from sim.errors import InputError
 from sim.loads import Loads
 
 from .paths import Touch
@@ -29,7 +30,7 @@ class Referee:
     """A thread that answers the newest frame by finite elements; older ones that it did not reach are dropped.
 
     Frames on the way to it that what went before is known from are answered too. Where the finite elements fail,
-    `failure` says why, and no further frames are answered.
+    `failure` says why, and no further frames are answered; where they refuse loads, that frame is left out alone.
     """
 
     def __init__(self, theatre: Theatre, scene: Scene) -> None:
@@ -70,8 +71,12 @@ class Referee:
                     return
                 question = self.newest
             begun, (asked, touch) = clock.perf_counter(), question
-            number, answer = session.towards(asked, touch)
-            self.truth = Truth(number, session.player.loads(number, touch), answer, clock.perf_counter() - begun)
+            try:
+                number, answer = session.towards(asked, touch)
+                self.truth = Truth(number, session.player.loads(number, touch), answer, clock.perf_counter() - begun)
+                self.failure = None
+            except InputError as error:
+                number, self.failure = asked, error
             with self.wake:
                 if self.newest is question and number == asked:
                     self.newest = None

@@ -1,0 +1,145 @@
+"""Visitors who share a page: what one of them asks ends it for nobody, and each reads who has the tool."""
+
+import threading
+
+import pytest
+from theatres import small, theatre_of
+from visitor import Visitor, free_port, wait_for
+
+from scenes.demo import SCRIPT, Demo
+from scenes.holding import holding
+from scenes.paths import press
+from scenes.play import Player
+from scenes.referee import Referee
+from scenes.theatre import Theatre
+from sim.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture
+def scene():
+    return small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
+
+
+class Silent:
+    """A referee that has nothing to say, and no finite elements to prepare."""
+
+    truth, failure = None, None
+
+    def __init__(self, theatre, scene):
+        pass
+
+    def ask(self, number, touch):
+        pass
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def demo(theatre, scene, monkeypatch):
+    monkeypatch.setattr("scenes.demo.Referee", Silent)
+    demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
+    demo.wish.set(plays=False)
+    yield demo
+    demo.close()
+
+
+@pytest.fixture
+def running(demo):
+    """The loop on a thread of its own, for a test's time; what it raises fails the test."""
+    done = threading.Event()
+    failed = []
+
+    def play():
+        while not done.is_set():
+            try:
+                demo.run(0.3)
+            except Exception as error:
+                failed.append(error)
+                return
+
+    loop = threading.Thread(target=play)
+    loop.start()
+    yield demo
+    done.set()
+    loop.join()
+    assert not failed
+
+
+def report(demo):
+    return demo.browser.text.content
+
+
+def refuse(monkeypatch, refused, error):
+    """Have loads refused that `refused` says, by frame number and touch."""
+    loads = Player.loads
+
+    def refusing(player, number, touch=None):
+        if refused(number, touch):
+            raise error
+        return loads(player, number, touch)
+
+    monkeypatch.setattr(Player, "loads", refusing)
+
+
+def test_a_load_that_is_refused_is_said_on_the_page_which_goes_on(running, monkeypatch):
+    refuse(monkeypatch, lambda number, touch: touch and touch.force > 0.3, InputError("0.35 N is too much: push less."))
+    one, other = Visitor(running.browser, 1200), Visitor(running.browser, 1200)
+    assert wait_for(lambda: running.browser.visitors == 2)
+    one.set(running.browser.inputs["force [N]"], 0.35)
+    assert wait_for(lambda: "error: this frame is left out (0.35 N is too much: push less.)" in report(running))
+    other.set(running.browser.inputs["force [N]"], 0.21)
+    assert wait_for(lambda: "force 0.21 N" in report(running))
+    one.wire.close()
+    other.wire.close()
+
+
+def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd):
+    monkeypatch.setattr("scenes.demo.READING", 0.2)
+    refuse(monkeypatch, lambda number, touch: number == 5, IndexError("none such"))
+    demo.wish.set(plays=True, number=4)
+    assert demo.run(2.0) > 1
+    assert demo.wish.number > 5
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and "sulcus demo: a defect: IndexError, none such (line" in said
+
+
+def test_loads_that_the_finite_elements_refuse_are_left_out_alone(theatre, scene, monkeypatch):
+    refuse(monkeypatch, lambda number, touch: number == 7, InputError("7 is refused."))
+    player = theatre.player("linear", scene)  # as quick to have, and asked the same way
+    monkeypatch.setattr(Theatre, "player", lambda *words: player)
+    referee = Referee(theatre, scene)
+    referee.ask(7, None)
+    assert wait_for(lambda: str(referee.failure) == "7 is refused.")
+    referee.ask(8, None)
+    assert wait_for(lambda: referee.truth is not None and referee.truth.number == 8)
+    assert referee.failure is None and referee.thread.is_alive()
+    referee.close()
+
+
+def test_each_visitor_reads_who_has_the_tool(running):
+    page = running.browser
+    one = Visitor(page, 1200)
+    assert wait_for(lambda: page.visitors == 1)
+    other = Visitor(page, 1200)
+    assert wait_for(lambda: page.here == {1, 2})
+
+    def read():
+        return [line.content for _, line in sorted(page.lines.items())]
+
+    assert wait_for(lambda: len(read()) == 2 and all("script moves the tool; 2 visitors" in line for line in read()))
+    one.set(page.inputs["force [N]"], 0.31)
+    assert wait_for(lambda: "**you hold the tool**" in read()[0] and "another visitor (number 1) holds" in read()[1])
+    other.set(page.inputs["place up [mm]"], 3.0)
+    assert wait_for(lambda: "another visitor (number 2) holds" in read()[0] and "**you hold" in read()[1])
+    other.wire.close()
+    assert wait_for(lambda: read() == [holding(1, 2, {1})])
+    assert "visitor 2 held the tool and has left" in read()[0]
+    one.set(page.inputs["tool"], SCRIPT)
+    assert wait_for(lambda: read() == ["the script moves the tool"])
+    one.wire.close()
