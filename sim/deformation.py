@@ -11,7 +11,11 @@ import numpy as np
 
 from .anatomy import Anatomy
 from .errors import InputError
-from .loads import Loads, all_finite
+from .given import all_finite, as_array, numbers, whole_numbers
+from .loads import Loads
+
+# Begins the history's keys of what only shortens the way to the next answer: whoever reads it may forget it.
+LEARNT_KEY = "l-bfgs "
 
 
 class Outcome(Enum):
@@ -136,19 +140,20 @@ class Deformation:
         Raises
         ------
         InputError
-            A vertex that is not among `self.nodes`.
+            A vertex that is not among `self.nodes`; what are no whole numbers.
         """
+        nodes = whole_numbers("the vertices", nodes)
         if np.array_equal(nodes, self.nodes):
             return self
-        order = np.argsort(self.nodes)
-        position = order[np.searchsorted(self.nodes, nodes, sorter=order).clip(max=len(order) - 1)]
-        missing = self.nodes[position] != nodes
+        missing = ~np.isin(nodes, self.nodes)
         if missing.any():
             raise InputError(
-                f"this deformation does not know vertex {np.asarray(nodes)[missing][0]}: ask for one of its "
-                f"{len(self.nodes)} vertices."
+                f"this deformation does not know vertex {nodes[missing][0]}: ask for one of its {len(self.nodes)} "
+                "vertices."
             )
-        return replace(self, displacement=self.displacement[:, position], nodes=np.asarray(nodes))
+        order = np.argsort(self.nodes)
+        position = order[np.searchsorted(self.nodes, nodes, sorter=order)]
+        return replace(self, displacement=self.displacement[:, position], nodes=nodes)
 
 
 def joined(parts: Sequence[Deformation]) -> Deformation:
@@ -176,8 +181,42 @@ def joined(parts: Sequence[Deformation]) -> Deformation:
     )
 
 
+def check_start(start: Deformation, count: int, vertices: int) -> None:
+    """Refuse a start that is not one of `count` load cases at all vertices of the mesh.
+
+    Raises
+    ------
+    InputError
+        What is no deformation; displacements of another shape; times or a history of other rows, or not finite.
+    """
+    if not isinstance(start, Deformation):
+        raise InputError(f"the start is a {type(start).__name__}: give a Deformation, or none.")
+    if np.shape(start.displacement) != (count, vertices, 3):
+        raise InputError(
+            f"the start has displacements of shape {np.shape(start.displacement)}: give every vertex of {count} load "
+            f"cases, ({count}, {vertices}, 3)."
+        )
+    for name, values in {"time": start.time, **start.history}.items():
+        array = as_array(f"the start's {name!r}", values)
+        good = array.dtype.kind in "fiu" and array.shape[:1] == (count,)
+        if not good or not (name.startswith(LEARNT_KEY) or all_finite(array)):
+            raise InputError(
+                f"the start's {name!r} are no {count} rows of finite numbers: start from an answer to {count} loads as "
+                "it came, or from rest."
+            )
+
+
 def guess(displacement: np.ndarray) -> Deformation:
-    """A start for a deformer: displacements (B, V, 3) [m] of every vertex that somebody has thought of."""
+    """A start for a deformer: displacements (B, V, 3) [m] of every vertex that somebody has thought of.
+
+    Raises
+    ------
+    InputError
+        Displacements of another shape, or not finite.
+    """
+    displacement = numbers("a guessed displacement", displacement)
+    if displacement.ndim != 3 or displacement.shape[2] != 3:
+        raise InputError(f"a guessed displacement has shape {displacement.shape}: give (B, V, 3) [m].")
     count, vertices, _ = displacement.shape
     unknown, none = np.full(count, np.nan), np.zeros(count)
     every, outcomes = np.arange(vertices), (Outcome.GUESSED,) * count

@@ -7,17 +7,20 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache, cached_property, lru_cache, partial
+from threading import RLock
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
 from .accuracy import TRAIN, Accuracy
+from .alone import alone
 from .anatomy import Anatomy
-from .columns import norms, unstacked
+from .at_rest import Resting
+from .columns import unstacked
 from .compile import check_causes, compile_problem
 from .correction import step_from
-from .deformation import Cost, Deformation, joined
+from .deformation import LEARNT_KEY, Cost, Deformation, check_start, joined
 from .device import find_device
 from .discretisation import discretise
 from .effects import Effect, solver_named
@@ -26,16 +29,16 @@ from .errors import InputError
 from .following import Following
 from .footprint import Skin
 from .frame import Frame
+from .given import at_least, vertex_numbers
 from .heading import moved_on, pushes_of, way_of
 from .inversion import Inversion
 from .ladder import FEWEST, Answer, Ladder, shortfall
-from .lbfgs import LEARNT_KEY, TAUGHT
-from .linear import Preconditioner, conjugate_gradients
+from .lbfgs import TAUGHT
 from .loads import Displaced, Loads, Nodal, Pushed
 from .memory import check_fits, fitting_batch
 from .pace import KEPT, alike
 from .patching import patching
-from .precondition import choose_preconditioner, is_exact, name_of, rest_solver
+from .precondition import choose_preconditioner, is_exact, name_of
 from .problem import Problem
 from .series import Reading, factors, taylor, terms_of
 from .still import Still
@@ -45,15 +48,13 @@ from .vicinity import vicinity_of
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"
-# Relative residual of a series' linear solves.
-SERIES_TOLERANCE = 1e-9
-# Up to so many unknowns a series' solves are worth a factor of their own on the CPU. Of 17,000 smoothed nodes it takes
-# 12 s, and a solve 10 ms instead of 295 by two levels.
-LARGEST_SERIES_FACTOR = 60_000
 
 
 class Fem:
     """A Deformer: static equilibrium by finite elements; a step in time where effects need it.
+
+    Threads may share it: they take turns under its `lock`, and each gets the answer that it would get alone. To use
+    several cores at once, give each thread a `Fem` of its own.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ class Fem:
     Raises
     ------
     InputError
-        Effects or elements that cannot be had, a body that is not held, a device that is not there.
+        Effects or elements that cannot be had, a body that is not held, a device that is not there, a batch of none.
     """
 
     def __init__(
@@ -89,6 +90,9 @@ class Fem:
         element: str | None = None,
         live: bool = False,
     ):
+        if not isinstance(accuracy, Accuracy):
+            raise InputError(f"accuracy is {accuracy!r:.80}: give an Accuracy, such as LIVE, TRAIN or REFERENCE.")
+        self.lock = RLock()
         self._anatomy = anatomy
         self.effects = tuple(effects)
         self.accuracy = accuracy
@@ -102,13 +106,14 @@ class Fem:
         if problem.device.on_cuda:
             near()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
         vicinity = vicinity_of(problem, preconditioner, self.effects, self.space) if plain else None
-        fitting = fitting_batch(problem.rows, problem.device) if batch is None else batch
+        fitting = fitting_batch(problem.rows, problem.device) if batch is None else at_least("batch", batch, 1)
         self.batch = fitting if vicinity is None else 1  # each load has a vicinity of its own
         patching_pays = live and plain and vicinity is None
         patch = patching(problem, preconditioner, self.effects, self.space) if patching_pays else None
         inversion = Inversion(self.space, problem.device)
         self._ladder = Ladder(problem, preconditioner, inversion, accuracy, near, vicinity or patch)
         self._paced = lru_cache(KEPT)(self._ladder_over)
+        self._resting = Resting(problem, preconditioner, accuracy.inner)
 
     @cached_property
     def description(self) -> str:
@@ -125,6 +130,7 @@ class Fem:
         """The body that is deformed."""
         return self._anatomy
 
+    @alone
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Static equilibrium under every load case.
 
@@ -138,7 +144,7 @@ class Fem:
             not; a vertex that the mesh does not have.
         """
         check_causes(self.effects, loads)
-        self._check_vertices(at)
+        at = None if at is None else self._vertices(at)
         if start is not None and self._following is not None:
             answer = self._following.answer(loads, start, lambda: self._guess(loads, start))
             if answer is not None:
@@ -183,13 +189,10 @@ class Fem:
             return None
         ladder = self._ladder
         frame = Frame(self.problem, ladder.preconditioner, ladder.inversion, self._skin, self.accuracy.tolerance)
-        return Following(self.problem, ladder.inversion, frame, self.description)
+        return Following(self.problem, ladder.inversion, frame, self.lock, self.description)
 
-    def _check_vertices(self, at: np.ndarray | None) -> None:
-        count = len(self._anatomy.mesh.nodes)
-        beyond = np.zeros(0) if at is None else at[(at < 0) | (at >= count)]
-        if len(beyond):
-            raise InputError(f"the mesh has no vertex {beyond[0]}: ask for some of 0 to {count - 1}.")
+    def _vertices(self, at: np.ndarray) -> np.ndarray:
+        return vertex_numbers("at", at, len(self._anatomy.mesh.nodes))
 
     def _check_static(self, loads: Loads) -> None:
         check_causes(self.effects, loads)
@@ -201,6 +204,7 @@ class Fem:
         linear = discretise(self._anatomy.mesh, "p1")
         return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature(step)
 
+    @alone
     def residual(self, loads: Loads, answer: Deformation) -> np.ndarray:
         """The relative residual (B,), in this solver's precision, of somebody's answers at every vertex.
 
@@ -213,6 +217,7 @@ class Fem:
         self.problem.begin(Cases(loads, answer.time, answer.history))
         return shortfall(self.problem, self.problem.device.array(self._guess(loads, answer)))
 
+    @alone
     def corrected(
         self, loads: Loads, answer: Deformation, at: np.ndarray
     ) -> tuple[Deformation, np.ndarray, np.ndarray]:
@@ -227,7 +232,7 @@ class Fem:
             As `residual`.
         """
         self._check_static(loads)
-        self._check_vertices(at)
+        at = self._vertices(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
         guess, cases = self._guess(loads, answer), Cases(loads, answer.time, answer.history)
         parts = []
@@ -238,6 +243,7 @@ class Fem:
         answers, before, left = zip(*parts, strict=True)
         return _joined(list(answers)), np.concatenate(before), np.concatenate(left)
 
+    @alone
     def reading(self, nodes: np.ndarray, modes: np.ndarray) -> Reading:
         """What `series` is asked for: the shares that modes (r, n, 3) have in the motion of vertices `nodes` (n,).
 
@@ -246,7 +252,7 @@ class Fem:
         InputError
             A vertex that the mesh does not have; memory that would not fit.
         """
-        self._check_vertices(nodes)
+        nodes = self._vertices(nodes)
         device, rows = self.problem.device, (3 * nodes[:, None] + np.arange(3)).ravel()
         check_fits(self.problem.rows, self.batch, len(modes), device, self._ladder.held)
         answers = np.empty((len(modes), self.problem.rows))
@@ -255,9 +261,10 @@ class Fem:
             force[rows] = modes[some].reshape(-1, len(rows)).T
             on_device = device.array(force)
             self.problem.constraint.project(on_device)
-            answers[some] = self._at_rest(on_device).numpy().T
+            answers[some] = self._resting.answer(on_device).numpy().T
         return Reading(answers, device)
 
+    @alone
     def series(self, loads: Loads, orders: int, reading: Reading, sizes: int = 1) -> np.ndarray:
         """Power series (G, terms, r) of what is read of the answers, in the sizes of the loads, as far as it converges.
 
@@ -292,44 +299,15 @@ class Fem:
             for first in range(0, len(found), max(groups, 1)):
                 some = loads.rows(slice(first * sizes, (first + groups) * sizes))
                 self.problem.begin(Cases(some, np.zeros(len(some))))
-                forces = taylor(self.problem, self._at_rest, len(some), sizes, edge, orders)
+                forces = taylor(self.problem, self._resting.answer, len(some), sizes, edge, orders)
                 told = [reading.of(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
                 found[first : first + groups] = np.concatenate(told, axis=1)
         return found
 
-    @cached_property
-    def _exact(self) -> Preconditioner | None:
-        """The inverse of the rest stiffness in the solver's own precision, where one is had or pays for many solves."""
-        pays = not self.problem.device.on_cuda and self.problem.rows <= LARGEST_SERIES_FACTOR
-        return rest_solver(self.problem) if pays or is_exact(self._ladder.preconditioner) else None
-
-    def _at_rest(self, force: wp.array) -> wp.array:
-        """Motions (3N, b) [m] that the stiffness at rest answers forces (3N, b) [N] with; the forces are lost."""
-        problem, columns = self.problem, force.shape[1]
-        if self._exact is not None:
-            out = problem.device.zeros(*force.shape)
-            self._exact.apply(force, np.ones(columns, bool), out)
-            problem.constraint.project(out)
-            return out
-        problem.linearise(problem.device.zeros(*force.shape), np.zeros(columns, bool))
-        self._ladder.preconditioner.prepare(problem, columns)
-        wanted = SERIES_TOLERANCE * norms(problem.device, force)
-        found = conjugate_gradients(problem, self._ladder.preconditioner, force, wanted, self.accuracy.inner)
-        if (norms(problem.device, force) > 10.0 * wanted).any():
-            raise InputError(
-                f"a linear solve of the series did not reach {SERIES_TOLERANCE:g} in {self.accuracy.inner} iterations: "
-                "ask for an Accuracy of more `inner` ones."
-            )
-        return found.x
-
     def _guess(self, loads: Loads, start: Deformation) -> np.ndarray:
         """First guesses (3N, B) [m]."""
         vertices = len(self._anatomy.mesh.nodes)
-        if start.displacement.shape != (len(loads), vertices, 3):
-            raise InputError(
-                f"the start has displacements of shape {start.displacement.shape}: give every vertex of "
-                f"{len(loads)} load cases, ({len(loads)}, {vertices}, 3)."
-            )
+        check_start(start, len(loads), vertices)
         full = self.space.interpolated(start.at(np.arange(vertices)).displacement)
         if len(self.space.edges) and MIDDLES in start.history:
             full[:, vertices:] += start.history[MIDDLES]

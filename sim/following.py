@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from threading import RLock
 from typing import Any
 from weakref import ref
 
 import numpy as np
 
-from .deformation import Cost, Deformation, Outcome
+from .deformation import LEARNT_KEY, Cost, Deformation, Outcome
 from .frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, Frame
 from .heading import BEFORE, PUSHES, knows, pushes_of, shares, way_of
 from .inversion import Inversion
-from .lbfgs import LEARNT, LEARNT_KEY, learnt_from, rows_first
+from .lbfgs import LEARNT, learnt_from, rows_first
 from .loads import Loads
 from .problem import Problem
 from .room import State
@@ -29,17 +30,22 @@ TURNED, BACK = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 class Kept(Mapping[str, Any]):
-    """A history of which the learnt pairs stay on the device until they are read, or about to be written over."""
+    """A history of which the learnt pairs stay on the device until they are read, or about to be written over.
 
-    def __init__(self, own: Mapping[str, np.ndarray], state: State):
+    `lock` is that of who answers: another thread may read while the next frame is about to be made.
+    """
+
+    def __init__(self, own: Mapping[str, np.ndarray], state: State, lock: RLock):
         self._own = dict(own)
+        self._lock = lock
         self.state: State | None = state
 
     def settle(self) -> None:
         """Bring to the host what is still on the device."""
-        if self.state is not None:
-            self._own |= {LEARNT_KEY + name: rows_first(self.state.columns[name]) for name in LEARNT}
-            self.state = None
+        with self._lock:
+            if self.state is not None:
+                self._own |= {LEARNT_KEY + name: rows_first(self.state.columns[name]) for name in LEARNT}
+                self.state = None
 
     def __getitem__(self, key: str) -> Any:
         if key not in self._own:
@@ -64,12 +70,15 @@ class Following:
         What the frame solves, and who counts its tetrahedra.
     frame
         Where that is done.
+    lock
+        Held by who asks for an answer.
     source
         What the answers call their solver.
     """
 
-    def __init__(self, problem: Problem, inversion: Inversion, frame: Frame, source: str = ""):
-        self._problem, self._inversion, self._frame, self._source = problem, inversion, frame, source
+    def __init__(self, problem: Problem, inversion: Inversion, frame: Frame, lock: RLock, source: str):
+        self._problem, self._inversion, self._frame, self._lock = problem, inversion, frame, lock
+        self._source = source
         self._nodes = np.arange(problem.rows // 3)
         self._last: Callable[[], Deformation | None] = _gone
         # Histories whose pairs stand where the frame ended, and where it began.
@@ -100,7 +109,7 @@ class Following:
         found = self._frame.push(point, radius, force, share)
         if found[STATUS] != DONE or found[INVERTED]:
             return None
-        history = Kept(way, self._frame.state)
+        history = Kept(way, self._frame.state, self._lock)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
         displacement = found[HEAD:].reshape(1, -1, 3).copy()
         displacement.setflags(write=False)  # as a start, the device's own stands in for it

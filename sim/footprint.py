@@ -18,6 +18,8 @@ from .errors import InputError
 FINENESS = 0.12
 # Each edge in so many pieces at least, and then in twice as many until that is fine enough.
 PIECES = 8
+# No edge is cut into more: a footprint of 0.1 mm needs them on a triangle of 50 m.
+MOST_PIECES = 2**22
 # Triangles that one thread searches, and findings of which it takes the nearest.
 CHUNK = wp.constant(16)
 
@@ -74,15 +76,19 @@ class Skin:
         (S, 3), or (S, 6) with the middles of `TRIANGLE_EDGES` if quadratic. The corners say where they lie.
     device
         Where its arrays live.
+    name
+        What a sentence calls it.
     """
 
-    def __init__(self, nodes: np.ndarray, triangles: np.ndarray, device: Device):
-        self.device = device
+    def __init__(self, nodes: np.ndarray, triangles: np.ndarray, device: Device, name: str = "surface"):
+        self.device, self._name = device, name
         self.nodes, table = np.unique(triangles, return_inverse=True)
         self.numbers = device.array(self.nodes, wp.int32)
         corners = nodes[triangles[:, :3]]
         centre = corners.mean(axis=1)
         reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+        edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0)
+        self._least = edge / (FINENESS * MOST_PIECES)
         self._corners = device.array(corners, wp.vec3d)
         self._ball = device.array(np.column_stack([centre, reach]), wp.vec4d)
         self._table = device.array(table.reshape(triangles.shape), wp.int32)
@@ -105,12 +111,12 @@ class Skin:
         Raises
         ------
         InputError
-            A footprint that does not touch the surface.
+            A footprint that does not touch the surface, or is too small to be integrated over its triangles.
         """
-        key = np.column_stack([points, radii]).tobytes()
-        if self._last is None or self._last[0] != key:
-            self._last = key, self._pressed(points, radii)
-        return self._last[1]
+        key, last = np.column_stack([points, radii]).tobytes(), self._last
+        if last is None or last[0] != key:
+            last = self._last = key, self._pressed(points, radii)
+        return last[1]  # another thread may have pressed elsewhere since
 
     def imprint(self, tools: wp.array) -> Imprint:
         """Where tools (B,) are about to press."""
@@ -131,17 +137,37 @@ class Skin:
         inputs = [self._corners, self._ball, self._table, self._position, imprint.tools, imprint.touched]
         self.device.launch(_press, (len(self._ball), len(imprint.tools)), inputs, [imprint.weight, imprint.sums])
 
+    def demand_touch(self, points: np.ndarray, radii: np.ndarray) -> None:
+        """Refuse tools, as `press` has them, of which one does not touch the surface.
+
+        Raises
+        ------
+        InputError
+            Naming the first of them.
+        """
+        self._demand(points, radii, self.nearest(points, radii)[1])
+
     def _pressed(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
+        small = radii.min(initial=np.inf)
+        if small < self._least:
+            raise InputError(
+                f"a footprint of {1e3 * small:.3g} mm is too small for the triangles of this surface: give a radius of "
+                f"at least {1e3 * self._least:.3g} mm."
+            )
         imprint = self.imprint(self._tools(points, radii))
         self.put(imprint)
-        missed = np.flatnonzero(np.isinf(imprint.touched.numpy().reshape(-1, 4)[:, 3]))
+        self._demand(points, radii, imprint.touched.numpy().reshape(-1, 4)[:, 3])
+        return Footprints(self.nodes, imprint.weight, imprint.sums)
+
+    def _demand(self, points: np.ndarray, radii: np.ndarray, away: np.ndarray) -> None:
+        """Refuse tools that are infinitely far `away` (B,) from the surface."""
+        missed = np.flatnonzero(np.isinf(away))
         if len(missed):
             number = missed[0]
             raise InputError(
                 f"load {number} presses at {np.round(1e3 * points[number], 1)} mm with a footprint of "
-                f"{1e3 * radii[number]:.3g} mm, which does not touch the surface: choose a point on it."
+                f"{1e3 * radii[number]:.3g} mm, which does not touch the {self._name}: choose a point on it."
             )
-        return Footprints(self.nodes, imprint.weight, imprint.sums)
 
     def _tools(self, points: np.ndarray, radii: np.ndarray) -> wp.array:
         return self.device.array(np.column_stack([points, radii]), wp.vec4d)
@@ -277,7 +303,7 @@ def _press(
     start, first, second = corners[s, 0] - point, corners[s, 1] - corners[s, 0], corners[s, 2] - corners[s, 0]
     longest = wp.max(wp.max(wp.length(first), wp.length(second)), wp.length(first - second))
     n = int(PIECES)
-    while longest > wp.float64(FINENESS) * radius * wp.float64(n):
+    while longest > wp.float64(FINENESS) * radius * wp.float64(n) and n < MOST_PIECES:
         n *= 2
     h = one / wp.float64(n)
     step = h * second

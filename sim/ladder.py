@@ -12,12 +12,12 @@ import warp as wp
 
 from .accuracy import Accuracy
 from .columns import gathered, scattered
-from .deformation import Outcome
+from .deformation import LEARNT_KEY, Outcome
 from .device import Device
 from .direction import NewtonCG
 from .elimination import Elimination
 from .inversion import Inversion
-from .lbfgs import LEARNT_KEY, Lbfgs, learnt_from
+from .lbfgs import Lbfgs, learnt_from
 from .linear import Preconditioner
 from .newton import find_equilibrium
 from .patching import NODES, Patching

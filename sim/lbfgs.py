@@ -14,6 +14,8 @@ import numpy as np
 import warp as wp
 
 from .columns import EXACT, WIDTHS, gathered, scattered
+from .deformation import LEARNT_KEY
+from .given import all_finite
 from .linear import Preconditioner
 from .problem import Problem
 from .room import Room, ground_of
@@ -25,8 +27,6 @@ TURNS_ON_CUDA, SMALLER_ON_CUDA, SMALLER = 2, 0.75, 0.85
 # What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
 # the newest pair and how many there are (b,).
 LEARNT = ("s", "w", "sy", "yw", "head", "known")
-# Begins the history's keys of these.
-LEARNT_KEY = "l-bfgs "
 # Learnt curvature travels with the answers of so few load cases: a larger batch has no next frame.
 TAUGHT = EXACT
 
@@ -144,11 +144,22 @@ def rows_first(array: wp.array) -> np.ndarray:
 
 
 def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
-    """What an earlier descent on as many rows = 3N left in the history; nothing if that does not fit these cases."""
+    """What an earlier descent on as many rows = 3N left in the history; nothing if that does not fit these cases.
+
+    It only shortens the way: what holds numbers that are not finite is forgotten.
+    """
     if any(LEARNT_KEY + name not in cases.history for name in LEARNT):
         return {}
     found = {name: np.asarray(cases.history[LEARNT_KEY + name]) for name in LEARNT}
     shape = {"s": (PAIRS, rows), "w": (PAIRS, rows), "sy": (PAIRS, PAIRS), "yw": (PAIRS, PAIRS)}
-    fits = all(array.shape == (len(cases.loads), *shape.get(name, ())) for name, array in found.items())
+    if any(array.shape != (len(cases.loads), *shape.get(name, ())) for name, array in found.items()):
+        return {}
     most = {"head": PAIRS - 1, "known": PAIRS}
-    return found if fits and all(((found[name] >= 0) & (found[name] <= most[name])).all() for name in most) else {}
+    if any(array.dtype.kind not in "fiu" for array in found.values()) or not all(
+        ((found[name] >= 0) & (found[name] <= last)).all() for name, last in most.items()
+    ):
+        return {}
+    # Other places hold whatever stood in the room.
+    used = (found["head"][:, None] - np.arange(PAIRS)) % PAIRS < found["known"][:, None]
+    places = {"s": used, "w": used} | dict.fromkeys(("sy", "yw"), used[:, :, None] & used[:, None, :])
+    return found if all(all_finite(found[name][place]) for name, place in places.items()) else {}

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from .errors import InputError
+from .given import as_array, numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +102,10 @@ MAGNITUDE = {
 }
 # Arrays of one number a load case.
 SCALARS = ("footprint", "csf_level", "share", "done")
+# Radii of footprints [m]: a needle's point is blunter than the least, and the widest covers a brain.
+SMALLEST_FOOTPRINT, LARGEST_FOOTPRINT = 1e-4, 0.1
+# A shorter vector has squares that are no numbers any more.
+SHORTEST = 1e-100
 # How far from a rotation the upper left of a pose may be.
 RIGID = 1e-6
 
@@ -119,22 +124,26 @@ class Loads:
     Raises
     ------
     InputError
-        Neither cause nor time, a kind twice, rows that do not agree, or a number that is not finite.
+        Neither cause nor time, a kind twice, rows that do not agree; what are no real, finite numbers of the shapes
+        that the causes name; radii of footprints outside 0.1 to 100 mm.
     """
 
     causes: tuple[Cause, ...]
     time: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.causes, tuple | list) or not all(isinstance(cause, Cause) for cause in self.causes):
+            known = ", ".join(kind.__name__ for kind in Cause.__args__)
+            raise InputError(f"Loads.causes is {self.causes!r:.80}: give a tuple of {known}.")
         kinds = [type(cause) for cause in self.causes]
         if len(set(kinds)) < len(kinds) or not (kinds or self.time is not None):
             names = ", ".join(kind.__name__ for kind in kinds) or "none"
             raise InputError(f"loads have the causes {names}: give at least one, or a time, and each kind once.")
         object.__setattr__(self, "causes", tuple(_checked(cause) for cause in self.causes))
         rows = {len(array) for cause in self.causes for array in vars(cause).values()}
-        time = np.zeros(max(rows)) if self.time is None else np.asarray(self.time, np.float64)
-        if time.ndim != 1 or not all_finite(time):
-            raise InputError(f"the times of loads have shape {time.shape}: give (B,) finite numbers [s].")
+        time = np.zeros(max(rows)) if self.time is None else numbers("Loads.time", self.time)
+        if time.ndim != 1:
+            raise InputError(f"Loads.time has shape {time.shape}: give (B,) [s].")
         if rows - {len(time)}:
             raise InputError(f"load arrays have {sorted(rows | {len(time)})} rows: give one row per load case.")
         object.__setattr__(self, "time", time)
@@ -205,17 +214,27 @@ def stacked(parts: Sequence[Loads]) -> Loads:
 
 
 def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) -> Loads:
-    """Loads of one pushing tool: point (3,) or (B, 3) [m], force (3,) or (B, 3) [N], footprint radius [m]."""
-    point, force = np.atleast_2d(point, force)
-    rows = max(len(point), len(force))
-    return Loads((Pushed(_shaped(point, (rows, 3)), _shaped(force, (rows, 3)), _shaped(footprint, (rows,))),))
+    """Loads of one pushing tool: point (3,) or (B, 3) [m], force (3,) or (B, 3) [N], footprint radius [m].
+
+    Raises
+    ------
+    InputError
+        As `Loads`.
+    """
+    rows = _repeated("Pushed", point=(point, (3,)), force=(force, (3,)), footprint=(footprint, ()))
+    return Loads((Pushed(**rows),))
 
 
 def posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads:
-    """Loads of the whole change of weight since the scan: direction (3,) or (B, 3), csf_level scalar or (B,) [m]."""
-    direction, level = np.atleast_2d(direction), np.atleast_1d(csf_level)
-    rows = max(len(direction), len(level))
-    return Loads((Posture(_shaped(direction, (rows, 3)), _shaped(level, (rows,)), np.ones(rows)),))
+    """Loads of the whole change of weight since the scan: direction (3,) or (B, 3), csf_level scalar or (B,) [m].
+
+    Raises
+    ------
+    InputError
+        As `Loads`.
+    """
+    rows = _repeated("Posture", direction=(direction, (3,)), csf_level=(csf_level, ()), share=(1.0, ()))
+    return Loads((Posture(**rows),))
 
 
 def check_field(name: str, field: np.ndarray, vertices: int) -> None:
@@ -230,20 +249,32 @@ def check_field(name: str, field: np.ndarray, vertices: int) -> None:
         raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {vertices}.")
 
 
-def all_finite(array: np.ndarray) -> bool:
-    """Whether no number is infinite or NaN: in a third of the time that `.all()` takes of a few numbers."""
-    return np.count_nonzero(np.isfinite(array)) == array.size
-
-
-def _shaped(values: float | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Values of a shape, or broadcast to it, which takes longer than all the rest of a push."""
-    array = np.asarray(values)
-    return array if array.shape == shape else np.broadcast_to(array, shape)
+def _repeated(name: str, **given: tuple[object, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    """Arrays of a cause, each with its shape in one load case: what is given once is for all cases."""
+    arrays = {}
+    for key, (values, shape) in given.items():
+        array = as_array(f"{name}.{key}", values)
+        if array.shape == shape:
+            array = array[None]
+        if array.ndim == 0 or array.shape[1:] != shape:
+            one, all_rows = ("a number", "(B,)") if not shape else ("(3,)", "(B, 3)")
+            raise InputError(f"{name}.{key} has shape {array.shape}: give {one} or {all_rows}.")
+        arrays[key] = array
+    counts = {len(array) for array in arrays.values()} - {1}
+    if len(counts) > 1:
+        told = ", ".join(f"{key} {len(array)}" for key, array in arrays.items())
+        raise InputError(f"{name} has rows of {told}: give each one row, or one for each load case.")
+    rows = counts.pop() if counts else 1
+    # To broadcast takes longer than all the rest of a push.
+    return {
+        key: array if len(array) == rows else np.broadcast_to(array, (rows, *array.shape[1:]))
+        for key, array in arrays.items()
+    }
 
 
 def _checked(cause: Cause) -> Cause:
     name = type(cause).__name__
-    arrays = {key: np.asarray(value, np.float64) for key, value in vars(cause).items()}
+    arrays = {key: numbers(f"{name}.{key}", value) for key, value in vars(cause).items()}
     whole_field = isinstance(cause, Nodal | Prescribed)
     for key, array in arrays.items():
         if key == "pose":
@@ -254,13 +285,16 @@ def _checked(cause: Cause) -> Cause:
         if not good or (not scalar_rows and array.shape[-1] != 3):
             want = "(B,)" if scalar_rows else "(B, V, 3)" if whole_field else "(B, 3)"
             raise InputError(f"{name}.{key} has shape {array.shape}: give {want}.")
-        if not all_finite(array):
-            raise InputError(f"{name}.{key} has a value that is not finite: every number must be finite.")
-        if key == "footprint" and len(array) and not array.min() > 0.0:
-            raise InputError(f"{name}.{key} has a radius of {array.min():g} m: give positive radii in metres.")
+        if key == "footprint" and len(array):
+            for radius in (array.min(), array.max()):
+                if not SMALLEST_FOOTPRINT <= radius <= LARGEST_FOOTPRINT:
+                    raise InputError(
+                        f"{name}.{key} has a radius of {radius:g} m: give positive radii in metres, from "
+                        f"{SMALLEST_FOOTPRINT:g} to {LARGEST_FOOTPRINT:g} (7 mm are 0.007)."
+                    )
         if key == "done" and ((array < 0.0) | (array % 1.0 != 0.0)).any():
             raise InputError(f"{name}.{key} is {array}: give how many steps are done, as whole numbers from 0 up.")
-        if key == "direction" and not array.any(axis=1).all():
+        if key == "direction" and not (np.abs(array).max(axis=1) >= SHORTEST).all():
             raise InputError(f"{name}.{key} has a row of zeros: give every load case the way that gravity pulls.")
     return type(cause)(**arrays)
 
@@ -271,8 +305,6 @@ def _check_poses(name: str, pose: np.ndarray, axes: int) -> None:
         raise InputError(
             f"{name}.pose has shape {pose.shape}: give {'(B, tools, 4, 4)' if axes == 4 else '(B, 4, 4)'}."
         )
-    if not all_finite(pose):
-        raise InputError(f"{name}.pose has a value that is not finite: every number must be finite.")
     turn = pose[..., :3, :3]
     off = np.abs(turn @ turn.swapaxes(-1, -2) - np.eye(3)).max(initial=0.0)
     if off > RIGID or (np.linalg.det(turn) < 0.0).any() or (pose[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():

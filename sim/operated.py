@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
+from threading import RLock
 
 import numpy as np
 
 from .accuracy import TRAIN, Accuracy
+from .alone import alone
 from .anatomy import Anatomy
-from .deformation import Deformation, joined
+from .deformation import Deformation, check_start, joined
 from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
 from .fem import MIDDLES, Fem
@@ -30,7 +32,7 @@ class Operated:
     """A Deformer: each load case is answered by the finite elements of what is left of the body.
 
     Vertices of which nothing is left stay where they were in the scan. Histories are those of the whole body, whose
-    elements and nodes that are gone remember nothing.
+    elements and nodes that are gone remember nothing. Threads may share it, and take turns, as in `Fem`.
 
     Parameters
     ----------
@@ -43,6 +45,7 @@ class Operated:
     """
 
     def __init__(self, bodies: tuple[Remains, ...], make: Callable[[Anatomy], Fem], ahead: bool = False):
+        self.lock = RLock()
         self._bodies = bodies
         self._solver = lru_cache(len(bodies) if ahead else KEPT)(lambda done: make(bodies[done].anatomy))
         self._rows = lru_cache(None)(lambda done: _rows(self._solver(done)))
@@ -59,6 +62,7 @@ class Operated:
         """What is left after so many steps."""
         return self._bodies[done]
 
+    @alone
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """As `Fem.deform`; `start` may be an answer after other steps, and what is left goes on from it.
 
@@ -67,6 +71,8 @@ class Operated:
         InputError
             As `Fem.deform`; more steps done than there are.
         """
+        if start is not None:
+            check_start(start, len(loads), len(self.anatomy.mesh.nodes))
         done, most = self._done(loads), len(self._bodies) - 1
         if (done > most).any():
             raise InputError(f"Resected.done is {done.max()}, but Resection has {most} steps: give at most that.")

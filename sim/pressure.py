@@ -34,11 +34,12 @@ def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
             f"the body {count}: give the whole answer to these loads."
         )
     device, surface = fem.problem.device, fem.space.surface
-    fem.problem.begin(Cases(loads, answer.time, answer.history, share=np.zeros(len(answer))))
-    u = device.array(answer.displacement.reshape(-1, 3 * count).T)
-    gradient = device.zeros(*u.shape)
-    for term in fem.problem.barriers:
-        term.add_gradient(u, gradient)
+    with fem.lock:
+        fem.problem.begin(Cases(loads, answer.time, answer.history, share=np.zeros(len(answer))))
+        u = device.array(answer.displacement.reshape(-1, 3 * count).T)
+        gradient = device.zeros(*u.shape)
+        for term in fem.problem.barriers:
+            term.add_gradient(u, gradient)
     force = np.linalg.norm(gradient.numpy().T.reshape(answer.displacement.shape), axis=2)
     corners = (fem.space.nodes + answer.displacement)[:, surface]
     sides = corners[:, :, 1:] - corners[:, :, :1]

@@ -14,6 +14,7 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
+from sim.given import whole_numbers
 from sim.loads import Loads, Pushed
 from sim.material import tissue_from_json
 from sim.threads import one_thread
@@ -22,13 +23,19 @@ from .bound import Bound, features_of
 from .encode import ENCODERS, Basis, directions
 from .envelope import Envelope, measured
 from .indentation import indented
-from .patch import Patch, open_patch
+from .patch import Patch, nearest, open_patch
 from .regressor import Fitted
 from .remainder import Remainder
 from .series import Series
 
 if TYPE_CHECKING:
     from .swift import Swift
+
+# Times the strongest force that was taught. Of loads so strong on the template's brain the finite elements find an
+# equilibrium of none, and at twice that force a prediction is off by a fifth to a third of the motion.
+STRONGEST = 3.0
+# Taught points are stored in single precision [m].
+STORED = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +146,26 @@ class Learned:
             return None
         return Swift(series, remainder, basis, self._patch, self.envelope, self.bounds)
 
+    def _demand_answerable(self, pushed: Pushed, doubtful: np.ndarray) -> None:
+        """Refuse what has no answer to be near to: a footprint off the open cortex, a force far beyond what was taught.
+
+        Of the `doubtful` (k,) rows alone: a load inside the envelope is neither, unless its radius is less than the
+        reach.
+        """
+        if not len(doubtful):
+            return
+        size, most = directions(pushed)[0], self.envelope.force[1]
+        strong = np.flatnonzero(size > STRONGEST * most)
+        if len(strong):
+            unit, name = (1.0, "N") if self.ball is None else (1e3, "mm")
+            raise InputError(
+                f"load {strong[0]} presses with {unit * size[strong[0]]:.3g} {name}, but this model was taught "
+                f"{unit * most:.3g} {name} at most: give up to {STRONGEST:g} times that, or ask the finite elements."
+            )
+        away = nearest(pushed.point[doubtful], self._patch.points)[1]
+        if (away > pushed.footprint[doubtful]).any():  # off all nodes of the cortex, if not off its triangles
+            self._patch.skin.demand_touch(pushed.point, pushed.footprint)
+
     def _demand_known(self, nodes: np.ndarray) -> None:
         inside = (nodes >= 0) & (nodes < len(self._knows))
         strange = ~(inside & self._knows[np.where(inside, nodes, 0)])
@@ -154,8 +181,11 @@ class Learned:
         Raises
         ------
         InputError
-            Loads of another kind, a start with other rows, or a vertex in `at` that the model does not know.
+            Loads of another kind, or that do not touch the open cortex, or are more than `STRONGEST` times as strong as
+            any that was taught; a start with other rows; a vertex in `at` that the model does not know.
         """
+        if start is not None and not isinstance(start, Deformation):
+            raise InputError(f"the start is a {type(start).__name__}: give a Deformation, or none.")
         if start is not None and len(start) != len(loads):
             raise InputError(
                 f"the start has displacements of shape {start.displacement.shape}: give one row for each of the "
@@ -163,9 +193,11 @@ class Learned:
             )
         begun = time.perf_counter()
         pushed = self.asked(loads)
-        nodes = self.nodes if at is None else np.asarray(at)
+        nodes = self.nodes if at is None else whole_numbers("at", at)
         if len(loads) == 1 and np.array_equal(nodes, self.anatomy.tumour_nodes) and self._swift is not None:
             displacement, excess, promised = self._swift.answer(pushed)
+            if excess > 0.0 or pushed.footprint[0] < self.envelope.reach + STORED:
+                self._demand_answerable(pushed, np.zeros(1, int))
             return predicted(displacement, nodes, loads, (excess > 0.0,), begun, promised, self.source)
         self._demand_known(nodes)
         with one_thread() if len(loads) == 1 else nullcontext():
@@ -173,6 +205,10 @@ class Learned:
 
     def _summed(self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float) -> Deformation:
         """The sum of the parts, asked at `begun` [s]."""
+        known = measured(self._patch, pushed)
+        excess = self.envelope.excess(pushed, known)
+        small = pushed.footprint < self.envelope.reach + STORED
+        self._demand_answerable(pushed, np.flatnonzero((excess > 0.0) | small))
         magnitude, direction = directions(pushed)
         # Beyond the taught forces the response stays what it was at the nearest of them.
         within = np.clip(magnitude, *self.envelope.force)
@@ -188,8 +224,6 @@ class Learned:
                 coefficients = sum(part.regressor.predict(features[part.encoder]) for part in parts)
                 response = parts[0].basis.decode(np.asarray(coefficients))
                 displacement[:, here] += magnitude[:, None, None] * response[:, row[here]]
-        known = measured(self._patch, pushed)
-        excess = self.envelope.excess(pushed, known)
         promised = np.array(np.nan)
         if self.bounds is not None:
             # As the motion, so its error: in proportion to a force weaker than any that was taught.

@@ -61,7 +61,7 @@ class Patch:
         from sim.device import find_device
         from sim.footprint import Skin
 
-        return Skin(self.points, self.triangles, find_device("cpu", "float64"))
+        return Skin(self.points, self.triangles, find_device("cpu", "float64"), "open cortex")
 
     @cached_property
     def rim(self) -> np.ndarray:

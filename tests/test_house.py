@@ -38,6 +38,7 @@ TIERS = (
     },
     {
         "precondition",
+        "resting",
         "condensation",
         "elimination",
         "patching",

@@ -38,8 +38,8 @@ def test_no_cause_or_one_twice_is_refused() -> None:
         (lambda: Loads((Nodal(np.zeros((COUNT, 3))),)), r"Nodal\.force has shape"),
         (lambda: Loads((Nodal(np.zeros((5, COUNT, 3))),), np.zeros(4)), r"\[4, 5\] rows"),
         (lambda: Loads(()), "at least one, or a time"),
-        (lambda: Loads((), np.array([0.1, np.nan])), "times of loads"),
-        (lambda: Loads((), np.array(0.1)), r"times of loads have shape \(\)"),
+        (lambda: Loads((), np.array([0.1, np.nan])), r"Loads\.time .*finite"),
+        (lambda: Loads((), np.array(0.1)), r"Loads\.time has shape \(\)"),
     ],
 )
 def test_bad_numbers_are_refused(build: Callable[[], Loads], sentence: str) -> None:

@@ -221,6 +221,27 @@ def test_outside_the_taught_range_is_said(trained, box):
     )
 
 
+@pytest.mark.parametrize("name", ["svr", "residual"])
+def test_what_has_no_answer_is_refused_alone_and_among_others(trained, box, name):
+    """Only the tumour is asked for: nothing that integrates over a footprint is there to complain."""
+    model = trained.models[name]
+    here, down, radius = model.envelope.points[0].astype(float), np.array([0.0, 0.0, -0.2]), 6e-3
+    strongest = model.envelope.force[1]
+
+    def asked(*points, force=down):
+        return model.deform(push(np.array(points), force, radius), at=box.tumour_nodes)
+
+    for way in ([0.0, 0.0, 1.0], [0.0, 0.0, 6.1e-3], [0.0, 0.0, -15e-3], [0.0, 0.06, 0.0], [1e29, 0.0, 0.0]):
+        with pytest.raises(InputError, match=r"load 0 .*does not touch the open cortex: choose a point on it"):
+            asked(here + way)
+        with pytest.raises(InputError, match=r"load 1 .*does not touch the open cortex"):
+            asked(here, here + way)
+    with pytest.raises(InputError, match=r"load 0 presses with 10 N, but this model was taught 0\..* N at most"):
+        asked(here, force=50.0 * down)
+    assert asked(here + [0.0, 0.0, 5.9e-3]).outcome[0] is not None
+    assert asked(here, force=2.9 * strongest * down / 0.2).outcome == (Outcome.EXTRAPOLATED,)
+
+
 def test_held_out_loads_lie_inside_the_envelope(trained, data):
     model = trained.models["linear"]
     held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
@@ -232,7 +253,7 @@ def test_held_out_loads_lie_inside_the_envelope(trained, data):
 def test_other_loads_and_other_vertices_are_refused(model, box):
     point = np.zeros((1, 3))
     lying = Posture(np.ones((1, 3)), np.zeros(1), np.ones(1))
-    for cause in (Displaced(point, point, np.ones(1)), Nodal(np.zeros((1, len(box.mesh.nodes), 3))), lying):
+    for cause in (Displaced(point, point, np.full(1, 6e-3)), Nodal(np.zeros((1, len(box.mesh.nodes), 3))), lying):
         with pytest.raises(InputError, match=f"{type(cause).__name__}.*taught pushing forces only"):
             model.deform(Loads((cause,)))
     deep = np.setdiff1d(np.arange(len(box.mesh.nodes)), model.nodes)[:1]

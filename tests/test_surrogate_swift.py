@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sim.deformation import Outcome
+from sim.errors import InputError
 from sim.loads import Loads, Pushed, push, stacked
 from surrogate.bound import features_of, fitted_bound
 from surrogate.encode import Basis, tool_features
@@ -80,12 +81,16 @@ def model(made):
 
 @pytest.fixture(scope="module")
 def asked(inside, dome):
-    """Forty each: as taught, off the cortex, too strong, aslant, of other widths, weak, of no force; and on the rim."""
+    """Forty each: as taught, beside the cortex, too strong, aslant, of other widths, weak, of none; and on the rim."""
     random = np.random.default_rng(2)
     cause, rim = inside.of(Pushed), open_patch(dome).rim.mean(axis=1)
+    size = np.linalg.norm(cause.force, axis=1)
+    strongest = 1.2 * size.max()
+    away = random.normal(size=cause.point.shape)
+    away *= (0.95 * cause.footprint * random.random(len(size)) / np.linalg.norm(away, axis=1))[:, None]
     other = [
-        replace(cause, point=cause.point + random.normal(0.0, 6e-3, cause.point.shape)),
-        replace(cause, force=10.0 * cause.force),
+        replace(cause, point=cause.point + away),
+        replace(cause, force=2.0 * cause.force * (strongest / size)[:, None]),
         replace(cause, force=cause.force * random.normal(size=cause.force.shape)),
         replace(cause, footprint=np.geomspace(1e-3, 2e-2, len(cause.footprint))),
         replace(cause, force=1e-3 * cause.force),
@@ -161,3 +166,15 @@ def test_answers_are_their_own_when_two_threads_ask(model, asked):
     for k, answer in enumerate(answers):
         truth = wanted[k % len(single)]
         assert np.abs(answer.displacement[0] - truth).max() <= 3e-6 * np.abs(truth).max()
+
+
+def test_the_shorter_way_refuses_what_the_longer_one_does(model, inside):
+    cause, nodes = inside.rows(slice(0, 1)).of(Pushed), model.anatomy.tumour_nodes
+    sparse = replace(model, envelope=replace(model.envelope, reach=1.0))  # everywhere is near a taught point
+    for each in (model, sparse):
+        assert each._swift is not None
+        for way in ([0.0, 0.0, 1.0], [0.0, 0.0, 1.1 * cause.footprint[0]], [0.0, 0.0, -20e-3], [1e29, 0.0, 0.0]):
+            with pytest.raises(InputError, match="does not touch the open cortex"):
+                each.deform(Loads((replace(cause, point=cause.point + way),)), at=nodes)
+    with pytest.raises(InputError, match="N at most: give up to 3 times that"):
+        model.deform(Loads((replace(cause, force=100.0 * cause.force),)), at=nodes)

@@ -1,0 +1,28 @@
+"""One thread at a time in what works on arrays of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from threading import RLock
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class Locked(Protocol):
+    """Who has a lock, which a thread may take again while it has it."""
+
+    lock: RLock
+
+
+def alone(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
+    """A method of a `Locked`, in which its lock is held: other threads wait until it returns."""
+
+    @wraps(method)
+    def held(self: Locked, *args: P.args, **kwargs: P.kwargs) -> R:
+        with self.lock:
+            return method(self, *args, **kwargs)
+
+    return held

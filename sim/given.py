@@ -1,0 +1,106 @@
+"""What callers give, checked before anything is computed: arrays of numbers, numbers of vertices, counts."""
+
+from __future__ import annotations
+
+import operator
+
+import numpy as np
+
+from .errors import InputError
+
+# No length, force or time in SI units is greater; fourth powers stay finite in double precision.
+LARGEST = 1e30
+
+
+def all_finite(array: np.ndarray) -> bool:
+    """Whether no number is infinite or NaN: in a third of the time that `.all()` takes of a few numbers."""
+    return np.count_nonzero(np.isfinite(array)) == array.size
+
+
+def as_array(name: str, values: object) -> np.ndarray:
+    """Values as an array of whatever type.
+
+    Raises
+    ------
+    InputError
+        Rows of different lengths, or what is no array.
+    """
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError, OverflowError, RuntimeError) as error:
+        raise InputError(f"{name} makes no array: give numbers, and as many in every row.") from error
+
+
+def numbers(name: str, values: object, largest: float = LARGEST) -> np.ndarray:
+    """Real, finite numbers as float64, of whatever shape they are given in; `name` says what they are.
+
+    Raises
+    ------
+    InputError
+        Text, truth values, complex numbers, objects, rows of different lengths; a number that is not finite, or beyond
+        `largest`.
+    """
+    array = as_array(name, values)
+    if array.dtype != np.float64:
+        if array.dtype.kind not in "fiu" and array.size:
+            raise InputError(f"{name} has the type {array.dtype}: give real numbers.")
+        with np.errstate(over="ignore"):  # of wider types
+            array = array.astype(np.float64)
+    # One pass: NaN compares with nothing.
+    if np.count_nonzero(np.abs(array) <= largest) != array.size:
+        if not all_finite(array):
+            raise InputError(f"{name} has a value that is not finite: every number must be finite.")
+        raise InputError(
+            f"{name} has a value of {np.abs(array).max():g}, beyond {largest:g}: give numbers in SI units (m, N, s)."
+        )
+    return array
+
+
+def whole_numbers(name: str, values: object) -> np.ndarray:
+    """Numbers (n,) of vertices, as integers.
+
+    Raises
+    ------
+    InputError
+        Fractions, truth values, anything but whole numbers in one dimension.
+    """
+    array = as_array(name, values)
+    if array.dtype.kind == "b":
+        raise InputError(f"{name} is a mask of truth values: give vertex numbers, as np.flatnonzero(mask) finds them.")
+    if array.ndim != 1 or (array.dtype.kind not in "iu" and array.size):
+        raise InputError(
+            f"{name} has shape {array.shape} and type {array.dtype}: give the numbers of vertices, (n,) integers."
+        )
+    return array if array.size else array.astype(np.intp)
+
+
+def vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
+    """Numbers (n,) of vertices of a mesh that has `count`.
+
+    Raises
+    ------
+    InputError
+        As `whole_numbers`; a vertex that the mesh does not have.
+    """
+    vertices = whole_numbers(name, values)
+    beyond = vertices[(vertices < 0) | (vertices >= count)]
+    if len(beyond):
+        raise InputError(f"the mesh has no vertex {beyond[0]}: ask for some of 0 to {count - 1}.")
+    return vertices
+
+
+def at_least(name: str, value: object, least: int) -> int:
+    """A whole number, at least `least`.
+
+    Raises
+    ------
+    InputError
+        Anything else; truth values are no numbers.
+    """
+    try:
+        number = operator.index(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        number = least - 1
+    if isinstance(value, bool | np.bool) or number < least:
+        raise InputError(f"{name} is {value!r}: give a whole number from {least} up.")
+    return number

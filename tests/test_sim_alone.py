@@ -1,0 +1,122 @@
+"""Threads that share a deformer get the answers that one of them alone would get."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import numpy as np
+import pytest
+from boxes import base_held, box
+
+from sim.accuracy import LIVE, REFERENCE, Accuracy
+from sim.deformation import LEARNT_KEY, Deformation
+from sim.effects import Elasticity, Held, NodalForce, Resection, ToolForce
+from sim.fem import Fem
+from sim.following import Kept
+from sim.loads import Loads, Resected, push
+from sim.operated import finite_elements
+
+BODY = base_held(box((4, 4, 4), 0.1))
+EFFECTS = Elasticity(), Held(), ToolForce(), NodalForce()
+PLACES = np.array([[0.03, 0.05, 0.1], [0.05, 0.04, 0.1], [0.06, 0.06, 0.1], [0.04, 0.07, 0.1]])
+THREADS = len(PLACES)
+T = TypeVar("T")
+
+
+def pushes(thread: int) -> list[Loads]:
+    """One thread's: single ones, and a batch in other forces."""
+    force = np.array([[0.0, 0.05, -0.2], [0.1, 0.0, -0.4], [0.0, 0.0, 0.3]]) * (1.0 + 0.2 * thread)
+    whole = push(PLACES[thread], force, 0.02)
+    return [whole.rows(slice(0, 1)), whole, whole.rows(slice(2, 3))]
+
+
+def same(one: Deformation, other: Deformation) -> None:
+    for name in ("displacement", "reaction", "residual", "iterations"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert set(one.history) == set(other.history)
+
+
+def at_once(work: Callable[[int], list[T]]) -> list[list[T]]:
+    """What each thread's work gives, all begun together."""
+    ready = threading.Barrier(THREADS)
+
+    def begin(thread: int) -> list[T]:
+        ready.wait()
+        return work(thread)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(begin, range(THREADS)))
+
+
+@pytest.mark.parametrize("accuracy", [LIVE, REFERENCE], ids=["float32", "float64"])
+def test_finite_elements_shared_by_threads_answer_bit_for_bit(accuracy: Accuracy) -> None:
+    """Cold and warm: what is learnt on the way travels in the answers, not in the solver."""
+    fem = Fem(BODY, EFFECTS, accuracy, "cpu", batch=2)
+
+    def work(thread: int) -> list[Deformation]:
+        answers = [fem.deform(loads) for loads in pushes(thread)]
+        warm = [fem.deform(loads.scaled(1.1), start) for loads, start in zip(pushes(thread), answers, strict=True)]
+        return answers + warm
+
+    alone = [work(thread) for thread in range(THREADS)]
+    for theirs, own in zip(at_once(work), alone, strict=True):
+        for one, other in zip(theirs, own, strict=True):
+            same(one, other)
+
+
+def test_residuals_corrections_and_series_shared_by_threads() -> None:
+    fem = Fem(BODY, EFFECTS, REFERENCE, "cpu", batch=2)
+    nodes = np.arange(40, 46)
+    modes = np.eye(18).reshape(18, 6, 3)
+
+    def work(thread: int) -> list[np.ndarray]:
+        loads = pushes(thread)[1]
+        found = fem.deform(loads.scaled(0.7))
+        corrected, before, left = fem.corrected(loads, found, nodes)
+        series = fem.series(loads, 2, fem.reading(nodes, modes))
+        return [fem.residual(loads, found), corrected.displacement, before, left, series]
+
+    alone = [work(thread) for thread in range(THREADS)]
+    for theirs, own in zip(at_once(work), alone, strict=True):
+        for one, other in zip(theirs, own, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_a_body_that_is_cut_shared_by_threads() -> None:
+    gone = np.flatnonzero((BODY.mesh.nodes[BODY.mesh.tets].mean(axis=1) > [0.0, 0.0, 0.075]).all(axis=1))[:9]
+    fem = finite_elements(BODY, (*EFFECTS, Resection((tuple(gone.tolist()),))), LIVE, "cpu")
+
+    def work(thread: int) -> list[Deformation]:
+        loads = pushes(thread)[1]
+        done = Resected(np.arange(len(loads)) % 2)
+        return [fem.deform(Loads((*loads.causes, done)))]
+
+    alone = [work(thread) for thread in range(THREADS)]
+    for (theirs,), (own,) in zip(at_once(work), alone, strict=True):
+        same(theirs, own)
+
+
+def test_what_an_answer_left_on_the_device_is_its_own_while_others_answer() -> None:
+    """Frame after frame, each thread on its own way; histories are read after others have moved on."""
+    fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), LIVE, "cpu")
+    fem._following = fem._follower()
+
+    def work(thread: int) -> list[Deformation]:
+        point, force = PLACES[thread], np.array([0.0, 0.05, -0.3])
+        answers = [fem.deform(push(point, force, 0.02))]
+        for number in range(1, 5):
+            answers.append(fem.deform(push(point + [1e-3 * number, 0.0, 0.0], force, 0.02), answers[-1]))
+            if number % 2:
+                dict(answers[-1].history)
+        return answers
+
+    alone = [work(thread) for thread in range(THREADS)]
+    assert isinstance(alone[0][-1].history, Kept)
+    names = [LEARNT_KEY + name for name in ("head", "known")]
+    for theirs, own in zip(at_once(work), alone, strict=True):
+        for one, other in zip(theirs, own, strict=True):
+            same(one, other)
+            assert all(np.array_equal(one.history[name], other.history[name]) for name in names)
