@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import Literal
 
 from .errors import InputError
+from .given import at_least
 
 Precision = Literal["float32", "float64"]
 FLOOR: dict[str, float] = {"float32": 2e-5, "float64": 1e-11}
@@ -33,7 +35,7 @@ class Accuracy:
     Raises
     ------
     InputError
-        A tolerance below the floor of the scalar type, or budgets that allow no work.
+        A tolerance below the floor of the scalar type, budgets that allow no work or are no whole numbers.
     """
 
     tolerance: float = 1e-6
@@ -43,19 +45,18 @@ class Accuracy:
     steps: int = 24
 
     def __post_init__(self) -> None:
-        if self.precision not in FLOOR:
+        if self.precision not in tuple(FLOOR):  # which need not be hashable
             raise InputError(f"no precision is called {self.precision!r}: choose one of {', '.join(FLOOR)}.")
         floor = FLOOR[self.precision]
+        if not isinstance(self.tolerance, Real):
+            raise InputError(f"tolerance is {self.tolerance!r:.80}: give a number from {floor:g} to 1.")
         if not floor <= self.tolerance < 1.0:
             raise InputError(
                 f"a tolerance of {self.tolerance:g} is outside [{floor:g}, 1): {self.precision} reaches {floor:g}; "
                 "ask for that, or for float64."
             )
-        if self.outer < 1 or self.inner < 1 or self.steps < 0:
-            raise InputError(
-                f"budgets of {self.outer} outer, {self.inner} inner and {self.steps} load steps allow no work: give at "
-                "least 1, 1 and 0."
-            )
+        for name, least in (("outer", 1), ("inner", 1), ("steps", 0)):
+            at_least(name, getattr(self, name), least)
 
 
 DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32", steps=0)

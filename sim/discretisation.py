@@ -162,8 +162,8 @@ def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
     InputError
         An unknown type; a linear type on a mesh that brings mid-edge nodes of its own.
     """
-    element = element or recommended(mesh)
-    if element not in ELEMENTS:
+    element = recommended(mesh) if element is None else element
+    if element not in tuple(ELEMENTS):  # which need not be hashable
         raise InputError(f"no element is called {element!r}: choose one of {', '.join(ELEMENTS)}.")
     none = np.zeros((0, 2), np.int32)
     if mesh.middles is not None:

@@ -92,6 +92,8 @@ class Fem:
     ):
         if not isinstance(accuracy, Accuracy):
             raise InputError(f"accuracy is {accuracy!r:.80}: give an Accuracy, such as LIVE, TRAIN or REFERENCE.")
+        if not isinstance(effects, Iterable):
+            raise InputError(f"effects is {effects!r:.80}: give a tuple of effects.")
         self.lock = RLock()
         self._anatomy = anatomy
         self.effects = tuple(effects)
@@ -153,7 +155,7 @@ class Fem:
         last = None if start is None else self._guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads)))
         if start is not None and last is not None:
-            cases = Cases(loads, start.time, start.history, last.T.reshape(len(loads), -1, 3))
+            cases = Cases(loads, start.time, start.history, last.T.reshape(len(loads), self.space.count, 3))
         some = alike(cases.steps, self.batch) if self.problem.paced else None
         batches = some or [(math.inf, rows) for rows in self._batches(len(loads))]
         parts = []
@@ -310,7 +312,7 @@ class Fem:
         check_start(start, len(loads), vertices)
         full = self.space.interpolated(start.at(np.arange(vertices)).displacement)
         if len(self.space.edges) and MIDDLES in start.history:
-            full[:, vertices:] += start.history[MIDDLES]
+            full[:, vertices:] += Cases(loads, start.time, start.history).past(MIDDLES, (len(self.space.edges), 3))
         return full.reshape(len(loads), self.problem.rows).T
 
     def _solve(

@@ -42,7 +42,7 @@ def numbers(name: str, values: object, largest: float = LARGEST) -> np.ndarray:
     """
     array = as_array(name, values)
     if array.dtype != np.float64:
-        if array.dtype.kind not in "fiu" and array.size:
+        if array.dtype.kind not in "fiu":
             raise InputError(f"{name} has the type {array.dtype}: give real numbers.")
         with np.errstate(over="ignore"):  # of wider types
             array = array.astype(np.float64)

@@ -95,6 +95,20 @@ def test_a_point_off_the_surface_is_refused(offset: list[float]) -> None:
         footprint_weights(nodes, triangles, points, np.full(2, RADIUS))
 
 
+@pytest.mark.parametrize("radius", [1e-12, 1e-300])
+def test_a_footprint_too_small_for_the_triangles_is_refused_at_once(radius: float) -> None:
+    """It would be cut into more pieces than there are whole numbers."""
+    with pytest.raises(InputError, match="too small for the triangles of this surface: give a radius of at least"):
+        weights(*sheet(30), radius=radius)
+
+
+def test_the_smallest_footprint_that_is_taken_is_integrated() -> None:
+    nodes, triangles = sheet(0)
+    weight = weights(nodes, triangles, radius=2e-7)
+    np.testing.assert_allclose(weight @ nodes, POINT, atol=1e-9)
+    assert weight.sum() == pytest.approx(1.0)
+
+
 def test_only_nodes_near_the_tool_are_loaded() -> None:
     nodes, triangles = sheet(3000)
     weight = weights(nodes, triangles)

@@ -299,7 +299,7 @@ def test_a_spent_budget_is_told(problem: Problem) -> None:
     assert found.outcome[-1] is Outcome.BUDGET
     assert found.iterations[-1] == 1
     assert found.residual[-1] > 1e-10
-    with pytest.raises(InputError, match="allow no work"):
+    with pytest.raises(InputError, match="give a whole number from"):
         Accuracy(outer=0)
 
 

@@ -1,7 +1,9 @@
 """Learned deformers: what they were taught, what they refuse, how they are scored and stored."""
 
 import json
+import threading
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -242,6 +244,21 @@ def test_what_has_no_answer_is_refused_alone_and_among_others(trained, box, name
     assert asked(here, force=2.9 * strongest * down / 0.2).outcome == (Outcome.EXTRAPOLATED,)
 
 
+@pytest.mark.parametrize("name", ["linear", "residual", "ann", "svr", "gp"])
+def test_threads_that_share_a_model_get_their_own_answers(trained, fresh, name):
+    """Each begins with nothing prepared, and presses the cortex elsewhere than the others do at the same time."""
+    wanted = [trained.models[name].deform(fresh.rows(slice(k, k + 1))).displacement for k in range(60)]
+    model, ready = replace(trained.models[name]), threading.Barrier(4)
+
+    def work(thread):
+        ready.wait()
+        return [model.deform(fresh.rows(slice(k, k + 1))).displacement for k in range(thread, 60, 4)]
+
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(work, range(4)))
+    assert all(np.array_equal(answer, wanted[k]) for k, answer in enumerate(sum(zip(*answers, strict=True), ())))
+
+
 def test_held_out_loads_lie_inside_the_envelope(trained, data):
     model = trained.models["linear"]
     held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
@@ -256,6 +273,14 @@ def test_other_loads_and_other_vertices_are_refused(model, box):
     for cause in (Displaced(point, point, np.full(1, 6e-3)), Nodal(np.zeros((1, len(box.mesh.nodes), 3))), lying):
         with pytest.raises(InputError, match=f"{type(cause).__name__}.*taught pushing forces only"):
             model.deform(Loads((cause,)))
+    tumour = np.isin(np.arange(len(box.mesh.nodes)), box.tumour_nodes)
+    wrong = ((tumour, "at is a mask"), ([1.5], "type float64"), ([[1]], "shape"), ([-1], "not vertex -1"), ("x", "<U1"))
+    for at, sentence in wrong:
+        with pytest.raises(InputError, match=sentence):
+            model.deform(push([0, 0, 0], [0, 0, -0.1], 6e-3), at=at)
+    with pytest.raises(InputError, match="the start is a int"):
+        model.deform(push([0, 0, 0], [0, 0, -0.1], 6e-3), 5)
+    assert len(model.deform(push([0, 0, 0], [0, 0, -0.1], 6e-3), at=box.tumour_nodes.tolist()).nodes)
     deep = np.setdiff1d(np.arange(len(box.mesh.nodes)), model.nodes)[:1]
     with pytest.raises(InputError, match=f"not vertex {deep[0]}"):
         model.deform(push([0, 0, 0], [0, 0, -0.1], 6e-3), at=deep)

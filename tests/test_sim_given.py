@@ -1,0 +1,252 @@
+"""What callers get wrong is a sentence that names it: arrays, vertices, starts, and what a solver is made with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from boxes import base_held, box
+
+from sim.accuracy import LIVE, Accuracy
+from sim.deformation import LEARNT_KEY, Deformation, guess
+from sim.effects import Elasticity, Held, Inertia, Resection, ToolForce
+from sim.errors import InputError
+from sim.fem import MIDDLES, Fem
+from sim.loads import (
+    Displaced,
+    Loads,
+    Nodal,
+    Posture,
+    Prescribed,
+    Pushed,
+    Resected,
+    Retracted,
+    Touching,
+    posture,
+    push,
+)
+from sim.operated import finite_elements
+
+BODY = base_held(box((3, 3, 3), 0.1))
+EFFECTS = Elasticity(), Held(), ToolForce()
+POINT, FORCE = np.array([0.05, 0.05, 0.1]), np.array([0.0, 0.0, -0.2])
+PUSH = push(POINT, FORCE, 0.02)
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "ragged": ([[1.0, 2.0, 3.0], [1.0]], "makes no array"),
+    "text": ("left", "type <U4"),
+    "texts": ([["a", "b", "c"]], "type <U1"),
+    "complex": (np.ones((1, 3)) * 1j, "type complex128"),
+    "objects": (np.array([[None, 1, 2]], object), "type object"),
+    "nothing": (None, "type object|shape"),
+    "truth values": (np.ones((1, 3), bool), "type bool"),
+    "nan": (np.array([[0.0, np.nan, 0.0]]), "finite"),
+    "infinite": (np.array([[0.0, np.inf, 0.0]]), "finite"),
+    "huge": (np.array([[0.0, 1e300, 0.0]]), r"1e\+300, beyond"),
+    "wide": (np.array([[0.0, 0.0, 1.0]], np.longdouble) * np.longdouble("1e4000"), "finite"),
+    "a whole number too long": ([[10**400, 0, 0]], "type object"),
+    "two columns": (np.zeros((1, 2)), "shape"),
+    "four columns": (np.zeros((3, 4)), "shape"),
+}
+CAUSES: dict[type, dict[str, np.ndarray]] = {
+    Pushed: {"point": POINT[None], "force": FORCE[None], "footprint": np.array([0.01])},
+    Displaced: {"point": POINT[None], "displacement": FORCE[None], "footprint": np.array([0.01])},
+    Nodal: {"force": np.zeros((1, 5, 3))},
+    Prescribed: {"displacement": np.zeros((1, 5, 3))},
+    Posture: {"direction": FORCE[None], "csf_level": np.zeros(1), "share": np.ones(1)},
+    Resected: {"done": np.zeros(1)},
+    Touching: {"pose": np.eye(4)[None, None]},
+    Retracted: {"pose": np.eye(4)[None], "displacement": FORCE[None]},
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_arrays_of_every_cause_are_refused_by_name(wrong: str) -> None:
+    value, _ = WRONG[wrong]
+    for kind, arrays in CAUSES.items():
+        assert len(Loads((kind(**arrays),))) == 1
+        for name in arrays:
+            with pytest.raises(InputError, match=rf"{kind.__name__}\.{name} (has|makes)"):
+                Loads((kind(**{**arrays, name: value}),))
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_arguments_of_push_and_posture_are_refused_by_name(wrong: str) -> None:
+    value, reason = WRONG[wrong]
+    for name in ("point", "force", "footprint"):
+        with pytest.raises(InputError, match=rf"Pushed\.{name} .*({reason}|shape)"):
+            push(**{"point": POINT, "force": FORCE, "footprint": 0.01, name: value})
+    for name in ("direction", "csf_level"):
+        with pytest.raises(InputError, match=rf"Posture\.{name} .*({reason}|shape)"):
+            posture(**{"direction": FORCE, "csf_level": 0.0, name: value})
+
+
+@pytest.mark.parametrize(
+    ("build", "sentence"),
+    [
+        (lambda: push(np.zeros((2, 3)), np.ones((3, 3)), 0.01), "rows of point 2, force 3, footprint 1"),
+        (lambda: push(POINT, np.ones((3, 3)), np.full(2, 0.01)), "rows of point 1, force 3, footprint 2"),
+        (lambda: push(POINT, FORCE, np.full((1, 1), 0.01)), r"Pushed\.footprint has shape \(1, 1\)"),
+        (lambda: push(POINT, FORCE, 7), r"a radius of 7 m: give positive radii in metres, .*7 mm are 0\.007"),
+        (lambda: push(POINT, FORCE, 1e-12), r"a radius of 1e-12 m.* from 0\.0001 to 0\.1"),
+        (lambda: posture(np.ones((2, 3)), np.zeros(3)), "rows of direction 2, csf_level 3"),
+        (lambda: posture(np.array([1e-200, 0.0, 0.0]), 0.0), "row of zeros"),
+        (lambda: Loads((5,)), r"Loads\.causes is \(5,\): give a tuple of Pushed, "),  # pyright: ignore[reportArgumentType]
+        (lambda: Loads(PUSH), r"Loads\.causes is Loads"),  # pyright: ignore[reportArgumentType]
+        (lambda: Loads(PUSH.causes, "now"), r"Loads\.time has the type"),  # pyright: ignore[reportArgumentType]
+        (lambda: Loads(PUSH.causes, np.array([1e300])), r"Loads\.time .* beyond"),
+        (lambda: Loads((Resected(np.array([1e300])),)), r"Resected\.done .* beyond"),
+    ],
+)
+def test_rows_and_radii(build: Callable[[], Loads], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        build()
+
+
+@pytest.fixture(scope="module")
+def fem() -> Fem:
+    return Fem(BODY, EFFECTS, LIVE, "cpu")
+
+
+@pytest.fixture(scope="module")
+def cut() -> Any:
+    return finite_elements(BODY, (*EFFECTS, Resection(((150, 151, 152),))), LIVE, "cpu")
+
+
+VERTICES = [
+    (np.ones(64, bool), "at is a mask of truth values: give vertex numbers, as np.flatnonzero"),
+    ([True, False], "at is a mask"),
+    ([1.5], r"at has shape \(1,\) and type float64: give the numbers of vertices"),
+    (np.array([1.0, 2.0]), "type float64"),
+    (np.array([[1, 2]]), r"shape \(1, 2\)"),
+    (3, r"shape \(\)"),
+    (["one"], "type <U3"),
+    ([[1], [1, 2]], "at makes no array"),
+    ([-1], "no vertex -1"),
+    ([10**6], "no vertex 1000000: ask for some of 0 to 63"),
+    (np.array([2**63 + 5], np.uint64), "no vertex"),
+]
+
+
+@pytest.mark.parametrize(("at", "sentence"), VERTICES)
+def test_vertices_that_are_none(fem: Fem, cut: Any, at: Any, sentence: str) -> None:
+    for body in (fem, cut):
+        with pytest.raises(InputError, match=sentence):
+            body.deform(PUSH, at=at)
+    for ask in (lambda: fem.corrected(PUSH, fem.deform(PUSH), at), lambda: fem.reading(at, np.ones((1, 1, 3)))):
+        with pytest.raises(InputError, match=sentence):
+            ask()
+    answer = fem.deform(PUSH)
+    with pytest.raises(InputError):
+        answer.at(at)
+
+
+def test_lists_of_vertices_will_do(fem: Fem, cut: Any) -> None:
+    for body in (fem, cut):
+        whole = body.deform(PUSH)
+        some_lists: list[Any] = [[5, 2], (5, 2), np.array([5, 2], np.uint8), [], [7, 7]]
+        for at in some_lists:
+            some = body.deform(PUSH, at=at)
+            np.testing.assert_array_equal(some.displacement, whole.displacement[:, np.array(at, int)])
+            np.testing.assert_array_equal(whole.at(at).displacement, some.displacement)
+            assert some.displacement.shape == (1, len(at), 3)
+    with pytest.raises(InputError, match="does not know vertex 3"):
+        fem.deform(PUSH, at=np.array([1])).at(np.array([3]))
+    with pytest.raises(InputError, match="does not know vertex 3"):
+        fem.deform(PUSH, at=np.zeros(0, int)).at(np.array([3]))
+
+
+@pytest.mark.parametrize("batch", [0, -1, 1.5, True, "2", np.nan])
+def test_batches_of_none(batch: Any) -> None:
+    with pytest.raises(InputError, match=r"batch is .*: give a whole number from 1 up"):
+        Fem(BODY, EFFECTS, LIVE, "cpu", batch=batch)
+
+
+@pytest.mark.parametrize(
+    ("made", "sentence"),
+    [
+        ({"accuracy": "live"}, "accuracy is 'live': give an Accuracy"),
+        ({"element": "p7"}, "no element is called 'p7'"),
+        ({"element": ["p1"]}, r"no element is called \['p1'\]"),
+        ({"effects": Elasticity()}, "effects is Elasticity.*: give a tuple of effects"),
+    ],
+)
+def test_a_solver_of_nonsense(made: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Fem(**{"anatomy": BODY, "effects": EFFECTS, "accuracy": LIVE, "device": "cpu", **made})
+
+
+@pytest.mark.parametrize(
+    ("budget", "sentence"),
+    [
+        ({"outer": 1.5}, "outer is 1.5: give a whole number from 1 up"),
+        ({"inner": 0}, "inner is 0"),
+        ({"steps": -1}, "steps is -1: give a whole number from 0 up"),
+        ({"tolerance": "fine"}, "tolerance is 'fine': give a number"),
+        ({"tolerance": np.nan}, "a tolerance of nan is outside"),
+        ({"precision": ["float32"]}, "no precision is called"),
+    ],
+)
+def test_an_accuracy_of_nonsense(budget: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Accuracy(**budget)
+    assert Accuracy(**{"tolerance": np.float32(1e-3), "outer": np.int32(4)}).outer == 4
+
+
+def spoilt(answer: Deformation, **history: Any) -> Deformation:
+    return replace(answer, history={**answer.history, **history})
+
+
+def test_starts_that_are_none(fem: Fem, cut: Any) -> None:
+    for body in (fem, cut):
+        good = body.deform(PUSH)
+        own = np.zeros((1, 64, 3))
+        wrong: list[tuple[Any, str]] = [
+            (5, "the start is a int"),
+            (good.displacement, "the start is a ndarray"),
+            (guess(np.zeros((2, 64, 3))), r"shape \(2, 64, 3\): give every vertex of 1 load cases, \(1, 64, 3\)"),
+            (guess(np.zeros((1, 8, 3))), r"shape \(1, 8, 3\)"),
+            (good.at(np.array([1, 2])), r"shape \(1, 2, 3\)"),
+            (replace(good, time=np.array([np.nan])), "the start's 'time' are no 1 rows of finite numbers"),
+            (replace(good, time=np.zeros(3)), "the start's 'time'"),
+            (spoilt(good, before=np.full((1, 192), np.nan)), "the start's 'before'"),
+            (spoilt(good, pushes=np.array("x")), "the start's 'pushes'"),
+            (spoilt(good, pushes=np.zeros((4, 2, 7))), "the start's 'pushes'"),
+            (spoilt(good, pushes=good.history["pushes"] * 1j), "the start's 'pushes'"),
+        ]
+        for start, sentence in wrong:
+            with pytest.raises(InputError, match=sentence):
+                body.deform(PUSH, start)
+        assert body.deform(PUSH, guess(own)).outcome[0].good
+    for values, sentence in ((np.full((1, 64, 3), np.nan), "finite"), (np.zeros((64, 3)), "shape"), ("x", "type")):
+        with pytest.raises(InputError, match=f"a guessed displacement .*{sentence}"):
+            guess(values)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_was_learnt_and_is_not_finite_is_forgotten(fem: Fem, value: float) -> None:
+    first = fem.deform(PUSH)
+    start = fem.deform(PUSH.scaled(1.1), first)
+    key = LEARNT_KEY + "s"
+    assert start.history[LEARNT_KEY + "known"][0] > 0
+    found = fem.deform(PUSH.scaled(1.2), spoilt(start, **{key: np.full_like(start.history[key], value)}))
+    plain = {name: array for name, array in start.history.items() if not name.startswith(LEARNT_KEY)}
+    other = fem.deform(PUSH.scaled(1.2), replace(start, history=plain))
+    np.testing.assert_array_equal(found.displacement, other.displacement)
+
+
+def test_mid_edge_nodes_of_another_body() -> None:
+    body = Fem(BODY, EFFECTS, LIVE, "cpu", element="p2")
+    answer = body.deform(PUSH)
+    wrong = spoilt(answer, **{MIDDLES: answer.history[MIDDLES][:, :, :2]})
+    with pytest.raises(InputError, match=f"the start's history of {MIDDLES} has shape"):
+        body.deform(PUSH, wrong)
+
+
+def test_no_load_at_all_from_a_start_is_no_answer_at_all() -> None:
+    body = Fem(BODY, (Elasticity(), Held(), ToolForce(), Inertia()), LIVE, "cpu")
+    none = PUSH.rows(np.arange(0))
+    assert len(body.deform(none, guess(np.zeros((0, 64, 3))))) == 0
