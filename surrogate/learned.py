@@ -31,9 +31,9 @@ from .series import Series
 if TYPE_CHECKING:
     from .swift import Swift
 
-# Times the strongest force that was taught. Of loads so strong on the template's brain the finite elements find an
-# equilibrium of none, and at twice that force a prediction is off by a fifth to a third of the motion.
-STRONGEST = 3.0
+# Times the strongest force, or the widest footprint, that was taught. Of three loads so strong on the template's brain
+# the finite elements find an equilibrium of none, and at twice the force a prediction is off by up to 31 %.
+FARTHEST = 3.0
 # Taught points are stored in single precision [m].
 STORED = 1e-6
 
@@ -147,21 +147,24 @@ class Learned:
         return Swift(series, remainder, basis, self._patch, self.envelope, self.bounds)
 
     def _demand_answerable(self, pushed: Pushed, doubtful: np.ndarray) -> None:
-        """Refuse what has no answer to be near to: a footprint off the open cortex, a force far beyond what was taught.
+        """Refuse what has no answer to be near to: a footprint off the open cortex, a size far beyond what was taught.
 
         Of the `doubtful` (k,) rows alone: a load inside the envelope is neither, unless its radius is less than the
         reach.
         """
         if not len(doubtful):
             return
-        size, most = directions(pushed)[0], self.envelope.force[1]
-        strong = np.flatnonzero(size > STRONGEST * most)
-        if len(strong):
-            unit, name = (1.0, "N") if self.ball is None else (1e3, "mm")
-            raise InputError(
-                f"load {strong[0]} presses with {unit * size[strong[0]]:.3g} {name}, but this model was taught "
-                f"{unit * most:.3g} {name} at most: give up to {STRONGEST:g} times that, or ask the finite elements."
-            )
+        force = ("a force", 1.0, "N") if self.ball is None else ("a depth", 1e3, "mm")
+        for (name, unit, symbol), size, (_, most) in (
+            (force, directions(pushed)[0], self.envelope.force),
+            (("a footprint", 1e3, "mm"), pushed.footprint, self.envelope.footprint),
+        ):
+            far = np.flatnonzero(size > FARTHEST * most)
+            if len(far):
+                raise InputError(
+                    f"load {far[0]} has {name} of {unit * size[far[0]]:.3g} {symbol}, but this model was taught "
+                    f"{unit * most:.3g} {symbol} at most: give up to {FARTHEST:g} times that, or ask the finite elements."
+                )
         away = nearest(pushed.point[doubtful], self._patch.points)[1]
         if (away > pushed.footprint[doubtful]).any():  # off all nodes of the cortex, if not off its triangles
             self._patch.skin.demand_touch(pushed.point, pushed.footprint)
@@ -181,8 +184,8 @@ class Learned:
         Raises
         ------
         InputError
-            Loads of another kind, or that do not touch the open cortex, or are more than `STRONGEST` times as strong as
-            any that was taught; a start with other rows; a vertex in `at` that the model does not know.
+            Loads of another kind, or that do not touch the open cortex, or are more than `FARTHEST` times as strong
+            or as wide as any that was taught; a start with other rows; a vertex in `at` that the model does not know.
         """
         if start is not None and not isinstance(start, Deformation):
             raise InputError(f"the start is a {type(start).__name__}: give a Deformation, or none.")

@@ -238,8 +238,10 @@ def test_what_has_no_answer_is_refused_alone_and_among_others(trained, box, name
             asked(here + way)
         with pytest.raises(InputError, match=r"load 1 .*does not touch the open cortex"):
             asked(here, here + way)
-    with pytest.raises(InputError, match=r"load 0 presses with 10 N, but this model was taught 0\..* N at most"):
+    with pytest.raises(InputError, match=r"load 0 has a force of 10 N, but this model was taught 0\..* N at most"):
         asked(here, force=50.0 * down)
+    with pytest.raises(InputError, match=r"load 0 has a footprint of 50 mm, but this model was taught .* mm at most"):
+        model.deform(push(here, down, 0.05), at=box.tumour_nodes)
     assert asked(here + [0.0, 0.0, 5.9e-3]).outcome[0] is not None
     assert asked(here, force=2.9 * strongest * down / 0.2).outcome == (Outcome.EXTRAPOLATED,)
 
