@@ -163,7 +163,8 @@ class Learned:
             if len(far):
                 raise InputError(
                     f"load {far[0]} has {name} of {unit * size[far[0]]:.3g} {symbol}, but this model was taught "
-                    f"{unit * most:.3g} {symbol} at most: give up to {FARTHEST:g} times that, or ask the finite elements."
+                    f"{unit * most:.3g} {symbol} at most: give up to {FARTHEST:g} times that, or ask the finite "
+                    "elements."
                 )
         away = nearest(pushed.point[doubtful], self._patch.points)[1]
         if (away > pushed.footprint[doubtful]).any():  # off all nodes of the cortex, if not off its triangles
