@@ -54,7 +54,7 @@ def at_once(work: Callable[[int], list[T]]) -> list[list[T]]:
 @pytest.mark.parametrize("accuracy", [LIVE, REFERENCE], ids=["float32", "float64"])
 def test_finite_elements_shared_by_threads_answer_bit_for_bit(accuracy: Accuracy) -> None:
     """Cold and warm: what is learnt on the way travels in the answers, not in the solver."""
-    fem = Fem(BODY, EFFECTS, accuracy, "cpu", batch=2)
+    fem = Fem(BODY, EFFECTS, accuracy, "cpu", batch=2, element="p1")
 
     def work(thread: int) -> list[Deformation]:
         answers = [fem.deform(loads) for loads in pushes(thread)]
@@ -68,7 +68,7 @@ def test_finite_elements_shared_by_threads_answer_bit_for_bit(accuracy: Accuracy
 
 
 def test_residuals_corrections_and_series_shared_by_threads() -> None:
-    fem = Fem(BODY, EFFECTS, REFERENCE, "cpu", batch=2)
+    fem = Fem(BODY, EFFECTS, REFERENCE, "cpu", batch=2, element="p1")
     nodes = np.arange(40, 46)
     modes = np.eye(18).reshape(18, 6, 3)
 
@@ -101,7 +101,7 @@ def test_a_body_that_is_cut_shared_by_threads() -> None:
 
 def test_what_an_answer_left_on_the_device_is_its_own_while_others_answer() -> None:
     """Frame after frame, each thread on its own way; histories are read after others have moved on."""
-    fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), LIVE, "cpu")
+    fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), LIVE, "cpu", element="p1")
     fem._following = fem._follower()
 
     def work(thread: int) -> list[Deformation]:

@@ -108,7 +108,7 @@ def test_rows_and_radii(build: Callable[[], Loads], sentence: str) -> None:
 
 @pytest.fixture(scope="module")
 def fem() -> Fem:
-    return Fem(BODY, EFFECTS, LIVE, "cpu")
+    return Fem(BODY, EFFECTS, LIVE, "cpu", element="p1")
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_lists_of_vertices_will_do(fem: Fem, cut: Any) -> None:
 @pytest.mark.parametrize("batch", [0, -1, 1.5, True, "2", np.nan])
 def test_batches_of_none(batch: Any) -> None:
     with pytest.raises(InputError, match=r"batch is .*: give a whole number from 1 up"):
-        Fem(BODY, EFFECTS, LIVE, "cpu", batch=batch)
+        Fem(BODY, EFFECTS, LIVE, "cpu", batch=batch, element="p1")
 
 
 @pytest.mark.parametrize(
@@ -247,6 +247,6 @@ def test_mid_edge_nodes_of_another_body() -> None:
 
 
 def test_no_load_at_all_from_a_start_is_no_answer_at_all() -> None:
-    body = Fem(BODY, (Elasticity(), Held(), ToolForce(), Inertia()), LIVE, "cpu")
+    body = Fem(BODY, (Elasticity(), Held(), ToolForce(), Inertia()), LIVE, "cpu", element="p1")
     none = PUSH.rows(np.arange(0))
     assert len(body.deform(none, guess(np.zeros((0, 64, 3))))) == 0
