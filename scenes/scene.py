@@ -26,6 +26,7 @@ from sim.effects import (
 from sim.errors import InputError
 from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
 from sim.material import Tissue
+from sim.script import run_script
 
 from .lying import Lie, supine
 from .paths import AIR, Path, Touch, idle
@@ -230,13 +231,28 @@ SCENES = ("press", "slide", "draw", "palpate", "retract", "brain_shift", "resect
 
 
 def find_scene(name: str) -> Scene:
-    """A built-in scene.
+    """A built-in scene by name, or the SCENE of a user's own file by its path, which ends in .py.
+
+    The file is run as any Python file is: with all the rights of who runs it.
 
     Raises
     ------
     InputError
-        No scene of that name.
+        No scene of that name; a file that is missing, does not run, or has no SCENE.
     """
+    if name.endswith(".py"):
+        return _own_scene(name)
     if name not in SCENES:
-        raise InputError(f"no scene is called {name!r}: choose one of {', '.join(SCENES)}.")
+        raise InputError(
+            f"no scene is called {name!r}: choose one of {', '.join(SCENES)}, or name a file of your own, MY_SCENE.py."
+        )
     return importlib.import_module(f"scenes.{name}").SCENE
+
+
+def _own_scene(path: str) -> Scene:
+    found = getattr(run_script(path), "SCENE", None)
+    if found is None:
+        raise InputError(f"{path}: has no SCENE. Let it say SCENE = Scene(...), as the built-in scenes do.")
+    if not isinstance(found, Scene):
+        raise InputError(f"{path}: its SCENE is a {type(found).__name__}. Make it a scenes.scene.Scene.")
+    return found

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scenes", nargs="*", help="which (default: all built-in scenes)")
+    parser.add_argument("scenes", nargs="*", help="which, MY_SCENE.py too (default: all built-in scenes)")
     parser.add_argument("--every", type=int, default=10, help="check every so many frames (default %(default)s)")
     parser.add_argument(
         "--certify", action="store_true", help="tell each frame's error without solving to the end, and correct it"

@@ -14,7 +14,7 @@ from .demo import add_theatre, deformer_name, scene_asked
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`")
+    parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--out", required=True, type=Path, help="the episode, .h5")
     add_theatre(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON line")

@@ -75,7 +75,7 @@ def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> s
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
+    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene or MY_SCENE.py (default press)")
     add_theatre(parser)
     parser.add_argument(
         "--host",

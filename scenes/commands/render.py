@@ -16,7 +16,7 @@ from .demo import add_theatre, deformer_name, scene_asked
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`")
+    parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--out", required=True, type=Path, help="folder of frame_0000.png, frame_0001.png, ...")
     parser.add_argument("--every", type=int, default=1, help="draw every so many frames (default %(default)s)")
     parser.add_argument("--film", type=Path, help="besides, a film: .mp4, .gif or .webp")

@@ -1,0 +1,114 @@
+"""Scenes in a researcher's own files: every command that plays takes one, and a file that is none gets a sentence."""
+
+import json
+import sys
+
+import pytest
+from theatres import put, theatre_of
+
+from scenes.cli import main
+from scenes.scene import find_scene
+from sim.errors import InputError
+from sim.script import run_script
+
+OWN = '''"""The tool nods twice."""
+
+from own_strokes import nod
+from scenes.scene import Scene, Viewpoint
+
+SCENE = Scene("nod", __doc__, nod(0.2), duration=0.07, viewpoint=Viewpoint(width=160, height=120))
+'''
+STROKES = """from scenes.paths import press
+
+def nod(force):
+    return press(force, rise=0.04, hold=0.0)
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(box, tmp_path_factory):
+    """A researcher's: a brain with its models, a scene, and a module that the scene imports."""
+    folder = tmp_path_factory.mktemp("own")
+    put(theatre_of(box), folder / "box.vtu")
+    (folder / "my_scene.py").write_text(OWN)
+    (folder / "own_strokes.py").write_text(STROKES)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["render", "--out", "frames", "--every", "2", "--json"],
+        ["collect", "--out", "nod.h5", "--json"],
+        ["check", "--every", "1", "--json"],
+        ["demo", "--seconds", "0.01", "--port", "8765"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_command_plays_it(folder, monkeypatch, capsys, words):
+    monkeypatch.chdir(folder)
+    done = main([words[0], "my_scene.py", *words[1:], "--anatomy", "box.vtu", "--deformer", "linear"])
+    out, err = capsys.readouterr()
+    assert done == 0, err
+    if "--json" in words:
+        told = json.loads(out)
+        assert (told["scenes"][0] if words[0] == "check" else told)["scene"] == "nod"
+
+
+def test_what_its_effects_cost_is_measured(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert main(["effects", "my_scene.py", "--every", "1", "--anatomy", "box.vtu", "--device", "cpu", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["scene"] == "nod" and "ToolForce" in {row["effect"] for row in told["effects"]}
+
+
+def test_the_same_text_runs_once_and_a_mended_one_anew(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text("class Mine: pass\n")
+    first = run_script(path)
+    assert run_script(path) is first and sys.modules[first.__name__] is first
+    path.write_text("class Mine: number = 2\n")
+    assert run_script(path).Mine.number == 2 and not hasattr(first.Mine, "number")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "my.py: has no SCENE. Let it say SCENE = Scene"),
+        ("SCENE = 'press'", "my.py: its SCENE is a str. Make it a scenes.scene.Scene."),
+        ("\nSCENE = Scene(", r"my.py, line 2: is no Python \('\(' was never closed\). Mend the file."),
+        ("one = 1\nSCENE = one / 0\n", "my.py, line 2: raised ZeroDivisionError: division by zero. Mend the file."),
+        ("import no_such_module", "line 1: raised ModuleNotFoundError: No module named 'no_such_module'"),
+        ("raise SystemExit(3)", "line 1: raised SystemExit: 3"),
+        ("def f():\n    raise ValueError('deep')\nf()", "line 2: raised ValueError: deep"),
+        ("x = '\0'", "my.py: is no Python|my.py, line 1: is no Python"),
+        (
+            "from sim.material import Material\n\nMaterial('linear', 3000.0, 0.5)",
+            r"my.py, line 3: Poisson's ratio is 0.5: give a number",
+        ),
+    ],
+)
+def test_a_file_that_makes_no_scene_is_a_sentence(tmp_path, text, words):
+    path = tmp_path / "my.py"
+    path.write_text(text)
+    modules = set(sys.modules)
+    with pytest.raises(InputError, match=words):
+        find_scene(str(path))
+    if text and "SCENE = 'press'" not in text:
+        assert not {name for name in set(sys.modules) - modules if name.startswith("own_my")}
+
+
+def test_a_file_that_is_not_there_is_a_sentence(tmp_path):
+    with pytest.raises(InputError, match=r"none\.py: cannot be read \(No such file or directory\)"):
+        find_scene(str(tmp_path / "none.py"))
+    with pytest.raises(InputError, match=r"'dance'.*MY_SCENE\.py"):
+        find_scene("dance")
+
+
+def test_a_command_says_the_sentence_and_writes_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my.py").write_text("SCENE = 1 / 0")
+    assert main(["render", "my.py", "--out", "frames"]) == 2
+    error = capsys.readouterr().err
+    assert "line 1: raised ZeroDivisionError" in error and "Traceback" not in error
+    assert [path.name for path in tmp_path.iterdir()] == ["my.py"]
