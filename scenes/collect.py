@@ -103,6 +103,8 @@ def caused(loads: Loads) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for cause in loads.causes:
         match cause:
+            case Pushed() if "force" in found:
+                raise InputError("episodes hold the force of one tool: collect a scene of one that pushes.")
             case Pushed():
                 found |= {"force": cause.force[0], "contact": cause.point[0]}
             case Posture() | Resected() | Retracted():

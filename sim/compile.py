@@ -1,8 +1,10 @@
-"""Effects + anatomy + device -> Problem: the one `match` over effects. A term's module is imported in its own arm."""
+"""Effects + anatomy + device -> Problem: the one `match` over effects. A term's module is imported in its own arm.
+
+Effects that this package does not know build their terms themselves.
+"""
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
@@ -13,16 +15,19 @@ import scipy.sparse as sp
 import warp as wp
 
 from .anatomy import Anatomy
+from .body import Body
 from .constraint import Constraint
 from .device import Device
 from .discretisation import Discretisation, discretise
 from .effects import (
+    BuiltIn,
     Effect,
     Elasticity,
     Gravity,
     Held,
     Inertia,
     NodalForce,
+    OwnEffect,
     Pulsation,
     Resection,
     Retraction,
@@ -48,7 +53,7 @@ from .loads import (
     Touching,
     check_field,
 )
-from .material import Tissue, coefficients_of, portion
+from .material import Tissue, coefficients_of, functions_of, portion
 from .problem import Imposed, Problem
 from .term import Barrier, Curved, Term
 
@@ -79,7 +84,8 @@ def compile_problem(
     Raises
     ------
     InputError
-        Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not held.
+        Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not held;
+        an effect of the caller's own that makes no term, or one of a name that is taken.
     """
     effects = tuple(effects)
     kinds = [type(effect) for effect in effects]
@@ -93,6 +99,7 @@ def compile_problem(
     space = space or discretise(anatomy.mesh, "p1")
     skin = skin or Skin(space.nodes, space.surface, device)
     terms: list[Term] = []
+    own: list[Term] = []
     barriers: list[Barrier] = []
     held = np.zeros_like(anatomy.held)
     normal = np.zeros_like(anatomy.slide_normal)
@@ -136,12 +143,32 @@ def compile_problem(
                 pass  # a constraint: `_impose` reads the loads
             case Resection():
                 raise InputError("Resection changes the body: make its solver with `operated.finite_elements`.")
+            case OwnEffect():
+                own.append(effect.term(Body(anatomy, space, skin, device)))
             case _:
-                allowed = ", ".join(kind.__name__ for kind in Effect.__args__)
-                raise InputError(f"no effect is called {type(effect).__name__}: choose from {allowed}.")
+                allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
+                raise InputError(
+                    f"no effect is called {type(effect).__name__}: choose from {allowed}; "
+                    "or let your own have cause, remembers and term, as sim.effects.OwnEffect does."
+                )
     check_held(anatomy.mesh, held, normal)
+    _check_names((*terms, *barriers), own)
     constraint = Constraint(space.held(held), space.sliding(normal, held), device)
-    return Problem((*terms, *barriers), constraint, device, partial(_impose, space, skin), tuple(barriers))
+    elastic = all(term.constant for term in own)
+    return Problem(
+        (*terms, *own, *barriers), constraint, device, partial(_impose, space, skin), tuple(barriers), elastic
+    )
+
+
+def _check_names(terms: Iterable[Term], own: Iterable[Term]) -> None:
+    """Refuse terms that are none, and names that two terms have."""
+    taken = {term.name for term in terms}
+    for term in own:
+        if not isinstance(term, Term):
+            raise InputError(f"an effect of your own made a {type(term).__name__}: let it make a sim.term.Term.")
+        if term.name in taken:
+            raise InputError(f"two terms are called {term.name!r}: give yours another name.")
+        taken.add(term.name)
 
 
 def _shear(effects: Iterable[Effect]) -> float:
@@ -158,10 +185,12 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
     InputError
         Naming the cause and the effect that it needs.
     """
+    effects = tuple(effects)
     answered = {CAUSES[type(effect)] for effect in effects if type(effect) in CAUSES}
+    answered |= {effect.cause for effect in effects if isinstance(effect, OwnEffect)}
     for cause in loads.causes:
         if type(cause) not in answered:
-            needed = next(effect.__name__ for effect, kind in CAUSES.items() if kind is type(cause))
+            needed = next((effect.__name__ for effect, kind in CAUSES.items() if kind is type(cause)), "that it is for")
             raise InputError(f"loads hold {type(cause).__name__}, which nothing answers: add the effect {needed}.")
 
 
@@ -286,7 +315,7 @@ def _obeying(
     """
     from .terms.elasticity import Elasticity as ElasticityTerm
 
-    law = importlib.import_module(f".terms.{tissues[0].law.replace('-', '_')}", __package__).LAW
+    law = functions_of(tissues)
     lame = np.array([portion(tissue, carries) for tissue in tissues])[which]
     coefficients = coefficients_of(tissues, carries)[which]
     name = f"elasticity {law.name}" if carries == "whole" else f"elasticity {law.name} of {carries}"

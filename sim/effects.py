@@ -6,13 +6,18 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from operator import index
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from .anatomy import Anatomy
 from .errors import InputError
-from .material import BRAIN, Tissue
+from .material import BRAIN, Tissue, check_described
 from .tools import Spatula, Tool
+
+if TYPE_CHECKING:
+    from .body import Body
+    from .term import Term
 
 # Of `Pulsation`: shares of the volume, by which the opened template moves as much as opened brains do.
 CARDIAC, RESPIRATORY = 1.5e-3, 1.5e-3
@@ -24,10 +29,20 @@ class Elasticity:
     """Tissue resists deformation. `regions` names the law of each region label; the rest obeys `default`.
 
     `default=None` makes a region without a law an error.
+
+    Raises
+    ------
+    InputError
+        What is no tissue.
     """
 
     default: Tissue | None = BRAIN
     regions: Mapping[int, Tissue] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for tissue in (self.default, *self.regions.values()):
+            if tissue is not None:
+                check_described(tissue)
 
     def __str__(self) -> str:
         """The tissues as they are named beside every answer."""
@@ -321,7 +336,7 @@ def _check_gap(effect: ToolContact | Retraction | SkullContact) -> None:
         raise InputError(f"{type(effect).__name__}.gap is {effect.gap} m: give a positive number.")
 
 
-Effect = (
+BuiltIn = (
     Elasticity
     | Held
     | Slide
@@ -336,6 +351,29 @@ Effect = (
     | Retraction
     | SkullContact
 )
+"""The effects that this package knows."""
+
+
+@runtime_checkable
+class OwnEffect(Protocol):
+    """An effect of your own, as a frozen dataclass: it builds its `Term` itself. `docs/extend.md` works one out."""
+
+    @property
+    def cause(self) -> type | None:
+        """The kind of cause that it answers; None: it acts by itself."""
+        ...
+
+    @property
+    def remembers(self) -> bool:
+        """Whether an answer depends on the one before, so that a scene cannot be entered in its middle."""
+        ...
+
+    def term(self, body: Body) -> Term:
+        """Its summand of the potential on a body. Import here what only the term needs."""
+        ...
+
+
+Effect = BuiltIn | OwnEffect
 """Everything that a scene may ask for."""
 
 
@@ -347,12 +385,19 @@ def pushed_effects(anatomy: Anatomy, tissue: Tissue) -> tuple[Effect, ...]:
 
 def remember(effects: Iterable[Effect]) -> bool:
     """Whether an answer depends on the one before: where tools were, velocities, stress that fades, what was cut."""
-    kinds = (Inertia, ToolContact, Retraction, Resection)
-    return any(isinstance(effect, kinds) or (isinstance(effect, Elasticity) and _relaxes(effect)) for effect in effects)
+    return any(map(_remembers, effects))
 
 
-def _relaxes(effect: Elasticity) -> bool:
-    return any(tissue.prony for tissue in (effect.default, *effect.regions.values()) if tissue is not None)
+def _remembers(effect: Effect) -> bool:
+    match effect:
+        case Inertia() | ToolContact() | Retraction() | Resection():
+            return True
+        case Elasticity():
+            return any(tissue.prony for tissue in (effect.default, *effect.regions.values()) if tissue is not None)
+        case OwnEffect():
+            return effect.remembers
+        case _:
+            return False
 
 
 def solver_named(element: str, effects: Iterable[Effect]) -> str:

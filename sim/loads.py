@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
@@ -90,8 +90,20 @@ class Retracted:
     displacement: np.ndarray
 
 
-Cause = Pushed | Displaced | Nodal | Prescribed | Posture | Resected | Touching | Retracted
-C = TypeVar("C", Pushed, Displaced, Nodal, Prescribed, Posture, Resected, Touching, Retracted)
+class OwnCause(Protocol):
+    """What an effect of your own answers: a frozen dataclass (eq=False) of arrays (B, ...), a row per load case."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def magnitude(self) -> str | None:
+        """The name of the array that grows with the load, so that half a load can be had; None: there is none."""
+        ...
+
+
+BuiltIn = Pushed | Displaced | Nodal | Prescribed | Posture | Resected | Touching | Retracted
+Cause = BuiltIn | OwnCause
+C = TypeVar("C")
 # The array of each cause that grows with the load; the others say where it acts. Tools move on `Cases.share`.
 MAGNITUDE = {
     Pushed: "force",
@@ -112,33 +124,38 @@ RIGID = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """B load cases, each the sum of all causes; at most one cause of each kind. Without any, time alone goes on.
+    """B load cases, each the sum of all causes. Without any, time alone goes on.
+
+    `Pushed` may come several times, once for each tool that pushes; every other kind once.
 
     Parameters
     ----------
     causes
-        `Pushed`, `Displaced`, `Nodal`, `Prescribed`, `Posture`, `Resected`, `Touching`, `Retracted`.
+        `Pushed`, `Displaced`, `Nodal`, `Prescribed`, `Posture`, `Resected`, `Touching`, `Retracted`, or an `OwnCause`.
     time
         (B,) [s]; the time at which the answer is wanted. Zero where nothing depends on time.
 
     Raises
     ------
     InputError
-        Neither cause nor time, a kind twice, rows that do not agree; what are no real, finite numbers of the shapes
-        that the causes name; radii of footprints outside 0.1 to 100 mm.
+        Neither cause nor time, a kind but `Pushed` twice, what is no cause, rows that do not agree; what are no real,
+        finite numbers of the shapes that the causes name; radii of footprints outside 0.1 to 100 mm.
     """
 
     causes: tuple[Cause, ...]
     time: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.causes, tuple | list) or not all(isinstance(cause, Cause) for cause in self.causes):
-            known = ", ".join(kind.__name__ for kind in Cause.__args__)
+        if not isinstance(self.causes, tuple | list):
+            known = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
             raise InputError(f"Loads.causes is {self.causes!r:.80}: give a tuple of {known}.")
         kinds = [type(cause) for cause in self.causes]
-        if len(set(kinds)) < len(kinds) or not (kinds or self.time is not None):
+        single = [kind for kind in kinds if kind is not Pushed]
+        if len(set(single)) < len(single) or not (kinds or self.time is not None):
             names = ", ".join(kind.__name__ for kind in kinds) or "none"
-            raise InputError(f"loads have the causes {names}: give at least one, or a time, and each kind once.")
+            raise InputError(
+                f"loads have the causes {names}: give at least one, or a time, and each kind but Pushed once."
+            )
         object.__setattr__(self, "causes", tuple(_checked(cause) for cause in self.causes))
         rows = {len(array) for cause in self.causes for array in vars(cause).values()}
         time = np.zeros(max(rows)) if self.time is None else numbers("Loads.time", self.time)
@@ -158,8 +175,21 @@ class Loads:
         return self.time
 
     def of(self, kind: type[C]) -> C | None:
-        """The cause of one kind, or None."""
-        return next((cause for cause in self.causes if isinstance(cause, kind)), None)
+        """The cause of one kind, or None.
+
+        Raises
+        ------
+        InputError
+            Several of that kind: who asks for one cannot answer them.
+        """
+        found = self.every(kind)
+        if len(found) > 1:
+            raise InputError(f"the loads have {len(found)} causes {kind.__name__}, but one is taken here: give one.")
+        return found[0] if found else None
+
+    def every(self, kind: type[C]) -> tuple[C, ...]:
+        """All causes of one kind."""
+        return tuple(cause for cause in self.causes if isinstance(cause, kind))
 
     def but(self, kind: type[Cause]) -> Loads:
         """The same loads without the cause of one kind."""
@@ -180,8 +210,8 @@ class Loads:
     def scaled(self, fraction: float | np.ndarray) -> Loads:
         """The same causes with every magnitude that they have times `fraction` (scalar or (B,))."""
 
-        def grown(cause: Cause) -> Cause:
-            name = MAGNITUDE.get(type(cause))
+        def grown(cause: Cause) -> Any:
+            name = MAGNITUDE.get(type(cause)) if isinstance(cause, BuiltIn) else cause.magnitude
             if name is None:
                 return cause
             array = getattr(cause, name)
@@ -274,6 +304,11 @@ def _repeated(name: str, **given: tuple[object, tuple[int, ...]]) -> dict[str, n
 
 def _checked(cause: Cause) -> Cause:
     name = type(cause).__name__
+    if not isinstance(cause, BuiltIn) and not (is_dataclass(cause) and hasattr(cause, "magnitude")):
+        allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
+        raise InputError(
+            f"{name} is no cause: choose from {allowed}; or make your own as sim.loads.OwnCause says, with a magnitude."
+        )
     arrays = {key: numbers(f"{name}.{key}", value) for key, value in vars(cause).items()}
     whole_field = isinstance(cause, Nodal | Prescribed)
     for key, array in arrays.items():
@@ -282,7 +317,10 @@ def _checked(cause: Cause) -> Cause:
             continue
         scalar_rows = key in SCALARS
         good = array.ndim == (1 if scalar_rows else 3 if whole_field else 2)
-        if not good or (not scalar_rows and array.shape[-1] != 3):
+        if not isinstance(cause, BuiltIn):
+            if not array.ndim:
+                raise InputError(f"{name}.{key} is one number: give a row per load case, (B, ...).")
+        elif not good or (not scalar_rows and array.shape[-1] != 3):
             want = "(B,)" if scalar_rows else "(B, V, 3)" if whole_field else "(B, 3)"
             raise InputError(f"{name}.{key} has shape {array.shape}: give {want}.")
         if key == "footprint" and len(array):

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import ClassVar
+from inspect import getattr_static
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from .errors import InputError
+
+if TYPE_CHECKING:
+    from .law import Law
 
 LAWS = ("linear", "corotational", "neo-hookean", "stable-neo-hookean")
 """The laws that E and nu determine; `Ogden` has constants of its own."""
@@ -80,6 +85,11 @@ class Material:
         """The same with other Lamé constants (mu, lambda) [Pa]."""
         return mu, lam
 
+    @property
+    def functions(self) -> Law:
+        """The law's Warp functions, imported with the first use."""
+        return _built_in(self.law)
+
 
 @dataclass(frozen=True)
 class Ogden:
@@ -104,7 +114,7 @@ class Ogden:
         tissue has.
     """
 
-    law: ClassVar[str] = "ogden"
+    law = "ogden"
     terms: tuple[tuple[float, float], ...]
     bulk: float
     prony: Pairs = ()
@@ -143,9 +153,84 @@ class Ogden:
         share = mu / self.lame[0]
         return (lam + 2.0 * mu / 3.0, *(number for c, m in self.terms for number in (share * c, m)))
 
+    @property
+    def functions(self) -> Law:
+        """The law's Warp functions, imported with the first use."""
+        return _built_in(self.law)
 
-Tissue = Material | Ogden
-"""What a region may be made of: each has `law`, `lame` and `coefficients`."""
+
+def _built_in(law: str) -> Law:
+    return importlib.import_module(f".terms.{law.replace('-', '_')}", __package__).LAW
+
+
+class Tissue(Protocol):
+    """What a region may be made of: `Material`, `Ogden`, or a law of your own as a frozen dataclass.
+
+    `conformance.check_tissue` holds one to what the solver asks of it.
+    """
+
+    @property
+    def law(self) -> str:
+        """The law's name; tissues of one name have the same `functions`."""
+        ...
+
+    @property
+    def functions(self) -> Law:
+        """The energy, the stress and its change, as Warp functions."""
+        ...
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        """Lamé's (mu, lambda) [Pa] at small strain."""
+        ...
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """What the functions take, as many of every tissue of the law."""
+        ...
+
+    def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
+        """The same with other Lamé constants (mu, lambda) [Pa] at small strain, mu = 0 among them.
+
+        The energy is linear in the two: smoothed elements carry shape and volume apart.
+        """
+        ...
+
+    @property
+    def prony(self) -> Pairs:
+        """How the resistance to a change of shape relaxes; () if it does not."""
+        ...
+
+
+def check_described(tissue: object) -> None:
+    """Refuse what does not say all that a `Tissue` says.
+
+    Raises
+    ------
+    InputError
+        Naming what is missing.
+    """
+    asked = ("law", "functions", "lame", "coefficients", "coefficients_at", "prony")
+    missing = [name for name in asked if getattr_static(tissue, name, None) is None]
+    if missing:
+        raise InputError(
+            f"{type(tissue).__name__} is no tissue: it has no {', '.join(missing)}. "
+            "Give a Material, an Ogden, or what `sim.material.Tissue` asks for."
+        )
+
+
+def functions_of(tissues: Iterable[Tissue]) -> Law:
+    """The Warp functions that tissues of one name share.
+
+    Raises
+    ------
+    InputError
+        Two laws of one name.
+    """
+    found = {tissue.functions: tissue.law for tissue in tissues}
+    if len(found) > 1:
+        raise InputError(f"two tissue laws are called {next(iter(found.values()))!r}: rename one.")
+    return next(iter(found))
 
 
 def check_prony(prony: Pairs, law: str) -> None:
@@ -171,9 +256,9 @@ def check_prony(prony: Pairs, law: str) -> None:
 
 def tissue_to_json(tissue: Tissue) -> str:
     """One line that `tissue_from_json` reads."""
-    constants = asdict(tissue)
+    constants = asdict(tissue)  # pyright: ignore[reportArgumentType]
     if not tissue.prony:
-        del constants["prony"]  # as it was written before there were any
+        constants.pop("prony", None)  # as it was written before there were any
     return json.dumps({"law": tissue.law, **constants})
 
 
@@ -214,9 +299,19 @@ def coefficients_of(tissues: Sequence[Tissue], carries: str = "whole") -> np.nda
     """Coefficients (n, k) of a `portion` of n tissues of one law.
 
     Shorter Ogden sums are filled up with terms (0, 1), which add 0.
+
+    Raises
+    ------
+    InputError
+        Tissues of another law that have different numbers of them.
     """
-    rows = [tissue.coefficients_at(*portion(tissue, carries)) for tissue in tissues]
-    longest = max(len(row) for row in rows)
+    rows = [tuple(tissue.coefficients_at(*portion(tissue, carries))) for tissue in tissues]
+    lengths = sorted({len(row) for row in rows})
+    if len(lengths) > 1 and tissues[0].law != Ogden.law:
+        raise InputError(
+            f"regions of the law {tissues[0].law} have {lengths[0]} and {lengths[-1]} coefficients: give all as many."
+        )
+    longest = lengths[-1]
     return np.array([row + (0.0, 1.0) * ((longest - len(row)) // 2) for row in rows])
 
 
@@ -228,7 +323,7 @@ BRAIN = Material("neo-hookean", 3000.0, 0.45)
 class MaterialSet:
     """A tissue, the time scale on which it behaves so, and where its constants come from."""
 
-    tissue: Tissue
+    tissue: Material | Ogden
     time_scale: str
     source: str
 

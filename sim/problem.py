@@ -41,6 +41,7 @@ class Problem:
     """Terms, constraints, and how loads impose displacements; N nodes on one device.
 
     Arrays are (3N, b): one column per live load case. `barriers` are those of the terms that bodies touch.
+    `elastic`: nothing but elasticity resists by itself; an effect of somebody's own might.
     """
 
     terms: tuple[Term, ...]
@@ -48,6 +49,7 @@ class Problem:
     device: Device
     impose: Callable[[Loads], Imposed] = nothing_imposed
     barriers: tuple[Barrier, ...] = ()
+    elastic: bool = True
 
     @property
     def rows(self) -> int:
@@ -57,7 +59,7 @@ class Problem:
     @property
     def plain(self) -> bool:
         """Whether forces that stay as they are act on what only ever resists: what shortcuts are made for."""
-        return all(term.constant or term.passive for term in self.terms)
+        return self.elastic and all(term.constant or term.passive for term in self.terms)
 
     @property
     def steep(self) -> bool:

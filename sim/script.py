@@ -31,7 +31,7 @@ def run_script(path: str | Path) -> ModuleType:
     if name in sys.modules:
         return sys.modules[name]
     try:
-        code = compile(text, str(path), "exec")
+        code = compile(text, str(path), "exec", dont_inherit=True)
     except (SyntaxError, ValueError) as error:  # a null byte is a ValueError in some versions
         line = getattr(error, "lineno", None)
         where = f"{path}, line {line}" if line else f"{path}"

@@ -80,6 +80,7 @@ class Cases:
         return np.zeros(whole) if found is None else np.asarray(found, np.float64)
 
 
+@runtime_checkable
 class Term(Protocol):
     """One summand of the total potential, for b load cases at once.
 

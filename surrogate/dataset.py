@@ -148,8 +148,17 @@ def read_embedded(file: h5py.File) -> Anatomy:
 
 
 def write_loads(file: h5py.File, loads: Loads) -> None:
-    """Store every cause's arrays under the cause's name, and the time."""
+    """Store every cause's arrays under the cause's name, and the time.
+
+    Raises
+    ------
+    InputError
+        Causes that `read_loads` would not find again: of another kind, or several of one.
+    """
     for cause in loads.causes:
+        if not isinstance(cause, tuple(CAUSES.values())) or len(loads.every(type(cause))) > 1:
+            names = ", ".join(type(cause).__name__ for cause in loads.causes)
+            raise InputError(f"the loads have the causes {names}: a data set holds each of {', '.join(CAUSES)} once.")
         for item in fields(cause):
             file[f"loads/{type(cause).__name__}/{item.name}"] = getattr(cause, item.name)
     file["loads/time"] = loads.times

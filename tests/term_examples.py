@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from boxes import base_held, box
@@ -17,9 +18,11 @@ from sim.device import Device
 from sim.discretisation import discretise
 from sim.effects import Elasticity, Gravity, Held, Inertia, NodalForce, Pulsation, ToolForce, Wave
 from sim.loads import Loads, Nodal, Posture, Pushed
+from sim.script import run_script
 from sim.term import Cases, Term
 from sim.terms.skull_contact import Skull
 
+VEINS = run_script(Path(__file__).parents[1] / "examples/veins.py")
 MESH = box((2, 2, 2), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
 ROWS = MESH.nodes.size
@@ -164,6 +167,7 @@ EXAMPLES = (
         "gravity": Example(of_effects(Gravity()), postures()),
         "inertia": Example(of_effects(Inertia(damping=3.0)), cases()),
         "skull contact": skull(),
+        "veins": Example(of_effects(VEINS.Veins((1, 5, 20), 30.0, 4e-3)), cases()),
         "spring": Example(lambda device: Spring(device, ROWS, 7.0), cases()),
         "wall": Example(lambda device: Wall(device, MESH.nodes, 0.12, 0.03, 500.0), cases(), bounded=True),
     }

@@ -16,8 +16,22 @@ HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
 """Each room and the rooms that it may import."""
 TIERS = (
-    {"device", "lanes", "columns", "rows", "product", "sparse", "sweep", "term", "constraint", "footprint"},
-    {"terms", "problem"},
+    {
+        "body",
+        "effects",
+        "resection",
+        "device",
+        "lanes",
+        "columns",
+        "rows",
+        "product",
+        "sparse",
+        "sweep",
+        "term",
+        "constraint",
+        "footprint",
+    },
+    {"terms", "problem", "conformance"},
     {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering", "narrow", "trial"},
     {
         "newton",

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from scenes.scene import SCENES, find_scene
-from sim.effects import Effect, Elasticity
+from sim.effects import BuiltIn, Elasticity
 from sim.material import LAWS
 
 TESTS = Path(__file__).parent
@@ -35,7 +35,7 @@ def cost(modules: str = "", kernels: str = "", classes: str = "") -> Cost:
 
 # A new effect adds one line.
 OF_EFFECT = {
-    "Elasticity": cost("elasticity invariants law loops source", "loops:add_gradient", "Elasticity Kernels Law _Part"),
+    "Elasticity": cost("elasticity invariants loops source", "loops:add_gradient", "Elasticity Kernels Law _Part"),
     "Held": cost(),
     "Slide": cost(),
     "ToolForce": cost("dead_force", "dead_force:spread dead_force:subtract", "DeadForce Forces Kernels"),
@@ -118,7 +118,7 @@ def law_of(name: str) -> str:
 
 
 def test_every_effect_and_law_has_its_line():
-    assert set(OF_EFFECT) == {kind.__name__ for kind in Effect.__args__}
+    assert set(OF_EFFECT) == {kind.__name__ for kind in BuiltIn.__args__}
     assert set(OF_LAW) == {*LAWS, "ogden", "prony"}
 
 

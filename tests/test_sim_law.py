@@ -1,74 +1,15 @@
 """Every tissue law: its formulas are each other's derivatives, meet Hooke's law, and do not cancel."""
 
-import importlib
-from dataclasses import dataclass
-from functools import cache
-
 import numpy as np
 import pytest
-import warp as wp
 from oracle import EVERY_LAW, energy_density, nearest_rotation, piola, tissue
 
-from sim.device import Device, Precision, find_device
+from sim.conformance import Evaluator, evaluator
 from sim.material import MATERIALS, Ogden, Tissue
-from sim.terms.law import Law
 
 POSITIVE = ("neo-hookean", "ogden")
 """Laws that are infinite where J <= 0."""
 MU = tissue("linear").lame[0]
-
-
-@dataclass(frozen=True)
-class Evaluated:
-    """Energies (n,), stresses (n, 3, 3) and stress changes (n, 3, 3) of one law, in units of Pa."""
-
-    energy: np.ndarray
-    stress: np.ndarray
-    change: np.ndarray
-
-
-@dataclass(frozen=True)
-class Evaluator:
-    """A law's Warp functions on arrays of displacement gradients; `of` is the tissue unless another is given."""
-
-    device: Device
-    kernel: wp.Kernel
-    of: Tissue
-
-    def __call__(self, H: np.ndarray, D: np.ndarray | None = None, of: Tissue | None = None) -> Evaluated:
-        count, device, coefficients = len(H), self.device, (of or self.of).coefficients
-        energy = device.zeros(count)
-        stress, change = (wp.zeros(count, dtype=device.matrix, device=device.name) for _ in range(2))
-        given = device.array(H, device.matrix), device.array(H if D is None else D, device.matrix)
-        constants = wp.types.vector(len(coefficients), device.scalar)(*coefficients)
-        device.launch(self.kernel, (count,), [*given, constants], [energy, stress, change])
-        return Evaluated(*(array.numpy().astype(np.float64) for array in (energy, stress, change)))
-
-
-@cache
-def evaluator(of: Tissue, precision: Precision) -> Evaluator:
-    law: Law = importlib.import_module(f"sim.terms.{of.law.replace('-', '_')}").LAW
-    device = find_device("cpu", precision)
-    scalar, mat = device.scalar, device.matrix
-    constants = wp.types.vector(len(of.coefficients), scalar)
-    density, stress_of, change_of = law.energy, law.stress, law.stress_change
-
-    @wp.kernel(module="unique")
-    def evaluate(
-        H: wp.array(dtype=mat),
-        D: wp.array(dtype=mat),
-        c: constants,
-        # outputs
-        energy: wp.array(dtype=scalar),
-        stress: wp.array(dtype=mat),
-        change: wp.array(dtype=mat),
-    ):
-        i = wp.tid()
-        energy[i] = density(H[i], c)
-        stress[i] = stress_of(H[i], c)
-        change[i] = change_of(H[i], D[i], c)
-
-    return Evaluator(device, evaluate, of)
 
 
 @pytest.fixture(scope="module", params=EVERY_LAW)

@@ -23,8 +23,8 @@ LOADS = push(POINT, FORCE, 0.02)
 def test_no_cause_or_one_twice_is_refused() -> None:
     with pytest.raises(InputError, match="causes none"):
         Loads(())
-    with pytest.raises(InputError, match="each kind once"):
-        Loads((LOADS.causes[0], LOADS.causes[0]))
+    with pytest.raises(InputError, match="each kind but Pushed once"):
+        Loads((Nodal(np.zeros((5, COUNT, 3))),) * 2)
 
 
 @pytest.mark.parametrize(

@@ -37,10 +37,10 @@ def kernels_of(device: Device) -> Kernels:
         # outputs
         force: wp.array2d(dtype=scalar),
     ):
-        """f_(3i+k)c = w_ic / (sum of w)_c F_ck."""
+        """f_(3i+k)c += w_ic / (sum of w)_c F_ck."""
         i, c = wp.tid()
         for k in range(3):
-            force[3 * i + k, c] = scalar(weight[i, c] / sums[c][0] * whole[c, k])
+            force[3 * i + k, c] += scalar(weight[i, c] / sums[c][0] * whole[c, k])
 
     @wp.kernel(module="unique")
     def subtract(
@@ -89,13 +89,14 @@ def pushed_forces(skin: Skin, device: Device, loads: Loads) -> Forces | None:
     InputError
         A footprint that does not touch the surface.
     """
-    cause = loads.of(Pushed)
-    if cause is None:
+    causes = loads.every(Pushed)
+    if not causes:
         return None
-    footprints = skin.press(cause.point, cause.footprint)
-    force = wp.empty((3 * len(skin.nodes), len(loads)), dtype=device.scalar, device=device.name)
-    inputs = [footprints.weight, footprints.sums, device.array(cause.force, wp.float64)]
-    device.launch(kernels_of(device).spread, footprints.weight.shape, inputs, [force])
+    force = device.zeros(3 * len(skin.nodes), len(loads))
+    for cause in causes:
+        footprints = skin.press(cause.point, cause.footprint)
+        inputs = [footprints.weight, footprints.sums, device.array(cause.force, wp.float64)]
+        device.launch(kernels_of(device).spread, footprints.weight.shape, inputs, [force])
     return Forces(skin.numbers, force)
 
 

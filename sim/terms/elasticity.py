@@ -12,9 +12,9 @@ import warp as wp
 from ..columns import Rooms
 from ..device import Device
 from ..element import Elements, hooke_stiffness
+from ..law import Law
 from ..term import Cases
 from ..together import cores, together
-from .law import Law
 from .loops import kernels_of, spreading_of
 from .source import Source
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from .law import Law
+from ..law import Law
 
 
 @wp.func

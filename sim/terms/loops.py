@@ -6,8 +6,8 @@ from functools import cache
 import warp as wp
 
 from ..device import Device
+from ..law import Law
 from .invariants import cofactor
-from .law import Law
 
 # A step must leave every volume above this share of what it was: the logarithm and its curvature stay moderate.
 VOLUME_KEPT = 0.1

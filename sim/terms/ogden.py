@@ -11,8 +11,8 @@ from typing import Any
 
 import warp as wp
 
+from ..law import Law
 from .invariants import exp_less_one, green_strain, log_one_plus, volume_change
-from .law import Law
 from .spectral import principal_axes
 
 

@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
+from ..law import Law
 from ..term import Cases
-from .law import Law
 
 
 class Source(Protocol):

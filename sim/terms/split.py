@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from ..device import Device
+from ..law import Law
 from .invariants import (
     cofactor_change,
     cofactor_excess,
@@ -15,7 +16,6 @@ from .invariants import (
     log_one_plus,
     volume_change,
 )
-from .law import Law
 
 
 @wp.func

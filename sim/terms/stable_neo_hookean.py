@@ -10,8 +10,8 @@ from typing import Any
 
 import warp as wp
 
+from ..law import Law
 from .invariants import cofactor, cofactor_change, cofactor_excess, second_order_volume, volume_change
-from .law import Law
 
 
 @wp.func

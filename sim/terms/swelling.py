@@ -12,8 +12,8 @@ import numpy as np
 import warp as wp
 
 from ..device import Device
+from ..law import Law
 from ..term import Cases
-from .law import Law
 
 
 @cache

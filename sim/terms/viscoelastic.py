@@ -25,10 +25,10 @@ import numpy as np
 import warp as wp
 
 from ..device import Device
+from ..law import Law
 from ..material import Pairs
 from ..term import Cases
 from .invariants import exp_less_one
-from .law import Law
 from .split import split_of
 
 # A symmetric tensor's components.

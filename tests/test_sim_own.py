@@ -1,0 +1,290 @@
+"""What a researcher adds from a file of their own: a tissue law, an effect, a cause; and several pushing tools."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from boxes import base_held, box
+from oracle import EVERY_LAW, tissue
+
+from sim.accuracy import REFERENCE, TRAIN
+from sim.compile import compile_problem
+from sim.conformance import check_tissue
+from sim.device import find_device
+from sim.effects import BuiltIn, Elasticity, Held, NodalForce, ToolForce, remember
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.footprint import footprint_weights
+from sim.law import Law
+from sim.loads import Loads, Nodal, Pushed, push
+from sim.material import Material, Ogden
+from sim.script import run_script
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+YEOH, VEINS = (run_script(EXAMPLES / name) for name in ("yeoh.py", "veins.py"))
+MESH = box((3, 3, 3), 0.06)
+HALVES = replace(MESH, region=(MESH.nodes[MESH.tets].mean(axis=1)[:, 0] > 0.03).astype(int))
+BODY, TWO = base_held(MESH), base_held(HALVES)
+TOP = np.array([0.03, 0.03, 0.06])
+PRESS = push(TOP, np.array([[0.1, 0.0, -0.4], [0.0, 0.0, -0.1]]), 15e-3)
+
+
+def answer(*effects: Any, loads: Loads = PRESS, body=BODY, element: str = "p1", **more: Any):
+    found = Fem(body, (*effects, Held(), ToolForce(), NodalForce()), REFERENCE, "cpu", element=element, **more).deform(
+        loads
+    )
+    assert all(outcome.good for outcome in found.outcome)
+    return found.displacement
+
+
+class TestLaw:
+    @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
+    def test_a_users_law_solves_as_the_built_in_one_that_it_equals(self, element):
+        """Yeoh without c2 is Ogden's law of one term with m = 2."""
+        own = answer(Elasticity(YEOH.Yeoh(500.0, 0.0, 1e4)), element=element)
+        known = answer(Elasticity(Ogden(((2000.0, 2.0),), 1e4)), element=element)
+        assert np.abs(known).max() > 2e-3
+        assert np.abs(own - known).max() < 1e-6 * np.abs(known).max()
+
+    def test_it_stiffens_as_it_says(self):
+        soft, stiff = (answer(Elasticity(YEOH.Yeoh(500.0, c2, 1e4))) for c2 in (0.0, 5e3))
+        ratio = np.abs(stiff).max(axis=(1, 2)) / np.abs(soft).max(axis=(1, 2))
+        assert ratio[0] < 0.95 < 0.99 < ratio[1] < 1.0  # the second load is a quarter of the first
+
+    def test_regions_mix_it_with_built_in_laws(self):
+        own, known = YEOH.Yeoh(500.0, 0.0, 1e4), Ogden(((2000.0, 2.0),), 1e4)
+        other = Material("neo-hookean", 6000.0, 0.4)
+        mixed = [answer(Elasticity(law, {1: other}), body=TWO, element="smoothed") for law in (own, known)]
+        assert np.abs(mixed[0] - mixed[1]).max() < 1e-6 * np.abs(mixed[1]).max()
+
+    def test_it_relaxes_when_it_says_so(self):
+        class Relaxing(YEOH.Yeoh):
+            law = "relaxing yeoh"
+            prony = ((0.5, 1.0),)
+
+        fem = Fem(BODY, (Elasticity(Relaxing(500.0, 500.0, 1e4)), Held(), ToolForce()), TRAIN, "cpu")
+        assert remember(fem.effects)
+        at_once = fem.deform(Loads(PRESS.causes, np.zeros(2)))
+        later = fem.deform(Loads(PRESS.causes, np.full(2, 3.0)), start=at_once)
+        assert np.abs(later.displacement).max() > 1.2 * np.abs(at_once.displacement).max()
+
+    @pytest.mark.parametrize("law", EVERY_LAW)
+    def test_every_built_in_law_passes_the_check_that_users_run(self, law):
+        found = check_tissue(tissue(law), small_strain=law == "linear")
+        assert len(found) > 12 and all(finding.kept for finding in found)
+
+    def test_the_example_passes_it_and_small_strain_is_not_for_all(self):
+        assert all(finding.kept for finding in check_tissue(YEOH.SOFT))
+        with pytest.raises(InputError, match=r"the law linear does not hold: stress turns with the tissue: off by"):
+            check_tissue(tissue("linear"))
+
+    @pytest.mark.parametrize(
+        ("broken", "words"),
+        [
+            ({"stress": "half"}, "Hooke's law at small strain.*stress is the energy's derivative"),
+            ({"stress_change": "half"}, "does not hold: stress_change is the stress's derivative: off by 1.0e"),
+            ({"needs_positive_volume": False}, "off by (nan|inf)"),
+        ],
+    )
+    def test_a_broken_law_is_told_what_is_broken(self, broken, words):
+        own_stress, own_change = YEOH.stress, YEOH.stress_change
+
+        @wp.func
+        def half_stress(H: Any, c: Any):
+            return own_stress(H, c) / type(c[0])(2.0)
+
+        @wp.func
+        def half_change(H: Any, D: Any, c: Any):
+            return own_change(H, D, c) / type(c[0])(2.0)
+
+        halves = {"stress": half_stress, "stress_change": half_change}
+        made = replace(YEOH.Yeoh.functions, **{k: halves[k] if v == "half" else v for k, v in broken.items()})
+
+        class Broken(YEOH.Yeoh):
+            law = "broken"
+            functions = made
+
+        with pytest.raises(InputError, match=words):
+            check_tissue(Broken(500.0, 1500.0, 1e4))
+
+    def test_wrong_constants_and_wrong_counts_are_sentences(self):
+        class Wrong(YEOH.Yeoh):
+            def coefficients_at(self, mu, lam):
+                return mu, self.c2, lam
+
+        with pytest.raises(InputError, match=r"Hooke's law at small strain"):
+            check_tissue(Wrong(500.0, 1500.0, 1e4))
+
+        class Longer(YEOH.Yeoh):
+            @property
+            def coefficients(self):
+                return 1.0, 2.0
+
+        with pytest.raises(InputError, match=r"2 coefficients, but 3 at other Lamé constants"):
+            check_tissue(Longer(500.0, 1500.0, 1e4))
+        with pytest.raises(InputError, match=r"Lamé constants -2.0"):
+            check_tissue(YEOH.Yeoh(-1.0, 0.0, 1e4))
+
+    def test_what_is_no_tissue_is_a_sentence(self):
+        with pytest.raises(InputError, match=r"str is no tissue: it has no law, functions.*Give a Material, an Ogden"):
+            Elasticity("jelly")  # pyright: ignore[reportArgumentType]
+
+    def test_two_laws_of_one_name_are_a_sentence(self):
+        class Other(YEOH.Yeoh):
+            functions = Law("yeoh", YEOH.energy, YEOH.stress, YEOH.stress_change)
+
+        with pytest.raises(InputError, match=r"two tissue laws are called 'yeoh'"):
+            answer(Elasticity(YEOH.SOFT, {1: Other(500.0, 0.0, 1e4)}), body=TWO)
+
+
+def surface_vertices(near: float = 0.02) -> tuple[int, ...]:
+    high = np.abs(MESH.nodes[:, 2] - 0.06) < 1e-9
+    return tuple(np.flatnonzero(high & (np.linalg.norm(MESH.nodes - TOP, axis=1) < near)).tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Pull:
+    """Of veins: how hard (B,)."""
+
+    share: np.ndarray
+    magnitude = "share"
+
+
+class TestEffect:
+    @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
+    def test_veins_hold_the_cortex_back(self, element):
+        loads = push(TOP, np.array([0.0, 0.0, -0.4]), 15e-3)
+        free = answer(Elasticity(), loads=loads, element=element, live=True)
+        veins = VEINS.Veins(surface_vertices(), 60.0, 5e-4)
+        tied = answer(Elasticity(), veins, loads=loads, element=element, live=True)
+        slack = answer(Elasticity(), VEINS.Veins(surface_vertices(), 60.0, 1.0), loads=loads, element=element)
+        assert np.abs(tied).max() < 0.8 * np.abs(free).max()
+        assert np.abs(slack - free).max() < 1e-6 * np.abs(free).max()
+
+    def test_their_force_is_what_the_tissue_answers(self):
+        """The same motion without veins, under the tool and the force that each vein takes."""
+        veins, loads = VEINS.Veins(surface_vertices(), 60.0, 5e-4), push(TOP, np.array([0.0, 0.0, -0.4]), 15e-3)
+        tied = answer(Elasticity(), veins, loads=loads)
+        at = list(veins.vertices)
+        far = np.linalg.norm(tied[:, at], axis=2, keepdims=True)
+        force = np.zeros_like(tied)
+        force[:, at] = -veins.stiffness * np.maximum(far - veins.slack, 0.0) / far * tied[:, at]
+        assert np.abs(force).max() > 1e-3
+        alike = answer(Elasticity(), loads=Loads((*loads.causes, Nodal(force))))
+        assert np.abs(alike - tied).max() < 1e-5 * np.abs(tied).max()
+
+    def test_no_shortcut_is_taken_past_them_and_forces_of_ones_own_keep_it(self):
+        def problem(*effects):
+            return compile_problem((Elasticity(), Held(), *effects), BODY, find_device("cpu", "float64"))
+
+        assert problem().plain and not problem(VEINS.Veins((5,))).plain
+        names = [term.name for term in problem(VEINS.Veins((5,)), ToolForce()).terms]
+        assert names[-1] == "veins" and "tool force" in names
+
+    def test_an_unknown_effect_is_named_with_the_known_ones_and_the_way_to_ones_own(self):
+        class Glue:
+            pass
+
+        with pytest.raises(InputError, match=r"no effect is called Glue: choose from Elasticity, .*Contact; or let"):
+            answer(Elasticity(), Glue())
+        assert VEINS.Veins not in BuiltIn.__args__
+
+    def test_what_makes_no_term_or_takes_a_name_is_a_sentence(self):
+        class Nothing(VEINS.Veins):
+            def term(self, body):
+                return 7
+
+        class Named(VEINS.Veins):
+            def term(self, body):
+                made = super().term(body)
+                made.name = "tool force"
+                return made
+
+        with pytest.raises(InputError, match=r"made a int: let it make a sim\.term\.Term"):
+            answer(Elasticity(), Nothing((5,)))
+        with pytest.raises(InputError, match=r"two terms are called 'tool force'"):
+            answer(Elasticity(), Named((5,)))
+        with pytest.raises(InputError, match=r"asked for 2 times"):
+            answer(Elasticity(), VEINS.Veins((5,)), VEINS.Veins((6,)))
+
+    def test_a_cause_of_ones_own_reaches_its_effect_and_no_other(self):
+        seen = []
+
+        class Pulled(VEINS.Veins):
+            cause = Pull
+            remembers = True
+
+            def term(self, body):
+                made = super().term(body)
+                made.begin = lambda cases: seen.append(cases.loads.of(Pull).share)
+                return made
+
+        loads = Loads((*PRESS.causes, Pull(np.array([1.0, 2.0]))))
+        answer(Elasticity(), Pulled((5,)), loads=loads)
+        assert seen[0].tolist() == [1.0, 2.0] and remember((Pulled((5,)),)) and not remember((VEINS.Veins((5,)),))
+        assert loads.scaled(0.5).of(Pull).share.tolist() == [0.5, 1.0]
+        with pytest.raises(InputError, match=r"loads hold Pull, which nothing answers: add the effect that it is for"):
+            answer(Elasticity(), loads=loads)
+
+    def test_what_is_no_cause_is_a_sentence(self):
+        with pytest.raises(InputError, match=r"float is no cause: choose from Pushed, .*Retracted; or make your own"):
+            Loads((3.0,))  # pyright: ignore[reportArgumentType]
+        with pytest.raises(InputError, match=r"Pull.share has a value that is not finite"):
+            Loads((Pull(np.array([np.nan])),))
+        with pytest.raises(InputError, match=r"Pull.share is one number: give a row per load case"):
+            Loads((Pull(np.float64(1.0)),))  # pyright: ignore[reportArgumentType]
+
+
+LEFT, RIGHT = np.array([0.02, 0.03, 0.06]), np.array([0.045, 0.03, 0.06])
+
+
+def pushed(point: np.ndarray, force: list[float], radius: float) -> Pushed:
+    return Pushed(np.array([point, point]), np.array([force, np.multiply(force, 0.5)]), np.full(2, radius))
+
+
+TOOLS = pushed(LEFT, [0.0, 0.05, -0.25], 12e-3), pushed(RIGHT, [-0.1, 0.0, -0.15], 8e-3)
+
+
+class TestTwoTools:
+    @pytest.mark.parametrize("element", ["p1", "smoothed"])
+    @pytest.mark.parametrize("live", [False, True])
+    def test_answer_is_that_of_the_sum_as_nodal_forces(self, element, live):
+        both = answer(Elasticity(), loads=Loads(TOOLS), element=element, live=live)
+        force = np.zeros((2, len(MESH.nodes), 3))
+        for tool in TOOLS:
+            share = footprint_weights(MESH.nodes, MESH.surface, tool.point, tool.footprint).toarray()
+            force += share[:, :, None] * tool.force[:, None]
+        summed = answer(Elasticity(), loads=Loads((Nodal(force),)), element=element)
+        first = answer(Elasticity(), loads=Loads(TOOLS[:1]), element=element)
+        assert np.abs(both - first).max() > 0.2 * np.abs(both).max()
+        assert np.abs(both - summed).max() < 1e-6 * np.abs(summed).max()
+
+    def test_frame_after_frame_goes_on_from_the_last(self):
+        """Neither the way that a push came on nor a patch around it is followed: what is left answers both."""
+        fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), TRAIN, "cpu", live=True)
+        last = None
+        for size in (0.4, 0.7, 1.0):
+            last = fem.deform(Loads(TOOLS).scaled(size).rows(slice(0, 1)), start=last)
+            assert last.outcome[0].good
+        alone = fem.deform(Loads(TOOLS).rows(slice(0, 1)))
+        assert np.abs(last.displacement - alone.displacement).max() < 1e-3 * np.abs(alone.displacement).max()
+        one = fem.deform(Loads(TOOLS[:1]).rows(slice(0, 1)), start=last)
+        assert one.outcome[0].good
+
+    def test_each_tool_has_its_reaction(self):
+        fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), TRAIN, "cpu")
+        reaction = fem.deform(Loads(TOOLS)).reaction
+        assert reaction.shape == (2, 2, 6)
+        for number, tool in enumerate(TOOLS):
+            assert np.allclose(reaction[:, number, :3], tool.force)
+
+    def test_who_takes_one_says_so(self):
+        loads = Loads(TOOLS)
+        assert loads.every(Pushed) == loads.causes and loads.only(Pushed) is None
+        with pytest.raises(InputError, match=r"2 causes Pushed, but one is taken here"):
+            loads.of(Pushed)
+        with pytest.raises(InputError, match=r"each kind but Pushed once"):
+            Loads((Nodal(np.zeros((1, 3, 3))), Nodal(np.zeros((1, 3, 3)))))
