@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Sequence
 
 from sim.errors import InputError
+from sim.script import run_script
 
 # A command's module is imported only when it is asked for: `sulcus solve` does not wait for torch.
 COMMANDS = {
@@ -30,6 +31,9 @@ COMMANDS = {
     "check": "play the built-in scenes blank and hold their figures to their bounds",
 }
 
+# Commands that make or read models, whose learners may be a user's own.
+PLUGGED = ("train", "judge", "scenes", "demo", "render", "collect", "check")
+
 # Commands with commands of their own; the first is meant where none is named.
 INNER = {"bench": ("stages", "elements", "robust", "live", "growth", "throughput", "published", "solver")}
 
@@ -47,9 +51,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name == asked:
             importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
+            if name in PLUGGED:
+                command.add_argument(
+                    "--plugin",
+                    action="append",
+                    default=[],
+                    metavar="FILE.py",
+                    help="run this file: it brings learners",
+                )
     args = parser.parse_args(arguments)
     warnings.formatwarning = lambda message, *rest: f"sulcus {args.command}: {message}\n"
     try:
+        for path in getattr(args, "plugin", ()):
+            run_script(path)
         return importlib.import_module(f"scenes.commands.{args.command}").run(args)
     except InputError as error:
         print(f"sulcus {args.command}: {error}", file=sys.stderr)

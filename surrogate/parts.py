@@ -24,6 +24,7 @@ from .dataset import Dataset
 from .encode import ENCODERS, Basis, directions, reduce, tool_features
 from .gp import Gp
 from .learned import Part, only_pushed
+from .learner import find_own, name_of
 from .linear import Linear
 from .patch import Patch, open_patch
 from .pcr import Pcr
@@ -261,11 +262,20 @@ def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
     if known.data.ball is not None:
         both = ((known.tumour, lesson.tumour), (known.cortex, lesson.cortex))
         return tuple(
-            _taught(LEARNT[name], (), nodes, known.patch, lesson.loads, truth) for nodes, truth in both if len(nodes)
+            _taught(_learnt(name), (), nodes, known.patch, lesson.loads, truth) for nodes, truth in both if len(nodes)
         )
     before = (known.table,) if name == "residual" else ()
-    learnt = _taught(LEARNT[name], before, known.tumour, known.patch, lesson.loads, lesson.tumour)
+    learnt = _taught(_learnt(name), before, known.tumour, known.patch, lesson.loads, lesson.tumour)
     return (*before, learnt, *known.cortex_table)
+
+
+def _learnt(name: str) -> tuple[str, Callable[[], Regressor]]:
+    """Encoder and regressor of a learner, a user's own too."""
+    if name in LEARNT:
+        return LEARNT[name]
+    own = find_own(name)
+    assert own is not None, name  # who trains has looked
+    return own.encoder, own.regressor
 
 
 def _touched(known: Expansion, lesson: Lesson) -> tuple[Part, list[tuple[np.ndarray, np.ndarray]]]:
@@ -293,5 +303,19 @@ def _taught(
     for part in before:
         response = response - part.response(ENCODERS[part.encoder](patch, loads))
     basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE)
-    encoder, regressor = kind
-    return Part(encoder, regressor().fit(ENCODERS[encoder](patch, loads), basis.encode(response)), basis)
+    encoder, make = kind
+    X, Y = ENCODERS[encoder](patch, loads), basis.encode(response)
+    regressor = make().fit(X, Y)
+    if name_of(type(regressor)) is not None:
+        _check_own(regressor, X, Y)
+    return Part(encoder, regressor, basis)
+
+
+def _check_own(regressor: Regressor, X: np.ndarray, Y: np.ndarray) -> None:
+    """Refuse a user's regressor that does not answer what it was taught with finite coefficients of its shape."""
+    found = np.asarray(regressor.predict(X))
+    if found.shape != Y.shape or not np.isfinite(found).all():
+        raise InputError(
+            f"the learner {name_of(type(regressor))} answers {X.shape[0]} loads with numbers of shape {found.shape}: "
+            f"let `predict` give {Y.shape}, all finite."
+        )

@@ -25,6 +25,7 @@ from .encode import Basis
 from .envelope import Envelope
 from .gp import Gp
 from .learned import Learned, Part
+from .learner import find_own, name_of
 from .linear import Linear
 from .pcr import Pcr
 from .regressor import Fitted, Regressor
@@ -51,7 +52,8 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
     Raises
     ------
     InputError
-        No model, models of different anatomies, a name that does not end in .npz, or a folder that cannot be written.
+        No model, models of different anatomies, a name that does not end in .npz, a folder that cannot be written, a
+        state that is more than arrays of numbers or text, or a regressor that nobody registered.
     """
     digests = {model.anatomy.digest for model in models.values()}
     if len(digests) != 1:
@@ -59,6 +61,8 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
     arrays: dict[str, np.ndarray] = {}
 
     def put(array: np.ndarray) -> str:
+        if not isinstance(array, np.ndarray) or array.dtype.hasobject:
+            raise InputError(f"{path}: a learner's state holds a {type(array).__name__} that is no array of numbers.")
         name = digest_of(array)  # parts that models share are stored once
         arrays[name] = array
         return name
@@ -103,12 +107,32 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         raise InputError(f"{path}: cannot be read as a model ({error}). Make one with `sulcus train`.") from error
 
 
+def _own_name(regressor: Fitted) -> str:
+    name = name_of(type(regressor))
+    if name is None:
+        raise InputError(f"{type(regressor).__name__} was never registered: see surrogate.learner.learner.")
+    return name
+
+
+def _kind(name: str) -> type[Fitted]:
+    """The class that a model file names: a built-in one, or one that the user has registered or installed."""
+    if name in FITTED:
+        return FITTED[name]
+    own = find_own(name)
+    if own is None:
+        raise InputError(
+            f"a model here was made by the learner {name!r}, which is not this package's own: name the file that "
+            "registers it by --plugin, or install the package that brings it."
+        )
+    return own.regressor
+
+
 def _described(model: Learned, put: Any) -> dict[str, Any]:
     names = {kind: name for name, kind in FITTED.items()}
     parts = [
         {
             "encoder": part.encoder,
-            "regressor": names[type(part.regressor)],
+            "regressor": names.get(type(part.regressor)) or _own_name(part.regressor),
             "state": {name: put(array) for name, array in part.regressor.state().items()},
             "nodes": put(part.basis.nodes),
             "modes": put(part.basis.modes),
@@ -131,7 +155,7 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
     parts = tuple(
         Part(
             part["encoder"],
-            FITTED[part["regressor"]].restored({name: arrays[key] for name, key in part["state"].items()}),
+            _kind(part["regressor"]).restored({name: arrays[key] for name, key in part["state"].items()}),
             Basis(arrays[part["nodes"]], arrays[part["modes"]]),
         )
         for part in description["parts"]

@@ -18,6 +18,7 @@ from .encode import directions
 from .envelope import Envelope, envelope_of, measured
 from .indentation import indented
 from .learned import Learned, only_pushed
+from .learner import OWN, find_own
 from .parts import EXPANDED, LEARNT, POSED, TOUCHED, Classroom, Expansion, Lesson, parts_of
 from .patch import Patch, nearest
 from .score import Score, errors, score
@@ -91,10 +92,14 @@ def train(
     """
     wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
     kinds, others, held = _kinds(data)
-    unknown = [name for name in wanted if name not in (*kinds, *others)]
+    unknown = [name for name in wanted if name not in (*kinds, *others) and find_own(name) is None]
     if unknown or not wanted:
-        raise InputError(f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {', '.join(kinds)}.")
-    strange = [name for name in wanted if name not in kinds]
+        allowed = ", ".join((*kinds, *OWN))
+        raise InputError(
+            f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {allowed}; "
+            "a file with one of your own is named by --plugin."
+        )
+    strange = [name for name in wanted if name in others and name not in kinds]
     if strange:
         raise InputError(
             f"{data.path}: holds {held}, of which {', '.join(strange)} cannot be had: choose from {', '.join(kinds)}."

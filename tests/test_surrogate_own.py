@@ -1,0 +1,159 @@
+"""Learners of a user's own: a file or a package brings them, and they are trained, stored and read like the others."""
+
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes.cli import main
+from sim.accuracy import TRAIN
+from sim.effects import Elasticity, Held, NodalForce, Slide, ToolForce
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import push
+from sim.meshfile import write_anatomy
+from sim.script import run_script
+from surrogate.dataset import read_dataset
+from surrogate.learner import OWN, find_own, learner
+from surrogate.sampling import draw
+from surrogate.simulate import simulate
+from surrogate.store import load, save
+from surrogate.train import train
+
+NEAREST = Path(__file__).parents[1] / "examples/nearest.py"
+
+
+@pytest.fixture
+def clean():
+    """Nobody has registered anything, and nobody will have."""
+    before, modules = dict(OWN), set(sys.modules)
+    OWN.clear()
+    yield
+    OWN.clear()
+    OWN.update(before)
+    for name in set(sys.modules) - modules:
+        if name.startswith("own_"):
+            del sys.modules[name]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, box):
+    """A researcher's, outside the packages: data, the brain, and a copy of the example."""
+    path = tmp_path_factory.mktemp("own")
+    fem = Fem(box, (Elasticity(), Held(), Slide(), ToolForce(), NodalForce()), TRAIN, "cpu")
+    simulate(path / "data.h5", fem, draw("palpation", box, 100, 0), {"preset": "palpation"})
+    write_anatomy(path / "box.vtu", box)
+    (path / "my_learner.py").write_text(NEAREST.read_text())
+    return path
+
+
+def forget(name: str) -> None:
+    """As in a new process."""
+    OWN.clear()
+    for module in [module for module in sys.modules if module.startswith("own_")]:
+        del sys.modules[module]
+    assert find_own(name) is None
+
+
+def test_a_file_brings_one_that_is_trained_stored_and_plays(folder, box, monkeypatch, capsys, clean):
+    monkeypatch.chdir(folder)
+    words = ["train", "data.h5", "--out", "box.model.npz", "--learners", "nearest,linear", "--json"]
+    assert main(words) == 2
+    assert "no learner is called nearest" in capsys.readouterr().err and not Path("box.model.npz").exists()
+    assert main([*words, "--plugin", "my_learner.py"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert {row["name"] for row in report["scores"]} == {"nearest", "linear"}
+    assert all(0.0 < row["mean_percent"] < 60.0 for row in report["scores"])
+    taught = load("box.model.npz", box)["nearest"]
+
+    forget("nearest")
+    with pytest.raises(InputError, match=r"made by the learner 'nearest', .* --plugin"):
+        load("box.model.npz", box)
+    run_script("my_learner.py")
+    again = load("box.model.npz", box)["nearest"]
+    loads = push(box.mesh.nodes[box.craniotomy][:3], np.array([0.0, 0.0, -0.2]), 7e-3)
+    assert np.array_equal(again.deform(loads).displacement, taught.deform(loads).displacement)
+    assert np.abs(again.deform(loads).displacement).max() > 1e-4
+
+    forget("nearest")
+    played = ["render", "press", "--out", "frames", "--every", "60", "--anatomy", "box.vtu", "--deformer", "nearest"]
+    assert main(played) == 2
+    assert "--plugin" in capsys.readouterr().err
+    assert main([*played, "--plugin", "my_learner.py"]) == 0
+    with np.load("box.model.npz", allow_pickle=False) as file:
+        assert all(not file[name].dtype.hasobject for name in file.files)
+
+
+def test_a_package_brings_one_that_is_looked_for_only_when_its_name_is_asked(tmp_path, monkeypatch, clean):
+    (tmp_path / "labs_learners.py").write_text(NEAREST.read_text().replace('"nearest"', '"labs"'))
+    made = tmp_path / "labs_learners-1.0.dist-info"
+    made.mkdir()
+    (made / "METADATA").write_text("Metadata-Version: 2.1\nName: labs-learners\nVersion: 1.0\n")
+    (made / "entry_points.txt").write_text("[sulcus.learners]\nlabs = labs_learners\nbroken = no_such_module\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert find_own("other") is None and "labs_learners" not in sys.modules
+    found = find_own("labs")
+    assert found is not None and found.regressor.__module__ == "labs_learners"
+    with pytest.raises(InputError, match="learner broken of no_such_module cannot be loaded"):
+        find_own("broken")
+    del sys.modules["labs_learners"]
+
+
+def test_ones_own_features(box, clean):
+    own = run_script(NEAREST)
+    learner("along", lambda patch, pushed: pushed.force)(type("Along", (own.Nearest,), {}))
+    assert find_own("along").encoder == "along"
+
+
+@pytest.mark.parametrize(
+    ("name", "encoder", "words"),
+    [
+        ("svr", "tool", "a learner is called 'svr' already"),
+        ("series-gp", "tool", "a learner is called 'series-gp' already"),
+        ("mine", "smell", "no encoder is called 'smell': choose one of nodal, tool"),
+    ],
+)
+def test_names_that_cannot_be_are_sentences(name, encoder, words, clean):
+    own = run_script(NEAREST)
+    with pytest.raises(InputError, match=words):
+        learner(name, encoder)(own.Nearest)
+
+
+def test_a_class_that_lacks_something_is_a_sentence(clean):
+    with pytest.raises(InputError, match="the learner empty has no fit, predict, state, restored"):
+        learner("empty")(type("Empty", (), {}))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("[:, 0]", r"answers \d+ loads with numbers of shape \(\d+,\): let `predict` give \(\d+, \d+\), all finite"),
+        (" * np.nan", r"numbers of shape \(\d+, \d+\): let `predict` give"),
+    ],
+)
+def test_answers_that_are_none_are_refused_when_it_is_taught(folder, tmp_path, capsys, change, words, clean):
+    path = tmp_path / "wrong.py"
+    path.write_text(NEAREST.read_text().replace(".astype(np.float32)", change))
+    out = tmp_path / "model.npz"
+    given = ["train", str(folder / "data.h5"), "--out", str(out), "--learners", "nearest", "--plugin", str(path)]
+    assert main(given) == 2 and not out.exists()
+    assert re.search(words, capsys.readouterr().err)
+
+
+def test_a_state_that_would_be_pickled_is_not_stored(folder, tmp_path, clean):
+    own = run_script(NEAREST)
+
+    class Sly(own.Nearest):
+        def state(self):
+            return {"thing": np.array([object()])}
+
+    learner("sly")(Sly)
+    model = train(read_dataset(folder / "data.h5"), ["linear"]).models["linear"]
+    part = replace(model.parts[0], regressor=Sly())
+    with pytest.raises(InputError, match="a learner's state holds a ndarray that is no array of numbers"):
+        save(tmp_path / "sly.npz", {"sly": replace(model, parts=(part,))})
+    assert not list(tmp_path.iterdir())
