@@ -26,7 +26,7 @@ from .scene import Scene
 from .site import Site
 from .stage import TOOL, Stage
 from .told import doubt_of, told
-from .tool import Blade, Probe
+from .tool import Instrument, Probe
 
 IN_BONE = "the bone is where this push needs the tool: do not rely on it"
 # Tissue may carry a tool into the bone's edge by so much before it counts [m].
@@ -191,7 +191,7 @@ class Player:
         positions[deformation.nodes] += deformation.displacement[row]
         return positions
 
-    def tool(self, tool: Probe | Blade, touch: Touch, positions: np.ndarray) -> HeldTool:
+    def tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> HeldTool:
         """Where the tool is: of one that pushes, where it comes to rest on the deformed cortex from outside.
 
         It is lifted off where it is idle. Tissue that is drawn aside may carry it to the bone's edge, which stops it.

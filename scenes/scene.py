@@ -32,7 +32,7 @@ from .lying import Lie, supine
 from .paths import AIR, Path, Touch, idle
 from .site import Contact, Site
 from .surgery import Debulking
-from .tool import Blade, Probe
+from .tool import Instrument, Probe
 
 # So far under the cortex a camera looks: between the tool and the tumour [m].
 UNDER = 6e-3
@@ -114,7 +114,7 @@ class Scene:
     path: Path = idle
     duration: float = 4.0
     effects: tuple[Effect, ...] = (Elasticity(), Held(), Slide(), ToolForce())
-    tool: Probe | Blade | None = PALPATION
+    tool: Instrument | None = PALPATION
     lying: Lie = supine
     surgery: Debulking | None = None
     viewpoint: Viewpoint = Viewpoint()

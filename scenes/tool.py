@@ -4,11 +4,38 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import trimesh
 
-from sim.tools import Ball, Spatula, core_of
+from sim.tools import Ball, Spatula, Tool, core_of
+
+
+class Instrument(Protocol):
+    """What a scene's hand may hold: `Probe`, `Blade`, or an instrument of your own as a frozen dataclass.
+
+    In its own frame [m] its lowest point is the origin and its shaft goes along +z.
+    """
+
+    @property
+    def radius(self) -> float:
+        """Of its footprint where it pushes, and of the room round its tip that it needs in an opening [m]."""
+        ...
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """How it looks; it is asked for in every frame."""
+        ...
+
+    @property
+    def shape(self) -> Tool:
+        """What of it touches tissue, for `ToolContact`."""
+        ...
+
+    def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
+        """T_world_tool (4, 4) as it touches `tip` (3,) [m] from outside; inward, aside: unit vectors (3,)."""
+        ...
 
 
 @dataclass(frozen=True)

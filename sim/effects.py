@@ -13,7 +13,7 @@ import numpy as np
 from .anatomy import Anatomy
 from .errors import InputError
 from .material import BRAIN, Tissue, check_described
-from .tools import Spatula, Tool
+from .tools import Spatula, Tool, check_tool
 
 if TYPE_CHECKING:
     from .body import Body
@@ -283,9 +283,7 @@ class ToolContact:
         if not self.tools:
             raise InputError("ToolContact has no tool: give at least one, such as Ball(7e-3), or leave the effect out.")
         for tool in self.tools:
-            if not isinstance(tool, Tool):
-                allowed = ", ".join(kind.__name__ for kind in Tool.__args__)
-                raise InputError(f"ToolContact has {tool!r} for a tool: choose from {allowed}.")
+            check_tool("ToolContact", tool)
         _check_gap(self)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .tools import Tool, core_of, distances_to
+from .tools import Core, Tool, cores_of, distances_to, extent_of
 
 # A step moves no point of a tool farther into tissue than this share of its radius: none comes out at its other side.
 STRIDE = 0.5
@@ -41,12 +41,12 @@ class Way:
         before, after = self.begin[:, :, :3], self.end[:, :, :3]
         turn = (before[..., :3].swapaxes(2, 3) @ after[..., :3]).reshape(-1, 3, 3)
         angle = Rotation.from_matrix(turn).magnitude().reshape(self.end.shape[:2])
-        extent = np.array([core_of(tool).extent for tool in tools])
+        extent = np.array([extent_of(tool) for tool in tools])
         return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
 
     def stride(self, tools: tuple[Tool, ...], clear: np.ndarray) -> np.ndarray:
         """The longest shares (B,), at most 1, of the way that tools may go at once that are `clear` (B, tools) [m]."""
-        most = clear + STRIDE * np.array([core_of(tool).radius for tool in tools])
+        most = clear + STRIDE * np.array([min(core.radius for core in cores_of(tool)) for tool in tools])
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
 
 
@@ -55,13 +55,17 @@ def approach(tool: Tool, pose: np.ndarray, points: np.ndarray, reach: np.ndarray
 
     `reach` (n,) [m] is how far the surface goes on round each vertex. A tool that is clear where it is came from there.
     """
-    core, out, shaft = core_of(tool), pose.copy(), pose[:3, 2]
+    out, shaft = pose.copy(), pose[:3, 2]
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
-    above = (local[:, 2] + reach)[aside <= core.radius + reach]
-    back, room = max(0.0, float(above.max(initial=0.0))), 0.0
+    back, room = max(_above(core, local, reach) for core in cores_of(tool)), 0.0
     for _ in range(MARCH):
         back = max(0.0, back - room)
         out[:3, 3] = pose[:3, 3] + back * shaft
         room = max(0.0, float((distances_to(tool, out, points) - reach).min()))
     return out
+
+
+def _above(core: Core, local: np.ndarray, reach: np.ndarray) -> float:
+    """How high [m] above the tool's origin the surface goes, at most, where a core on its way down meets it."""
+    aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
+    return max(0.0, float((local[:, 2] + reach)[aside <= core.radius + reach].max(initial=0.0)))

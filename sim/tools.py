@@ -1,4 +1,6 @@
-"""Rigid tools that touch tissue: each is all that lies within a radius of a point, a line or a rectangle.
+"""Rigid tools that touch tissue: each is all that lies within a radius of a point, a line, a rectangle or a box.
+
+A tool of your own is the union of several such.
 
 In a tool's own frame its lowest point is the origin and its shaft goes along +z.
 """
@@ -7,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -78,7 +81,7 @@ class Spatula:
             )
 
 
-Tool = Ball | Capsule | Spatula
+BuiltIn = Ball | Capsule | Spatula
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +104,45 @@ class Core:
         return float(np.linalg.norm(np.abs(self.centre) + self.half)) + self.radius
 
 
-def core_of(tool: Tool) -> Core:
-    """What a tool is made of."""
+@runtime_checkable
+class OwnTool(Protocol):
+    """A shape of your own, as a frozen dataclass: the union of several cores, one rigid body."""
+
+    @property
+    def cores(self) -> tuple[Core, ...]:
+        """What it is made of. Its lowest point is the origin, its shaft goes along +z; cores may overlap."""
+        ...
+
+
+Tool = BuiltIn | OwnTool
+
+
+def check_tool(effect: str, tool: object) -> None:
+    """Refuse what tissue cannot touch.
+
+    Raises
+    ------
+    InputError
+        What is no tool, or one of no cores, or of cores that are not finite or have no radius.
+    """
+    if not isinstance(tool, Tool):
+        allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
+        raise InputError(f"{effect} has {tool!r} for a tool: choose from {allowed}, or give one that has cores.")
+    cores = cores_of(tool)
+    for core in cores:
+        if not (np.isfinite([*core.centre, *core.half, core.radius]).all() and core.radius > 0.0):
+            raise InputError(f"{tool!r} has a core that is not finite or has no radius: give a positive one in metres.")
+    if not cores:
+        raise InputError(f"{tool!r} has no cores: give at least one, of which tissue touches the surface.")
+
+
+def cores_of(tool: Tool) -> tuple[Core, ...]:
+    """What a tool is made of: all that lies within any of these."""
+    return (core_of(tool),) if isinstance(tool, BuiltIn) else tuple(tool.cores)
+
+
+def core_of(tool: BuiltIn) -> Core:
+    """What a tool of one core is made of."""
     match tool:
         case Ball(radius):
             return Core(np.array([0.0, 0.0, radius]), np.zeros(3), radius)
@@ -112,8 +152,16 @@ def core_of(tool: Tool) -> Core:
             return Core(np.array([0.0, 0.0, edge]), np.array([0.5 * width - edge, 0.5 * length - edge, 0.0]), edge)
 
 
+def extent_of(tool: Tool) -> float:
+    """How far the tool's farthest point is from its origin [m], at most."""
+    return max(core.extent for core in cores_of(tool))
+
+
 def distances_to(tool: Tool, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Signed distances (n,) [m] of points (n, 3) [m] from a tool at T_world_tool `pose` (4, 4); negative inside."""
-    core = core_of(tool)
-    local = (points - pose[:3, 3]) @ pose[:3, :3] - core.centre
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    return np.min([_distances(core, local - core.centre) for core in cores_of(tool)], axis=0)
+
+
+def _distances(core: Core, local: np.ndarray) -> np.ndarray:
     return np.linalg.norm(local - np.clip(local, -core.half, core.half), axis=1) - core.radius

@@ -2,14 +2,21 @@
 
 import json
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 from theatres import put, theatre_of
 
 from scenes.cli import main
 from scenes.scene import find_scene
+from scenes.stage import TOOL
+from scenes.theatre import Theatre
 from sim.errors import InputError
+from sim.meshfile import read_anatomy
 from sim.script import run_script
+from sim.tools import distances_to
 
 OWN = '''"""The tool nods twice."""
 
@@ -60,6 +67,38 @@ def test_what_its_effects_cost_is_measured(folder, monkeypatch, capsys):
     assert main(["effects", "my_scene.py", "--every", "1", "--anatomy", "box.vtu", "--device", "cpu", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["scene"] == "nod" and "ToolForce" in {row["effect"] for row in told["effects"]}
+
+
+SUCKER = Path(__file__).parents[1] / "examples/sucker.py"
+HELD_BY = """from dataclasses import replace
+
+from scenes.scene import Viewpoint
+from own_sucker import SCENE as LAID, Sucker
+
+TOOL = Sucker(stl="sucker.stl")
+SCENE = replace(LAID, tool=TOOL, duration=1.0, viewpoint=Viewpoint(width=160, height=120))
+"""
+
+
+def test_a_tool_of_ones_own_is_seen_as_its_own_mesh_and_touches_as_its_own_shape(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    (folder / "own_sucker.py").write_text(SUCKER.read_text())
+    (folder / "held.py").write_text(HELD_BY)
+    look = trimesh.creation.box([30.0, 4.0, 50.0])
+    look.apply_translation([0.0, 0.0, 25.0])
+    look.export(folder / "sucker.stl")
+    scene = find_scene("held.py")
+    assert np.ptp(scene.tool.mesh.vertices, axis=0) == pytest.approx([0.03, 0.004, 0.05], abs=1e-6)
+    box = Theatre(read_anatomy("box.vtu"), None, {}, "cpu")
+    frames = list(box.player("fem", scene).frames(every=15))
+    assert all(frame.deformation.outcome[0].good for frame in frames)
+    assert np.abs(frames[-1].deformation.displacement).max() > 1e-3
+    assert (frames[-1].picture.segmentation == TOOL).sum() > 100
+    reads = frames[-1].deformation.reaction[0]
+    assert reads.shape == (1, 6) and np.linalg.norm(reads[0, :3]) > 1e-3
+    there = frames[-1].pose
+    tip = distances_to(scene.tool.shape, there, box.anatomy.mesh.nodes + frames[-1].deformation.displacement[0])
+    assert tip.min() > -1e-4  # no vertex is inside of it
 
 
 def test_the_same_text_runs_once_and_a_mended_one_anew(tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,22 +13,26 @@ from boxes import base_held, box
 from sim.accuracy import REFERENCE, Accuracy
 from sim.deformation import Deformation, Outcome
 from sim.effects import Elasticity, Held, ToolContact
+from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.material import Material
-from sim.tools import Ball, Capsule, Spatula, Tool, distances_to
+from sim.script import run_script
+from sim.tools import Ball, Capsule, Core, Spatula, Tool, distances_to
 
 SOFT = Material("neo-hookean", 3000.0, 0.45)
 SIDE, HEIGHT = 0.08, 0.04
+BENT = run_script(Path(__file__).parents[1] / "examples/sucker.py").Bent
 BLOCK = base_held(box((8, 8, 4), SIDE))
 TOOLS: dict[str, Tool] = {
     "ball": Ball(7e-3),
     "tip": Ball(2e-3),
     "rod": Capsule(4e-3, 0.02),
     "blade": Spatula(0.015, 0.03, 1.5e-3),
+    "own": BENT(3e-3, 0.02, 8e-3),
 }
 # A tip as deep as it is thick would be swallowed: it has no shaft.
-DEPTHS = {"ball": 4e-3, "tip": 1.5e-3, "rod": 4e-3, "blade": 4e-3}
+DEPTHS = {"ball": 4e-3, "tip": 1.5e-3, "rod": 4e-3, "blade": 4e-3, "own": 3e-3}
 
 
 def at(*place: float, turn: np.ndarray | None = None) -> np.ndarray:
@@ -98,3 +104,41 @@ def test_a_tool_reads_what_the_base_bears(name: str, element: str) -> None:
     place = at(0.5 * SIDE + 1e-3, 0.5 * SIDE - 2e-3, HEIGHT - DEPTHS[name])[:3, 3]
     arm = fem.space.nodes + u.numpy().reshape(-1, 3) - place
     np.testing.assert_allclose(moment, -np.cross(arm, bears).sum(axis=0), atol=1e-6 * size * SIDE)
+
+
+def test_a_tool_of_two_cores_is_two_tools_that_move_as_one() -> None:
+    """Two balls apart: the same motion, and its reaction is theirs about its own origin."""
+
+    @dataclass(frozen=True)
+    class Pair:
+        apart: float
+
+        @property
+        def cores(self) -> tuple[Core, ...]:
+            return tuple(Core(np.array([x, 0.0, 6e-3]), np.zeros(3), 6e-3) for x in (0.0, self.apart))
+
+    place, apart = np.array([0.025, 0.04, HEIGHT - 3e-3]), 0.03
+    pair = Fem(BLOCK, [Elasticity(SOFT), Held(), ToolContact((Pair(apart),))], REFERENCE, "cpu")
+    balls = Fem(BLOCK, [Elasticity(SOFT), Held(), ToolContact((Ball(6e-3), Ball(6e-3)))], REFERENCE, "cpu")
+    one = pair.deform(Loads((Touching(at(*place)[None, None]),)))
+    both = balls.deform(Loads((Touching(np.stack([at(*place), at(*place + [apart, 0.0, 0.0])])[None]),)))
+    assert one.outcome == both.outcome == (Outcome.CONVERGED,)
+    assert np.abs(both.displacement).max() > 2e-3
+    assert np.abs(one.displacement - both.displacement).max() < 1e-7
+    assert one.reaction.shape == (1, 1, 6)
+    force = both.reaction[0, :, :3]
+    moment = both.reaction[0, :, 3:].sum(axis=0) + np.cross([apart, 0.0, 0.0], force[1])
+    assert np.allclose(one.reaction[0, 0], [*force.sum(axis=0), *moment], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("cores", "words"),
+    [
+        ((), "has no cores: give at least one"),
+        ((Core(np.zeros(3), np.zeros(3), 0.0),), "not finite or has no radius"),
+        ((Core(np.array([np.nan, 0.0, 0.0]), np.zeros(3), 1e-3),), "not finite or has no radius"),
+    ],
+)
+def test_a_tool_of_no_shape_is_a_sentence(cores: tuple[Core, ...], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        ToolContact((type("Shapeless", (), {"cores": cores})(),))

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..loads import Retracted, Touching
 from ..motion import Way, approach
 from ..term import Cases
-from ..tools import Tool, core_of, distances_to
+from ..tools import Tool, cores_of, distances_to
 from ..triangles import areas, edge_lengths
 from .reduced import HOST, Reduced
 from .touch import BULGE, Scale, Surface, Tools, kernels_of
@@ -69,11 +69,12 @@ class Contact:
         device: Device,
     ):
         self.name = name
-        self._whole, self._corners = (nodes, whole), [core_of(tool).corners for tool in tools]
+        cores = [core for tool in tools for core in cores_of(tool)]
+        self._owner = np.repeat(np.arange(len(tools)), [len(cores_of(tool)) for tool in tools])
+        self._whole, self._corners = (nodes, whole), [core.corners for core in cores]
         self._triangles = triangles
         self._shapes, self._way, self._device = tools, way, device
         self._kernels = kernels_of(device, triangles.shape[1])
-        cores = [core_of(tool) for tool in tools]
         corners = nodes[triangles[:, :3]]
         longest = STRETCH * edge_lengths(corners).max(axis=1)
         fine = np.sqrt(2.0 * min(core.radius for core in cores) * SAG * gap) / FARTHEST
@@ -117,7 +118,7 @@ class Contact:
         moved = nodes + u.numpy().T.reshape(u.shape[1], -1, 3)
         inner = [
             np.concatenate([corners @ T[:3, :3].T + T[:3, 3] for corners, T in zip(self._corners, pose, strict=True)])
-            for pose in self._pose
+            for pose in self._pose[:, self._owner]
         ]
         return np.array([enclosed(points, body, surface).any() for points, body in zip(inner, moved, strict=True)])
 
@@ -199,10 +200,9 @@ class Contact:
 
     def reaction(self, u: wp.array) -> np.ndarray:
         """(b, tools, 6): force [N] and moment [N m] about its origin that each tool exerts at u (3N, b) [m]."""
-        count = len(self._tools.radius)
-        out = wp.zeros((u.shape[1], count, 6), dtype=wp.float64, device=self._device.name)
+        out = wp.zeros((u.shape[1], len(self._owner), 6), dtype=wp.float64, device=self._device.name)
         self._launch(self._kernels.add_reaction, [u], out, u.shape[1])
-        return out.numpy()
+        return np.add.reduceat(out.numpy(), np.unique(self._owner, return_index=True)[1], axis=1)
 
     def end(self, u: wp.array) -> np.ndarray | None:
         """Where the tools are (b, tools, 4, 4): the next way begins there."""
@@ -211,8 +211,9 @@ class Contact:
     def _stand(self, pose: np.ndarray | None) -> None:
         self._pose = pose
         if pose is not None:
-            self._tools.rotation = self._device.array(pose[:, :, :3, :3].swapaxes(0, 1), wp.mat33d)
-            self._tools.origin = self._device.array(pose[:, :, :3, 3].swapaxes(0, 1), wp.vec3d)
+            of_cores = pose[:, self._owner].swapaxes(0, 1)
+            self._tools.rotation = self._device.array(of_cores[:, :, :3, :3], wp.mat33d)
+            self._tools.origin = self._device.array(of_cores[:, :, :3, 3], wp.vec3d)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:
         if self._pose is not None:
