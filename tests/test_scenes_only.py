@@ -35,7 +35,7 @@ def cost(modules: str = "", kernels: str = "", classes: str = "") -> Cost:
 
 # A new effect adds one line.
 OF_EFFECT = {
-    "Elasticity": cost("elasticity invariants loops source", "loops:add_gradient", "Elasticity Kernels Law _Part"),
+    "Elasticity": cost("elasticity invariants loops source", "loops:add_gradient", "Elasticity Kernels _Part"),
     "Held": cost(),
     "Slide": cost(),
     "ToolForce": cost("dead_force", "dead_force:spread dead_force:subtract", "DeadForce Forces Kernels"),
