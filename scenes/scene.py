@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any, cast
 
 import numpy as np
 
@@ -145,7 +146,8 @@ class Scene:
             if not isinstance(effect, Elasticity):
                 return effect
             relaxes = () if effect.default is None else effect.default.prony
-            return replace(effect, default=replace(tissue, prony=tissue.prony or relaxes))
+            series = {"prony": relaxes} if relaxes and not tissue.prony else {}
+            return replace(effect, default=replace(cast(Any, tissue), **series))
 
         return replace(self, effects=tuple(made(effect) for effect in self.effects), element=element or self.element)
 
