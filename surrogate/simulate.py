@@ -2,29 +2,51 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.deformation import Deformation, Deformer, Outcome
+from sim.deformation import Deformer
 from sim.errors import InputError
+from sim.files import check_output, demand_space, written_stream
 from sim.loads import Loads, Nodal, Touching
+from sim.reading import read_as
 from sim.stages import listened, stage
 
-from .dataset import FORMAT, read_loads, stored, write_embedded, write_loads
+from .dataset import (
+    FORMAT,
+    UNCHECKED,
+    digest_of_loads,
+    provenance_of,
+    read_embedded,
+    read_loads,
+    read_rows,
+    stored,
+    write_embedded,
+    write_loads,
+    write_provenance,
+)
+from .journal import Batch, DamageWarning, Journal, opened
+from .legend import TITLE, explain
 from .patch import open_patch
+from .rows import CHECKSUM, checksums, row_type, rows_of
 
 # Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
 # solve with the rest stiffness is the answer.
 UNIT_FORCE = 1e-6
-# What the groups of the file are called where their seconds are told.
+# What the groups of the file are called where their seconds are told, and what their displacements are told in [m].
 STAGES = {"unit": "unit responses", "answers": "loads"}
-NAME_TYPE = f"S{max(len(outcome.name) for outcome in Outcome)}"
+UNITS = {"unit": UNIT_FORCE, "answers": 1.0}
+# From this version of HDF5 on, whatever says where arrays lie has checksums.
+READERS = ("v108", "v108")
 
 
 @dataclass(frozen=True)
@@ -42,6 +64,58 @@ class Solved:
         return self.units + self.loads
 
 
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What is asked of a deformer: unit responses, then loads, in batches.
+
+    Parameters
+    ----------
+    deformer, loads
+        As in `simulate`.
+    nodes
+        (m,) vertices that are pushed by a unit force; none where the loads are poses.
+    batch
+        Rows that are solved together.
+    """
+
+    deformer: Deformer
+    loads: Loads
+    nodes: np.ndarray
+    batch: int
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The body."""
+        return self.deformer.anatomy
+
+    @property
+    def row(self) -> np.dtype:
+        """What a row is."""
+        return row_type(len(self.anatomy.mesh.nodes))
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Rows of each group."""
+        return {"unit": 3 * len(self.nodes), "answers": len(self.loads)}
+
+    @property
+    def batches(self) -> list[Batch]:
+        """Group and first row of every batch."""
+        return [(name, first) for name, rows in self.counts.items() for first in range(0, rows, self.batch)]
+
+    def rows(self, batch: Batch) -> np.ndarray:
+        """The numbers of a batch's rows."""
+        name, first = batch
+        return np.arange(first, min(first + self.batch, self.counts[name]))
+
+    def solved(self, batch: Batch) -> np.ndarray:
+        """A batch's rows (`rows.row_type`)."""
+        rows = self.rows(batch)
+        asked = unit_loads(self.anatomy, rows) if batch[0] == "unit" else self.loads.rows(rows)
+        answer = self.deformer.deform(asked).at(np.arange(len(self.anatomy.mesh.nodes)))
+        return rows_of(answer, UNITS[batch[0]])
+
+
 def simulate(
     path: str | Path,
     deformer: Deformer,
@@ -52,9 +126,10 @@ def simulate(
 ) -> Solved:
     """Answer every load, and the unit forces on the open cortex unless the loads are poses, into an HDF5 file.
 
-    Rows go to `PATH.partial`, whose whole space is laid out first: a kill at any moment leaves a file that opens, and
-    the same call goes on at the first unfinished batch with the same batches, so the result has the same bytes. The
-    finished file takes its name last. More loads of the same draw extend a finished file.
+    Batches go to `PATH.partial` (`journal`), where a kill at any moment loses one at most: the same call goes on with
+    the same batches, so that the result has the same bytes but for its date. What is damaged there is solved anew. The
+    HDF5 file is written last, and whole. More loads of the same draw extend a finished file, and what is damaged in a
+    finished file is solved anew.
 
     Parameters
     ----------
@@ -68,31 +143,44 @@ def simulate(
     Raises
     ------
     InputError
-        A batch below one, a file that holds something else or is being written, a folder that cannot be written to.
+        A batch below one, a file that holds something else or is being written, a folder that cannot be written to or
+        has too little room.
+
+    Warns
+    -----
+    DamageWarning
+        Rows that were done before, and are damaged.
     """
     path = Path(path)
     if batch < 1:
         raise InputError(f"a batch of {batch} solves nothing: give --batch >= 1.")
+    check_output(path, path.suffix)
+    nodes = open_patch(deformer.anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
     stated = {**provenance, "format": FORMAT, "anatomy": deformer.anatomy.digest, "batch": str(batch)}
     partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and not partial.exists():
-            with h5py.File(path, "r") as finished:
-                _demand_same(finished, stated, loads)
-                if len(stored(finished, "answers/done")) >= len(loads):
-                    return Solved()
-        if not partial.exists():
-            _lay_out(partial, deformer.anatomy, loads, stated, path if path.exists() else None, batch)
-        with h5py.File(partial, "r+") as file:
-            _demand_same(file, stated, loads, len(loads))
-            solved = _fill(file, deformer, loads, batch, progress)
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error}). Another run may be writing it; else choose another name."
-        ) from error
-    return solved
+    finished: set[Batch] = set()
+    work = Work(deformer, loads, nodes, batch)
+    if path.exists():
+        before = _earlier(path, stated, loads)
+        if len(before) > len(loads):
+            work = Work(deformer, before, nodes, batch)
+        finished = _whole_batches(path, work)
+        if not partial.exists() and not set(work.batches) - finished and _same_body(path, work):
+            return Solved()
+    size = work.row.itemsize * sum(work.counts.values())
+    held = partial.stat().st_size if partial.exists() else 0
+    demand_space(path, max(size - held, 0) + size, size)
+    said = {
+        **stated,
+        "number of loads": str(len(work.loads)),
+        "hash of the loads": digest_of_loads(work.loads),
+    }
+    with listened() as seconds, opened(partial, said) as journal:
+        solved = _fill(journal, work, finished, progress)
+        with stage(STAGES["answers"]):
+            _write(path, work, stated, journal)
+    partial.unlink(missing_ok=True)
+    return Solved(solved["unit"], solved["answers"], *(seconds[name] for name in STAGES.values()))
 
 
 def unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:
@@ -102,118 +190,131 @@ def unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:
     return Loads((Nodal(force),))
 
 
-def _fill(
-    file: h5py.File, deformer: Deformer, loads: Loads, batch: int, progress: Callable[[int, int], None]
-) -> Solved:
-    """Solve what is not done. A second thread writes each batch while the next is solved: one ahead, in order."""
-    done = {name: stored(file, f"{name}/done")[:] for name in ("unit", "answers")}
-    total = sum(len(flags) for flags in done.values())
-    solved = dict.fromkeys(done, 0)
-    with listened() as seconds, ThreadPoolExecutor(1) as writer:
-        for name, flags in done.items():
+def _fill(journal: Journal, work: Work, finished: set[Batch], progress: Callable[[int, int], None]) -> dict[str, int]:
+    """Solve what is in neither file. A second thread writes a batch while the next is solved: one ahead, in order."""
+    total, done = sum(work.counts.values()), 0
+    solved = dict.fromkeys(work.counts, 0)
+    with ThreadPoolExecutor(1) as writer:
+        for name in work.counts:
             written: Future[None] | None = None
             with stage(STAGES[name]):
-                for first in range(0, len(flags), batch):
-                    rows = np.arange(first, min(first + batch, len(flags)))
-                    if not flags[rows].all():
-                        asked = unit_loads(deformer.anatomy, rows) if name == "unit" else loads.rows(rows)
-                        answer = deformer.deform(asked).at(np.arange(len(deformer.anatomy.mesh.nodes)))
+                for batch in (each for each in work.batches if each[0] == name):
+                    count = len(work.rows(batch))
+                    if batch not in finished and batch not in journal:
+                        rows = work.solved(batch)
                         if written is not None:
                             written.result()
-                        written = writer.submit(_write, file, name, first, answer)
-                        solved[name] += len(rows)
-                    flags[rows] = True
-                    progress(sum(int(every.sum()) for every in done.values()), total)
+                        written = writer.submit(journal.add, batch, rows.tobytes())
+                        solved[name] += count
+                    done += count
+                    progress(done, total)
                 if written is not None:
                     written.result()
-    return Solved(solved["unit"], solved["answers"], *seconds.values())
+    return solved
 
 
-def _write(file: h5py.File, name: str, first: int, answer: Deformation) -> None:
-    """Put answers into the rows from `first` on, and then call them done."""
-    response = answer.displacement / UNIT_FORCE if name == "unit" else answer.displacement
-    columns = {
-        # In the width of the file, 64 kB a load on a brain of 5,300 nodes: HDF5 converts at a third of the speed.
-        "displacement": response.astype(np.float32, copy=False),
-        "outcome": np.array([outcome.name for outcome in answer.outcome], NAME_TYPE),
-        "iterations": answer.iterations,
-        "residual": answer.residual,
-    }
-    here = slice(first, first + len(answer))
-    for item, column in columns.items():
-        stored(file, f"{name}/{item}")[here] = column
-    file.flush()  # the rows must be in the file before they are called done
-    stored(file, f"{name}/done")[here] = True
-    file.flush()
+def _write(path: Path, work: Work, stated: Mapping[str, str], journal: Journal) -> None:
+    """Write the data set: batches of the journal, and those of the finished file that it takes the place of."""
+    with written_stream(path, path.suffix) as stream, h5py.File(stream, "w", libver=READERS) as file:
+        facts = {
+            "title": TITLE,
+            "length_unit": "m",
+            "force_unit": "N",
+            "frame": "RAS",
+            "tool": _tool(work.loads, stated),
+            "compression": "none: packed, displacements are a sixth smaller",
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "sulcus version": version("sulcus"),
+        }
+        write_provenance(file, {**facts, **stated})
+        write_embedded(file, work.anatomy)
+        write_loads(file, work.loads)
+        arrays = {
+            (name, item): group.create_dataset(item, (rows, *kind.shape), kind.base)
+            for name, rows in work.counts.items()
+            for group in [file.create_group(name)]
+            for item, kind in [(item, work.row[item]) for item in work.row.names or ()] + [("checksum", CHECKSUM)]
+        }
+        file["unit/node"] = np.repeat(work.nodes, 3)
+        explain(file)
+        for batch in work.batches:
+            rows = np.frombuffer(journal.read(batch), work.row) if batch in journal else _kept(path, work, batch)
+            here = slice(batch[1], batch[1] + len(rows))
+            for item in work.row.names or ():
+                arrays[batch[0], item][here] = rows[item]
+            arrays[batch[0], "checksum"][here] = checksums(rows)
 
 
-def _lay_out(
-    partial: Path, anatomy: Anatomy, loads: Loads, stated: Mapping[str, str], finished: Path | None, batch: int
-) -> None:
-    """Create the file with all its space; keep the whole batches of a `finished` file that it extends."""
-    nodes = open_patch(anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
-    draft = partial.with_name(f".{partial.name}")
-    try:
-        with h5py.File(draft, "w") as file:
-            file.attrs.update(stated)
-            file.attrs.update(length_unit="m", force_unit="N", frame="RAS")
-            write_embedded(file, anatomy)
-            write_loads(file, loads)
-            for name, rows in (("unit", 3 * len(nodes)), ("answers", len(loads))):
-                group = file.create_group(name)
-                for item, shape, kind in (
-                    ("displacement", (rows, len(anatomy.mesh.nodes), 3), np.float32),
-                    ("outcome", (rows,), NAME_TYPE),
-                    ("iterations", (rows,), np.int32),
-                    ("residual", (rows,), np.float64),
-                    ("done", (rows,), bool),
-                ):
-                    array = group.create_dataset(item, shape, kind)
-                    if rows:  # a first write makes HDF5 allocate the whole array: later writes touch no metadata
-                        array[-1] = np.zeros(shape[1:], kind)
-            file["unit/node"] = np.repeat(nodes, 3)
-            if finished is not None:
-                with h5py.File(finished, "r") as source:
-                    _copy_batches(source, file, batch)
-        draft.replace(partial)
-    finally:
-        draft.unlink(missing_ok=True)
+def _kept(path: Path, work: Work, batch: Batch) -> np.ndarray:
+    """A batch's rows in a finished file, found undamaged before."""
+    with h5py.File(path, "r") as before:
+        rows, good = _batch(before, work, batch)
+    if not good.all():
+        raise InputError(f"{path}: rows were damaged just now: give the same command again, and they are solved anew.")
+    return rows
 
 
-def _copy_batches(source: h5py.File, target: h5py.File, batch: int) -> None:
-    """Whole batches only: a last short batch would have been solved in other company."""
-    for name in ("unit", "answers"):
-        rows = len(stored(source, f"{name}/done"))
-        whole = rows if rows == len(stored(target, f"{name}/done")) else rows // batch * batch
-        for item in ("displacement", "outcome", "iterations", "residual", "done"):
-            for first in range(0, whole, batch):
-                here = slice(first, min(first + batch, whole))
-                stored(target, f"{name}/{item}")[here] = stored(source, f"{name}/{item}")[here]
+def _tool(loads: Loads, stated: Mapping[str, str]) -> str:
+    """What acts, in a sentence."""
+    if loads.of(Touching) is None:
+        return "a force on a round footprint that stays with the tissue: see loads/Pushed"
+    return f"a rigid ball, radius {stated.get('ball', 'not told')} m, moved by pose: see loads/Touching"
 
 
-def _demand_same(file: h5py.File, stated: Mapping[str, str], loads: Loads, count: int | None = None) -> None:
-    """Raise unless the file was begun with the same texts and the same loads (and as many, if `count` is given)."""
-    for name, wanted in stated.items():
-        found = file.attrs.get(name, "nothing")
-        if found != wanted:
-            raise InputError(
-                f"{file.filename}: was made with {name} {found}, but now {name} is {wanted}: repeat the first command, "
-                "or choose another --out."
-            )
-    before = read_loads(file)
-    if count is not None and len(before) != count:
-        raise InputError(
-            f"{file.filename}: was begun for {len(before)} loads, not {count}: finish it first, or delete it."
-        )
+def _batch(file: h5py.File, work: Work, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+    """A batch's rows in a finished file, and which of them are whole."""
+    rows = work.rows(batch)
+    return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
+
+
+def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
+    """The loads of a finished file, which must be the first of `loads` or begin with them, and its texts the same."""
+    with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
+        said = provenance_of(file)
+        if said.get("format") == UNCHECKED:
+            raise InputError(f"{path}: is of an earlier version, whose files do not go on: choose another --out.")
+        for name, wanted in stated.items():
+            found = said.get(name, "nothing")
+            if found != wanted:
+                raise InputError(
+                    f"{path}: was made with {name} {found}, but now {name} is {wanted}: repeat the first command, or "
+                    "choose another --out."
+                )
+        before = read_loads(file)
     shared = np.arange(min(len(before), len(loads)))
-    if not _equal(before.rows(shared), loads.rows(shared)):
-        raise InputError(f"{file.filename}: holds other loads than these: choose another --out.")
+    if digest_of_loads(before.rows(shared)) != digest_of_loads(loads.rows(shared)):
+        raise InputError(f"{path}: holds other loads than these: choose another --out.")
+    return before
 
 
-def _equal(one: Loads, other: Loads) -> bool:
-    """Whether two sets of loads are the same, bit by bit."""
-    kinds = [sorted(type(cause).__name__ for cause in loads.causes) for loads in (one, other)]
-    pairs = [(a, b) for a in one.causes for b in other.causes if type(a) is type(b)]
-    return kinds[0] == kinds[1] and all(
-        np.array_equal(array, vars(b)[name]) for a, b in pairs for name, array in vars(a).items()
-    )
+def _same_body(path: Path, work: Work) -> bool:
+    """Whether the body in a finished file is undamaged."""
+    with h5py.File(path, "r") as file:
+        try:
+            return read_embedded(file).digest == work.anatomy.digest
+        except InputError:
+            return False
+
+
+def _whole_batches(path: Path, work: Work) -> set[Batch]:
+    """The batches that a finished file holds undamaged.
+
+    A last short batch is none, unless it is the last again: it would have been solved in other company.
+    """
+    held, damaged = set(), []
+    with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
+        rows = {name: len(stored(file, f"{name}/checksum", "u")) for name in work.counts}
+        for batch in work.batches:
+            numbers = work.rows(batch)
+            if numbers[-1] < rows[batch[0]] and (rows[batch[0]] == work.counts[batch[0]] or len(numbers) == work.batch):
+                good = _batch(file, work, batch)[1]
+                damaged += [f"row {row} of `{batch[0]}`" for row in numbers[~good]]
+                held |= {batch} if good.all() else set()
+    if damaged:
+        more = f" and {len(damaged) - 5} more" if damaged[5:] else ""
+        warnings.warn(
+            f"{path}: {', '.join(damaged[:5])}{more}: damaged. They are solved anew, and all else is kept.",
+            DamageWarning,
+            stacklevel=3,
+        )
+    return held

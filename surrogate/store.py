@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -16,8 +15,10 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.files import written_whole
 from sim.mesh import digest_of
+from sim.reading import read_as
 
 from .ann import Ann
+from .archive import Archive
 from .bayesian import Bayesian
 from .bound import Bound
 from .contact import Contact
@@ -32,6 +33,7 @@ from .regressor import Fitted, Regressor
 from .remainder import Remainder
 from .series import Series
 from .svr import Svr
+from .vetting import demand_finite, demand_sound
 
 FORMAT = "sulcus model 2"
 REGRESSORS: dict[str, type[Regressor]] = {
@@ -83,28 +85,36 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
     Raises
     ------
     InputError
-        A file that is missing or not a model file of this project, or that was taught on another anatomy.
+        A file that is missing or not a model file of this project, that was taught on another anatomy, or that holds
+        a model which cannot be.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
-    try:
-        # Opened here: numpy leaves a broken archive open.
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            header = json.loads(str(file["header"]))
-            if header["format"] != FORMAT:
-                raise InputError(f"{path}: has the format {header['format']!r}, not {FORMAT!r}: train it anew.")
-            if header["anatomy"] != anatomy.digest:
-                raise InputError(
-                    f"{path}: was taught on the anatomy {header['anatomy']}, but this one is {anatomy.digest}: "
-                    "use the mesh that it was made for, or run `sulcus simulate` and `sulcus train` for this one."
-                )
-            arrays = {name: file[name] for name in file.files if name != "header"}
-        return {name: _rebuilt(description, arrays, anatomy) for name, description in header["models"].items()}
-    except InputError:
-        raise
-    except (OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read as a model ({error}). Make one with `sulcus train`.") from error
+    with read_as(path, "a model", "Make one with `sulcus train`."), path.open("rb") as raw:
+        archive = Archive(raw)
+        header = json.loads(archive.text("header"))
+        if header["format"] != FORMAT:
+            raise InputError(f"{path}: has the format {str(header['format'])[:40]!r}, not {FORMAT!r}: train it anew.")
+        if header["anatomy"] != anatomy.digest:
+            raise InputError(
+                f"{path}: was taught on the anatomy {str(header['anatomy'])[:40]}, but this one is {anatomy.digest}: "
+                "use the mesh that it was made for, or run `sulcus simulate` and `sulcus train` for this one."
+            )
+        arrays = archive.arrays(_keys(header["models"].values()))
+        models = {name: _rebuilt(description, arrays, anatomy) for name, description in header["models"].items()}
+        for name, model in models.items():
+            demand_sound(name, model)
+        return models
+
+
+def _keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
+    """The names of all arrays that models refer to."""
+    for description in descriptions:
+        for part in description["parts"]:
+            yield from (part["nodes"], part["modes"], *part["state"].values())
+        yield description["envelope"]["points"]
+        yield from (description["bounds"] or {}).values()
 
 
 def _own_name(regressor: Fitted) -> str:
@@ -152,14 +162,12 @@ def _described(model: Learned, put: Any) -> dict[str, Any]:
 
 
 def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:
-    parts = tuple(
-        Part(
-            part["encoder"],
-            _kind(part["regressor"]).restored({name: arrays[key] for name, key in part["state"].items()}),
-            Basis(arrays[part["nodes"]], arrays[part["modes"]]),
-        )
-        for part in description["parts"]
-    )
+    parts = []
+    for part in description["parts"]:
+        state = {name: arrays[key] for name, key in part["state"].items()}
+        demand_finite(state)
+        basis = Basis(arrays[part["nodes"]], arrays[part["modes"]])
+        parts.append(Part(part["encoder"], _kind(part["regressor"]).restored(state), basis))
     envelope = dict(description["envelope"])
     envelope["points"] = arrays[envelope["points"]]
     for name in ("force", "footprint"):
@@ -168,7 +176,7 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
     bounds = None if promised is None else Bound(**{name: arrays[key] for name, key in promised.items()})
     return Learned(
         anatomy,
-        parts,
+        tuple(parts),
         Envelope(**envelope),
         description["bound"],
         bounds,

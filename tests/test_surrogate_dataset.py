@@ -1,6 +1,5 @@
 """Data sets: nothing is lost to a kill, nothing is mixed, failed cases stay."""
 
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,7 @@ from boxes import box as cube
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, posture, push
-from surrogate.dataset import read_dataset, read_embedded, read_loads, write_embedded, write_loads
+from surrogate.dataset import SEAL, read_dataset, read_embedded, read_loads, write_embedded, write_loads
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
 
@@ -85,40 +84,70 @@ def test_failed_cases_stay_marked(tmp_path, pretender, loads):
     assert (np.abs(data.displacement(slice(None))).max(axis=(1, 2)) > 0).all()
 
 
+def unfinished(folder, pretender, loads, path="data.h5"):
+    """A run that was stopped before its last batch."""
+
+    class StopError(Exception):
+        pass
+
+    def stop(done, total):
+        if done > total - 8:
+            raise StopError
+
+    with pytest.raises(StopError):
+        simulate(folder / path, pretender, loads, SAID, 8, stop)
+    return folder / path
+
+
 KILLED = """
 import os, runpy, signal, sys
 import h5py
 tools = runpy.run_path(sys.argv[1])
 box = tools["make_box"]()
+from surrogate import journal
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
-path, last, writes = sys.argv[2], int(sys.argv[3]), 0
-write = h5py.Dataset.__setitem__
-def dying(self, rows, values):
-    global writes
-    write(self, rows, values)
-    writes += 1
-    if writes == last:
+path, kind, last, count = sys.argv[2], sys.argv[3], int(sys.argv[4]), 0
+def dying(*given):
+    global count
+    count += 1
+    if count == last and kind == "torn":
+        given[0]._file.write(journal._record(*given[1:], given[0]._key)[:1000])
+        given[0]._file.flush()
+    if count == last:
         os.kill(os.getpid(), signal.SIGKILL)
-h5py.Dataset.__setitem__ = dying
+    return before(*given)
+owner, name = (h5py.Dataset, "__setitem__") if kind == "file" else (journal.Journal, "add")
+before = getattr(owner, name)
+setattr(owner, name, dying)
 simulate(path, tools["Pretender"](box), draw("palpation", box, 20, 0), {"preset": "palpation", "seed": "0"}, 8)
 """
+
+
+def undated(path):
+    """The bytes of a data set, but for its date and the hash of it."""
+    with h5py.File(path) as file:
+        dates = [file.attrs[name].encode() for name in ("date", SEAL)]
+    raw = path.read_bytes()
+    assert all(raw.count(date) == 1 for date in dates)
+    return raw.replace(dates[0], b"").replace(dates[1], b"")
 
 
 def test_a_killed_run_ends_with_the_bytes_of_an_uninterrupted_one(tmp_path, pretender, loads):
     whole, killed = tmp_path / "whole.h5", tmp_path / "killed.h5"
     simulate(whole, pretender, loads, SAID, 8)
-    # In the layout; between the columns of a unit batch; before its flag; in a batch of answers.
-    deaths = [7, 17, 19, 103]
-    for writes in deaths:
-        command = [sys.executable, "-c", KILLED, str(Path(__file__).with_name("conftest.py")), str(killed), str(writes)]
+    # Before the first batch; in the middle of one of unit responses, and one of answers; while the file is written.
+    deaths = [("clean", 1), ("torn", 3), ("torn", 22), ("file", 9)]
+    for kind, number in deaths:
+        words = [str(Path(__file__).with_name("conftest.py")), str(killed), kind, str(number)]
+        command = [sys.executable, "-c", KILLED, *words]
         assert subprocess.run(command, cwd=tmp_path, check=False, capture_output=True).returncode == -9
         assert not killed.exists()
     with pytest.raises(InputError, match="unfinished run"):
         read_dataset(killed)
-    solved = simulate(killed, pretender, loads, SAID, 8).rows
-    assert 0 < solved < len(loads) + 3 * int(pretender.anatomy.craniotomy.sum())
-    assert killed.read_bytes() == whole.read_bytes()
+    assert [path.name.startswith(".sulcus-") for path in sorted(tmp_path.iterdir())] == [True, False, False]
+    assert simulate(killed, pretender, loads, SAID, 8).rows == 0
+    assert sorted(tmp_path.iterdir()) == [killed, whole] and undated(killed) == undated(whole)
 
 
 def test_a_finished_file_is_left_alone_and_extended(tmp_path, box, pretender, loads):
@@ -129,8 +158,9 @@ def test_a_finished_file_is_left_alone_and_extended(tmp_path, box, pretender, lo
     more = draw("palpation", box, 30, 0)
     assert simulate(path, pretender, more, SAID, 8).rows == 30 - 16  # the last, short batch is solved again
     simulate(direct, pretender, more, SAID, 8)
-    assert path.read_bytes() == direct.read_bytes()
-    assert simulate(path, pretender, loads, SAID, 8).rows == 0 and path.read_bytes() == direct.read_bytes()
+    assert undated(path) == undated(direct)
+    after = path.read_bytes()
+    assert simulate(path, pretender, loads, SAID, 8).rows == 0 and path.read_bytes() == after
 
 
 def test_other_parameters_are_refused(tmp_path, box, pretender, loads):
@@ -142,9 +172,16 @@ def test_other_parameters_are_refused(tmp_path, box, pretender, loads):
         simulate(path, pretender, loads, SAID, 16)
     with pytest.raises(InputError, match="other loads"):
         simulate(path, pretender, draw("palpation", box, 20, 1), SAID, 8)
-    shutil.move(path, tmp_path / "data.h5.partial")
-    with pytest.raises(InputError, match="begun for 20 loads"):
+
+
+def test_an_unfinished_run_goes_on_with_its_own_loads_alone(tmp_path, box, pretender, loads):
+    path = unfinished(tmp_path, pretender, loads)
+    with pytest.raises(InputError, match=r"number of loads 20, but now number of loads is 30.*delete it"):
         simulate(path, pretender, draw("palpation", box, 30, 0), SAID, 8)
+    with pytest.raises(InputError, match="hash of the loads"):
+        simulate(path, pretender, draw("palpation", box, 20, 1), SAID, 8)
+    with pytest.raises(InputError, match="preset palpation, but now preset is mixed"):
+        simulate(path, pretender, loads, {**SAID, "preset": "mixed"}, 8)
 
 
 def test_bad_files_are_sentences(tmp_path, pretender, loads):
@@ -153,7 +190,7 @@ def test_bad_files_are_sentences(tmp_path, pretender, loads):
     (tmp_path / "text.h5").write_text("not HDF5")
     with pytest.raises(InputError, match="cannot be read"):
         read_dataset(tmp_path / "text.h5")
-    with pytest.raises(InputError, match=r"cannot be written"):
+    with pytest.raises(InputError, match=r"text.h5: cannot be read as a data set.*Delete it"):
         simulate(tmp_path / "text.h5", pretender, loads, SAID)
     h5py.File(tmp_path / "other.h5", "w").close()
     with pytest.raises(InputError, match="not a data set"):

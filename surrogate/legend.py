@@ -1,0 +1,98 @@
+"""What each array of a data set is: written beside it, so that the file is understood without this project."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import h5py
+
+TITLE = (
+    "Answers of a finite-element solver to loads of a tool on a brain. anatomy/ is the body; loads/CAUSE/ are the "
+    "loads, one row each; answers/ has the answer of each load, row by row; unit/ has responses to unit forces. SI "
+    "units; coordinates are the anatomy's own, in RAS (x to the right, y to the front, z up)."
+)
+GROUPS = {
+    "anatomy": "The body in its rest configuration, and how it is held. `digest` is a hash of all arrays here.",
+    "loads": "What the tool does, one row a load case. `digest` is a hash of all arrays here.",
+    "answers": "The static answer to each row of loads/.",
+    "unit": "Small-strain responses to a unit force of 1 N at one node of the open cortex: of each node in unit/node "
+    "along x, then y, then z. They are scaled from 1e-6 N, and superpose. Empty where the loads are poses.",
+}
+CASE, VERTEX, RAS = "load case", "mesh vertex, as the rows of anatomy/nodes", "x, y, z (RAS)"
+CHECKED = (
+    "zlib.crc32 of the row's bytes, little-endian and in this order: displacement, outcome (padded with zeros), "
+    "iterations, residual"
+)
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """Unit, axes in order with ; between, and meaning of an array; vectors and points are in the frame RAS."""
+
+    unit: str
+    axes: str
+    text: str
+
+    def beside(self, array: h5py.Dataset) -> None:
+        """Write it."""
+        array.attrs.update(unit=self.unit, axes=self.axes, meaning=self.text)
+        if "RAS" in self.axes:
+            array.attrs["frame"] = "RAS"
+
+
+_ROWS = {
+    "outcome": Meaning("1", CASE, "how the answer came about; names that begin with CONVERGED may be relied on"),
+    "iterations": Meaning("1", CASE, "steps that the solver took"),
+    "residual": Meaning(
+        "1", CASE, "norm of the forces left over, over that of the largest of elasticity, load and hold"
+    ),
+    "checksum": Meaning("1", CASE, CHECKED),
+}
+MEANINGS = {
+    "anatomy/nodes": Meaning("m", f"vertex; {RAS}", "positions at rest"),
+    "anatomy/tets": Meaning("1", "tetrahedron; corner", "rows of anatomy/nodes, of positive volume"),
+    "anatomy/middles": Meaning(
+        "1", "tetrahedron; edge 01, 12, 02, 03, 13, 23", "rows of anatomy/nodes on the edges of quadratic tetrahedra"
+    ),
+    "anatomy/region": Meaning("1", "tetrahedron", "1 brain, 2 tumour"),
+    "anatomy/held": Meaning("1", f"vertex; {RAS}", "which components of the displacement are prescribed, as zero"),
+    "anatomy/slide_normal": Meaning(
+        "1", f"vertex; {RAS}", "unit normal along which the vertex cannot move, as it slides along the skull; else zero"
+    ),
+    "anatomy/craniotomy": Meaning("1", "vertex", "which vertices of the surface are free and may be touched"),
+    "loads/time": Meaning("s", CASE, "when the answer is wanted; 0 where nothing depends on time"),
+    "loads/Pushed/point": Meaning("m", f"{CASE}; {RAS}", "centre of the tool's round footprint, on the body at rest"),
+    "loads/Pushed/force": Meaning("N", f"{CASE}; {RAS}", "total force on the body, of fixed direction"),
+    "loads/Pushed/footprint": Meaning(
+        "m",
+        CASE,
+        "radius r of the footprint; the traction at a distance s r from the point is in proportion to sqrt(1 - s^2)",
+    ),
+    "loads/Touching/pose": Meaning(
+        "m",
+        f"{CASE}; tool; row; column (RAS)",
+        "T_world_tool, from the tool's frame to RAS: a rotation, and in the last column the tool's origin",
+    ),
+    "answers/displacement": Meaning("m", f"{CASE}; {VERTEX}; {RAS}", "displacement from rest"),
+    "unit/displacement": Meaning(
+        "m/N",
+        f"node and axis of the force, as in unit/node; {VERTEX}; {RAS}",
+        "response per newton",
+    ),
+    "unit/node": Meaning(
+        "1", "row of the responses", "the vertex that the unit force acts on; rows 3 k, 3 k + 1, 3 k + 2 along x, y, z"
+    ),
+    **{f"{group}/{name}": meaning for group in ("answers", "unit") for name, meaning in _ROWS.items()},
+}
+
+
+def explain(file: h5py.File) -> None:
+    """Write beside every array and group what it is."""
+    for name, text in GROUPS.items():
+        file.require_group(name).attrs["meaning"] = text
+
+    def each(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset) and name in MEANINGS:
+            MEANINGS[name].beside(item)
+
+    file.visititems(each)

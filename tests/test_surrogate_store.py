@@ -1,0 +1,206 @@
+"""Model files from outside: bounded, believed only where a training could have made them, and refused in sentences."""
+
+import json
+import tracemalloc
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim.errors import InputError
+from surrogate.bound import Bound
+from surrogate.dataset import read_dataset
+from surrogate.encode import Basis
+from surrogate.learned import Part
+from surrogate.sampling import draw
+from surrogate.simulate import simulate
+from surrogate.store import load, save
+from surrogate.train import train
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory, pretender):
+    path = tmp_path_factory.mktemp("store") / "data.h5"
+    simulate(path, pretender, draw("palpation", pretender.anatomy, 180, 0), {"preset": "palpation"})
+    return train(read_dataset(path), ["linear", "svr"]).models
+
+
+@pytest.fixture(scope="module")
+def stored(models, tmp_path_factory):
+    path = tmp_path_factory.mktemp("stored") / "model.npz"
+    save(path, models)
+    return path
+
+
+def part_with(part, **changes):
+    return Part(part.encoder, part.regressor, Basis(**{**vars(part.basis), **changes}))
+
+
+def put(array, place, value):
+    changed = array.copy()
+    changed[place] = value
+    return changed
+
+
+def basis(change):
+    return lambda model: replace(
+        model, parts=(part_with(model.parts[0], **change(model.parts[0].basis)), *model.parts[1:])
+    )
+
+
+def envelope(**changes):
+    return lambda model: replace(model, envelope=replace(model.envelope, **changes))
+
+
+def bounds(**changes):
+    def change(model):
+        arrays = vars(model.bounds)
+        return replace(model, bounds=Bound(**arrays | {name: made(arrays[name]) for name, made in changes.items()}))
+
+    return change
+
+
+def encoder(name):
+    return lambda model: replace(model, parts=(replace(model.parts[0], encoder=name),))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (basis(lambda b: {"nodes": put(b.nodes, -1, 10**6)}), "nodes lie outside the mesh"),
+        (basis(lambda b: {"nodes": put(b.nodes, 0, -1)}), "nodes lie outside the mesh"),
+        (basis(lambda b: {"nodes": b.nodes[::-1]}), "not sorted"),
+        (basis(lambda b: {"nodes": put(b.nodes, 1, b.nodes[0])}), "come twice"),
+        (basis(lambda b: {"nodes": b.nodes.astype(float)}), "no vertex numbers"),
+        (basis(lambda b: {"modes": put(b.modes, (0, 0), np.nan)}), "modes are no finite numbers"),
+        (basis(lambda b: {"modes": b.modes[:, 3:]}), "modes are not those of its nodes"),
+        (basis(lambda b: {"modes": b.modes[1:]}), "answers no load"),
+        (lambda model: replace(model, parts=()), "no parts"),
+        (
+            lambda model: replace(model, parts=(replace(model.parts[0], encoder="magic"),)),
+            "no encoder is called 'magic'",
+        ),
+        (encoder("nodal"), "cannot be read as a model"),
+        (lambda model: replace(model, bound=-1.0), "bound is no distance"),
+        (lambda model: replace(model, ball=-0.01), "ball has no radius"),
+        (envelope(reach=-1.0), "reach is none"),
+        (envelope(angle=float("nan")), "angle is none"),
+        (envelope(force=(1.0, 0.1)), "range of force is none"),
+        (envelope(footprint=(0.0, 0.1)), "range of footprint is none"),
+        (envelope(points=np.full((3, 3), np.nan)), "taught points are none"),
+        (bounds(quantile=lambda q: -q), "bounds are negative"),
+        (bounds(quantile=lambda q: q[::-1] * [[2.0], [1.0]]), "shrink with their probability"),
+        (bounds(quantile=lambda q: np.full_like(q, np.nan)), "no numbers"),
+        (bounds(deviation=lambda d: 0.0 * d), "scale of its bounds"),
+        (bounds(weights=lambda w: w[1:]), "another shape"),
+        (bounds(profile=lambda p: 2.0 + p), "share of its bounds"),
+    ],
+)
+def test_a_model_that_cannot_be_is_refused(models, box, tmp_path, change, sentence):
+    save(tmp_path / "model.npz", {"svr": change(models["svr"])})
+    with pytest.raises(InputError, match=sentence) as caught:
+        load(tmp_path / "model.npz", box)
+    assert str(caught.value).startswith(str(tmp_path / "model.npz")) and "sulcus train" in str(caught.value)
+
+
+def test_what_a_regressor_knows_is_finite(models, box, tmp_path):
+    model = models["linear"]
+    linear = type(model.parts[0].regressor).restored({"compliance": model.parts[0].regressor.compliance_ * np.nan})
+    save(tmp_path / "model.npz", {"linear": replace(model, parts=(replace(model.parts[0], regressor=linear),))})
+    with pytest.raises(InputError, match="'compliance' are no finite numbers"):
+        load(tmp_path / "model.npz", box)
+
+
+def test_what_no_model_refers_to_is_not_read(stored, box, tmp_path):
+    """64 MB of zeros beside the models, in 64 kB."""
+    path = tmp_path / "model.npz"
+    path.write_bytes(stored.read_bytes())
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("bomb.npy", "w") as member:
+        np.lib.format.write_array(member, np.zeros(2**23))
+    tracemalloc.start()
+    try:
+        assert set(load(path, box)) == {"linear", "svr"}
+        assert tracemalloc.get_traced_memory()[1] < 2**25
+    finally:
+        tracemalloc.stop()
+
+
+def rewritten(stored, path, change):
+    """The file with another header, and its members as they were."""
+    with zipfile.ZipFile(stored) as source, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target:
+        for name in source.namelist():
+            raw = source.read(name)
+            if name == "header.npy":
+                text = change(str(np.load(stored)["header"]))
+                with target.open(name, "w") as member:
+                    np.lib.format.write_array(member, np.array(text))
+            else:
+                target.writestr(name, raw)
+    return path
+
+
+def test_declared_sizes_are_held_against_what_there_is(stored, box, tmp_path):
+    path = tmp_path / "model.npz"
+    with zipfile.ZipFile(stored) as source, zipfile.ZipFile(path, "w") as target:
+        for name in source.namelist():
+            raw = bytearray(source.read(name))
+            if name != "header.npy":
+                start = raw.index(b"'shape': (") + 10
+                raw[start : start + 1] = b"9"  # more than the member holds
+            target.writestr(name, bytes(raw))
+    with pytest.raises(InputError, match=r"is not what it says|cannot be"):
+        load(path, box)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: "[" * 100_000,
+        lambda text: "not json",
+        lambda text: "[]",
+        lambda text: json.dumps({**json.loads(text), "models": []}),
+        lambda text: json.dumps({**json.loads(text), "models": {"a": {}}}),
+        lambda text: text.replace('"regressor": "svr"', '"regressor": "forest"'),
+        lambda text: text.replace('"nodes": "', '"nodes": "0'),
+        lambda text: text.replace('"reach": ', '"reach": "far", "r": '),
+    ],
+)
+def test_a_header_that_says_something_else_is_a_sentence(stored, box, tmp_path, change):
+    path = rewritten(stored, tmp_path / "model.npz", change)
+    with pytest.raises(InputError, match="Make one with `sulcus train`") as caught:
+        load(path, box)
+    assert len(str(caught.value).splitlines()) == 1 and "allow_pickle" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("offset", "value"), [(6, 1), (8, 99)])
+def test_encrypted_and_oddly_packed_members_are_sentences(stored, box, tmp_path, offset, value):
+    raw = bytearray(stored.read_bytes())
+    place = -1
+    for mark, field in ((b"PK\x03\x04", offset), (b"PK\x01\x02", offset + 2)):
+        while (place := raw.find(mark, place + 1)) >= 0:
+            raw[place + field] = value
+    path = tmp_path / "model.npz"
+    path.write_bytes(raw)
+    with pytest.raises(InputError, match="cannot be read as a model: it is damaged, or of another kind"):
+        load(path, box)
+
+
+def test_memory_that_is_not_there_is_a_sentence(stored, box, monkeypatch):
+    def starved(*given, **named):
+        raise MemoryError
+
+    monkeypatch.setattr("numpy.lib.format.read_array", starved)
+    with pytest.raises(InputError, match="asks for more memory than there is"):
+        load(stored, box)
+
+
+def test_random_damage_is_a_sentence_or_no_damage(stored, models, box, tmp_path):
+    path = tmp_path / "model.npz"
+    for seed in range(25):
+        random = np.random.default_rng(seed)
+        raw = np.frombuffer(stored.read_bytes(), np.uint8).copy()
+        raw[random.integers(0, len(raw), 20)] ^= random.integers(1, 256, 20).astype(np.uint8)
+        path.write_bytes(raw.tobytes())
+        with pytest.raises(InputError):
+            load(path, box)
