@@ -277,8 +277,10 @@ def tissue_from_json(text: str) -> Tissue:
             terms = tuple((float(c), float(m)) for c, m in constants["terms"])
             return Ogden(terms, float(constants["bulk"]), prony)
         return Material(**constants, prony=prony)
-    except (ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{text!r} is no tissue that this version knows ({error}): simulate anew.") from error
+    except InputError as error:
+        raise InputError(f"{text[:200]!r} is no tissue: {error}") from error
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(f"{text[:200]!r} is no tissue that this version knows: simulate anew.") from error
 
 
 # Where shape and volume are carried by different elements, those that carry shape keep a Poisson's ratio of 0.3.

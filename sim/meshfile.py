@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .anatomy import Anatomy
 from .errors import InputError
 from .files import written_whole
-from .mesh import TetMesh, oriented
+from .limits import LARGEST_MESH
+from .mesh import MeshWarning, TetMesh, oriented
+from .reading import read_as
+from .vtu import demand_small
+
+if TYPE_CHECKING:
+    import meshio
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 # meshio's names of tetrahedra by their nodes; it brings every format's order of mid-edge nodes to VTK's.
 CELLS = {4: "tetra", 10: "tetra10"}
+
+# An anatomy's longest side [m]: a mouse's brain has 15 mm, a whole head 0.3 m.
+SMALLEST, LARGEST = 5e-3, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +58,20 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
         raise InputError(f"{path}: no such file. Give a tetrahedral mesh that meshio reads, such as .vtu or .msh.")
     if unit not in UNITS:
         raise InputError(f"no unit is called {unit!r}: choose one of {', '.join(UNITS)}.")
-    try:
-        raw = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parser raises, or exit
-        reason = str(error).strip() or type(error).__name__
-        raise InputError(f"{path}: cannot be read as a mesh ({reason}). Convert it to .vtu or .msh.") from error
+    remedy = "Convert it to .vtu or .msh."
+    # meshio prints what it stumbles over, and warns of arrays that it skips.
+    with read_as(path, "a mesh", remedy), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        if path.suffix == ".vtu":
+            demand_small(path, LARGEST_MESH)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            raw = meshio.read(path)
+    with read_as(path, "a mesh", remedy):
+        return _taken(path, raw, UNITS[unit])
+
+
+def _taken(path: Path, raw: meshio.Mesh, metre: float) -> MeshFile:
+    """What meshio read, with lengths in units of `metre` [m]."""
     kinds = {block.type for block in raw.cells}
     found = kinds.intersection(CELLS.values())
     if not found:
@@ -72,16 +94,13 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
             region = stored.astype(np.int32)
         if stored.ndim != 1 or not np.array_equal(stored, region):
             raise InputError(f"{path}: cell data `region` must be one whole number for each tetrahedron.")
-    try:
-        table, turned = oriented(raw.points, table)
-        tets, middles = np.split(table, [4], axis=1)
-        nodes = np.asarray(raw.points, np.float64) * UNITS[unit]
-        mesh = TetMesh(nodes, tets, region, middles if middles.size else None)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    table, turned = oriented(raw.points, table)
+    tets, middles = np.split(table, [4], axis=1)
+    nodes = np.asarray(raw.points, np.float64) * metre
+    mesh = TetMesh(nodes, tets, region, middles if middles.size else None)
     if turned:
         notes.append(f"turned {turned} tetrahedra of negative orientation")
-    return MeshFile(mesh, dict(raw.point_data), tuple(notes))
+    return MeshFile(mesh, {name: np.asarray(field) for name, field in raw.point_data.items()}, tuple(notes))
 
 
 def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray]) -> None:
@@ -111,9 +130,12 @@ def read_anatomy(path: str | Path) -> Anatomy:
     Raises
     ------
     InputError
-        As `read_mesh`; and a mesh that lacks `held`, `slide_normal` or `craniotomy`.
+        As `read_mesh`; a mesh that lacks `held`, `slide_normal` or `craniotomy`, or has numbers there that are none;
+        a body that is too small or too large for one in metres.
     """
-    file = read_mesh(path)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the body measures", MeshWarning)  # it is refused instead
+        file = read_mesh(path)
     missing = [name for name in ("held", "slide_normal", "craniotomy") if name not in file.point_data]
     if missing:
         raise InputError(
@@ -121,10 +143,18 @@ def read_anatomy(path: str | Path) -> Anatomy:
             "anatomy. Make one with `sulcus anatomy`, or add them."
         )
     data = file.point_data
-    try:
-        return Anatomy(file.mesh, data["held"] != 0, data["slide_normal"], data["craniotomy"] != 0)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    with read_as(path, "an anatomy", "Make one with `sulcus anatomy`."):
+        for name in ("held", "slide_normal", "craniotomy"):
+            if data[name].dtype.kind not in "fiub" or not np.isfinite(data[name]).all():
+                raise InputError(f"`{name}` has values that are no finite numbers: give 0 or 1, or unit normals.")
+        anatomy = Anatomy(file.mesh, data["held"] != 0, data["slide_normal"], data["craniotomy"] != 0)
+        size = float(np.ptp(anatomy.mesh.nodes, axis=0).max())
+        if not SMALLEST <= size <= LARGEST:
+            raise InputError(
+                f"the body measures {1e3 * size:,.3g} mm, and an anatomy {1e3 * SMALLEST:g} to {1e3 * LARGEST:g} mm: "
+                "its coordinates must be metres."
+            )
+        return anatomy
 
 
 def write_anatomy(path: str | Path, anatomy: Anatomy) -> None:

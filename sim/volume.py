@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .errors import InputError
+from .limits import MOST_VOXELS
+from .reading import read_as
 
 if TYPE_CHECKING:
     from nibabel.nifti1 import Nifti1Image
@@ -16,6 +20,9 @@ if TYPE_CHECKING:
 METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
 SAME_PLACE = 1e-3  # [m]; sform and qform that differ by less differ by round-off
 COARSEST = 6e-3  # [m]; larger voxels do not show a brain's surface
+FINEST = 1e-5  # [m]; no scanner of a brain resolves less
+# Bytes read at once, and bytes behind the voxels that are read for the checksum after them.
+PIECE, SURPLUS = 2**20, 2**24
 REMEDY = "Give one three-dimensional NIfTI volume (.nii or .nii.gz)."
 
 
@@ -35,7 +42,8 @@ def read_volume(path: str | Path) -> Volume:
     ------
     InputError
         A path that is no readable NIfTI file; several volumes, a slice, colours or complex numbers; values that are
-        not finite; an affine that is singular; voxels of more than 6 mm.
+        not finite; an affine that is singular; voxels of more than 6 mm or less than 0.01 mm, or too many of them; a
+        slope that is no number; a file that ends before its voxels do.
     """
     import nibabel
 
@@ -44,22 +52,44 @@ def read_volume(path: str | Path) -> Volume:
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {REMEDY}")
     if not path.name.lower().endswith((".nii", ".nii.gz")):
         raise InputError(f"{path}: is not called .nii or .nii.gz. {REMEDY}")
-    try:
+    with read_as(path, "NIfTI", REMEDY):
         image = nibabel.load(path)
         if not isinstance(image, nibabel.Nifti1Image):
-            raise TypeError(f"it is {type(image).__name__}")
+            raise InputError(f"{path}: is no NIfTI volume in one file. {REMEDY}")
+        _demand_held(path, image)
         values = np.asanyarray(image.dataobj)
         unit = str(image.header.get_xyzt_units()[0])
-    except Exception as error:  # nibabel and zlib raise whatever the damaged byte led to
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as NIfTI ({reason}). {REMEDY}") from error
-    affine = np.array(image.affine, np.float64)
-    metre = METRES.get(unit, 1e-3)
-    affine[:3] *= metre
-    _check(path, values, affine)
-    while values.ndim > 3:
-        values = values[..., 0]
-    return Volume(values, affine, _assumed(image, metre))
+        affine = np.array(image.affine, np.float64)
+        metre = METRES.get(unit, 1e-3)
+        affine[:3] *= metre
+        _check(path, values, affine)
+        while values.ndim > 3:
+            values = values[..., 0]
+        return Volume(values, affine, _assumed(image, metre))
+
+
+def _demand_held(path: Path, image: Nifti1Image) -> None:
+    """Refuse a file that declares more voxels than may be, or more than it has: no memory is taken before."""
+    voxels = math.prod(image.shape)
+    if voxels > MOST_VOXELS:
+        raise InputError(f"{path}: has {voxels:.3g} voxels, and {MOST_VOXELS:.3g} are the most. Resample it.")
+    with image.file_map["image"].get_prepare_fileobj("rb") as file:
+        header = type(image.header).from_fileobj(file)  # the image's own has forgotten them
+    slope, shift = float(header["scl_slope"]), float(header["scl_inter"])
+    if not math.isfinite(slope) or not math.isfinite(shift):
+        raise InputError(
+            f"{path}: its values have the slope {slope:g} and the intercept {shift:g}, which are no numbers. Export it "
+            "again."
+        )
+    needed = int(header["vox_offset"]) + voxels * header.get_data_dtype().itemsize
+    held = 0
+    with gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb") as file:
+        while piece := file.read(PIECE):  # to its end, where gzip has its checksum
+            held += len(piece)
+            if held > needed + SURPLUS:
+                break
+    if held < needed:
+        raise InputError(f"{path}: ends after {held:,} of {needed:,} bytes. Copy or export it again.")
 
 
 def _assumed(image: Nifti1Image, metre: float) -> tuple[str, ...]:
@@ -91,6 +121,11 @@ def _check(path: Path, values: np.ndarray, affine: np.ndarray) -> None:
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) <= 1e-6 * spacing.prod():
         raise InputError(f"{path}: its affine is singular, so its voxels have no place. Set the sform or qform.")
+    if spacing.min() < FINEST:
+        raise InputError(
+            f"{path}: its voxels measure {spacing.min() * 1e3:.3g} mm along an axis; {FINEST * 1e3:g} mm is the least. "
+            "Set the voxel size, or resample it."
+        )
     if spacing.max() > COARSEST:
         voxel = " x ".join(f"{edge * 1e3:.3g}" for edge in spacing)
         raise InputError(

@@ -75,7 +75,7 @@ def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
     # They rise; where one basis has the tumour and the cortex, once more from the start.
     rises = np.diff(nodes.astype(np.int64)) > 0
     _demand(
-        np.count_nonzero(~rises) <= 1 and len(np.unique(nodes)) == len(nodes), "its nodes are not sorted, or come twice"
+        bool(np.sum(~rises) <= 1) and len(np.unique(nodes)) == len(nodes), "its nodes are not sorted, or come twice"
     )
     known = np.union1d(anatomy.tumour_nodes, open_patch(anatomy).nodes)
     _demand(bool(np.isin(nodes, known).all()), "its nodes are none of tumour and open cortex")
@@ -105,7 +105,7 @@ def _check_envelope(envelope: Envelope) -> None:
     for name in ("reach", "angle"):
         value = getattr(envelope, name)
         _demand(value == 0.0 or _positive(value), f"its {name} is none")
-    _demand(np.isfinite(envelope.overhang) and _positive(envelope.line_force), "its range of loads is none")
+    _demand(bool(np.isfinite(envelope.overhang)) and _positive(envelope.line_force), "its range of loads is none")
 
 
 def _check_bounds(bounds: Bound, anatomy: Anatomy) -> None:

@@ -1,0 +1,247 @@
+"""Files from outside: one sentence of ours whatever is wrong, bounded memory, and no left-overs of killed runs."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import os
+import platform
+import re
+import struct
+import subprocess
+import sys
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+from boxes import base_held, box
+
+from sim import limits
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.files import check_output, demand_space, written_stream, written_whole
+from sim.intensity import read_intensity
+from sim.material import BRAIN, tissue_from_json, tissue_to_json
+from sim.mesh import TetMesh
+from sim.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
+from sim.reading import read_as
+from sim.volume import read_volume
+
+BODY = base_held(box((2, 2, 2), 0.02))
+
+
+def volume(path: Path, shape: tuple[int, ...] = (6, 6, 6), edge: float = 1.0) -> Path:
+    image = nibabel.Nifti1Image(np.ones(shape, np.uint8), np.diag([edge, edge, edge, 1.0]))
+    nibabel.save(image, path)
+    return path
+
+
+def header_with(path: Path, place: int, form: str, *values: float) -> Path:
+    """A .nii or .nii.gz with other numbers in its header."""
+    packed = path.name.endswith(".gz")
+    raw = bytearray(gzip.decompress(path.read_bytes()) if packed else path.read_bytes())
+    struct.pack_into(form, raw, place, *values)
+    path.write_bytes(gzip.compress(bytes(raw)) if packed else bytes(raw))
+    return path
+
+
+class TestVolumes:
+    @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
+    def test_voxels_that_are_not_there_take_no_memory(self, tmp_path: Path, name: str) -> None:
+        path = header_with(volume(tmp_path / name), 40, "<4h", 3, 700, 700, 700)
+        tracemalloc.start()
+        try:
+            with pytest.raises(InputError, match=r"ends after 568 of 343,000,352 bytes"):
+                read_volume(path)
+            assert tracemalloc.get_traced_memory()[1] < 2**24
+        finally:
+            tracemalloc.stop()
+
+    def test_no_volume_is_larger_than_the_limit(self, tmp_path: Path) -> None:
+        path = header_with(volume(tmp_path / "a.nii.gz"), 40, "<4h", 3, 1600, 1600, 1600)
+        with pytest.raises(InputError, match=r"4\.1e\+09 voxels, and 5\.37e\+08 are the most"):
+            read_volume(path)
+
+    @pytest.mark.parametrize("numbers", [(np.nan, 0.0), (-np.inf, 0.0)])
+    def test_a_slope_is_a_number(self, tmp_path: Path, numbers: tuple[float, float]) -> None:
+        with pytest.raises(InputError, match=r"slope .* which are no numbers"):
+            read_volume(header_with(volume(tmp_path / "a.nii"), 112, "<2f", *numbers))
+
+    def test_voxels_have_a_size(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match=r"measure 1e-20 mm along an axis; 0\.01 mm is the least"):
+            read_volume(volume(tmp_path / "a.nii", edge=1e-20))
+        assert read_volume(volume(tmp_path / "b.nii", edge=0.1)).values.shape == (6, 6, 6)
+
+    def test_damage_is_a_sentence(self, tmp_path: Path) -> None:
+        whole = volume(tmp_path / "a.nii.gz", (20, 20, 20)).read_bytes()
+        for place in range(0, len(whole), 7):
+            path = tmp_path / "b.t1.nii.gz"
+            path.write_bytes(whole[:place] + bytes([whole[place] ^ 255]) + whole[place + 1 :])
+            try:
+                read_intensity(path)
+            except InputError as error:
+                assert str(error).startswith(str(path)) and "Error -" not in str(error)
+
+
+def fattened(path: Path, megabytes: int) -> Path:
+    """A .vtu whose points are packed zeros, one block of so many megabytes."""
+    block = zlib.compress(bytes(megabytes * 2**20))
+    head = base64.b64encode(struct.pack("<4I", 1, megabytes * 2**20, 0, len(block))).decode()
+    text = path.read_text()
+    start = text.index('NumberOfComponents="3" format="binary">') + len('NumberOfComponents="3" format="binary">')
+    path.write_text(text[:start] + head + base64.b64encode(block).decode() + text[text.index("<", start) :])
+    return path
+
+
+class TestMeshes:
+    def test_a_small_file_does_not_fill_the_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
+        monkeypatch.setattr("sim.meshfile.LARGEST_MESH", 2**22)
+        assert read_mesh(tmp_path / "a.vtu").mesh.digest == BODY.mesh.digest
+        fattened(tmp_path / "a.vtu", 64)
+        tracemalloc.start()
+        try:
+            with pytest.raises(InputError, match=r"inflate to more than 0\.00419 GB"):
+                read_mesh(tmp_path / "a.vtu")
+            assert tracemalloc.get_traced_memory()[1] < 2**24
+        finally:
+            tracemalloc.stop()
+        assert limits.LARGEST_MESH > 2**31
+
+    @pytest.mark.parametrize("text", ["no xml", "", "<VTKFile type='ImageData'/>", "<VTKFile", "<a/>"])
+    def test_nothing_of_a_library_is_told_or_printed(
+        self, tmp_path: Path, capfd: pytest.CaptureFixture, text: str
+    ) -> None:
+        path = tmp_path / "a.vtu"
+        path.write_text(text)
+        with pytest.raises(InputError) as caught:
+            read_mesh(path)
+        assert str(caught.value) == (
+            f"{path}: cannot be read as a mesh: it is damaged, or of another kind. Convert it to .vtu or .msh."
+        )
+        assert capfd.readouterr() == ("", "")
+
+    def test_an_anatomy_is_in_metres(self, tmp_path: Path) -> None:
+        mesh = TetMesh(BODY.mesh.nodes, BODY.mesh.tets, BODY.mesh.region)
+        write_mesh(tmp_path / "m.vtu", mesh, self.fields())
+        assert read_anatomy(tmp_path / "m.vtu").digest == BODY.digest
+        with pytest.warns(UserWarning, match="--unit mm"):
+            large = TetMesh(1e3 * mesh.nodes, mesh.tets, mesh.region)
+        write_mesh(tmp_path / "mm.vtu", large, self.fields())
+        with pytest.raises(InputError, match=r"measures 2e.04 mm, .*must be metres"):
+            read_anatomy(tmp_path / "mm.vtu")
+
+    @pytest.mark.parametrize("name", ["held", "slide_normal", "craniotomy"])
+    def test_marks_are_numbers(self, tmp_path: Path, name: str) -> None:
+        field = self.fields()[name].astype(float)
+        field[3] = np.nan
+        write_mesh(tmp_path / "a.vtu", BODY.mesh, self.fields() | {name: field})
+        with pytest.raises(InputError, match=f"`{name}` has values that are no finite numbers"):
+            read_anatomy(tmp_path / "a.vtu")
+
+    @staticmethod
+    def fields() -> dict[str, np.ndarray]:
+        return {
+            "held": BODY.held.astype(np.uint8),
+            "slide_normal": BODY.slide_normal,
+            "craniotomy": BODY.craniotomy.astype(np.uint8),
+        }
+
+    def test_damage_is_a_sentence_or_another_anatomy(self, tmp_path: Path) -> None:
+        write_anatomy(tmp_path / "a.vtu", BODY)
+        whole = np.frombuffer((tmp_path / "a.vtu").read_bytes(), np.uint8)
+        refused = 0
+        for seed in range(40):
+            random = np.random.default_rng(seed)
+            raw = whole.copy()
+            raw[random.integers(0, len(raw), 3)] = random.integers(0, 256, 3)
+            (tmp_path / "b.vtu").write_bytes(raw.tobytes())
+            try:
+                assert isinstance(read_anatomy(tmp_path / "b.vtu"), Anatomy)
+            except InputError as error:
+                refused += 1
+                assert str(error).startswith(str(tmp_path / "b.vtu")) and "\n" not in str(error)
+        assert refused > 20
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", "3", "null", "{}", "[" * 100_000, '{"law": []}', '{"law": "linear", "young": "a", "poisson": 0.3}']
+)
+def test_a_tissue_that_is_none_is_a_sentence(text: str) -> None:
+    assert tissue_from_json(tissue_to_json(BRAIN)) == BRAIN
+    with pytest.raises(InputError) as caught:
+        tissue_from_json(text)
+    assert len(str(caught.value)) < 400 and "object" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (MemoryError("4 GiB"), "more memory than there is"),
+        (RecursionError("maximum depth"), "nested too deeply"),
+        (zlib.error("Error -3"), "damaged"),
+        (NotImplementedError("method 99"), "damaged"),
+        (RuntimeError("encrypted"), "damaged"),
+        (PermissionError(13, "library text"), "permission denied"),
+        (SystemExit(1), "damaged"),
+    ],
+)
+def test_whatever_a_library_raises_is_a_sentence(error: BaseException, reason: str) -> None:
+    sentence = rf"a\.x: cannot be read as a thing: .*{reason}.*\. Make one\."
+    with pytest.raises(InputError, match=sentence) as caught, read_as("a.x", "a thing", "Make one."):
+        raise error
+    assert not re.search(r"4 GiB|depth|-3|99|encrypted|library", str(caught.value))
+
+
+def test_an_interruption_stays_one() -> None:
+    with pytest.raises(KeyboardInterrupt), read_as("a.x", "a thing", "Make one."):
+        raise KeyboardInterrupt
+
+
+class TestWriting:
+    LEAVING = "import os, sys; from sim.files import written_whole\nwith written_whole(sys.argv[1], '.txt') as p:\n"
+    LEAVING += " p.write_text('half'); os.kill(os.getpid(), 9)"
+
+    def test_what_a_killed_run_left_is_swept_by_the_next(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.txt"
+        house = Path(__file__).parents[1]
+        done = subprocess.run([sys.executable, "-c", self.LEAVING, str(path)], cwd=house, check=False)
+        (left,) = tmp_path.iterdir()
+        assert done.returncode == -9 and left.read_text() == "half"
+        living = left.with_name(re.sub(r"-\d+-a", f"-{os.getppid()}-a", left.name))
+        other = left.with_name(left.name.replace("a.txt", "b.txt"))
+        elsewhere = left.with_name(left.name.replace(f"{zlib.crc32(platform.node().encode()):08x}", "0" * 8))
+        for file in (living, other, elsewhere):
+            file.write_text("not ours")
+        with written_whole(path, ".txt") as partial:
+            assert not left.exists()
+            partial.write_text("whole")
+        assert sorted(tmp_path.iterdir()) == sorted([path, living, other, elsewhere])
+
+    @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no such file system")
+    def test_a_folder_that_takes_no_files_is_told_before_the_work(self) -> None:
+        with pytest.raises(InputError, match=r"cannot be written there \(No such file or directory\)"):
+            check_output("/proc/a.txt", ".txt")
+
+    def test_a_stream_that_cannot_be_written_is_told_at_the_end(self, tmp_path: Path) -> None:
+        resource = pytest.importorskip("resource")
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+        try:
+            with pytest.raises(InputError, match="File too large"), written_stream(tmp_path / "a.h5", ".h5") as file:
+                assert file.write(bytes(200_000)) == 200_000
+                file.seek(0)
+            with pytest.raises(InputError, match=r"files are limited to 0\.1 MB"):
+                demand_space(tmp_path / "a.h5", 1, 200_000)
+            demand_space(tmp_path / "a.h5", 1, 50_000)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert not list(tmp_path.iterdir())
+
+    def test_a_library_that_fails_says_nothing(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError) as caught, written_whole(tmp_path / "a.h5", ".h5"):
+            raise OSError("Unable to synchronously create file (errno = 2, flags = 13)")
+        assert "flags" not in str(caught.value)
