@@ -25,6 +25,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN
 from sim.meshfile import read_anatomy, write_anatomy
+from sim.reading import read_as
 from sim.subject import Plan, make_anatomy
 from sim.template import Tumour, template_subject
 from surrogate.sampling import draw
@@ -132,13 +133,17 @@ def read_rows(path: Path, stated: str) -> list[Row]:
     """
     if not path.exists():
         return []
-    first, *lines = path.read_text().splitlines() or [""]
-    if first != json.dumps(stated):
-        raise InputError(f"{path}: holds another trial, or none: choose another --out, or remove it.")
-    try:
-        return [Row(**json.loads(line)) for line in lines]
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: its last line is not whole ({error}): remove that line.") from error
+    with read_as(path, "the record of a trial", "Choose another --out, or remove it."):
+        first, *lines = path.read_text().splitlines() or [""]
+        if first != json.dumps(stated):
+            raise InputError(f"{path}: holds another trial, or none: choose another --out, or remove it.")
+        rows = []
+        for number, line in enumerate(lines, start=2):
+            try:
+                rows.append(Row(**json.loads(line)))
+            except (TypeError, ValueError, RecursionError) as error:
+                raise InputError(f"{path}: its line {number} is not whole: remove that line.") from error
+        return rows
 
 
 def append_row(path: Path, stated: str, row: Row) -> None:

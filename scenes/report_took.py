@@ -15,9 +15,11 @@ def note_seconds(made: Path, seconds: float) -> None:
 
 
 def noted_seconds(made: Path) -> float | None:
-    """What was kept; None where nothing was."""
-    path = _beside(made)
-    return json.loads(path.read_text()).get("seconds") if path.exists() else None
+    """What was kept; None where nothing was, or nothing whole."""
+    try:
+        return float(json.loads(_beside(made).read_text())["seconds"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return None
 
 
 def _beside(made: Path) -> Path:

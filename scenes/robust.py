@@ -17,6 +17,7 @@ from sim.effects import Effect
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
+from sim.reading import read_as
 from surrogate.sampling import BRUTAL, TOOLS, draw
 
 SETS = (*TOOLS, "seed", BRUTAL.name)
@@ -149,13 +150,20 @@ def read_records(path: Path, stated: str) -> list[Record]:
     if not path.exists():
         return []
     types = {item.name: {"str": str, "int": int, "float": float}[str(item.type)] for item in fields(Record)}
-    with open(path, newline="") as file:
-        if file.readline().strip() != f"# {stated}":
+    remedy = "Choose another --out, or remove it."
+    with read_as(path, "the record of a trial", remedy), open(path, newline="") as file:
+        first, *written = file.read().splitlines(keepends=True) or [""]
+        if first.strip() != f"# {stated}":
             raise InputError(f"{path}: holds another trial, or none: choose another --out, or remove it.")
-        try:
-            return [Record(**{name: types[name](row[name]) for name in types}) for row in csv.DictReader(file)]
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path}: its last line is not whole ({error}): remove that line.") from error
+        if written and not written[-1].endswith("\n"):  # its last number may be cut short
+            raise InputError(f"{path}: its last line is not whole: remove that line.")
+        records, lines = [], csv.DictReader(written)
+        for row in lines:
+            try:
+                records.append(Record(**{name: types[name](row[name]) for name in types}))
+            except (KeyError, TypeError, ValueError) as error:
+                raise InputError(f"{path}: its line {lines.line_num + 1} is not whole: remove that line.") from error
+        return records
 
 
 def append_records(path: Path, stated: str, found: Sequence[Record]) -> None:
