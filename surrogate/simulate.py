@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from typing import TypeVar
 
 import h5py
 import numpy as np
@@ -47,6 +48,7 @@ STAGES = {"unit": "unit responses", "answers": "loads"}
 UNITS = {"unit": UNIT_FORCE, "answers": 1.0}
 # From this version of HDF5 on, whatever says where arrays lie has checksums.
 READERS = ("v108", "v108")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -237,12 +239,27 @@ def _write(path: Path, work: Work, stated: Mapping[str, str], journal: Journal) 
         }
         file["unit/node"] = np.repeat(work.nodes, 3)
         explain(file)
-        for batch in work.batches:
+
+        def taken(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
             rows = np.frombuffer(journal.read(batch), work.row) if batch in journal else _kept(path, work, batch)
+            return rows, checksums(rows)
+
+        for batch, (rows, sums) in _ahead(taken, work.batches):
             here = slice(batch[1], batch[1] + len(rows))
             for item in work.row.names or ():
                 arrays[batch[0], item][here] = rows[item]
-            arrays[batch[0], "checksum"][here] = checksums(rows)
+            arrays[batch[0], "checksum"][here] = sums
+
+
+def _ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
+    """What is made of each batch, in order; a second thread makes the next meanwhile."""
+    with ThreadPoolExecutor(1) as maker:
+        coming = [maker.submit(made, batch) for batch in batches[:1]]
+        for batch, following in zip(batches, [*batches[1:], None], strict=True):
+            ready = coming.pop().result()
+            if following is not None:
+                coming.append(maker.submit(made, following))
+            yield batch, ready
 
 
 def _kept(path: Path, work: Work, batch: Batch) -> np.ndarray:
