@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib.metadata import version
 
 from sim.errors import InputError
 from sim.script import run_script
+
+from .guidance import guidance
 
 # A command's module is imported only when it is asked for: `sulcus solve` does not wait for torch.
 COMMANDS = {
     "anatomy": "make a tetrahedral brain with a tumour, from the template or from a label volume",
     "solve": "find the static equilibrium of any tetrahedral mesh",
     "simulate": "draw loads of a tool and answer them by finite elements, into a data set",
-    "train": "fit the surrogates to a data set and say who wins",
-    "judge": "hold models to loads that they have never seen: errors, and whether their bounds hold",
+    "train": "fit surrogate models to a data set, and compare their errors on cortex that was left out",
+    "judge": "test models on loads that they have never seen: errors, and whether their bounds hold",
     "export": "write a learnt model as an ONNX file, for programs in other languages",
     "patient": "from a label volume to a brain ready for the scenes: anatomy, simulate, train",
     "scenes": "list the built-in scenes: effects, who can play them, pictures and cost",
@@ -25,10 +29,10 @@ COMMANDS = {
     "demo": "play a scene on a page in the browser",
     "render": "write the frames of a scene as pictures, without display",
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
-    "sensitivity": "what else moves the tumour: tissue, skull, tool and element, each off by what is not known of it",
+    "sensitivity": "how far the tumour's motion changes with tissue, skull, tool and element, one at a time",
     "bench": "measure what each stage costs, what each element is worth, how robust and how fast the solver is",
     "report": "measure what accuracy costs in time, for every deformer, as a page",
-    "check": "play the built-in scenes blank and hold their figures to their bounds",
+    "check": "play scenes without display, and fail where a picture is farther off than its stated bounds",
 }
 
 # Commands that make or read models, whose learners may be a user's own.
@@ -38,17 +42,32 @@ PLUGGED = ("train", "judge", "scenes", "demo", "render", "collect", "check")
 INNER = {"bench": ("stages", "elements", "robust", "live", "growth", "throughput", "published", "solver")}
 
 
+POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+")
+"""A point whose first coordinate is negative, which argparse would take for an option."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0 (done), 1 (ran, but did not reach what was asked) or 2 (bad input)."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(prog="sulcus", description=__doc__, epilog="Research only; not a medical device.")
+    arguments = _with_points(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        prog="sulcus",
+        description=__doc__,
+        epilog="First steps: `sulcus demo`, then `sulcus patient --help`. Research only; not a medical device.",
+    )
+    parser.add_argument("--version", action="version", version=f"sulcus {version('sulcus')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     asked = arguments[0] if arguments else None
     inner = INNER.get(asked or "", ())
     if inner and (len(arguments) == 1 or arguments[1] not in (*inner, "-h", "--help")):
         arguments.insert(1, inner[0])
     for name, text in COMMANDS.items():
-        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        command = commands.add_parser(
+            name,
+            help=text,
+            description=text[0].upper() + text[1:] + ".",
+            epilog=guidance(name),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
         if name == asked:
             importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
             if name in PLUGGED:
@@ -68,6 +87,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"sulcus {args.command}: {error}", file=sys.stderr)
         return 2
+
+
+def _with_points(arguments: Sequence[str]) -> list[str]:
+    """The arguments, with a point joined to the option before it: `--opening-at=-3,4,5`."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1].startswith("--") and POINT.fullmatch(argument):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 if __name__ == "__main__":

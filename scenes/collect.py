@@ -39,9 +39,16 @@ UNITS = {
 
 
 def collect(
-    path: Path, theatre: Theatre, player: Player, deformer: str, progress: Callable[[Iterable], Iterable]
+    path: Path,
+    theatre: Theatre,
+    player: Player,
+    deformer: str,
+    progress: Callable[[Iterable], Iterable],
+    solved: Callable[[int], object] = lambda more: None,
 ) -> dict[str, object]:
     """Play a scene and write its episode; the file appears whole or not at all. Returns what it holds.
+
+    `progress` passes the frames on as they are drawn; `solved` hears how many more the finite elements have answered.
 
     Raises
     ------
@@ -61,7 +68,7 @@ def collect(
                 stores[name][frame.number] = code
             rows.append(motion(frame, player))
             loads.append(frame.loads)
-        outcomes = write_motion(file, player, rows, truth_of(theatre, player.scene, loads))
+        outcomes = write_motion(file, player, rows, truth_of(theatre, player.scene, loads, solved))
         describe(file, player, deformer)
     return {"out": str(path), "scene": player.scene.name, "deformer": deformer, "frames": total, "fem": outcomes}
 

@@ -11,9 +11,9 @@ from .errors import InputError
 from .geodesic import distances
 from .mesh import TetMesh
 from .normals import blurred_normals
+from .placing import STEM
 
 Skull = Literal["slide", "held"]
-STEM = 0.15  # of the brain's height: in the template 21 mm, the medulla and what touches it
 FEWEST_OPEN = 6  # nodes; fewer do not carry a tool
 # [m], a standard deviation: the skull's inside is smoother than a brain, whose folds must not catch in it.
 BLUR = 6e-3

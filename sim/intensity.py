@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from .volume import read_volume
 
 BRIGHTEST = 99.5  # per cent of the voxels in the crop are at most white
 MARGIN = 0.015  # [m] round what is looked at
+HEADER = 348  # bytes of NIfTI
+SIGNED = b"sulcus: intensities beside a mesh"
+"""By which what was written here is told from a user's own scan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +75,15 @@ def write_intensity(path: str | Path, intensity: Intensity) -> None:
     affine = np.diag([1e3, 1e3, 1e3, 1.0]) @ intensity.affine
     image = nibabel.Nifti1Image(intensity.values, affine)
     image.header.set_xyzt_units("mm")
+    image.header["descrip"] = SIGNED
     with written_whole(path, ".gz") as partial:
         nibabel.save(image, partial)
+
+
+def is_sidecar(path: str | Path) -> bool:
+    """Whether a file is one that `write_intensity` wrote; OSError where it cannot be read."""
+    with gzip.open(path, "rb") as file:
+        return SIGNED in file.read(HEADER)
 
 
 def read_intensity(path: str | Path) -> Intensity:

@@ -8,20 +8,18 @@ from typing import cast
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import ConvexHull
 
 from .errors import InputError
 from .field import mask_field
 from .intensity import Intensity
+from .placing import Piece, site_over
 from .subject import Subject, rim
 from .volume import read_volume
 
 SMALLEST_BRAIN, LARGEST_BRAIN = 20e-6, 5000e-6  # [m^3]
 FEWEST_VOXELS = 27  # of a tumour; fewer have no shape
 SPECK = 1e-3  # of the tumour's volume; smaller components are noise
-HULL_DEPTH = 6e-3  # [m] under the convex hull: deeper cortex lies in a fissure and cannot be reached through the skull
 EXTENSION = 8  # voxels
-BASE = 0.3  # of the brain's height, under which the skull is not opened unless the tumour lies there too
 
 
 def volume_subject(
@@ -30,7 +28,8 @@ def volume_subject(
     """The subject in a NIfTI file of whole-number labels, of which some are `brain` and some `tumour`.
 
     The solid is brain or tumour, its largest component, with holes filled; tumour components outside it are left out,
-    and each such change is noted. `t1` is a volume of intensities in the same space.
+    and each such change is noted. The skull is opened over the largest of them. `t1` is a volume of intensities in the
+    same space.
 
     Raises
     ------
@@ -57,6 +56,7 @@ def volume_subject(
         )
     inside = _inside(path, solid, marked, voxel, notes)
     cortex, interface = rim(solid, volume.affine), rim(inside, volume.affine)
+    pieces = _pieces(inside, volume.affine)
     intensity = None
     if t1 is not None:
         grey = read_volume(t1)
@@ -67,9 +67,10 @@ def volume_subject(
         cortex=cortex,
         interface=interface,
         tumour_volume=float(inside.sum() * voxel),
-        site=_site(cortex, interface.mean(axis=0)),
+        site=site_over(cortex, pieces[0].centre),
         intensity=intensity,
         notes=tuple(notes),
+        pieces=pieces,
     )
 
 
@@ -145,10 +146,12 @@ def _extended(tumour: np.ndarray, solid: np.ndarray) -> np.ndarray:
     return extended
 
 
-def _site(cortex: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """The point (3,) [m] of the cortex nearest to the tumour's `centre` (3,) that can be reached through the skull."""
-    hull = ConvexHull(cortex).equations
-    depth = np.concatenate([-(part @ hull[:, :3].T + hull[:, 3]).max(axis=1) for part in np.array_split(cortex, 50)])
-    floor = min(cortex[:, 2].min() + BASE * np.ptp(cortex[:, 2]), centre[2])
-    reachable = cortex[(depth <= HULL_DEPTH) & (cortex[:, 2] >= floor)]
-    return reachable[np.linalg.norm(reachable - centre, axis=1).argmin()]
+def _pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[Piece, ...]:
+    """The tumour's connected pieces, the largest first; of a piece's surface voxels the mean is its centre."""
+    component, count = cast(tuple[np.ndarray, int], ndimage.label(tumour, np.ones((3, 3, 3))))
+    voxel = abs(float(np.linalg.det(affine[:3, :3])))
+    pieces = []
+    for number in range(1, count + 1):
+        one = component == number
+        pieces.append(Piece(float(one.sum() * voxel), rim(one, affine).mean(axis=0)))
+    return tuple(sorted(pieces, key=lambda piece: -piece.volume))

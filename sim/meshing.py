@@ -25,7 +25,7 @@ ROUNDING = 2.0**0.5  # a cell up to this much larger than wanted is not halved
 SLACKS = (0.0, 3e-4, 6e-4, 1.2e-3, 2.4e-3)  # [m] that nodes may leave their surface by, attempt by attempt
 DEEPEST = 4  # halvings of the coarsest cell
 TOO_COARSE = "so few nodes do not show the brain or the tumour: ask for more nodes, or check the labels."
-TOO_INTRICATE = "the surfaces are too intricate for so few nodes: ask for more nodes, or smooth the labels."
+MORE = (1.25, 1.6, 2.0, 2.5)  # times the nodes asked for, tried only to say how many would do
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +59,27 @@ def mesh_solids(solids: Solids, count: int) -> TetMesh:
     Raises
     ------
     InputError
-        A solid that so few nodes cannot show, or a count that the search for a lattice size does not reach.
+        A solid that so few nodes cannot show, with a number that can, if one of up to 2.5 times as many does; a count
+        that the search for a lattice size does not reach.
     """
+    mesh = _meshed(solids, count)
+    if mesh is not None:
+        return mesh
+    more = (int(round(count * times, -2)) for times in MORE)
+    would_do = next((number for number in more if _would_do(solids, number)), None)
+    remedy = "smooth the labels" if would_do is None else f"ask for {would_do}, or smooth the labels"
+    raise InputError(f"the surfaces are too intricate for {count} nodes: {remedy}.")
+
+
+def _would_do(solids: Solids, count: int) -> bool:
+    try:
+        return _meshed(solids, count) is not None
+    except InputError:
+        return False
+
+
+def _meshed(solids: Solids, count: int) -> TetMesh | None:
+    """The mesh with `count` nodes; None where some of its tetrahedra are inside out. Raises as `mesh_solids`."""
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
     for _ in range(TRIALS):
@@ -100,8 +119,8 @@ def carve(solids: Solids, edge: float) -> Pieces:
     return cut(body, solids.tumour, pinned=surface)
 
 
-def _finished(solids: Solids, pieces: Pieces) -> TetMesh:
-    """The surfaces fitted, what is flat on them trimmed, and the bad angles improved."""
+def _finished(solids: Solids, pieces: Pieces) -> TetMesh | None:
+    """The surfaces fitted, what is flat on them trimmed, the bad angles improved; None: some remain inside out."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
     surface, _ = _surfaces(pieces)
@@ -113,7 +132,7 @@ def _finished(solids: Solids, pieces: Pieces) -> TetMesh:
         pieces = pieces.kept(~ears(pieces.tets, bad))
         pieces = replace(pieces, nodes=improved(pieces.nodes, pieces.tets, _projection(solids, pieces, slack)))
     if (smallest_sines(pieces.nodes[pieces.tets]) <= 0.0).any():
-        raise InputError(TOO_INTRICATE)
+        return None
     region = np.where(pieces.inside, TUMOUR_LABEL, BRAIN_LABEL)
     return TetMesh(pieces.nodes, pieces.tets, region)
 

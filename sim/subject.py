@@ -14,6 +14,7 @@ from .errors import InputError
 from .field import Field
 from .intensity import Intensity
 from .meshing import Solids, mesh_solids
+from .placing import Piece
 
 FEWEST_NODES, MOST_NODES = 2_000, 250_000
 SMALLEST_CRANIOTOMY, LARGEST_CRANIOTOMY = 0.015, 0.120  # [m]
@@ -63,6 +64,8 @@ class Subject:
         T1 intensities, where they are known.
     notes
         Sentences about what was changed in reading.
+    pieces
+        Of the tumour, the largest first.
     """
 
     brain: Field
@@ -73,6 +76,7 @@ class Subject:
     site: np.ndarray
     intensity: Intensity | None = None
     notes: tuple[str, ...] = ()
+    pieces: tuple[Piece, ...] = ()
 
 
 def make_anatomy(subject: Subject, plan: Plan) -> Anatomy:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, cast
 
@@ -11,6 +12,7 @@ from scipy import ndimage
 from .errors import InputError
 from .field import Field, mask_field
 from .intensity import Intensity
+from .placing import Piece, site_over
 from .subject import Subject, rim
 
 VOLUME = 1470e-6  # [m^3]; the mask itself has 1,883 ml, more than a person
@@ -36,10 +38,13 @@ CLEARANCE = 5e-4  # [m] of brain that must lie round the tumour
 class Tumour:
     """A tumour to be placed: radius (of the ball of the same volume) and cover, its cap's depth under the cortex [m].
 
+    `middle` (x, y, z) [m], RAS, places it in the head; without it, it lies `cover` under the cortex of a `site`.
+
     Raises
     ------
     InputError
-        A radius outside 3 to 35 mm, a cover outside 1 to 60 mm, or a shape or site that is not known.
+        A radius outside 3 to 35 mm, a cover outside 1 to 60 mm, a shape or site that is not known, or a middle that
+        is not finite.
     """
 
     radius: float = 0.012
@@ -47,6 +52,7 @@ class Tumour:
     shape: Shape = "sphere"
     site: str = "central"
     seed: int = 0
+    middle: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         for name, value, low, high in (
@@ -64,6 +70,15 @@ class Tumour:
             raise InputError(f"no site is called {self.site!r}: choose one of {', '.join(SITES)}.")
         if self.seed < 0:
             raise InputError(f"a seed of {self.seed} is negative: give 0 or more.")
+        if self.middle is not None and not np.isfinite(self.middle).all():
+            raise InputError("a tumour's middle needs three finite coordinates.")
+
+    @property
+    def place(self) -> str:
+        """Where it is to lie, in words."""
+        if self.middle is not None:
+            return f"at {', '.join(f'{1e3 * value:g}' for value in self.middle)} mm"
+        return f"with {self.cover * 1e3:g} mm of cover at the {self.site} site"
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,16 +115,22 @@ def template_subject(tumour: Tumour) -> Subject:
     """
     grey, mask, affine = _scaled_template()
     brain, cortex = mask_field(mask, affine), rim(mask, affine)
-    site, inward = _site(brain, cortex, tumour.site)
-    shape = _placed(tumour, site, inward)
+    if tumour.middle is None:
+        site, inward = _site(brain, cortex, tumour.site)
+        shape = _placed(tumour, site, inward)
+    else:
+        shape = _round(tumour, lambda unit, scale: np.array(tumour.middle))
+        site = site_over(cortex, shape.middle)
     interface = shape.middle + _sphere(400) * shape.radius(_sphere(400))[:, None]
     if (brain(interface) > -CLEARANCE).any():
         raise InputError(
-            f"a {tumour.shape} tumour of {tumour.radius * 1e3:g} mm radius with {tumour.cover * 1e3:g} mm of cover at "
-            f"the {tumour.site} site reaches out of the brain: choose a smaller radius, another cover, or another site."
+            f"a {tumour.shape} tumour of {tumour.radius * 1e3:g} mm radius {tumour.place} reaches out of the brain: "
+            "choose a smaller radius, or another place."
         )
     volume = 4.0 / 3.0 * np.pi * tumour.radius**3
-    return Subject(brain, shape, cortex, interface, volume, site, Intensity(grey, affine))
+    return Subject(
+        brain, shape, cortex, interface, volume, site, Intensity(grey, affine), pieces=(Piece(volume, shape.middle),)
+    )
 
 
 def _scaled_template() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -143,14 +164,18 @@ def _site(brain: Field, cortex: np.ndarray, name: str) -> tuple[np.ndarray, np.n
 
 def _placed(tumour: Tumour, site: np.ndarray, inward: np.ndarray) -> Lobed:
     """The tumour with its cap `cover` under `site` (3,), seen along `inward` (3,)."""
+    return _round(tumour, lambda unit, scale: site + (tumour.cover + scale * unit.radius(-inward[None])[0]) * inward)
+
+
+def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:
+    """The tumour round a `middle` (3,) [m], told its shape at unit scale and its scale [m]."""
     rng = np.random.default_rng(tumour.seed)
     directions = rng.normal(size=(LOBES if tumour.shape == "lobed" else 0, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     heights = rng.uniform(0.3, 1.0, len(directions)) * LOBE_HEIGHT
     unit = Lobed(np.zeros(3), directions, heights, 1.0)
     scale = tumour.radius / (unit.radius(_sphere(20_000)) ** 3).mean() ** (1.0 / 3.0)
-    cap = scale * unit.radius(-inward[None])[0]
-    return Lobed(site + (tumour.cover + cap) * inward, directions, heights, scale)
+    return Lobed(middle(unit, scale), directions, heights, scale)
 
 
 def _sphere(count: int) -> np.ndarray:

@@ -7,20 +7,25 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.errors import InputError
-from sim.files import check_output
 from sim.intensity import sidecar, write_intensity
 from sim.labels import volume_subject
 from sim.mesh import dihedral_angles
 from sim.meshfile import write_anatomy
 from sim.meshing import surface_errors
+from sim.placing import side_of
 from sim.stages import stage
 from sim.subject import Plan, Subject, make_anatomy
 from sim.template import SITES, Tumour, template_subject
+
+from ..beside import demand_no_strangers
+from ..output import add_force, claimed
+from ..placed import add_opening_arguments, opened, point
 
 # Lengths in millimetres, as on the command line.
 DEFAULTS = {
@@ -39,7 +44,7 @@ PRESETS = {
     # Tonutti et al. 2017: forces from 20 mm off the centre of a tumour of 12 mm radius, 98 cm2 of cortex left free.
     "seed": {"cover": 8.0, "craniotomy": 110.0, "skull": "held"},
 }
-PLACED = ("radius", "cover", "tumour_shape", "site")
+PLACED = ("radius", "cover", "tumour_shape", "site", "tumour_at")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--craniotomy", type=float, metavar="MM", help="diameter along the cortex [mm] (50)")
     parser.add_argument("--skull", choices=("slide", "held"), help="how the brain's surface meets the skull (slide)")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="default", help="values of what is not given")
+    add_opening_arguments(parser)
     own = parser.add_argument_group("your own brain")
     own.add_argument("--labels", type=Path, metavar="FILE.nii.gz", help="label volume; without it, the template")
     own.add_argument("--brain", type=_labels, metavar="1,2", help="labels that are brain")
@@ -65,27 +71,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     placed.add_argument("--cover", type=float, metavar="MM", help="depth of its cap under the cortex [mm] (10)")
     placed.add_argument("--tumour-shape", choices=("sphere", "lobed"), help="its shape (sphere)")
     placed.add_argument("--site", choices=tuple(SITES), help="the cortex that it lies under (central)")
+    placed.add_argument(
+        "--tumour-at", type=point, metavar="X,Y,Z", help="its middle [mm, RAS], in place of --site and --cover"
+    )
     placed.add_argument("--seed", type=int, default=0, metavar="N", help="another lobed shape for another seed (0)")
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as one line of JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Make the anatomy, write it, and print what it is."""
     began = time.perf_counter()
-    check_output(args.out, ".vtu")
+    read = (args.labels, args.t1)
+    claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, read)
+    beside = sidecar(args.out)
+    claimed(beside, ".gz", "a scan that sulcus put beside an anatomy", args.force, read)
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
     plan = Plan(args.nodes, 1e-3 * chosen["craniotomy"], chosen["skull"])
     with stage("labels" if args.labels else "template"):
-        subject = _subject(args, chosen)
+        subject = opened(_subject(args, chosen), args)
     for note in subject.notes:
         print(f"{args.labels}: {note}", file=sys.stderr)
     print(f"sulcus anatomy: meshing with about {plan.nodes} nodes ...", file=sys.stderr)
     with stage("mesh"):
         anatomy = make_anatomy(subject, plan)
+    for path in demand_no_strangers(args.out, anatomy.digest, args.force):
+        print(f"{path}: was made with the anatomy that is replaced: simulate and train anew.", file=sys.stderr)
     with stage("write the mesh"):
         intensity = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy])
         write_anatomy(args.out, anatomy)
-        beside = sidecar(args.out)
         if intensity is None:
             beside.unlink(missing_ok=True)  # of an earlier mesh of this name
         else:
@@ -113,8 +127,11 @@ def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
         for name in ("brain", "tumour", "t1"):
             if getattr(args, name) is not None:
                 raise InputError(f"--{name} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out.")
+        if args.tumour_at is not None and (args.site is not None or args.cover is not None):
+            raise InputError("--tumour-at says where the tumour lies: leave out --site and --cover, or --tumour-at.")
+        middle = None if args.tumour_at is None else tuple(1e-3 * value for value in args.tumour_at)
         lengths = 1e-3 * chosen["radius"], 1e-3 * chosen["cover"]
-        return template_subject(Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed))
+        return template_subject(Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed, middle))
     if not args.brain or not args.tumour:
         raise InputError(
             "--labels needs --brain and --tumour, the labels of each: for instance --brain 1,2 --tumour 3."
@@ -125,7 +142,7 @@ def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     return volume_subject(args.labels, args.brain, args.tumour, args.t1)
 
 
-def _figures(anatomy: Anatomy, subject: Subject) -> dict[str, float | int | str]:
+def _figures(anatomy: Anatomy, subject: Subject) -> dict[str, Any]:
     mesh = anatomy.mesh
     volume = mesh.volumes[mesh.region == TUMOUR_LABEL].sum()
     error, weight = surface_errors(mesh.nodes, mesh.surface, subject.brain)
@@ -142,8 +159,33 @@ def _figures(anatomy: Anatomy, subject: Subject) -> dict[str, float | int | str]
         "tumour_volume_error_percent": round(100.0 * float(volume / subject.tumour_volume - 1.0), 3),
         "surface_error_mean_mm": round(1e3 * float(np.average(error, weights=weight)), 3),
         "surface_error_p95_mm": round(1e3 * float(np.quantile(error, 0.95, weights=weight, method="inverted_cdf")), 3),
+        "opening": _place(subject, subject.site),
+        "tumour_pieces": [
+            {"ml": round(1e6 * piece.volume, 3), **_place(subject, piece.centre)} for piece in subject.pieces
+        ],
         "digest": anatomy.digest,
     }
+
+
+def _place(subject: Subject, place: np.ndarray) -> dict[str, Any]:
+    """Where a point (3,) [m] lies: in mm, and in words."""
+    low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
+    return {"at_mm": [round(1e3 * value, 1) for value in place.tolist()], "side": side_of(place, low, high)}
+
+
+def _said(place: dict[str, Any]) -> str:
+    at = ", ".join(f"{value:g}" for value in place["at_mm"])
+    return f"{place['side']}, at {at} mm (right, anterior, superior)"
+
+
+def _pieces(pieces: list[dict[str, Any]]) -> list[str]:
+    if len(pieces) == 1:
+        return [f"tumour: {_said(pieces[0])}"]
+    listed = [f"  piece {number}: {piece['ml']:g} ml, {_said(piece)}" for number, piece in enumerate(pieces, start=1)]
+    return [
+        f"tumour: {len(pieces)} pieces; the skull is opened over piece 1 unless --opening-over says otherwise",
+        *listed,
+    ]
 
 
 def _sentences(figures: dict) -> str:
@@ -151,6 +193,8 @@ def _sentences(figures: dict) -> str:
         "{nodes} nodes, {tets} tetrahedra; worst dihedral angle {worst_dihedral_deg} deg",
         "brain {brain_ml} ml; surface off by {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
         "tumour {tumour_ml} ml ({tumour_volume_error_percent:+} % of the label's), {tumour_nodes} nodes",
+        *_pieces(figures["tumour_pieces"]),
+        f"opening: {_said(figures['opening'])}",
         "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} sliding, {held_nodes} held",
         "written to {mesh}" + (", intensities to {t1}" if figures["t1"] else "") + " in {seconds} s",
     ]

@@ -14,7 +14,8 @@ from tqdm import tqdm
 
 from sim.discretisation import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
-from sim.files import check_output
+
+from ..output import add_force, claimed
 
 if TYPE_CHECKING:
     from ..growth import Row
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("growth.png"), metavar="PLOT.png",
         help="the plot; rows and meshes are kept beside it, and an unfinished run goes on (default %(default)s)",
     )  # fmt: skip
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 
 
@@ -50,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     for size in args.sizes:
         Plan(size)
     find_device(args.device, "float32")
-    out = check_output(args.out, ".png")
+    out = claimed(args.out, ".png", "a picture of sulcus", args.force)
     where, record = machine(args.device), out.with_suffix(".jsonl")
     trial = Trial(args.element, args.device, out.parent)
     stated = f"{where.split(';')[0]}, {args.device} {args.element}"

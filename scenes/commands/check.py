@@ -35,6 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check scene by scene. 1: a bound was not kept."""
+    from tqdm import tqdm
+
     from ..check import measure
     from ..scene import SCENES
     from ..theatre import open_theatre
@@ -49,8 +51,13 @@ def run(args: argparse.Namespace) -> int:
         name = deformer_name(args, theatre, scene)
         print(f"{scene.name} by {theatre.described(name, scene)}", file=table)
         player = theatre.player(name, scene)
-        frames = list(player.frames(args.every))
-        truth = truth_of(theatre, scene, [frame.loads for frame in frames])
+        total = len(scene.times[:: args.every])
+        with tqdm(total=2 * total, unit="frame", desc=scene.name, leave=False, file=sys.stderr) as bar:
+            frames = []
+            for frame in player.frames(args.every):
+                frames.append(frame)
+                bar.update()
+            truth = truth_of(theatre, scene, [frame.loads for frame in frames], bar.update)
         figures = measure(player, player.camera, frames, truth)
         broken = figures.broken(scene.bounds)
         played = {"scene": scene.name, "deformer": name, "solver": theatre.described(name, scene)}

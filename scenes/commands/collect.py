@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from sim.files import check_output
-
+from ..output import add_force, claimed
 from .demo import add_theatre, deformer_name, scene_asked
 
 
@@ -17,6 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--out", required=True, type=Path, help="the episode, .h5")
     add_theatre(parser)
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
 
@@ -28,12 +29,19 @@ def run(args: argparse.Namespace) -> int:
     from ..theatre import open_theatre
 
     scene = scene_asked(args, args.scene)
+    out = claimed(args.out, ".h5", "an episode of `sulcus collect`", args.force, [args.anatomy])
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
-    out = check_output(args.out, ".h5")
-    report = collect(
-        out, theatre, player, name, lambda frames: tqdm(frames, total=len(scene.times), unit="frame", file=sys.stderr)
-    )
+    total = len(scene.times)
+    with tqdm(total=2 * total, unit="frame", desc="drawn", file=sys.stderr) as bar:
+
+        def drawn(frames: Iterable) -> Iterator:
+            for frame in frames:
+                yield frame
+                bar.update()
+            bar.set_description("finite elements")
+
+        report = collect(out, theatre, player, name, drawn, bar.update)
     print(json.dumps(report) if args.json else f"{report['frames']} frames by {name} in {out}; FEM: {report['fem']}")
     return 0

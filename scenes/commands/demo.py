@@ -28,8 +28,18 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
         "--deformer", help="linear, ann, svr, ... or fem; auto: by budget (default: the learnt one of least error)"
     )
     budget = parser.add_argument_group("a budget, in place of a deformer; the error is what each states")
-    budget.add_argument("--within-mm", type=float, metavar="MM", help="the fastest that is off by no more")
-    budget.add_argument("--within-ms", type=float, metavar="MS", help="the most accurate that takes no longer a frame")
+    budget.add_argument(
+        "--within-mm",
+        type=float,
+        metavar="MM",
+        help="take the fastest deformer whose stated error is at most this [mm]",
+    )
+    budget.add_argument(
+        "--within-ms",
+        type=float,
+        metavar="MS",
+        help="take the most accurate deformer that needs at most this a frame [ms]",
+    )
     add_tissue_arguments(parser)
     add_element_argument(parser)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")

@@ -29,6 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve the scene with and without each."""
+    from tqdm import tqdm
+
     from ..ablation import rows
     from ..theatre import open_theatre
 
@@ -41,11 +43,14 @@ def run(args: argparse.Namespace) -> int:
     print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
     print(f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}", file=table)
     found = []
-    for row in rows(theatre, scene, args.every):
-        found.append(row)
-        figures = (row.milliseconds, row.held_mb, row.tumour_mm, row.cortex_mm)
-        cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
-        print(f"| {' | '.join([row.effect, *cells, row.refused])} |", file=table, flush=True)
+    count = 1 + len(scene.effects_on(theatre.anatomy))
+    with tqdm(total=count, unit="effect", leave=False, file=sys.stderr) as bar:
+        for row in rows(theatre, scene, args.every):
+            found.append(row)
+            figures = (row.milliseconds, row.held_mb, row.tumour_mm, row.cortex_mm)
+            cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
+            bar.write(f"| {' | '.join([row.effect, *cells, row.refused])} |", file=table)
+            bar.update()
     if args.json:
         print(json.dumps({"scene": scene.name, "solver": who, "effects": [asdict(row) for row in found]}))
     return 0

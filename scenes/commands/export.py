@@ -6,10 +6,11 @@ import argparse
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.files import check_output
 from sim.meshfile import read_anatomy
 from surrogate.exchange import write_onnx
 from surrogate.store import load
+
+from ..output import add_force, claimed
 
 ENDING = ".model.npz"
 
@@ -27,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the open cortex too, not the tumour alone: then the graph wants the footprint's weights at its nodes",
     )
+    add_force(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,13 +39,18 @@ def run(args: argparse.Namespace) -> int:
     InputError
         A model or a mesh that is not there, or a learner that is not in the file.
     """
-    out = check_output(args.out, ".onnx")
-    mesh = args.anatomy or args.model.with_name(args.model.name.removesuffix(ENDING) + ".vtu")
-    missing = [path for path in (args.model, mesh) if not path.is_file()]
-    if missing:
-        raise InputError(
-            f"{missing[0]}: no such file; give a model of `sulcus train`, its mesh beside it or --anatomy."
-        )
+    out = claimed(args.out, ".onnx", "a graph of `sulcus export`", args.force)
+    if not args.model.is_file():
+        raise InputError(f"{args.model}: no such file. Give a model of `sulcus train`.")
+    mesh = args.anatomy
+    if mesh is None:
+        if not args.model.name.endswith(ENDING):
+            raise InputError(
+                f"{args.model}: is not called MESH{ENDING}, so its mesh is not known. Give the mesh by --anatomy."
+            )
+        mesh = args.model.with_name(args.model.name.removesuffix(ENDING) + ".vtu")
+    if not mesh.is_file():
+        raise InputError(f"{mesh}: no such file, but {args.model} needs its mesh. Give the mesh by --anatomy.")
     models = load(args.model, read_anatomy(mesh))
     name = args.learner or min(models, key=lambda each: models[each].bound)
     if name not in models:

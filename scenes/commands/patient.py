@@ -11,12 +11,13 @@ from pathlib import Path
 from sim.accuracy import TRAIN
 from sim.device import find_device
 from sim.errors import InputError
-from sim.files import check_output
 from sim.material import BRAIN, LAWS
 from sim.stages import listened
 from surrogate.sampling import PRESETS
 from surrogate.split import APART, FEWEST
 
+from ..output import add_force, claimed
+from ..placed import add_opening_arguments, opening_words
 from ..tissue import add_element_argument
 
 
@@ -29,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, type=Path, help="the anatomy, PATIENT.vtu; all else is put beside it")
     parser.add_argument("--nodes", type=int, default=5300, help="mesh nodes (default %(default)s)")
     parser.add_argument("--craniotomy", type=float, default=50.0, help="diameter [mm] (default %(default)s)")
+    add_opening_arguments(parser)
     parser.add_argument("--count", type=int, default=1000, help="loads to simulate (default %(default)s)")
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
     parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law (default %(default)s)")
@@ -37,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--learners", default="linear,series-gp", help="as `sulcus train` has them (default %(default)s)"
     )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="a JSON line of each step, then one of the seconds")
 
 
@@ -46,19 +49,24 @@ def run(args: argparse.Namespace) -> int:
     from ..theatre import model_path
 
     # Said now, not after minutes of meshing.
-    check_output(args.out, ".vtu")
+    data, model = args.out.with_suffix(".h5"), model_path(args.out)
+    claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, [args.labels, args.t1])
+    claimed(data, ".h5", "a data set of `sulcus simulate`", args.force)
+    claimed(model, ".npz", "a model of `sulcus train`", args.force)
     find_device(args.device, TRAIN.precision)
     if args.count - args.count // APART < FEWEST + 1:
         raise InputError(f"--count {args.count} is too few to learn from and to leave {FEWEST} discs out: give more.")
-    data, model = args.out.with_suffix(".h5"), model_path(args.out)
+    force = ["--force"] if args.force else []
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]
     steps = [
         ["anatomy", "--labels", str(args.labels), "--brain", args.brain, "--tumour", args.tumour, *t1,
-         "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), "--out", str(args.out)],
+         "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), *opening_words(args),
+         "--out", str(args.out), *force],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--preset", args.preset,
          "--device", args.device, "--material", args.material,
-         *([] if args.element is None else ["--element", args.element])],
-        ["train", str(data), "--out", str(model), "--learners", args.learners, "--device", args.device],
+         *([] if args.element is None else ["--element", args.element]), *force],
+        ["train", str(data), "--out", str(model), "--learners", args.learners, "--device", args.device,
+         *force],
     ]  # fmt: skip
     began = time.perf_counter()
     with listened() as seconds:

@@ -5,13 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ar.screen import Film, read_png, write_film
 from sim.errors import InputError
-from sim.files import check_output
 
+from ..output import add_force, claimed, claimed_folder, claimed_frames
 from .demo import add_theatre, deformer_name, scene_asked
+
+if TYPE_CHECKING:
+    from ..scene import Scene
+    from ..theatre import Theatre
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--film", type=Path, help="besides, a film: .mp4, .gif or .webp")
     parser.add_argument("--plain", action="store_true", help="without the panel of figures")
     add_theatre(parser)
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
 
@@ -35,34 +42,44 @@ def run(args: argparse.Namespace) -> int:
     scene = scene_asked(args, args.scene)
     if args.every < 1:
         raise InputError(f"--every {args.every}: give a whole number from 1 up.")
-    if args.out.exists() and not args.out.is_dir():
-        raise InputError(f"{args.out}: is a file, but the frames need a folder. Choose another name.")
-    if args.film is not None and args.film.suffix not in (".mp4", ".gif", ".webp"):
-        raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
+    claimed_folder(args.out, "frames")
+    if args.film is not None:
+        if args.film.suffix not in (".mp4", ".gif", ".webp"):
+            raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
+        claimed(args.film, args.film.suffix, "a film of `sulcus render`", args.force)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
-    if args.film is not None:
-        check_output(args.film, args.film.suffix)
+    run_of = _run(args, theatre, scene, name)
+    others = claimed_frames(args.out, run_of, args.force)
     written, bad = [], 0
     try:
-        film = Film(args.out)
+        for path in others:
+            path.unlink()
+        film = Film(args.out, run_of)
         for frame in tqdm(player.frames(every=args.every), total=len(scene.times[:: args.every]), file=sys.stderr):
             film.show(frame.number, frame.shown if args.plain else labelled(frame, name))
             written.append(args.out / f"frame_{frame.number:04d}.png")
             bad += not frame.deformation.outcome[0].good
         if args.film is not None:
+            args.film.parent.mkdir(parents=True, exist_ok=True)
             write_film(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
     except OSError as error:
         raise InputError(f"{args.out}: the frames cannot be written ({error}). Choose another folder.") from error
-    who = theatre.described(name, scene)
-    report = {
-        "scene": scene.name,
-        "deformer": name,
-        "solver": who,
-        "frames": len(written),
-        "not_good": bad,
-        "out": str(args.out),
-    }
-    print(json.dumps(report) if args.json else f"{len(written)} frames by {who} in {args.out}; {bad} not good")
+    film, who = None if args.film is None else str(args.film), theatre.described(name, scene)
+    report = {"scene": scene.name, "deformer": name, "solver": who, "frames": len(written), "not_good": bad}
+    report |= {"out": str(args.out), "film": film}
+    beside = "" if film is None else f", film {film}"
+    unanswered = f"; {bad} of them show an answer that did not converge or is extrapolated" if bad else ""
+    said = f"{len(written)} frames by {who} in {args.out}{beside}{unanswered}"
+    print(json.dumps(report) if args.json else said)
     return 1 if bad else 0
+
+
+def _run(args: argparse.Namespace, theatre: Theatre, scene: Scene, name: str) -> str:
+    """What tells this run's frames from another's: scene, deformer, anatomy and all that changes the pictures."""
+    model = theatre.models.get(name)
+    about = scene.effects_on(theatre.anatomy), scene.element, scene.tool, scene.viewpoint, scene.accuracy
+    taught = None if model is None else (model.bound, dict(model.training))
+    marks = repr((scene.name, name, theatre.anatomy.digest, about, taught, args.every, args.plain))
+    return f"run {sha256(marks.encode()).hexdigest()[:16]}"

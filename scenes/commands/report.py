@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from sim.errors import InputError
-from sim.files import check_output
+
+from ..output import add_force, claimed
 
 if TYPE_CHECKING:
     from ..report_page import Section
@@ -37,14 +38,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size.add_argument(
         "--full", action="store_true", help="all laws, elements, meshes, tolerances and precisions with each other"
     )
-    parser.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="(default %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("report"), metavar="DIR", help="folder of the page (default %(default)s)"
+    )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument(
         "--data", nargs="+", type=Path, default=[], metavar="DATA.h5",
         help="data sets of `sulcus simulate`, each with rows of its own (default: one is made, smoothed, palpation)",
     )  # fmt: skip
     parser.add_argument("--anatomy", metavar="MESH.vtu", help="of the data that is made (default: the template)")
-    parser.add_argument("--loads", type=int, metavar="N", help=f"held against the reference ({QUICK[1]}, {WHOLE[1]})")
+    parser.add_argument(
+        "--loads",
+        type=int,
+        metavar="N",
+        help=f"how many loads to compare with the reference (--quick {QUICK[1]}, else {WHOLE[1]})",
+    )
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 
 
@@ -73,7 +82,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     from ..report_study import Study
 
     find_device(args.device, "float32")
-    check_output(args.out / "index.html", ".html")
+    claimed(args.out / "index.html", ".html", "a page of `sulcus report`", args.force)
     count, loads, beyond = QUICK if args.quick else WHOLE
     if args.loads is not None and args.loads < 1:
         raise InputError(f"--loads {args.loads} plays nothing: give at least 1.")

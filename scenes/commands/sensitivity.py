@@ -15,8 +15,10 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.discretisation import ELEMENTS
-from sim.files import check_output, written_whole
+from sim.files import written_whole
 from surrogate.sampling import PRESETS, draw
+
+from ..output import add_force, claimed
 
 if TYPE_CHECKING:
     from surrogate.learned import Learned
@@ -59,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--out", type=Path, metavar="TABLE.csv", help="the table, unrounded")
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 
 
@@ -71,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     from ..variant import Body, variants
 
     if args.out:
-        check_output(args.out, ".csv")
+        claimed(args.out, ".csv", "a table of `sulcus sensitivity`", args.force)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     anatomy = theatre.anatomy
     model = theatre.models.get(theatre.best(find_scene("press")))

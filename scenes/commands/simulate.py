@@ -17,7 +17,6 @@ from sim.deformation import Outcome
 from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.files import check_output
 from sim.loads import Loads
 from sim.material import tissue_to_json
 from sim.memory import WIDEST, WIDEST_ON_CUDA
@@ -29,10 +28,13 @@ from surrogate.poses import ball_of, draw_poses
 from surrogate.sampling import PRESETS, draw
 from surrogate.simulate import Solved, simulate
 
+from ..beside import remove_data
+from ..output import add_force, claimed
 from ..shipped import template_path
 from ..tissue import add_element_argument, add_tissue_arguments, tissue_of
 
 INTERRUPTED = 130
+DATA = "a data set of `sulcus simulate`"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,12 +64,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--batch", type=int, help=f"loads solved together (default: as fit, up to {WIDEST}, on CUDA {WIDEST_ON_CUDA})"
     )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
 
 
 def run(args: argparse.Namespace) -> int:
     """Returns 0: the file is complete, whether or not every case converged; it says which did."""
-    out = check_output(args.out, ".h5")
+    out = claimed(args.out, ".h5", DATA, args.force)
     with stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
         ball, loads = _drawn(args, anatomy)
@@ -90,6 +93,8 @@ def run(args: argparse.Namespace) -> int:
         **({} if ball is None else {"ball": repr(ball.radius)}),
         **{f"{name} version": version(name) for name in ("sulcus", "warp-lang", "numpy")},
     }
+    if args.force:
+        remove_data(out, {**provenance, "anatomy": anatomy.digest})
     with tqdm(unit="load", disable=args.json, file=sys.stderr) as bar:
 
         def progress(done: int, total: int) -> None:

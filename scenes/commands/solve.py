@@ -15,10 +15,10 @@ from sim.deformation import Deformation, guess
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.files import check_output
 from sim.loads import Cause, Loads, Nodal, Prescribed
 from sim.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 
+from ..output import add_force, claimed
 from ..tissue import add_element_argument, add_tissue_arguments, regions_of, tissue_of
 
 
@@ -44,7 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--precision", default="float64", choices=("float32", "float64"))
     parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
-    parser.add_argument("--out", required=True, help=".vtu in metres with point data `displacement` [m]")
+    parser.add_argument(
+        "--out", required=True, help=".vtu in metres with point data `displacement` [m]; not the mesh itself"
+    )
+    add_force(parser)
+    parser.add_argument("--json", action="store_true", help="changes nothing: the result is one JSON line in any case")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
     Then the equilibrium under the largest share of the load that has one is written, or the last state where none has.
     """
-    out = check_output(args.out, ".vtu")
+    out = claimed(args.out, ".vtu", "a result of `sulcus solve`", args.force, [args.mesh])
     accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision)
     tissue = tissue_of(args)
     regions = regions_of(args.region, tissue)
@@ -73,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     outcome, residual = deformation.outcome[0], float(deformation.residual[0])
     reached, inverted = float(deformation.reached[0]), int(deformation.inverted[0])
     if reached < 1.0:
-        what = f"in equilibrium under {reached:.1%} of the load" if reached else "in equilibrium under no share of it"
+        what = f"in equilibrium under {reached:.1%} of the load" if reached else "the last state, in no equilibrium"
         print(f"{args.mesh}: {outcome.value}; what is written is {what}", file=sys.stderr)
     if inverted:  # an equilibrium of every law but `neo-hookean` may lie there: converged, and no tissue
         print(f"{args.mesh}: {inverted} tetrahedra are inside out: the load is beyond the law's range", file=sys.stderr)

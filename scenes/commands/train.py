@@ -5,18 +5,22 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 
 import numpy as np
 from tqdm import tqdm
 
-from sim.files import check_output
+from sim.errors import InputError
 from sim.stages import stage
-from surrogate.dataset import read_dataset
-from surrogate.parts import Expansion
+from surrogate.dataset import Dataset, read_dataset
+from surrogate.parts import EXPANDED, Expansion
 from surrogate.score import table, winner
+from surrogate.split import APART
 from surrogate.store import save
-from surrogate.train import LEARNERS, OF_POSES, Trained, learners_for, train
+from surrogate.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, learners_for, train
+
+from ..output import add_force, claimed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,15 +38,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="auto",
         help="where finite elements make the series: auto, cpu or cuda (default %(default)s)",
     )
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 
 
 def run(args: argparse.Namespace) -> int:
     """Returns 0 when the models are written."""
-    out = check_output(args.out, ".npz")
+    out = claimed(args.out, ".npz", "a model of `sulcus train`", args.force)
+    asked = None if args.learners is None else [name.strip() for name in args.learners.split(",")]
+    if asked is not None and not all(asked):
+        raise InputError(
+            f"--learners {args.learners!r}: name each learner, with one comma between two, or leave it out."
+        )
     with stage("read the data"):
         data = read_dataset(args.data)
-    learners = learners_for(data) if args.learners is None else [name.strip() for name in args.learners.split(",")]
+    learners = asked or list(learners_for(data))
+    for note in _warnings(data, learners):
+        print(f"sulcus train: {note}", file=sys.stderr)
     with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
         expansion = Expansion(
             data, args.device, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places")
@@ -53,6 +65,23 @@ def run(args: argparse.Namespace) -> int:
     failed = int(np.sum(~data.good))
     print(_for_machines(trained, args.out, failed) if args.json else _for_people(trained, args.out, failed))
     return 0
+
+
+def _warnings(data: Dataset, learners: Sequence[str]) -> list[str]:
+    """What takes long, and what too few loads cannot give, in sentences."""
+    notes, good = [], int(data.good.sum())
+    expanded = [name for name in learners if name in EXPANDED]
+    if expanded:
+        notes.append(
+            f"{' and '.join(expanded)} begin with a table that the finite elements fill, which takes minutes on a CPU; "
+            "the bar counts its places."
+        )
+    if good // APART < FEWEST_APART:
+        notes.append(
+            f"of {good} loads {good // APART} are kept to calibrate error bounds, and {FEWEST_APART} are needed: the "
+            f"models will state no bound for a load. `sulcus simulate --count {APART * FEWEST_APART}` is the least."
+        )
+    return notes
 
 
 def _for_people(trained: Trained, out: str, failed: int) -> str:
@@ -69,10 +98,16 @@ def _for_people(trained: Trained, out: str, failed: int) -> str:
                 f"on those discs, where nothing is promised, bounds of {name} held for {found}"
                 for name, found in trained.left_out.items()
             ),
-            f"the models written were taught {trained.taught} loads; {trained.calibrated} others calibrated bounds",
+            f"the models written were taught {trained.taught} loads; {_calibration(trained)}",
             f"written: {out}",
         ]
     )
+
+
+def _calibration(trained: Trained) -> str:
+    if trained.calibrated < FEWEST_APART:
+        return f"{trained.calibrated} others are too few to calibrate bounds, so none is stated"
+    return f"{trained.calibrated} others calibrated bounds"
 
 
 def _for_machines(trained: Trained, out: str, failed: int) -> str:

@@ -1,0 +1,71 @@
+"""What stands below each command's help: examples, what to do next, and the scenes that there are."""
+
+from __future__ import annotations
+
+# Named here too, so that a command's help waits for no scene to be imported.
+NAMES = "press, slide, draw, palpate, retract, brain_shift, resection, pulsation"
+PLAYING = ("demo", "render", "collect", "check", "effects")
+"""Commands that are told which scene to play."""
+
+EXAMPLES = {
+    "anatomy": """examples:
+  sulcus anatomy --out brain.vtu --preset superficial
+  sulcus anatomy --labels labels.nii.gz --brain 1,2 --tumour 3 --opening-over 2 --out patient.vtu
+next: sulcus simulate brain.vtu --out brain.h5""",
+    "solve": """example:
+  sulcus solve mesh.vtu --material neo-hookean --young 3000 --poisson 0.45 --out moved.vtu
+next: open moved.vtu in ParaView; `displacement` is in metres""",
+    "simulate": """example:
+  sulcus simulate brain.vtu --out brain.h5 --count 1000
+next: sulcus train brain.h5 --out brain.model.npz""",
+    "train": """example:
+  sulcus train brain.h5 --out brain.model.npz --learners linear,series-gp
+next: sulcus demo --anatomy brain.vtu, which finds brain.model.npz beside the mesh; or sulcus judge""",
+    "judge": """example:
+  sulcus simulate brain.vtu --out fresh.h5 --count 200 --seed 1
+  sulcus judge brain.model.npz fresh.h5
+next: sulcus export brain.model.npz --out brain.onnx""",
+    "export": """example:
+  sulcus export brain.model.npz --out brain.onnx
+next: run it by ONNX Runtime; the file itself says what goes in and what comes out""",
+    "patient": """example:
+  sulcus patient labels.nii.gz --brain 1,2 --tumour 3 --t1 t1.nii.gz --out patient.vtu
+next: sulcus demo --anatomy patient.vtu""",
+    "scenes": """examples:
+  sulcus scenes
+  sulcus scenes --out pictures
+next: sulcus demo palpate""",
+    "effects": """example:
+  sulcus effects press --every 20
+next: sulcus sensitivity""",
+    "demo": """examples:
+  sulcus demo
+  sulcus demo palpate --anatomy patient.vtu
+next: open the address that it prints""",
+    "render": """example:
+  sulcus render press --out frames --every 2 --film press.mp4
+next: sulcus collect press --out press.h5, for depth, segmentation and forces too""",
+    "collect": """example:
+  sulcus collect press --out press.h5
+next: read it by h5py; its attributes give units and frames""",
+    "sensitivity": """example:
+  sulcus sensitivity --count 8 --out sensitivity.csv
+next: open the table in a spreadsheet""",
+    "bench": """examples:
+  sulcus bench
+  sulcus bench throughput
+next: sulcus report --quick""",
+    "report": """example:
+  sulcus report --quick --out report
+next: open report/index.html""",
+    "check": """examples:
+  sulcus check
+  sulcus check press palpate --every 30
+next: sulcus render a scene that fails, and look""",
+}
+
+
+def guidance(command: str) -> str:
+    """The text below a command's help."""
+    scenes = f"scenes: {NAMES};\n  `sulcus scenes` says what happens in each\n\n" if command in PLAYING else ""
+    return scenes + EXAMPLES[command]
