@@ -42,7 +42,7 @@ NOTES = (
     "Set-up, compiling and warm-up are not in it. Memory: the largest resident size of the process that made and "
     "played the row alone; card: what it took of the graphics card.",
     "Bounds are promised for loads like those that were taught; how often they hold in discs of cortex and beyond the "
-    "range that were not is told, and promised by nobody. In discs it is that of a model, and loads, apart from the "
+    "range that were not is shown, but no model promises it. In discs it is that of a model, and loads, apart from the "
     "figures beside it: some loads calibrate, and others stand in the discs.",
     "Adapting: wall time until the row answers again after a fifth of the tumour is taken out of its middle: for "
     "finite elements set-up and the first load, for what is learnt its solves and fitting, all anew; in brackets the "

@@ -76,5 +76,7 @@ def find_device(name: str, precision: Precision) -> Device:
         name = "cuda:0" if "cuda:0" in present else "cpu"
     alias = "cuda:0" if name == "cuda" else name
     if alias not in present:
-        raise InputError(f"there is no device {name!r} here: choose auto or one of {', '.join(present)}.")
+        no_card = alias.startswith("cuda") and not wp.is_cuda_available()
+        why = ", as no NVIDIA driver with a card was found" if no_card else ""
+        raise InputError(f"there is no device {name!r} here{why}: choose auto or one of {', '.join(present)}.")
     return Device(alias, precision)

@@ -198,11 +198,12 @@ def test_the_command(tmp_path, capsys):
     assert main([*words, "--device", "cpu", "--out", str(tmp_path / "table.csv")]) == 0
     said = capsys.readouterr().out
     for text in (
-        "| force or motion | as drawn | 5 % off |", "| surrogate's error |  | table |  |  | 0.123 |",
+        "| force or motion    | as drawn    | 5 % off   |", "| surrogate's error  |             | table     |        | 0.123  |",
         "held-out bipolar loads", "of the kind p2", "--beside p2", "No node of this anatomy slides",
         "Take --element smoothed",
     ):  # fmt: skip
         assert text in said
+    assert max(len(line) for line in said.splitlines() if line.startswith("|")) <= 120
     with open(tmp_path / "table.csv", newline="") as file:
         table = list(csv.DictReader(file))
     assert [row["what"] for row in told["rows"]] == [row["what"] for row in table]

@@ -166,7 +166,7 @@ def _say(args: argparse.Namespace, sections: Sequence[Section]) -> None:
         print(json.dumps({"page": str(page), "sections": [asdict(section) for section in sections]}))
         return
     for section in sections:
-        print(f"{section.name}: mean and largest distance from the reference [mm], ms a load")
+        print(f"{section.name}: distance from the reference, mean and largest [mm]; median time a load [ms]")
         width = max((len(row.name) for row in section.rows), default=0)
         for row in section.rows:
             if row.reference is None or row.median is None:
