@@ -53,6 +53,13 @@ def opening_words(args: argparse.Namespace) -> list[str]:
     return [f"{name}={text}" for name, text in texts.items()]
 
 
+def opened_over(args: argparse.Namespace) -> str:
+    """What the skull is opened over, in words."""
+    if args.opening_at is not None:
+        return "the point given"
+    return f"piece {args.opening_over or 1}" if not isinstance(args.opening_over, tuple) else "the point given"
+
+
 def opened(subject: Subject, args: argparse.Namespace) -> Subject:
     """The subject with its skull opened where the options say.
 

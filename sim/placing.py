@@ -57,7 +57,8 @@ def opening_at(cortex: np.ndarray, point: np.ndarray) -> np.ndarray:
     InputError
         A point that is not finite, or more than 20 mm from there; one over the brainstem.
     """
-    site = _nearest(_outermost(cortex), _finite(point, "--opening-at"))
+    _demand_finite(point, "--opening-at")
+    site = _nearest(_outermost(cortex), point)
     apart = float(np.linalg.norm(site - point))
     if apart > NEAR:
         raise InputError(
@@ -75,7 +76,7 @@ def opening_over(cortex: np.ndarray, point: np.ndarray, depth: float) -> np.ndar
     InputError
         A point that is not finite, or more than 5 mm outside the brain; one over the brainstem.
     """
-    _finite(point, "--opening-over")
+    _demand_finite(point, "--opening-over")
     if not depth > -NEAR / 4.0:
         raise InputError(
             f"the point {_mm(point)} mm lies {-depth * 1e3:.0f} mm outside the brain: give a point inside. "
@@ -95,10 +96,9 @@ def _nearest(points: np.ndarray, place: np.ndarray) -> np.ndarray:
     return points[np.linalg.norm(points - place, axis=1).argmin()]
 
 
-def _finite(point: np.ndarray, option: str) -> np.ndarray:
+def _demand_finite(point: np.ndarray, option: str) -> None:
     if not np.isfinite(point).all():
         raise InputError(f"{option} {_mm(point)}: every coordinate must be a finite number [mm].")
-    return point
 
 
 def _not_over_stem(cortex: np.ndarray, site: np.ndarray) -> np.ndarray:

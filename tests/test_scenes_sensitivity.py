@@ -198,7 +198,8 @@ def test_the_command(tmp_path, capsys):
     assert main([*words, "--device", "cpu", "--out", str(tmp_path / "table.csv")]) == 0
     said = capsys.readouterr().out
     for text in (
-        "| force or motion    | as drawn    | 5 % off   |", "| surrogate's error  |             | table     |        | 0.123  |",
+        "| force or motion    | as drawn    | 5 % off   |",
+        "| surrogate's error  |             | table     |        | 0.123  |",
         "held-out bipolar loads", "of the kind p2", "--beside p2", "No node of this anatomy slides",
         "Take --element smoothed",
     ):  # fmt: skip

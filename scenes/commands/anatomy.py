@@ -25,7 +25,7 @@ from sim.template import SITES, Tumour, template_subject
 
 from ..beside import demand_no_strangers
 from ..output import add_force, claimed
-from ..placed import add_opening_arguments, opened, point
+from ..placed import add_opening_arguments, opened, opened_over, point
 
 # Lengths in millimetres, as on the command line.
 DEFAULTS = {
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
             beside.unlink(missing_ok=True)  # of an earlier mesh of this name
         else:
             write_intensity(beside, intensity)
-    figures = _figures(anatomy, subject)
+    figures = _figures(args, anatomy, subject)
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
     summary = {**files, **figures, "seconds": round(time.perf_counter() - began, 2)}
     print(json.dumps(summary) if args.json else _sentences(summary))
@@ -142,7 +142,7 @@ def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     return volume_subject(args.labels, args.brain, args.tumour, args.t1)
 
 
-def _figures(anatomy: Anatomy, subject: Subject) -> dict[str, Any]:
+def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject) -> dict[str, Any]:
     mesh = anatomy.mesh
     volume = mesh.volumes[mesh.region == TUMOUR_LABEL].sum()
     error, weight = surface_errors(mesh.nodes, mesh.surface, subject.brain)
@@ -159,7 +159,7 @@ def _figures(anatomy: Anatomy, subject: Subject) -> dict[str, Any]:
         "tumour_volume_error_percent": round(100.0 * float(volume / subject.tumour_volume - 1.0), 3),
         "surface_error_mean_mm": round(1e3 * float(np.average(error, weights=weight)), 3),
         "surface_error_p95_mm": round(1e3 * float(np.quantile(error, 0.95, weights=weight, method="inverted_cdf")), 3),
-        "opening": _place(subject, subject.site),
+        "opening": {"over": opened_over(args), **_place(subject, subject.site)},
         "tumour_pieces": [
             {"ml": round(1e6 * piece.volume, 3), **_place(subject, piece.centre)} for piece in subject.pieces
         ],
@@ -178,14 +178,11 @@ def _said(place: dict[str, Any]) -> str:
     return f"{place['side']}, at {at} mm (right, anterior, superior)"
 
 
-def _pieces(pieces: list[dict[str, Any]]) -> list[str]:
+def _pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
     if len(pieces) == 1:
         return [f"tumour: {_said(pieces[0])}"]
     listed = [f"  piece {number}: {piece['ml']:g} ml, {_said(piece)}" for number, piece in enumerate(pieces, start=1)]
-    return [
-        f"tumour: {len(pieces)} pieces; the skull is opened over piece 1 unless --opening-over says otherwise",
-        *listed,
-    ]
+    return [f"tumour: {len(pieces)} pieces; the skull is opened over {over}", *listed]
 
 
 def _sentences(figures: dict) -> str:
@@ -193,7 +190,7 @@ def _sentences(figures: dict) -> str:
         "{nodes} nodes, {tets} tetrahedra; worst dihedral angle {worst_dihedral_deg} deg",
         "brain {brain_ml} ml; surface off by {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
         "tumour {tumour_ml} ml ({tumour_volume_error_percent:+} % of the label's), {tumour_nodes} nodes",
-        *_pieces(figures["tumour_pieces"]),
+        *_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
         f"opening: {_said(figures['opening'])}",
         "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} sliding, {held_nodes} held",
         "written to {mesh}" + (", intensities to {t1}" if figures["t1"] else "") + " in {seconds} s",

@@ -86,7 +86,11 @@ def run(args: argparse.Namespace) -> int:
     changed = variants(anatomy, body, args.beside)
     where = machine(args.device)
     lines = sys.stderr if args.json else sys.stdout
-    print(f"{where}\n\n{_opening(study, args.preset)}\n\n{_line(HEAD)}\n{_line(['-' * width for width in WIDTHS])}", file=lines, flush=True)
+    print(
+        f"{where}\n\n{_opening(study, args.preset)}\n\n{_line(HEAD)}\n{_line(['-' * width for width in WIDTHS])}",
+        file=lines,
+        flush=True,
+    )
     found = []
     with tqdm(total=1 + len(changed), unit="row", file=sys.stderr) as bar:
         for row in rows(study, changed):

@@ -1,0 +1,172 @@
+"""What the command line says before, while and after it works."""
+
+import json
+from types import SimpleNamespace
+
+import nibabel
+import numpy as np
+import pytest
+import warp as wp
+from balls import ball
+from theatres import put, theatre_of
+
+from ar.screen import read_png, signature
+from scenes.cli import COMMANDS, _with_points, main
+from scenes.commands.train import _warnings
+from scenes.guidance import EXAMPLES, NAMES, PLAYING
+from scenes.placed import opened
+from scenes.scene import SCENES
+from scenes.truth import truth_of
+from sim.device import find_device
+from sim.errors import InputError
+from sim.labels import volume_subject
+from sim.loads import push
+
+
+def helped(words, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_the_version_is_told(capsys):
+    assert helped(["--version"], capsys).startswith("sulcus 0.")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_help_has_examples_that_parse_and_says_what_next(name, capsys, monkeypatch):
+    text = helped([name, "--help"], capsys)
+    assert "next: " in text and set(EXAMPLES) == set(COMMANDS)
+    examples = [line.split()[1:] for line in EXAMPLES[name].splitlines() if line.startswith("  sulcus ")]
+    assert any(words[0] == name for words in examples)
+    monkeypatch.setattr("argparse.ArgumentParser.error", lambda self, message: pytest.fail(message))
+    for words in examples:
+        monkeypatch.setattr(f"scenes.commands.{words[0]}.run", lambda args: 0)
+        assert main(words) == 0
+    assert (NAMES in text) == (name in PLAYING)
+
+
+def test_scenes_are_those_that_there_are():
+    assert tuple(NAMES.split(", ")) == SCENES
+
+
+def test_a_point_may_begin_with_a_minus():
+    assert _with_points(["--opening-at", "-3,4.5,-6", "--nodes", "-3"]) == ["--opening-at=-3,4.5,-6", "--nodes", "-3"]
+    assert _with_points(["--out", "-x", "-1,2,3"]) == ["--out", "-x", "-1,2,3"]
+
+
+def test_training_says_what_takes_long_and_what_too_few_loads_cannot_give():
+    few, many = (SimpleNamespace(good=np.ones(count, bool)) for count in (20, 76))
+    series, bounds = _warnings(few, ["linear", "series-gp"])
+    assert "minutes on a CPU" in series and "of 20 loads 5 are kept" in bounds and "--count 76" in bounds
+    assert _warnings(many, ["linear"]) == []
+
+
+@pytest.mark.parametrize("learners", ["", "linear,,svr", " "])
+def test_learners_without_a_name_are_a_sentence(learners, tmp_path, capsys):
+    assert main(["train", "none.h5", "--out", str(tmp_path / "m.npz"), "--learners", learners]) == 2
+    assert "name each learner" in capsys.readouterr().err
+
+
+def test_it_is_said_why_there_is_no_cuda():
+    if wp.is_cuda_available():
+        pytest.skip("there is")
+    with pytest.raises(InputError, match="no NVIDIA driver"):
+        find_device("cuda", "float32")
+
+
+def test_whoever_waits_for_the_truth_sees_it_go_by(pretender):
+    theatre = SimpleNamespace(fem=lambda scene, accuracy, batch: pretender)
+    loads = [push(np.array([0.001 * k, 0.0, 0.0]), np.array([0.0, 0.0, -0.1]), 6e-3) for k in range(20)]
+    heard = []
+    found = truth_of(theatre, None, loads, heard.append)
+    assert heard == [16, 4]
+    alone = np.concatenate([pretender.deform(load).displacement for load in loads])
+    np.testing.assert_allclose(found.displacement, alone, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def folder(box, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("guided")
+    put(theatre_of(box), folder / "box.vtu")
+    return folder
+
+
+def test_frames_of_another_run_are_refused_or_removed(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    words = ["render", "press", "--anatomy", "box.vtu", "--device", "cpu", "--out", str(tmp_path), "--plain"]
+    assert main([*words, "--every", "60", "--film", str(tmp_path / "press.gif")]) == 0
+    assert f"film {tmp_path / 'press.gif'}" in capsys.readouterr().out
+    first = {path: path.read_bytes() for path in tmp_path.glob("frame_*.png")}
+    assert len(first) == 3 and len({signature(path) for path in first}) == 1
+    assert all(read_png(path).shape == (480, 640, 3) for path in first)
+    (tmp_path / "frame_mine.png").write_bytes(b"mine")
+    assert main([*words, "--every", "120"]) == 2
+    assert "holds 3 frames of another run" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in first} == first
+    assert main([*words, "--every", "120", "--force"]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "frame_0000.png", "frame_0120.png", "frame_mine.png", "press.gif",
+    ]  # fmt: skip
+    assert main([*words, "--every", "120", "--film", str(tmp_path / "press.gif")]) == 0  # the same run once more
+
+
+def test_checking_shows_how_far_it_is(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert main(["check", "press", "--anatomy", "box.vtu", "--device", "cpu", "--every", "60"]) in (0, 1)
+    assert "press: " in capsys.readouterr().err
+
+
+def two_foci(folder):
+    """A head with a tumour of 10 mm radius on the right, and one of 6 mm on the left, in front."""
+    ball(folder)
+    image = nibabel.load(folder / "labels.nii.gz")
+    labels = np.asarray(image.dataobj).copy()
+    places = 2.0 * (np.moveaxis(np.indices((64, 64, 64)), 0, -1) - 31.5)
+    labels[np.linalg.norm(places - [-25.0, 25.0, 20.0], axis=-1) < 6.0] = 2
+    nibabel.save(nibabel.Nifti1Image(labels, image.affine), folder / "labels.nii.gz")
+
+
+def test_the_skull_is_opened_over_the_piece_that_is_asked_for(tmp_path):
+    two_foci(tmp_path)
+    subject = volume_subject(tmp_path / "labels.nii.gz", (1,), (2,))
+    large, small = subject.pieces
+    assert large.volume > 3.0 * small.volume and large.centre[0] > 0.0 > small.centre[0]
+    asked = dict.fromkeys(("opening_at", "opening_over"))
+    site = opened(subject, SimpleNamespace(**asked)).site
+    assert site[0] > 0.0 and site @ large.centre > 0.99 * np.linalg.norm(site) * np.linalg.norm(large.centre)
+    site = opened(subject, SimpleNamespace(**asked | {"opening_over": 2})).site
+    assert site @ small.centre > 0.99 * np.linalg.norm(site) * np.linalg.norm(small.centre)
+    at = opened(subject, SimpleNamespace(**asked | {"opening_at": (-50.0, 0.0, 20.0)})).site
+    assert np.linalg.norm(at - [-0.05, 0.0, 0.02]) < 5e-3
+    with pytest.raises(InputError, match="has 2 pieces: choose 1 to 2"):
+        opened(subject, SimpleNamespace(**asked | {"opening_over": 3}))
+
+
+def test_an_anatomy_says_where_its_pieces_lie_and_refuses_to_leave_data_behind(tmp_path, capsys):
+    two_foci(tmp_path)
+    out = tmp_path / "me.vtu"
+    words = ["anatomy", "--labels", str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--nodes", "2000"]
+    words += ["--opening-over", "-25,25,20", "--out", str(out)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "2 pieces; the skull is opened over the point given" in said and "piece 2: 0.88 ml, left anterior" in said
+    assert "opening: left anterior superior" in said
+    (tmp_path / "me.h5.partial").write_text(json.dumps({"anatomy": "of another"}))
+    before = out.read_bytes()
+    assert main(words) == 2
+    assert "me.h5.partial" in (error := capsys.readouterr().err) and "--force" in error and out.read_bytes() == before
+
+
+def test_a_patient_hands_force_and_opening_on_and_begins_nothing_that_it_cannot_end(tmp_path, monkeypatch, capsys):
+    steps = []
+    monkeypatch.setattr("scenes.cli.main", lambda words: steps.append(words) or 0)
+    words = ["patient", "labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu"]
+    words += ["--out", str(tmp_path / "me.vtu")]
+    assert main([*words, "--force", "--opening-at", "-30,1.5,60"]) == 0
+    assert all("--force" in step for step in steps) and "--opening-at=-30.0,1.5,60.0" in steps[0]
+    steps.clear()
+    (tmp_path / "me.model.npz").write_bytes(b"mine")
+    assert main(words) == 2 and not steps
+    assert "me.model.npz" in capsys.readouterr().err

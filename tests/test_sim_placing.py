@@ -1,0 +1,83 @@
+"""Where the skull is opened, and what places are called."""
+
+import re
+
+import numpy as np
+import pytest
+
+import sim.meshing
+from sim.errors import InputError
+from sim.placing import BASE, HULL_DEPTH, opening_at, opening_over, side_of, site_over
+
+LOW, HIGH = np.array([-0.07, -0.09, -0.06]), np.array([0.07, 0.09, 0.08])
+
+
+@pytest.fixture(scope="module")
+def cortex():
+    """Points of an egg of 140 x 180 x 140 mm, with a fissure to its middle in the plane x = 0 at the top."""
+    rng = np.random.default_rng(0)
+    way = rng.normal(size=(2000, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    outer = way * [0.07, 0.09, 0.07]
+    fissure = np.column_stack([np.zeros(500), rng.uniform(-0.05, 0.05, 500), rng.uniform(0.0, 0.04, 500)])
+    return np.concatenate([outer, fissure])
+
+
+def test_an_opening_is_centred_on_the_nearest_cortex_that_can_be_reached(cortex):
+    asked = np.array([-0.055, 0.02, 0.05])
+    site = opening_at(cortex, asked)
+    assert np.linalg.norm(site - asked) == pytest.approx(np.linalg.norm(cortex - asked, axis=1).min())
+    # From a point in the fissure the skull is reached over it, not in it.
+    site = opening_over(cortex, np.array([0.005, 0.0, 0.035]), 0.01)
+    assert abs(np.linalg.norm(site / [0.07, 0.09, 0.07]) - 1.0) < HULL_DEPTH / 0.07 and site[2] > 0.06
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        ((0.2, 0.0, 0.0), "lies 130 mm from the nearest cortex"),
+        ((0.0, 0.0, 0.03), "give --opening-over"),
+        ((0.0, 0.0, -0.072), "over the brainstem"),
+        ((np.nan, 0.0, 0.0), "finite"),
+    ],
+)
+def test_an_opening_that_cannot_be_is_a_sentence(cortex, place, reason):
+    with pytest.raises(InputError, match=reason):
+        opening_at(cortex, np.array(place))
+
+
+def test_over_a_point_outside_nothing_is_opened(cortex):
+    with pytest.raises(InputError, match="lies 30 mm outside the brain"):
+        opening_over(cortex, np.array([0.1, 0.0, 0.0]), -0.03)
+    with pytest.raises(InputError, match="over the brainstem"):
+        opening_over(cortex, np.array([0.0, 0.0, -0.069]), 0.0)
+    deep = site_over(cortex, np.array([0.0, 0.0, 0.0]))
+    assert deep[2] >= -0.07 + BASE * 0.14 - 1e-3
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ((-0.05, 0.07, 0.06), "left anterior superior"),
+        ((0.05, -0.07, -0.04), "right posterior inferior"),
+        ((0.0, 0.0, 0.01), "midline"),
+        ((0.03, 0.0, 0.01), "right"),
+    ],
+)
+def test_places_are_called_as_clinicians_call_them(place, words):
+    assert side_of(np.array(place), LOW, HIGH) == words
+
+
+def test_too_few_nodes_are_told_how_many_would_do(monkeypatch):
+    asked = []
+
+    def meshed(solids, count):
+        asked.append(count)
+        return "mesh" if count >= 4000 else None
+
+    monkeypatch.setattr(sim.meshing, "_meshed", meshed)
+    with pytest.raises(InputError, match=re.escape("too intricate for 3000 nodes: ask for 4800, or smooth")):
+        sim.meshing.mesh_solids(None, 3000)
+    assert asked == [3000, 3800, 4800]
+    with pytest.raises(InputError, match="for 1000 nodes: smooth the labels"):
+        sim.meshing.mesh_solids(None, 1000)
