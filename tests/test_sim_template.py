@@ -77,6 +77,18 @@ def test_the_cap_lies_as_deep_as_asked():
         assert subject.brain(subject.site[None])[0] == pytest.approx(0.0, abs=5e-5)
 
 
+def test_a_tumour_lies_where_it_is_put_and_the_skull_is_opened_over_it():
+    subject = template_subject(Tumour(middle=(-0.030, 0.010, 0.040), radius=0.010))
+    np.testing.assert_array_equal(subject.tumour.middle, [-0.030, 0.010, 0.040])
+    assert [piece.volume for piece in subject.pieces] == [subject.tumour_volume]
+    arm = subject.site - subject.tumour.middle
+    assert subject.site[0] < -0.02 and 0.01 < np.linalg.norm(arm) < 0.04
+    with pytest.raises(InputError, match=r"at 0, 0, 200 mm reaches out"):
+        template_subject(Tumour(middle=(0.0, 0.0, 0.2)))
+    with pytest.raises(InputError, match="finite"):
+        Tumour(middle=(0.0, float("nan"), 0.0))
+
+
 def test_seeds_vary_the_lobed_shape_but_not_its_volume():
     first, again, other = (template_subject(Tumour(shape="lobed", seed=seed)).tumour for seed in (1, 1, 2))
     rng = np.random.default_rng(0)
