@@ -27,11 +27,12 @@ from sim.effects import (
 from sim.errors import InputError
 from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
 from sim.material import Tissue
+from sim.open_cortex import Place
 from sim.script import run_script
 
 from .lying import Lie, supine
 from .paths import AIR, Path, Touch, idle
-from .site import Contact, Site
+from .site import Site
 from .surgery import Debulking
 from .tool import Instrument, Probe
 
@@ -162,7 +163,7 @@ class Scene:
         kept = tuple(effect for effect in self.effects if not isinstance(effect, gone))
         return kept if self.surgery is None else (*kept, _resection(self.surgery, anatomy))
 
-    def contact(self, site: Site, touch: Touch) -> Contact:
+    def contact(self, site: Site, touch: Touch) -> Place:
         """The material point that the tool touches."""
         assert self.tool is not None
         return site.contact(touch.x, touch.y, self.tool.radius)

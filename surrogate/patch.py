@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.normals import vertex_normals
+from sim.open_cortex import distances_to, rim_of
 from sim.triangles import areas
 
 if TYPE_CHECKING:
@@ -66,17 +67,11 @@ class Patch:
     @cached_property
     def rim(self) -> np.ndarray:
         """Edges (E, 2, 3) [m] that belong to one triangle only."""
-        edges = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges, count = np.unique(edges, axis=0, return_counts=True)
-        return self.points[edges[count == 1]]
+        return rim_of(self.points, self.triangles)
 
     def rim_distance(self, points: np.ndarray) -> np.ndarray:
         """Distances (B,) [m] from `points` (B, 3) to the rim."""
-        start, along = self.rim[:, 0], self.rim[:, 1] - self.rim[:, 0]
-        offset = points[:, None] - start
-        share = np.einsum("bei,ei->be", offset, along) / np.einsum("ei,ei->e", along, along)
-        offset -= np.clip(share, 0.0, 1.0)[:, :, None] * along
-        return np.sqrt(np.einsum("bei,bei->be", offset, offset).min(axis=1))
+        return distances_to(self.rim, points)
 
     def place(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (n, 3) [m] and their unit inward normals (n, 3) from uniform numbers (n, 3); uniform by area."""

@@ -1,0 +1,50 @@
+"""The point of a triangulated surface that is closest to a given one, in plain NumPy."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Closest(NamedTuple):
+    """Closest points (B, 3) [m], and where they lie: triangle (B,) and barycentric weights (B, 3)."""
+
+    point: np.ndarray
+    triangle: np.ndarray
+    weights: np.ndarray
+
+
+def closest(points: np.ndarray, corners: np.ndarray) -> Closest:
+    """Find what is closest to points (B, 3) [m] on triangles with corners (S, 3, 3), or (B, S, 3, 3) [m].
+
+    It is the foot on a triangle's plane where that lies inside, else the closest point of an edge. Triangles without
+    area have edges all the same. All pairs are looked at: meant for a few hundred triangles.
+    """
+    corners = corners if corners.ndim == 4 else corners[None]
+    edge = np.roll(corners, -1, axis=2) - corners
+    arm = points[:, None, None] - corners
+    square = np.einsum("bsei,bsei->bse", edge, edge)
+    share = np.einsum("bsei,bsei->bse", arm, edge) / np.where(square > 0.0, square, 1.0)
+    share = np.clip(share, 0.0, 1.0)
+    off = arm - share[..., None] * edge
+    normal = np.cross(edge[:, :, 0], edge[:, :, 1])
+    twice = np.einsum("bsi,bsi->bs", normal, normal)  # the square of twice the area
+    twice = np.where(twice > 0.0, twice, np.inf)[..., None]
+    # The weight of a corner is the area that the foot spans with the edge across from it.
+    spanned = np.einsum("bsi,bsei->bse", normal, np.cross(edge, arm)) / twice
+    inner = np.roll(spanned, -1, axis=2)
+    inside = (inner > 0.0).all(axis=2)
+    height = np.einsum("bsi,bsi->bs", normal, arm[:, :, 0]) ** 2 / twice[..., 0]
+    far = np.concatenate([np.einsum("bsei,bsei->bse", off, off), np.where(inside, height, np.inf)[..., None]], axis=2)
+    triangle, kind = np.divmod(far.reshape(len(far), -1).argmin(axis=1), 4)
+    row = np.arange(len(far))
+    weights = inner[row, triangle]
+    on_edge = kind < 3
+    some, start = row[on_edge], kind[on_edge]
+    along = share[some, triangle[on_edge], start]
+    weights[on_edge] = 0.0
+    weights[some, start] = 1.0 - along
+    weights[some, (start + 1) % 3] = along
+    at = corners[np.minimum(row, len(corners) - 1), triangle]
+    return Closest(np.einsum("bc,bci->bi", weights, at), triangle, weights)

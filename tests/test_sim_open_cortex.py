@@ -1,0 +1,68 @@
+"""The open cortex: its frame, places on it, and the closest points of surfaces."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from scenes.shipped import template_path
+from sim.closest import closest
+from sim.errors import InputError
+from sim.meshfile import read_anatomy
+from sim.open_cortex import open_cortex
+
+
+@pytest.fixture(scope="module")
+def template():
+    return read_anatomy(template_path())
+
+
+def test_closest_points_are_those_of_trimesh(template):
+    random = np.random.default_rng(0)
+    triangles = template.tumour_surface
+    nodes = template.mesh.nodes
+    surface = trimesh.Trimesh(nodes, triangles, process=False)
+    points = nodes[template.tumour_nodes].mean(axis=0) + random.normal(scale=0.015, size=(200, 3))
+    found = closest(points, nodes[triangles])
+    there, distance, _ = trimesh.proximity.closest_point_naive(surface, points)
+    assert np.linalg.norm(found.point - points, axis=1) == pytest.approx(distance, abs=1e-12)
+    assert np.abs(found.point - there).max() < 1e-9
+    assert (found.weights >= 0.0).all() and found.weights.sum(axis=1) == pytest.approx(1.0)
+    corners = nodes[triangles[found.triangle]]
+    assert np.allclose(np.einsum("bc,bci->bi", found.weights, corners), found.point, atol=1e-15)
+    # Every surface its own point.
+    shifts = random.normal(scale=1e-3, size=(200, 1, 1, 3))
+    moved = closest(points + shifts[:, 0, 0], nodes[triangles] + shifts)
+    assert np.allclose(moved.point - shifts[:, 0, 0], found.point, atol=1e-12)
+
+
+def test_of_triangles_without_area_edges_are_closest():
+    flat = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[5.0, 0.0, 0.0]] * 3])
+    found = closest(np.array([[0.5, 1.0, 0.0], [5.0, 2.0, 0.0]]), flat)
+    assert np.allclose(found.point, [[0.5, 0.0, 0.0], [5.0, 0.0, 0.0]])
+
+
+def test_a_place_is_where_it_was_asked_for(template):
+    cortex = open_cortex(template)
+    assert np.allclose(cortex.place().point, cortex.origin, atol=1e-12)
+    for right, up in ((5.0, 0.0), (0.0, -7.0), (-6.0, 6.0)):
+        place = cortex.place(right_mm=right, up_mm=up)
+        way = 1e3 * (place.point - cortex.origin)
+        assert way @ cortex.right == pytest.approx(right, abs=1.5) and way @ cortex.up == pytest.approx(up, abs=1.5)
+        assert np.linalg.norm(place.inward) == pytest.approx(1.0)
+        assert place.inward @ cortex.axis > 0.7  # into the brain
+        assert np.allclose(place.carried(template.mesh.nodes), place.point, atol=1e-15)
+        assert np.isin(place.vertices, template.open_surface).all()
+
+
+@pytest.mark.parametrize("asked", [(60.0, 0.0), (0.0, -200.0), (float("nan"), 0.0)])
+def test_a_place_under_the_bone_is_refused(template, asked):
+    with pytest.raises(InputError, match="outside the open cortex: stay within"):
+        open_cortex(template).place(*asked)
+
+
+def test_without_a_craniotomy_there_is_none(template):
+    closed = replace(template, craniotomy=np.zeros(len(template.mesh.nodes), bool))
+    with pytest.raises(InputError, match="no open cortex"):
+        open_cortex(closed)
