@@ -18,15 +18,17 @@ from sim.given import whole_numbers
 from sim.loads import Loads, Pushed
 from sim.material import tissue_from_json
 from sim.threads import one_thread
+from sim.tip import tip_gauge
 
 from .bound import Bound, features_of
 from .encode import ENCODERS, Basis, directions
-from .envelope import Envelope, measured
+from .envelope import Envelope, Measured, measured
 from .indentation import indented
 from .patch import Patch, nearest, open_patch
 from .regressor import Fitted
 from .remainder import Remainder
 from .series import Series
+from .tip import Distance, TipModel
 
 if TYPE_CHECKING:
     from .swift import Swift
@@ -84,6 +86,8 @@ class Learned:
         What it was taught with, as text.
     ball
         Radius [m] of the ball whose poses it answers; None: it answers pushes. Where it says force, there is depth [m].
+    tip
+        What it was taught of the distance from tip to tumour, if anything.
     """
 
     anatomy: Anatomy
@@ -93,6 +97,7 @@ class Learned:
     bounds: Bound | None = None
     training: Mapping[str, str] = field(default_factory=dict)
     ball: float | None = None
+    tip: TipModel | None = None
 
     @cached_property
     def source(self) -> str:
@@ -228,13 +233,43 @@ class Learned:
                 coefficients = sum(part.regressor.predict(features[part.encoder]) for part in parts)
                 response = parts[0].basis.decode(np.asarray(coefficients))
                 displacement[:, here] += magnitude[:, None, None] * response[:, row[here]]
-        promised = np.array(np.nan)
-        if self.bounds is not None:
-            # As the motion, so its error: in proportion to a force weaker than any that was taught.
-            weaker = np.minimum(magnitude / self.envelope.force[0], 1.0)
-            told = features_of(pushed, known._replace(magnitude=within))
-            promised = np.where(weaker > 0.0, self.bounds.of(told, magnitude, excess), 0.0) * weaker
+        promised = self._promised(self.bounds, pushed, known, excess)
         return predicted(displacement, nodes, loads, excess > 0.0, begun, promised, self.source)
+
+    def _promised(self, bound: Bound | None, pushed: Pushed, known: Measured, excess: np.ndarray) -> np.ndarray:
+        """What a bound (2, B) [m] says of loads; NaN where there is none."""
+        if bound is None:
+            return np.full((2, len(excess)), np.nan)
+        # As the motion, so its error: in proportion to a force weaker than any that was taught.
+        weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
+        told = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *self.envelope.force)))
+        return np.where(weaker > 0.0, bound.of(told, known.magnitude, excess), 0.0) * weaker
+
+    def distance(self, loads: Loads, answer: Deformation | None = None, lift: float = 0.0) -> Distance:
+        """Predict the distance from the tool's tip to the tumour, both in the deformed brain, see `sim.tip.TipGauge`.
+
+        Parameters
+        ----------
+        answer
+            What this model answered the loads with, if that is known: of the open cortex and the tumour at least.
+        lift
+            How far [m] a tool that pushes has been lifted off again, against the open cortex's inward axis.
+
+        Raises
+        ------
+        InputError
+            Loads of another kind, or an answer that does not know the open cortex and the tumour.
+        """
+        pushed = self.asked(loads)
+        if answer is None:
+            answer = self.deform(loads, at=self.nodes)
+        found = tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.ball, lift)
+        tip = self.tip or TipModel()
+        magnitude, direction = directions(pushed)
+        within = np.clip(magnitude, *self.envelope.force)[:, None] * direction
+        found = tip.corrected(found, self._patch, replace(pushed, force=within), magnitude)
+        known = measured(self._patch, pushed)
+        return Distance(found, self._promised(tip.bound, pushed, known, self.envelope.excess(pushed, known)))
 
     def asked(self, loads: Loads) -> Pushed:
         """What the model is asked: pushes, or the poses of its ball as `indentation.indented` has them.

@@ -29,12 +29,12 @@ class Remainder:
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Learn from `tool_features` X (n, 8) and remainders Y (n, r)."""
         self.faint_ = np.array(FAINT * X[:, 6].max())
-        self.gp_ = Gp().fit(_with_pressing(X), Y / self._unit(X))
+        self.gp_ = Gp().fit(with_pressing(X), Y / self._unit(X))
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of `tool_features` (B, 8)."""
-        return (self.gp_.predict(_with_pressing(X)) * self._unit(X)).astype(np.float32)
+        return (self.gp_.predict(with_pressing(X)) * self._unit(X)).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
         """The process's, and `faint` [N]."""
@@ -53,5 +53,6 @@ class Remainder:
         return X[:, 6:7] ** ORDERS + self.faint_**ORDERS
 
 
-def _with_pressing(X: np.ndarray) -> np.ndarray:
+def with_pressing(X: np.ndarray) -> np.ndarray:
+    """`tool_features` (n, 8), and force over radius: (n, 9)."""
     return np.column_stack([X, X[:, 6] / X[:, 7]])

@@ -33,6 +33,7 @@ from .regressor import Fitted, Regressor
 from .remainder import Remainder
 from .series import Series
 from .svr import Svr
+from .tip import TipModel
 from .vetting import demand_finite, demand_sound
 
 FORMAT = "sulcus model 2"
@@ -114,7 +115,9 @@ def _keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
         for part in description["parts"]:
             yield from (part["nodes"], part["modes"], *part["state"].values())
         yield description["envelope"]["points"]
-        yield from (description["bounds"] or {}).values()
+        tip = description.get("tip") or {}
+        for named in (description["bounds"], tip.get("bound"), tip.get("correction")):
+            yield from (named or {}).values()
 
 
 def _own_name(regressor: Fitted) -> str:
@@ -150,15 +153,39 @@ def _described(model: Learned, put: Any) -> dict[str, Any]:
         for part in model.parts
     ]
     envelope = {**asdict(model.envelope), "points": put(model.envelope.points)}
-    bounds = None if model.bounds is None else {name: put(array) for name, array in vars(model.bounds).items()}
     return {
         "parts": parts,
         "envelope": envelope,
         "bound": model.bound,
-        "bounds": bounds,
+        "bounds": _put_bound(model.bounds, put),
         "training": dict(model.training),
         "ball": model.ball,
+        "tip": None if model.tip is None else _described_tip(model.tip, put),
     }
+
+
+def _described_tip(tip: TipModel, put: Any) -> dict[str, Any]:
+    known = tip.correction
+    correction = None if known is None else {name: put(array) for name, array in known.state().items()}
+    return {"correction": correction, "bound": _put_bound(tip.bound, put)}
+
+
+def _rebuilt_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray]) -> TipModel | None:
+    if description is None:
+        return None
+    known = description["correction"]
+    state = {} if known is None else {name: arrays[key] for name, key in known.items()}
+    demand_finite(state)
+    correction = None if known is None else Gp.restored(state)
+    return TipModel(correction, _rebuilt_bound(description["bound"], arrays))
+
+
+def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
+    return None if bound is None else {name: put(array) for name, array in vars(bound).items()}
+
+
+def _rebuilt_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray]) -> Bound | None:
+    return None if names is None else Bound(**{name: arrays[key] for name, key in names.items()})
 
 
 def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:
@@ -172,14 +199,14 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
     envelope["points"] = arrays[envelope["points"]]
     for name in ("force", "footprint"):
         envelope[name] = tuple(envelope[name])
-    promised = description["bounds"]
-    bounds = None if promised is None else Bound(**{name: arrays[key] for name, key in promised.items()})
     return Learned(
         anatomy,
         tuple(parts),
         Envelope(**envelope),
         description["bound"],
-        bounds,
+        _rebuilt_bound(description["bounds"], arrays),
         description["training"],
+        # Older files do not have these.
         description.get("ball"),
+        _rebuilt_tip(description.get("tip"), arrays),
     )

@@ -10,9 +10,10 @@ import numpy as np
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
 from sim.stages import stage
+from sim.tip import tip_gauge
 
 from .bound import LEVELS, conformal, features_of, fitted_bound
-from .coverage import TENTHS, Coverage, coverage
+from .coverage import TENTHS, Coverage, coverage, distance_coverage
 from .dataset import Dataset
 from .encode import directions
 from .envelope import Envelope, envelope_of, measured
@@ -23,6 +24,14 @@ from .parts import EXPANDED, LEARNT, POSED, TOUCHED, Classroom, Expansion, Lesso
 from .patch import Patch, nearest
 from .score import Score, errors, score
 from .split import APART, MOST_APART, Split, leave_discs_out
+from .tip_training import (
+    Measured,
+    calibrated_distance,
+    corrected_if_better,
+    distance_errors,
+    measured_distances,
+    with_correction,
+)
 
 # Of pushes, and of poses.
 LEARNERS = ("linear", *LEARNT, *EXPANDED)
@@ -39,6 +48,7 @@ class Trained:
     which the models' bounds were calibrated, `taught` that of those which the models were taught. `left_out` says by
     learner how often bounds held on the discs left out, where nothing is promised: those of the scored model,
     of which loads outside the discs tell all, half of them the scale and half of them how much of it.
+    `distance_left_out` says the same of the distance from tip to tumour.
     """
 
     models: dict[str, Learned]
@@ -48,6 +58,7 @@ class Trained:
     calibrated: int
     taught: int
     left_out: dict[str, Coverage]
+    distance_left_out: dict[str, Coverage]
 
 
 def learners_for(data: Dataset) -> tuple[str, ...]:
@@ -124,11 +135,15 @@ def train(
     with stage("read"):
         truth = data.displacement(nodes)[data.good]
         cortex = data.displacement(shared.cortex)[data.good]
+        at = np.concatenate([nodes, shared.cortex])
+        both = np.concatenate([truth, cortex], axis=1)
+        told = measured_distances(tip_gauge(data.anatomy), loads, both, at, data.ball)
 
     def lesson(rows: np.ndarray) -> Lesson:
         return Lesson(_rows(pushed, rows), truth[rows], cortex[rows])
 
-    lessons = [lesson(_first(split.taught, most)), *([lesson(_first(~apart, most))] if apart.any() else [])]
+    chosen = [_first(split.taught, most), *([_first(~apart, most)] if apart.any() else [])]
+    lessons = [lesson(rows) for rows in chosen]
     rooms = [Classroom(each, shared) for each in lessons]
     test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
     tested, left = (_rows(pushed, rows) for rows in (split.test, apart))
@@ -137,7 +152,7 @@ def train(
     if apart.any():
         beside = np.flatnonzero(nearest(left.point, split.centres)[1] > split.radius)
         envelopes.append(envelope_of(patch, lessons[1].loads, left))
-    models, scores, left_out = {}, [], {}
+    models, scores, left_out, distance_left_out = {}, [], {}, {}
     for name in wanted:
         with stage(f"learn {name}"):
             model = Learned(
@@ -150,22 +165,39 @@ def train(
         with stage("score"):
             scores.append(score(name, model, test, truth[split.test], nodes))
             held_out = errors(model, test, truth[split.test], nodes).max(axis=1)
-        seen = _features(patch, tested, envelopes[0]), held_out
+            model, off = corrected_if_better(model, patch, told.rows(chosen[0]), told.rows(split.test))
+        features = _features(patch, tested, envelopes[0])
+        seen, seen_distance = (features, held_out), (features, off)
         models[name] = replace(model, bound=min(conformal(held_out, LEVELS[0]), float(held_out.max())))
         if len(beside) >= 2 * FEWEST_APART and len(test) >= TENTHS:
             with stage("calibrate"):
                 known = fresh.rows(beside), truth[apart][beside]
                 left_out[name] = coverage(_bounded(model, patch, *known, nodes), test, truth[split.test])
+                bounded = _distance_bounded(model, patch, told.rows(apart).rows(beside))
+                distance_left_out[name] = distance_coverage(bounded, test, told.distance[split.test])
         if apart.any():
             with stage(f"learn {name}"):
                 parts = parts_of(name, rooms[1], lessons[1])
                 models[name] = replace(models[name], parts=parts, envelope=envelopes[1])
+                if model.tip is not None and model.tip.correction is not None:
+                    models[name] = with_correction(models[name], patch, told.rows(chosen[1]))
         if apart.sum() >= FEWEST_APART:
             with stage("calibrate"):
                 models[name] = _calibrated(models[name], patch, seen, fresh, truth[apart], nodes)
+                features = _features(patch, left, models[name].envelope)
+                models[name] = calibrated_distance(models[name], seen_distance, features, told.rows(apart))
         progress(name)
     motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
-    return Trained(models, tuple(scores), split, motion, int(apart.sum()), len(lessons[-1].loads.point), left_out)
+    return Trained(
+        models,
+        tuple(scores),
+        split,
+        motion,
+        int(apart.sum()),
+        len(lessons[-1].loads.point),
+        left_out,
+        distance_left_out,
+    )
 
 
 def _kinds(data: Dataset) -> tuple[tuple[str, ...], tuple[str, ...], str]:
@@ -180,6 +212,13 @@ def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, node
     return _calibrated(
         model, patch, (_features(patch, model.asked(scale), model.envelope), error), share, truth[1::2], nodes
     )
+
+
+def _distance_bounded(model: Learned, patch: Patch, known: Measured) -> Learned:
+    """The same of the distance from tip to tumour."""
+    scale, share = known.rows(slice(None, None, 2)), known.rows(slice(1, None, 2))
+    features = [_features(patch, model.asked(some.loads), model.envelope) for some in (scale, share)]
+    return calibrated_distance(model, (features[0], distance_errors(model, scale)), features[1], share)
 
 
 def _calibrated(

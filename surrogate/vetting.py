@@ -37,7 +37,9 @@ def demand_sound(name: str, model: Learned) -> None:
         texts = (*model.training, *model.training.values())
         _demand(all(isinstance(text, str) for text in texts), "what it says of its training is no text")
         if model.bounds is not None:
-            _check_bounds(model.bounds, model.anatomy)
+            _check_bounds(model.bounds, len(model.anatomy.tumour_nodes))
+        if model.tip is not None and model.tip.bound is not None:
+            _check_bounds(model.tip.bound, 1)  # of one distance
     except InputError as error:
         raise InputError(f"the model {name!r} cannot be: {error}. Make one with `sulcus train`.") from error
 
@@ -108,7 +110,7 @@ def _check_envelope(envelope: Envelope) -> None:
     _demand(bool(np.isfinite(envelope.overhang)) and _positive(envelope.line_force), "its range of loads is none")
 
 
-def _check_bounds(bounds: Bound, anatomy: Anatomy) -> None:
+def _check_bounds(bounds: Bound, count: int) -> None:
     for name, array in vars(bounds).items():
         _demand(array.dtype.kind == "f" and not np.isnan(array).any(), f"{name!r} of its bounds are no numbers")
     terms = 1 + FEATURES + FEATURES * (FEATURES + 1) // 2
@@ -117,7 +119,7 @@ def _check_bounds(bounds: Bound, anatomy: Anatomy) -> None:
         "deviation": (FEATURES,),
         "weights": (terms,),
         "quantile": (len(LEVELS), len(bounds.edges) + 1),
-        "profile": (len(anatomy.tumour_nodes),),
+        "profile": (count,),
     }
     for name, shape in shapes.items():
         _demand(getattr(bounds, name).shape == shape, f"{name!r} of its bounds have another shape")

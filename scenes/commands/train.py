@@ -98,6 +98,10 @@ def _for_people(trained: Trained, out: str, failed: int) -> str:
                 f"on those discs, where nothing is promised, bounds of {name} held for {found}"
                 for name, found in trained.left_out.items()
             ),
+            *(
+                f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"
+                for name, found in trained.distance_left_out.items()
+            ),
             f"the models written were taught {trained.taught} loads; {_calibration(trained)}",
             f"written: {out}",
         ]
@@ -125,6 +129,7 @@ def _for_machines(trained: Trained, out: str, failed: int) -> str:
             "held_out": int(split.test.sum()),
             "calibrated": trained.calibrated,
             "left_out": {name: asdict(found) for name, found in trained.left_out.items()},
+            "distance_left_out": {name: asdict(found) for name, found in trained.distance_left_out.items()},
             "not_converged": failed,
         }
     )

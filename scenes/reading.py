@@ -1,0 +1,62 @@
+"""The number that is read beside the tool: how far its tip is from the tumour, and how far off that may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sim.deformation import Deformation, Deformer
+from sim.loads import Loads, Pushed, Touching
+from sim.tip import tip_gauge
+from surrogate.learned import Learned
+
+from .tool import Blade, Probe
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The distance from tip to tumour.
+
+    Parameters
+    ----------
+    distance
+        [m].
+    bound
+        With probability 0.95 the finite elements' distance is no farther off [m]; None where nothing is promised.
+    """
+
+    distance: float
+    bound: float | None
+
+    def __str__(self) -> str:
+        promised = "" if self.bound is None else f" +- {1e3 * self.bound:.1f}"
+        return f"{1e3 * self.distance:.1f}{promised} mm"
+
+
+def reading(
+    deformer: Deformer, loads: Loads, answer: Deformation, tool: Probe | Blade | None, lift: float = 0.0
+) -> Reading | None:
+    """Read the distance in the first load case of a deformer's answer; None where no round tool pushes or is moved.
+
+    Of finite elements it is their own and has no bound. A learnt model promises nothing outside what it was taught.
+
+    Parameters
+    ----------
+    answer
+        Of the open cortex and the tumour at least.
+    lift
+        How far [m] an idle tool that pushes is drawn off the tissue.
+
+    Raises
+    ------
+    InputError
+        An answer without open cortex or tumour.
+    """
+    if not isinstance(tool, Probe) or (loads.of(Pushed) is None and loads.of(Touching) is None):
+        return None
+    if not isinstance(deformer, Learned):
+        gauge = tip_gauge(deformer.anatomy)
+        return Reading(float(gauge.distances(loads, answer.displacement, answer.nodes, tool.radius, lift)[0]), None)
+    found = deformer.distance(loads, answer, lift)
+    promised = float(found.bound[0, 0])
+    kept = answer.outcome[0].good and promised < float("inf")
+    return Reading(float(found.value[0]), promised if kept else None)
