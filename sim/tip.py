@@ -87,7 +87,7 @@ class TipGauge:
             Loads of another kind, poses of a ball of unknown radius, vertices that are missing, an anatomy without
             tumour, or a ball that passes the open cortex by.
         """
-        if not len(self._tumour[0]):
+        if not len(self.anatomy.tumour_nodes):
             raise InputError("the anatomy has no tumour, from which a tip had a distance: make one that has.")
         row = np.full(len(self.anatomy.mesh.nodes), -1)
         row[nodes] = np.arange(len(nodes))

@@ -62,7 +62,7 @@ class Bound:
 
 
 def fitted_bound(
-    seen: tuple[np.ndarray, np.ndarray], features: np.ndarray, force: np.ndarray, error: np.ndarray
+    seen: tuple[np.ndarray, np.ndarray], features: np.ndarray, force: np.ndarray, error: np.ndarray, each: int = CLASS
 ) -> Bound:
     """A bound whose scale follows what was `seen`, calibrated on other loads.
 
@@ -72,6 +72,8 @@ def fitted_bound(
         Features (m, f) and largest errors (m,) [m] of loads that the model was not taught.
     features, force, error
         (n, f), (n,) [N] and errors (n, k) [m] at each vertex, of the calibration loads.
+    each
+        Calibration loads of a class of force, at least: fewer than 99 promise nothing at 0.99.
     """
     mean, deviation = standardisation(seen[0])
     design = _monomials(_standard(seen[0], mean, deviation))
@@ -81,7 +83,7 @@ def fitted_bound(
     weights = np.linalg.solve(design.T @ design + penalty, design.T @ wanted)
     worst = error.max(axis=1)
     ratio = worst / np.exp(_monomials(_standard(features, mean, deviation)) @ weights)
-    count = int(np.clip(len(ratio) // CLASS, 1, CLASSES))
+    count = int(np.clip(len(ratio) // each, 1, CLASSES))
     edges = np.unique(np.quantile(force, np.arange(1, count) / count))
     edges = edges[edges < force.max()]  # equal forces are of one class
     count, member = len(edges) + 1, np.searchsorted(edges, force)

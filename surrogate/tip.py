@@ -14,8 +14,8 @@ from .gp import Gp
 from .patch import Patch
 from .remainder import with_pressing
 
-# Of the taught loads, so many are conditioned on at most.
-MOST = 2000
+# Of the taught loads, so many tell the process's lengths, and so many it is conditioned on, at most.
+ROWS, MOST = 300, 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Distance:
     bound: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class TipModel:
     """What is learnt of the distance itself.
 
@@ -72,4 +72,6 @@ def fitted_correction(patch: Patch, pushed: Pushed, off: np.ndarray) -> Gp | Non
     some = magnitude > 0.0
     if not some.any():
         return None
-    return Gp(most=MOST).fit(correction_features(patch, pushed)[some], (off[some] / magnitude[some])[:, None])
+    return Gp(rows=ROWS, most=MOST).fit(
+        correction_features(patch, pushed)[some], (off[some] / magnitude[some])[:, None]
+    )

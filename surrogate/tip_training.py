@@ -15,6 +15,10 @@ from .learned import Learned
 from .patch import Patch
 from .tip import MOST, TipModel, fitted_correction
 
+# Calibration loads of a class of force. A tip snaps through with the cortex, so that the tail of its errors grows with
+# the force: classes are as small as 99 in 100 allows.
+CLASS = 100
+
 
 @dataclass(frozen=True, eq=False)
 class Measured:
@@ -71,5 +75,5 @@ def calibrated_distance(
     """
     assert model.tip is not None
     force = directions(model.asked(known.loads))[0]
-    bound = fitted_bound(seen, features, force, distance_errors(model, known)[:, None])
+    bound = fitted_bound(seen, features, force, distance_errors(model, known)[:, None], CLASS)
     return replace(model, tip=replace(model.tip, bound=bound))

@@ -1,0 +1,215 @@
+"""The distance from tip to tumour: measured as the tool is drawn, learnt with a correction, bounded and stored."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from scenes.reading import Reading, reading
+from scenes.shipped import template_path
+from scenes.theatre import model_path
+from scenes.tool import Blade, Probe
+from sim.deformation import Outcome
+from sim.errors import InputError
+from sim.loads import Loads, Pushed, Touching
+from sim.meshfile import read_anatomy
+from sim.open_cortex import open_cortex
+from sim.tip import tip_gauge
+from surrogate.bound import features_of
+from surrogate.coverage import distance_coverage
+from surrogate.dataset import read_dataset
+from surrogate.envelope import measured
+from surrogate.learned import only_pushed
+from surrogate.patch import open_patch
+from surrogate.poses import draw_poses
+from surrogate.sampling import draw
+from surrogate.simulate import simulate
+from surrogate.store import load, save
+from surrogate.tip import TipModel
+from surrogate.tip_training import calibrated_distance, distance_errors, measured_distances
+from surrogate.train import train
+
+
+@pytest.fixture(scope="module")
+def gauge(box):
+    return tip_gauge(box)
+
+
+@pytest.fixture(scope="module")
+def trained(pretender, tmp_path_factory):
+    path = tmp_path_factory.mktemp("tip") / "data.h5"
+    simulate(path, pretender, draw("palpation", pretender.anatomy, 800, 0), {"preset": "palpation"})
+    return train(read_dataset(path), ["linear"])
+
+
+@pytest.fixture(scope="module")
+def model(trained):
+    return trained.models["linear"]
+
+
+@pytest.fixture(scope="module")
+def fresh(pretender, gauge):
+    """Loads that no model saw, and the truth."""
+    loads = draw("palpation", pretender.anatomy, 300, 7)
+    answer = pretender.deform(loads)
+    return loads, gauge.distances(loads, answer.displacement, answer.nodes)
+
+
+class Proportional:
+    """A Deformer that answers every load as its thousandth, a thousand times."""
+
+    def __init__(self, pretender):
+        self.anatomy, self.pretender = pretender.anatomy, pretender
+
+    def deform(self, loads, start=None, at=None):
+        answer = self.pretender.deform(loads.scaled(1e-3), start, at)
+        return replace(answer, displacement=1e3 * answer.displacement)
+
+
+def surface(positions, triangles):
+    return trimesh.Trimesh(positions, triangles, process=False)
+
+
+def test_it_is_measured_from_a_ball_that_rests_on_the_deformed_cortex(box, pretender, gauge):
+    loads = draw("palpation", box, 6, 3)
+    answer = pretender.deform(loads)
+    pushed, axis = only_pushed(loads), open_cortex(box).axis
+    found = gauge.distances(loads, answer.displacement, answer.nodes)
+    lifted = gauge.distances(loads, answer.displacement, answer.nodes, lift=2e-3)
+    for row in range(6):
+        moved = box.mesh.nodes + answer.displacement[row]
+        cortex = surface(box.mesh.nodes, box.open_surface)
+        at, _, triangle = trimesh.proximity.closest_point_naive(cortex, pushed.point[row][None])
+        share = trimesh.triangles.points_to_barycentric(cortex.triangles[triangle], at)[0]
+        middle = share @ moved[box.open_surface[triangle[0]]]
+        # Bisection: as far down as the ball enters nothing.
+        high, low, radius = -0.05, 0.02, pushed.footprint[row]
+        after = surface(moved, box.open_surface)
+        for _ in range(40):
+            half = 0.5 * (high + low)
+            away = trimesh.proximity.closest_point_naive(after, (middle + half * axis)[None])[1][0]
+            high, low = (half, low) if away > radius else (high, half)
+        tip = middle + (high + radius) * axis
+        tumour = surface(moved, box.tumour_surface)
+        to = trimesh.proximity.closest_point_naive(tumour, np.stack([tip, tip - 2e-3 * axis]))[1]
+        assert found[row] == pytest.approx(to[0], abs=1e-8) and lifted[row] == pytest.approx(to[1], abs=1e-8)
+
+
+def test_of_a_pose_the_tip_is_where_the_pose_has_it(box, gauge):
+    loads = draw_poses("palpation", box, 5, 0, 6e-3)
+    still = np.zeros((5, len(gauge.nodes), 3))
+    touching = loads.of(Touching)
+    assert touching is not None
+    pose = touching.pose[:, 0]
+    tip = pose[:, :3, 3] + 6e-3 * pose[:, :3, 2] + 6e-3 * open_cortex(box).axis
+    away = trimesh.proximity.closest_point_naive(surface(box.mesh.nodes, box.tumour_surface), tip)[1]
+    assert gauge.distances(loads, still, gauge.nodes, 6e-3) == pytest.approx(away, abs=1e-12)
+    with pytest.raises(InputError, match="no ball of known radius"):
+        gauge.distances(loads, still, gauge.nodes)
+
+
+def test_what_it_needs_it_asks_for(box, gauge, fresh):
+    loads = fresh[0].rows(slice(0, 1))
+    nodes = box.tumour_nodes
+    with pytest.raises(InputError, match="ask for the open cortex and the tumour"):
+        gauge.distances(loads, np.zeros((1, len(nodes), 3)), nodes)
+    whole = replace(box, mesh=replace(box.mesh, region=np.ones(len(box.mesh.tets), int)))
+    with pytest.raises(InputError, match="has no tumour"):
+        tip_gauge(whole).distances(loads, np.zeros((1, len(box.mesh.nodes), 3)), np.arange(len(box.mesh.nodes)))
+
+
+def test_the_bound_holds_as_often_as_it_says(model, fresh):
+    found = distance_coverage(model, *fresh)
+    assert 0.92 <= found.held[0] <= 0.99 and found.held[1] >= found.held[0]
+    # It follows the load: bounds of one size would be the 95th percentile for all.
+    told = model.distance(fresh[0])
+    error = np.abs(told.value - fresh[1])
+    assert np.median(told.bound[0]) < 0.7 * np.quantile(error, 0.95)
+
+
+def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, gauge):
+    def known(count, seed):
+        loads = draw("palpation", pretender.anatomy, count, seed)
+        answer = pretender.deform(loads)
+        return measured_distances(gauge, loads, answer.displacement, answer.nodes, None)
+
+    def features(some):
+        pushed = model.asked(some.loads)
+        return features_of(pushed, measured(open_patch(model.anatomy), pushed))
+
+    scale, kept, later = known(200, 20), known(1000, 21), known(1000, 22)
+    bounded = calibrated_distance(model, (features(scale), distance_errors(model, scale)), features(kept), kept)
+    found = distance_coverage(bounded, later.loads, later.distance)
+    assert 0.93 <= found.held[0] <= 0.97 and min(found.tenths) > 0.87 and found.held[1] > 0.975
+
+
+def test_the_correction_brings_distances_nearer(model, fresh):
+    plain = replace(model, tip=None).distance(fresh[0])
+    assert np.isnan(plain.bound).all()
+    off, left = (np.abs(told.value - fresh[1]).mean() for told in (plain, model.distance(fresh[0])))
+    assert left < 0.5 * off
+
+
+def test_a_correction_that_does_not_help_is_left_out(box, pretender, tmp_path):
+    """Of tissue that gives in proportion the table of compliances knows all."""
+    linear = Proportional(pretender)
+    simulate(tmp_path / "data.h5", linear, draw("palpation", box, 120, 0), {"preset": "palpation"})
+    model = train(read_dataset(tmp_path / "data.h5"), ["linear"]).models["linear"]
+    loads = draw("palpation", box, 20, 5)
+    answer, gauge = linear.deform(loads), tip_gauge(box)
+    truth = gauge.distances(loads, answer.displacement, answer.nodes)
+    assert np.abs(model.distance(loads).value - truth).max() < 2e-5
+
+
+def test_without_a_push_nothing_is_off_and_far_outside_the_bound_is_wide(model, fresh):
+    loads = fresh[0].rows(slice(0, 20))
+    idle = model.distance(loads.scaled(0.0))
+    still = np.zeros((20, len(model.nodes), 3))
+    assert np.array_equal(idle.value, tip_gauge(model.anatomy).distances(loads, still, model.nodes))
+    assert (idle.bound == 0.0).all()
+    strong = model.distance(loads.scaled(4.0))
+    assert (strong.bound[0] > 2.0 * model.distance(loads).bound[0]).all() and (strong.value >= 0.0).all()
+
+
+def test_an_answer_at_hand_is_taken(model, fresh):
+    loads = fresh[0].rows(slice(0, 3))
+    answer = model.deform(loads, at=tip_gauge(model.anatomy).nodes)
+    given, asked = model.distance(loads, answer), model.distance(loads)
+    assert given.value == pytest.approx(asked.value, abs=1e-9) and np.array_equal(given.bound, asked.bound)
+
+
+def test_the_store_keeps_it(model, fresh, tmp_path):
+    bare = replace(model, tip=None)
+    save(tmp_path / "m.npz", {"whole": model, "bare": bare, "none": replace(model, tip=TipModel())})
+    models = load(tmp_path / "m.npz", model.anatomy)
+    for found, expected in ((models["whole"], model), (models["bare"], bare)):
+        one, other = found.distance(fresh[0]), expected.distance(fresh[0])
+        assert np.array_equal(one.value, other.value) and np.array_equal(one.bound, other.bound, equal_nan=True)
+    assert models["bare"].tip is None and models["none"].tip == TipModel()
+
+
+def test_models_of_before_answer_without_a_bound():
+    anatomy = read_anatomy(template_path())
+    model = load(model_path(template_path()), anatomy)["series-gp"]
+    at = open_cortex(anatomy).place()
+    loads = Loads((Pushed(at.point[None], 0.1 * at.inward[None], np.array([7e-3])),))
+    told = model.distance(loads)
+    assert 5e-3 < told.value[0] < 12e-3
+    if model.tip is None:
+        assert np.isnan(told.bound).all()
+
+
+def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender, gauge, fresh):
+    loads, tool = fresh[0].rows(slice(2, 3)), Probe()
+    answer, truth = model.deform(loads), pretender.deform(loads)
+    found = reading(model, loads, answer, tool)
+    told = model.distance(loads)
+    assert found == Reading(told.value[0], told.bound[0, 0])
+    assert reading(pretender, loads, truth, tool) == Reading(fresh[1][2], None)
+    plain = replace(model, tip=None).distance(loads).value[0]
+    outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
+    assert reading(model, loads, outside, tool) == Reading(told.value[0], None)
+    assert reading(replace(model, tip=None), loads, answer, tool) == Reading(plain, None)
+    assert reading(model, loads, answer, Blade()) is None and reading(model, loads, answer, None) is None
+    assert str(Reading(5.53e-3, 0.62e-3)) == "5.5 +- 0.6 mm" and str(Reading(5.53e-3, None)) == "5.5 mm"
