@@ -299,6 +299,8 @@ def test_stored_models_answer_alike(trained, box, fresh, tmp_path):
         assert again[name].bound == model.bound and dict(again[name].training) == dict(model.training)
     with np.load(path, allow_pickle=False) as file:
         assert json.loads(str(file["header"]))["anatomy"] == box.digest
+    # Of the distance from tip to tumour each model knows its own.
+    save(path, {name: replace(model, tip=None) for name, model in trained.models.items()})
     with zipfile.ZipFile(path) as archive:
         shared = [entry for entry in archive.namelist() if entry != "header.npy"]
     assert len(shared) == len(set(shared)) < 2 * 4 * len(LEARNERS) + 30
