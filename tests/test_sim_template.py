@@ -124,6 +124,17 @@ def test_the_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
     assert fast.held.all(axis=1).sum() + fast.craniotomy.sum() == len(np.unique(fast.mesh.surface))
 
 
+def test_the_skull_slides_on_the_gradient_of_a_gaussian_of_6_mm(anatomy):
+    """The definition, summed over all triangles: their inward area vectors, weighed by distance."""
+    mesh, skull = anatomy.mesh, anatomy.slide_normal.any(axis=1)
+    corners = mesh.nodes[mesh.surface]
+    area = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    squared = ((mesh.nodes[skull][:, None] - corners.mean(axis=1)) ** 2).sum(axis=2)
+    gradient = np.exp(-squared / (2.0 * 6e-3**2)) @ area
+    wanted = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+    assert np.degrees(np.arccos((anatomy.slide_normal[skull] * wanted).sum(axis=1).min())) < 1.0
+
+
 def test_what_cannot_be_placed_is_refused(subject):
     for values, reason in (
         ({"radius": 0.05}, "radius of 50 mm is outside"),

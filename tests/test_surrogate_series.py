@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import make_box
 
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import NodalForce, pushed_effects
@@ -17,6 +18,7 @@ from surrogate.parts import COARSE, EXPANDED, FINE, Expansion, Lesson
 from surrogate.patch import open_patch
 from surrogate.series import ORDERS, SPANS, Series, forms
 from surrogate.simulate import simulate
+from surrogate.split import Split
 from surrogate.store import load, save
 from surrogate.tabulate import radii_between, tabulated, with_middles
 from surrogate.train import learners_for, train
@@ -114,13 +116,17 @@ def _first_order(series, loads, patch):
     return series.predict(tool_features(patch, weak)) * size[:, None]
 
 
-@pytest.fixture(scope="module")
-def data(box, tmp_path_factory):
-    path = tmp_path_factory.mktemp("series") / "data.h5"
+def simulated(path, box):
+    """160 pushes of one ball on a box."""
     fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     loads = Loads((pushes(open_patch(box), 160, 5, (7e-3, 7e-3), 0.25),))
     simulate(path, fem, loads, {"tissue": tissue_to_json(TISSUE), "element": "p1"})
     return read_dataset(path)
+
+
+@pytest.fixture(scope="module")
+def data(box, tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp("series") / "data.h5", box)
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +155,16 @@ def test_a_series_beats_the_table_of_first_order(trained):
     linear, series, learnt = trained.scores
     # A hundred loads teach the process nothing yet: it must do no harm.
     assert series.mean_mm < 0.2 * linear.mean_mm and learnt.mean_mm < 1.5 * series.mean_mm
+
+
+def test_on_known_cortex_the_process_halves_what_the_series_leaves(tmp_path):
+    """Nine open nodes and 120 loads among them: every fourth load is tested, wherever it lies."""
+    small = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=15e-3)
+    data = simulated(tmp_path / "data.h5", small)
+    fourth = np.where(np.arange(data.good.sum()) % 4 == 3, 0, -1)
+    split = Split(np.zeros((1, 3)), 1.0, fourth, 1.0)
+    series, learnt = train(data, EXPANDED, split=split, expansion=Expansion(data, "cpu")).scores
+    assert learnt.mean_percent < 0.6 * series.mean_percent
 
 
 def test_the_cortex_moves_as_the_finite_elements_say(trained, data, box, patch):
