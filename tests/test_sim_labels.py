@@ -240,3 +240,33 @@ def test_a_brain_that_the_volume_cuts_is_said_to_be_cut(tmp_path):
     plane = labels.shape[2] // 2 + 18
     cut = volume_subject(save(tmp_path / "cut.nii", labels[..., :plane], affine), (1,), (3,))
     assert any(f"{(labels[..., plane - 1] > 0).sum()} voxels of the brain lie on" in note for note in cut.notes)
+
+
+@pytest.mark.parametrize(("unit", "per_millimetre"), [("meter", 1e-3), ("micron", 1e3), ("unknown", 1.0)])
+def test_a_file_in_other_units_holds_the_same_brain(tmp_path, unit, per_millimetre):
+    affine, places = grid(AFFINES["thick slices"])
+    labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
+    image = nibabel.Nifti1Image(labels, np.diag([*[per_millimetre] * 3, 1.0]) @ affine)
+    image.header.set_xyzt_units(unit)
+    nibabel.save(image, tmp_path / "other.nii")
+    here = volume_subject(save(tmp_path / "mm.nii", labels, affine), (1,), (3,))
+    there = volume_subject(tmp_path / "other.nii", (1,), (3,))
+    assert there.tumour_volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.05)
+    for name in ("site", "cortex", "interface", "tumour_volume"):
+        np.testing.assert_allclose(getattr(there, name), getattr(here, name), rtol=1e-5, atol=1e-8)
+    points = MIDDLE + AXES * np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
+    np.testing.assert_allclose(there.brain(points), here.brain(points), atol=1e-7)
+
+
+def test_intensities_are_read_where_their_own_affine_says(tmp_path):
+    """One bright voxel on a grid that is turned and finer along one axis than the labels'."""
+    path, labels, _ = labelled(tmp_path / "labels.nii", AFFINES["thick slices"])
+    affine, places = grid(AFFINES["oblique and negative"])
+    grey = np.full(places.shape[:3], 20.0, np.float32)
+    bright = tuple(np.array(grey.shape) // 2 + [9, -5, 7])
+    grey[bright] = 100.0
+    assert grey.shape != labels.shape
+    nibabel.save(nibabel.Nifti1Image(grey, affine), tmp_path / "t1.nii")
+    subject = volume_subject(path, (1, 2), (3, 4), tmp_path / "t1.nii")
+    beside = places[bright] + 1e-3 * np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, -4.0, 0.0], [0.0, 0.0, 4.0]])
+    np.testing.assert_allclose(255.0 * subject.intensity.at(beside), [100.0, 20.0, 20.0, 20.0], rtol=1e-3)
