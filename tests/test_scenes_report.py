@@ -5,19 +5,20 @@ import json
 import re
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 from conftest import make_box
 
 from ar.screen import read_png
-from scenes import report, report_reference
+from scenes import report, report_learner, report_reference
 from scenes.cli import main
 from scenes.commands import report as command
 from scenes.peak import peak_memory
 from scenes.report import UNBUILT, every, learners, rows, star
 from scenes.report_adapt import debulked, debulked_study, simulate_debulked, simulating_seconds
 from scenes.report_elements import OWN, Elements
-from scenes.report_learner import Learner, counts
+from scenes.report_learner import Learner, counts, measure_learner
 from scenes.report_page import Section, write_report
 from scenes.report_plots import against_time, front
 from scenes.report_reference import beyond_of, reference_of, solve_beyond, solve_reference
@@ -31,12 +32,15 @@ from sim.fem import Fem
 from sim.loads import Pushed
 from sim.material import Material, tissue_to_json
 from sim.meshfile import write_anatomy
+from sim.threads import one_thread
 from surrogate.dataset import read_dataset
+from surrogate.encode import directions, reduce, tool_features
 from surrogate.envelope import envelope_of
-from surrogate.parts import EXPANDED
-from surrogate.published import published_nodes
+from surrogate.parts import COARSE, EXPANDED
+from surrogate.published import from_angles, published_nodes, sites_of, thirteen, to_angles
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
+from surrogate.svr import Svr
 from surrogate.train import train
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
@@ -110,6 +114,56 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
     assert np.allclose([*discs["mm"].values(), *discs["percent"].values()], wanted, rtol=1e-5)
     assert discs["loads"] == test.sum() and discs["values"] == test.sum() * len(box.tumour_nodes)
     assert stored[2]["taught"] == study.discs.taught.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
+
+
+@pytest.mark.parametrize("name", ["svr", "published-svr"])
+def test_a_learner_is_held_to_loads_that_it_was_not_taught(study, box, tmp_path, name, monkeypatch):
+    """Fitted here to the taught rows; in the file that the report reads, answers to the discs' loads are wild."""
+    taught, pushed, nodes = study.discs.taught, study.pushed, Learner(name).vertices(box)
+    truth = study.dataset.displacement(nodes)[study.dataset.good]
+    path = tmp_path / "data.h5"
+    path.write_bytes(study.data.read_bytes())
+    with h5py.File(path, "r+") as file:
+        stored = file["answers/displacement"]
+        wild = np.random.default_rng(0).normal(scale=1e-2, size=stored.shape[1:])
+        for load in np.flatnonzero(study.dataset.good)[study.discs.test]:
+            stored[load] = wild
+    monkeypatch.setattr(report_learner, "counts", lambda most: [])
+    monkeypatch.setattr(report_learner, "_covered", lambda *known: {})
+    with one_thread():
+        row, field = measure_learner(replace(study, data=path), Learner(name))
+    lesson = Pushed(pushed.point[taught], pushed.force[taught], pushed.footprint[taught])
+    if name == "svr":
+        size, (every, direction) = directions(lesson)[0], directions(pushed)
+        basis = reduce(nodes, truth[taught] / size[:, None, None], *COARSE)
+        machine = Svr().fit(tool_features(study.patch, lesson), basis.encode(truth[taught] / size[:, None, None]))
+        within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
+        guess = every[:, None, None] * basis.decode(machine.predict(tool_features(study.patch, within)))
+    else:
+        learnt, asked = (thirteen(*sites_of(box, nodes), each) for each in (lesson, pushed))
+        angles = to_angles(truth[taught].astype(float))
+        told = [Svr().fit(x, angles[:, k]).predict(asked[k]) for k, x in enumerate(learnt)]
+        guess = from_angles(np.stack(told, axis=1).astype(float))
+    played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.played.of(Pushed).point]
+    np.testing.assert_allclose(field, guess[played], rtol=1e-3, atol=1e-9)
+    wanted = 1e3 * np.linalg.norm(guess[study.discs.test] - wild[nodes], axis=2)
+    mm = row.teacher["discs"].mm
+    assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
+    assert row.taught == taught.sum()
+
+
+def test_what_is_played_lies_in_the_discs_alone(study):
+    every = replace(study, loads=10_000).played.of(Pushed)
+    some, split = study.played.of(Pushed), study.discs
+    assert len(every.point) == split.test.sum() and len(some.point) == 2
+    for pushed in (every, some):
+        into = np.linalg.norm(pushed.point[:, None] - split.centres, axis=2).min(axis=1)
+        assert into.max() <= split.radius
+        assert not np.isin(pushed.point[:, 0], study.pushed.point[split.taught, 0]).any()
+    taught = np.linalg.norm(study.pushed.point[split.taught][:, None] - split.centres, axis=2).min(axis=1)
+    assert taught.min() > split.radius
+    force, size = (np.linalg.norm(each.force, axis=1) for each in (some, every))
+    assert list(force) == [size.min(), size.max()]
 
 
 def test_rows_say_what_they_are(found, box):

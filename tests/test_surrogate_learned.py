@@ -6,6 +6,7 @@ import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from sim.deformation import Deformer, Outcome
 from sim.errors import InputError
 from sim.loads import Displaced, Loads, Nodal, Posture, Pushed, push
 from surrogate.bound import features_of, fitted_bound
+from surrogate.coverage import coverage
 from surrogate.dataset import read_dataset
 from surrogate.envelope import measured
 from surrogate.learned import Learned
@@ -73,10 +75,12 @@ def test_no_force_no_motion_and_weak_loads_in_proportion(model, fresh):
     assert model.deform(fresh.scaled(0.0)).outcome[0] is Outcome.PREDICTED
 
 
-def test_learners_beat_no_motion_and_the_residual_beats_its_table(trained):
+def test_learners_are_as_near_as_they_were(trained):
+    """Each within a fifth to a third of what it scored when this was written; the table does not depend on luck."""
     mean = {row.name: row.mean_percent for row in trained.scores}
-    assert mean["linear"] < 25.0 and mean["svr"] < 25.0 and mean["ann"] < 8.0
-    assert mean["residual"] < 0.5 * mean["linear"]
+    assert mean["linear"] == pytest.approx(6.88, rel=0.01)
+    known = {"pcr": 16.0, "ann": 3.0, "svr": 13.5, "gp": 1.3, "residual": 0.4}
+    assert {name for name, most in known.items() if mean[name] > most} == set()
     assert winner(trained.scores).mean_mm == min(row.mean_mm for row in trained.scores)
 
 
@@ -93,6 +97,47 @@ def test_no_load_of_a_left_out_disc_is_learnt(trained, scored, data):
         assert distance.min() > split.radius * (1 - 1e-5)
         assert len(model.envelope.points) == split.taught.sum()
     assert len(split.test) == data.good.sum() < len(data.loads)  # failed cases are neither learnt nor scored
+
+
+def poisoned(data, rows, folder):
+    """The same data, but for wild answers in some `rows` of those that converged."""
+    path = folder / "poisoned.h5"
+    path.write_bytes(data.path.read_bytes())
+    with h5py.File(path, "r+") as file:
+        stored = file["answers/displacement"]
+        wild = np.random.default_rng(0).normal(scale=1e-2, size=stored.shape[1:])
+        for row in np.flatnonzero(data.good)[rows]:
+            stored[row] = wild
+    return read_dataset(path)
+
+
+def arrays_of(model):
+    """All that a model's parts hold."""
+    for part in model.parts:
+        yield from (part.basis.nodes, part.basis.modes, *part.regressor.state().values())
+
+
+def test_no_answer_to_a_held_out_load_reaches_a_scored_model(trained, scored, data, tmp_path):
+    """Bit for bit: wild answers to the loads of the discs and to those apart change scores alone."""
+    again = train(poisoned(data, ~trained.split.taught, tmp_path), ["linear", "pcr", "svr"], split=trained.split)
+    for row in again.scores:
+        known, taught = scored.models[row.name], again.models[row.name]
+        for before, after in zip(arrays_of(known), arrays_of(taught), strict=True):
+            assert np.array_equal(before, after), row.name
+        assert row.mean_mm > 5.0
+
+
+def test_no_answer_that_calibrates_reaches_a_model(trained, data, tmp_path):
+    """Bit for bit; the bounds themselves must follow."""
+    apart = np.arange(data.good.sum()) >= data.good.sum() - trained.calibrated
+    again = train(poisoned(data, apart, tmp_path), ["linear", "svr"])
+    for name, model in again.models.items():
+        for before, after in zip(arrays_of(trained.models[name]), arrays_of(model), strict=True):
+            assert np.array_equal(before, after), name
+        assert model.bound == trained.models[name].bound
+        assert (model.bounds.quantile[0] > 10.0 * trained.models[name].bounds.quantile[0]).all()
+    before = {row.name: row.mean_mm for row in trained.scores}
+    assert [row.mean_mm for row in again.scores] == [before[name] for name in again.models]
 
 
 def test_what_is_used_was_taught_the_discs_too(trained, scored, data):
@@ -191,6 +236,24 @@ def test_scores_are_the_errors_of_the_held_out_loads(trained, scored, data, box)
     assert trained.motion == pytest.approx(motion.mean(), rel=1e-4)
     assert np.mean(miss.max(axis=1) <= model.bound * (1 + 1e-6)) >= 0.95
     assert row.mean_mm <= row.p95_mm <= row.p999_mm <= row.max_mm and row.microseconds > 0
+
+
+def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
+    """Of four loads in turn one misses by less than the bound at 95 %, two by less than that at 99 %, one by more."""
+    known = trained.models["linear"]
+    quantile = known.bounds.quantile[0] * np.array([[1.0], [2.0]])
+    model = replace(known, bounds=replace(known.bounds, quantile=quantile))
+    answer = model.deform(fresh, at=box.tumour_nodes)
+    miss = np.resize([0.9, 1.1, 1.9, 2.1], len(fresh)) * answer.bound[0]
+    truth = answer.displacement.copy()
+    truth[:, -1, 1] -= miss  # one vertex alone
+    found = coverage(model, fresh, truth)
+    assert found.held == (0.25, 0.75) and str(found).startswith("25.0 % at 95 %, 75.0 % at 99 %;")
+    assert found.bound_mm == pytest.approx(1e3 * np.median(answer.bound[0]))
+    assert found.error_mm == pytest.approx(1e3 * np.median(miss), rel=1e-4)
+    assert found.extrapolated == answer.outcome.count(Outcome.EXTRAPOLATED) and found.loads == len(fresh)
+    weakest = np.argsort(np.linalg.norm(fresh.of(Pushed).force, axis=1))
+    assert found.tenths == tuple((weakest[k : k + 6] % 4 == 0).mean() for k in range(0, 60, 6))
 
 
 def test_score_sees_a_shift(pretender, box, fresh):
