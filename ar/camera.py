@@ -77,7 +77,10 @@ class Camera:
         return (in_camera - self.T_camera_world[:3, 3]) @ self.T_camera_world[:3, :3]
 
     def perturbed(self, degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Camera:
-        """The same camera turned about its own centre by an angle [degree] round `axis` (camera frame)."""
+        """The same camera, before which the world is turned about its centre by an angle [degree].
+
+        Right-handed round `axis` (camera frame): round y, the default, what lies ahead moves to the right.
+        """
         direction = np.asarray(axis, np.float64) / np.linalg.norm(axis)
         turn = np.eye(4)
         turn[:3, :3] = cv2.Rodrigues(np.radians(degrees) * direction)[0]

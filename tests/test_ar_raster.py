@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ar.camera import Camera, look_at
-from ar.raster import rasterise
+from ar.raster import rasterise, rows_reached
 from ar.raycast import raycast
 
 NO_TRIANGLES = np.zeros((0, 3), int)
@@ -45,6 +45,17 @@ def test_it_sees_what_rays_see(seed):
     assert np.abs(drawn.depth - cast.depth)[seen].max() < 1e-6
     near_edge = drawn.weights.min(axis=-1) < 1e-3
     assert np.abs(drawn.weights - cast.weights)[seen & ~near_edge].max() < 2e-3
+
+
+@pytest.mark.parametrize("depth", [5e-4, 0.0, -5e-4, -0.2])
+def test_a_triangle_that_reaches_the_camera_may_cover_every_row(depth):
+    """Where a corner is nearer than the near plane, its own row says nothing: it may lie on the other side."""
+    here = camera(height=41)
+    corners = np.array([[-0.1, 0.02, 0.3], [0.1, 0.02, 0.3], [0.0, 0.02, depth]])
+    assert rows_reached(corners @ here.K.T, 1e-3, here.height) == (0, here.height)
+    behind = corners @ here.T_camera_world[:3, :3] + here.centre
+    drawn = rasterise(here, behind, np.array([[0, 1, 2]]))
+    assert drawn.mask[-1].any() and not drawn.mask[: here.height // 2].any()
 
 
 def test_a_closed_surface_has_no_cracks_and_the_same_depth_as_rays():

@@ -9,7 +9,7 @@ from theatres import PUSHING, on_template, small, template_theatre
 
 from ar.camera import project_cv2
 from scenes.lying import Lying
-from scenes.paths import Touch, draw, press, slide, smooth
+from scenes.paths import AIR, Touch, draw, lay, palpate, press, slide, smooth
 from scenes.scene import SCENES, Viewpoint, find_scene
 from scenes.site import site_of
 from scenes.stage import CORTEX, DRAPE, TOOL, Stage, clipped
@@ -83,6 +83,19 @@ class TestPaths:
         assert motion[0, 3] == 0.0 and (np.diff(motion[:, 3]) >= 0.0).all() and not motion[:, 4].any()
         held = motion[np.linspace(0.0, 2.5, 251) >= 1.5]
         assert np.allclose(held[:, 2], 0.3) and np.allclose(held[:, 3], 0.6)
+
+    def test_a_tool_is_laid_on_from_the_air_tilted_towards_x_and_stays(self):
+        path = lay(3e-3, tilt=0.4, rise=1.0, at=(0.002, -0.001))
+        assert path(-1.0).depth == path(0.0).depth == -AIR and path(0.5).depth == pytest.approx(0.5 * (3e-3 - AIR))
+        for time in (1.0, 5.0):
+            assert path(time) == Touch(0.002, -0.001, 0.0, (0.4, 0.0), pytest.approx(3e-3))
+
+    def test_palpation_comes_down_slides_and_lifts_off(self):
+        path = palpate(2e-3, START, END, seconds=2.0, rise=0.5)
+        assert path(0.0).depth == -AIR and path(3.0).depth == pytest.approx(-AIR)
+        for time, place in ((0.5, START), (1.5, np.mean([START, END], axis=0)), (2.5, END)):
+            touch = path(time)
+            assert (touch.x, touch.y, touch.depth) == pytest.approx((*place, 2e-3)) and touch.force == 0.0
 
     def test_a_path_is_a_function_of_time_alone(self):
         for path in PATHS.values():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -81,6 +82,12 @@ def test_regions_obey_the_same_law() -> None:
     assert found == {2: Material("neo-hookean", 9000.0, 0.3), -1: Material("neo-hookean", 500.0, 0.49)}
     found = regions_of(["7:500,2;300,-4;1e4"], MATERIALS["minutes"].tissue)
     assert found == {7: Ogden(((500.0, 2.0), (300.0, -4.0)), 1e4)}
+
+
+@pytest.mark.parametrize(("name", "text"), [("seconds", "2:9000,0.3"), ("minutes", "2:500,2;1e4")])
+def test_regions_relax_as_the_rest_does(name: str, text: str) -> None:
+    slow = replace(MATERIALS[name].tissue, prony=((0.3, 2.0),))
+    assert regions_of([text], slow)[2].prony == ((0.3, 2.0),)
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,14 @@ def test_the_crop_keeps_the_place_and_scales_to_white(tmp_path):
     assert sorted(tmp_path.iterdir()) == [path]
 
 
+def test_the_crop_reaches_15_mm_beyond_the_box_round_the_points():
+    """Voxels of 1 mm: one point has 15 to each side, the two of a trilinear value, and no more; less at the border."""
+    cube = Intensity(np.ones((60, 60, 60), np.float32), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+    crop = cube.around(np.array([[0.0302, 0.0302, 0.0502]]))
+    assert crop.values.shape == (32, 32, 25)
+    np.testing.assert_allclose(crop.affine[:3, 3], [0.015, 0.015, 0.035], atol=1e-12)
+
+
 def test_a_volume_elsewhere_or_black_is_refused(tmp_path):
     with pytest.raises(InputError, match="does not cover"):
         ramp().around(places([[400.0, 0.0, 0.0]]))
