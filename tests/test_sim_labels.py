@@ -136,6 +136,19 @@ def test_the_skull_is_not_opened_from_below(tmp_path):
     assert subject.site[2] >= low[2]
 
 
+def test_the_skull_is_opened_over_cortex_that_can_be_reached(tmp_path):
+    """A fissure as deep as the brain is half high runs beside the tumour: its wall is nearest, and out of reach."""
+    affine, places = grid(AFFINES["straight"])
+    middle = MIDDLE + [0.012, 0.0, 0.012]
+    fissure = (np.abs(places[..., 0] - MIDDLE[0] + 0.001) < 0.0025) & (places[..., 2] > MIDDLE[2])
+    labels = np.where(ball(places, middle, 0.007), 3, ellipsoid(places) & ~fissure)
+    subject = volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3,))
+    nearest = subject.cortex[np.linalg.norm(subject.cortex - middle, axis=1).argmin()]
+    assert np.linalg.norm((nearest - MIDDLE) / AXES) < 0.5 and not subject.notes
+    assert np.linalg.norm((subject.site - MIDDLE) / AXES) > 0.85
+    assert np.linalg.norm(subject.site - middle) < 0.035
+
+
 @pytest.mark.parametrize(
     ("brain", "tumour", "reason"),
     [
