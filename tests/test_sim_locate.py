@@ -22,3 +22,4 @@ def test_what_lies_outside_is_read_nearby():
     mesh = box((2, 2, 2), size=0.1)
     found = locate(mesh, np.array([[0.03, 0.04, 0.11]]))
     assert np.allclose(found.read(mesh.nodes[None]), [[[0.03, 0.04, 0.1]]], atol=0.01)
+    assert (found.weights >= 0.0).all() and np.allclose(found.weights.sum(axis=1), 1.0)
