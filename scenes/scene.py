@@ -44,8 +44,8 @@ UNDER = 6e-3
 class Viewpoint:
     """A camera by its place relative to the open cortex: from the side, for a tool moves a tumour mostly downwards.
 
-    distance [m] along the outward normal; tilt [rad] of the line of sight towards the site's `up`; vertical field of
-    view [rad]; size of the picture [pixel].
+    distance [m] from the site; tilt [rad] of the way to the camera, from the outward normal towards the site's `up`;
+    vertical field of view [rad]; size of the picture [pixel].
     """
 
     distance: float = 0.20

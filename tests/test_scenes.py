@@ -206,6 +206,14 @@ class TestCamera:
         aside = project_cv2(camera, (site.origin + 0.01 * site.right)[None])[0]
         assert above[1] < middle[1] - 10.0 and aside[0] > middle[0] + 10.0
 
+    @pytest.mark.parametrize("tilt", [-0.35, 0.0, 0.5])
+    def test_it_stands_as_far_and_as_high_as_asked(self, site, tilt):
+        camera = Viewpoint(distance=0.15, tilt=tilt, fov=0.4, width=200, height=100).camera(site)
+        away = camera.centre - site.origin
+        along = [away @ way for way in (-site.axis, site.up, site.right)]
+        assert along == pytest.approx([0.15 * np.cos(tilt), 0.15 * np.sin(tilt), 0.0], abs=1e-12)
+        assert (camera.vertical_fov, camera.width, camera.height) == (pytest.approx(0.4), 200, 100)
+
     @pytest.mark.parametrize("name", PUSHING)
     def test_cortex_drape_and_tool_are_seen(self, template, name):
         play = on_template(name)
