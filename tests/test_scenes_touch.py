@@ -123,6 +123,18 @@ class TestRetract:
         assert (np.diff(reads[held]) < 0.0).all() and reads[-1] < 0.9 * reads[held][0]
         assert reads[0] == 0.0 and all(frame.deformation.outcome[0].good for frame in frames)
 
+    @pytest.mark.parametrize("touch", [Touch(depth=-AIR), Touch(depth=3e-3), Touch(2e-3, -1e-3, 0.0, (0.5, 0.0), 3e-3)])
+    def test_the_blade_is_laid_on_clear_of_the_tissue_and_moved_to_where_the_hand_is(self, theatre, touch):
+        scene, site = small("retract"), theatre.site
+        cause = scene.loads(site, touch, 0.0).of(Retracted)
+        apart = distances_to(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)
+        upright = site.direction(touch) @ site.axis
+        assert apart.min() == pytest.approx(AIR * upright, abs=0.3e-3)
+        moved = cause.pose[0].copy()
+        moved[:3, 3] += cause.displacement[0]
+        np.testing.assert_allclose(moved, scene.pose(site, touch), atol=1e-15)
+        assert cause.displacement[0] == pytest.approx((AIR + touch.depth) * site.direction(touch))
+
 
 class TestPulsation:
     def test_the_ball_reads_the_pulse(self, theatre):
