@@ -13,6 +13,7 @@ from conftest import make_box
 from theatres import small, theatre_of
 
 from scenes.cli import main
+from scenes.retract import RELAXING
 from scenes.scene import Scene
 from scenes.site import site_of
 from scenes.theatre import Theatre, open_theatre
@@ -20,7 +21,7 @@ from scenes.truth import truth_of
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
 from sim.discretisation import RECOMMENDED
-from sim.effects import Elasticity
+from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN, Material, Tissue
@@ -114,6 +115,21 @@ def test_models_are_judged_with_what_they_were_taught(box, body, tmp_path) -> No
     right = Fem(box, (Elasticity(STIFF), *others), TRAIN, "cpu", element="smoothed").deform(loads[0])
     found = truth_of(theatre, scene, loads)
     assert np.array_equal(found.displacement, right.displacement) and found.displacement.any()
+
+
+def test_the_truth_of_a_frame_knows_what_went_before() -> None:
+    """Tissue that relaxes: pressed, held and all but let go, it is not where it was never pressed."""
+    anatomy = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
+    theatre = Theatre(anatomy, None, {}, "cpu")
+    scene = replace(small(), effects=(Elasticity(RELAXING), Held(), Slide(), ToolForce()), element="p1")
+    moments = ((1.5, 0.5), (1.5, 2.0), (0.5, 2.2))
+    loads = [scene.loads(theatre.site, scene.path(moment), time) for moment, time in moments]
+    found, fem, last = truth_of(theatre, scene, loads).displacement, theatre.fem(scene, TRAIN), None
+    for row, load in zip(found, loads, strict=True):
+        last = fem.deform(load, start=last)
+        np.testing.assert_allclose(row, last.displacement[0], atol=1e-9)
+    alone = fem.deform(loads[2]).displacement[0]
+    assert np.linalg.norm(found[2] - alone) > 0.1 * np.linalg.norm(alone)
 
 
 def test_the_scene_names_tissue_and_element(box) -> None:

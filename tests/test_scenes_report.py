@@ -11,7 +11,7 @@ import pytest
 from conftest import make_box
 
 from ar.screen import read_png
-from scenes import report, report_learner, report_reference
+from scenes import report, report_learner, report_reference, report_row
 from scenes.cli import main
 from scenes.commands import report as command
 from scenes.peak import peak_memory
@@ -21,8 +21,8 @@ from scenes.report_elements import OWN, Elements
 from scenes.report_learner import Learner, counts, measure_learner
 from scenes.report_page import Section, write_report
 from scenes.report_plots import against_time, front
-from scenes.report_reference import beyond_of, reference_of, solve_beyond, solve_reference
-from scenes.report_row import Row, figures_of, row_from_json, row_to_json
+from scenes.report_reference import Truth, beyond_of, reference_of, solve_beyond, solve_reference
+from scenes.report_row import Row, against_reference, figures_of, row_from_json, row_to_json
 from scenes.report_rows import measured
 from scenes.report_series import series_seconds, tabulate_series
 from scenes.report_study import Study
@@ -196,6 +196,16 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     assert series_seconds(study, "linear") == 0.0
     assert row.teacher["discs"].mm.mean < 0.5 * measured(study, SPECS[2], tmp_path / "l.png").teacher["discs"].mm.mean
     assert {spec.name for spec in learners()} > set(EXPANDED)
+
+
+def test_only_loads_that_both_converged_for_are_compared(study, box, monkeypatch):
+    truth = Truth(np.full((2, len(study.drawn), 3), 1e-3), np.array([True, False]), np.ones(2))
+    monkeypatch.setattr(report_row, "reference_of", lambda study: truth)
+    answer = np.full((2, len(box.tumour_nodes), 3), [[[1e-3, 1e-3, 3e-3]], [[np.nan] * 3]])
+    for good, loads in (([True, True], 1), ([True, False], 1)):
+        figures = against_reference(study, answer, np.array(good), box.tumour_nodes)
+        assert figures.loads == loads and figures.mm.mean == pytest.approx(2.0) == figures.mm.largest
+    assert against_reference(study, answer, np.array([False, True]), box.tumour_nodes) is None
 
 
 def test_tenths_of_the_force_and_of_no_load_nothing():

@@ -118,8 +118,10 @@ def test_a_tool_of_two_cores_is_two_tools_that_move_as_one() -> None:
             return tuple(Core(np.array([x, 0.0, 6e-3]), np.zeros(3), 6e-3) for x in (0.0, self.apart))
 
     place, apart = np.array([0.025, 0.04, HEIGHT - 3e-3]), 0.03
-    pair = Fem(BLOCK, [Elasticity(SOFT), Held(), ToolContact((Pair(apart),))], REFERENCE, "cpu")
-    balls = Fem(BLOCK, [Elasticity(SOFT), Held(), ToolContact((Ball(6e-3), Ball(6e-3)))], REFERENCE, "cpu")
+    pair = Fem(BLOCK, [Elasticity(SOFT), Held(), ToolContact((Pair(apart),))], REFERENCE, "cpu", element="p1")
+    balls = Fem(
+        BLOCK, [Elasticity(SOFT), Held(), ToolContact((Ball(6e-3), Ball(6e-3)))], REFERENCE, "cpu", element="p1"
+    )
     one = pair.deform(Loads((Touching(at(*place)[None, None]),)))
     both = balls.deform(Loads((Touching(np.stack([at(*place), at(*place + [apart, 0.0, 0.0])])[None]),)))
     assert one.outcome == both.outcome == (Outcome.CONVERGED,)

@@ -65,7 +65,7 @@ class TestLaw:
             law = "relaxing yeoh"
             prony = ((0.5, 1.0),)
 
-        fem = Fem(BODY, (Elasticity(Relaxing(500.0, 500.0, 1e4)), Held(), ToolForce()), TRAIN, "cpu")
+        fem = Fem(BODY, (Elasticity(Relaxing(500.0, 500.0, 1e4)), Held(), ToolForce()), TRAIN, "cpu", element="p1")
         assert remember(fem.effects)
         at_once = fem.deform(Loads(PRESS.causes, np.zeros(2)))
         later = fem.deform(Loads(PRESS.causes, np.full(2, 3.0)), start=at_once)
@@ -264,7 +264,7 @@ class TestTwoTools:
 
     def test_frame_after_frame_goes_on_from_the_last(self):
         """Neither the way that a push came on nor a patch around it is followed: what is left answers both."""
-        fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), TRAIN, "cpu", live=True)
+        fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), TRAIN, "cpu", live=True, element="p1")
         last = None
         for size in (0.4, 0.7, 1.0):
             last = fem.deform(Loads(TOOLS).scaled(size).rows(slice(0, 1)), start=last)
@@ -275,7 +275,7 @@ class TestTwoTools:
         assert one.outcome[0].good
 
     def test_each_tool_has_its_reaction(self):
-        fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), TRAIN, "cpu")
+        fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), TRAIN, "cpu", element="p1")
         reaction = fem.deform(Loads(TOOLS)).reaction
         assert reaction.shape == (2, 2, 6)
         for number, tool in enumerate(TOOLS):

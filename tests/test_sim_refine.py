@@ -1,5 +1,7 @@
 """A mesh twice as fine is the same body."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from boxes import box as block
@@ -39,6 +41,12 @@ def test_what_holds_the_body_holds_it_still(box):
     # Free and not to be touched: on edges between an open and a held node.
     near = np.abs(np.linalg.norm(fine.mesh.nodes[surface[rim]], axis=1) - 25e-3)
     assert near.max() < 8e-3
+
+
+def test_what_is_held_or_slides_is_not_open_even_where_a_tool_was_let(box):
+    everywhere = np.isin(np.arange(len(box.mesh.nodes)), box.mesh.surface)
+    fine = refined(replace(box, craniotomy=everywhere))
+    assert fine.craniotomy.any() and not fine.held[fine.craniotomy].any()
 
 
 def test_a_quadratic_mesh_is_refused():

@@ -17,7 +17,7 @@ from sim.loads import Displaced, Loads, Nodal, Posture, Pushed, push
 from surrogate.bound import features_of, fitted_bound
 from surrogate.coverage import coverage
 from surrogate.dataset import read_dataset
-from surrogate.envelope import measured
+from surrogate.envelope import envelope_of, measured
 from surrogate.learned import Learned
 from surrogate.parts import EXPANDED
 from surrogate.patch import open_patch
@@ -322,6 +322,21 @@ def test_threads_that_share_a_model_get_their_own_answers(trained, fresh, name):
     with ThreadPoolExecutor(4) as pool:
         answers = list(pool.map(work, range(4)))
     assert all(np.array_equal(answer, wanted[k]) for k, answer in enumerate(sum(zip(*answers, strict=True), ())))
+
+
+def test_an_envelope_reaches_as_far_as_errors_were_measured(box):
+    """In place, by loads held out; in force, angle and radius, by those taught alone."""
+    patch = open_patch(box)
+    taught = push([[0.0, 0.0, 0.0], [10e-3, 0.0, 0.0]], [[0.0, 0.0, -0.1], [0.0, 0.0, -0.2]], [5e-3, 6e-3]).of(Pushed)
+    held = push([[13e-3, 0.0, 0.0], [0.0, 4e-3, 0.0]], [[0.3, 0.0, -0.9], [0.0, 0.0, -0.9]], [9e-3, 9e-3]).of(Pushed)
+    found = envelope_of(patch, taught, held)
+    assert found.reach == pytest.approx(4e-3) and np.allclose(found.points, taught.point)
+    overhang = held.footprint - patch.rim_distance(held.point)
+    assert found.overhang == pytest.approx(overhang.max()) and found.angle == pytest.approx(0.0, abs=1e-7)
+    assert (found.force, found.footprint) == ((0.1, 0.2), (5e-3, 6e-3)) and found.line_force == pytest.approx(
+        0.2 / 6e-3
+    )
+    assert not found.holds(patch, held).any() and found.holds(patch, taught).all()
 
 
 def test_held_out_loads_lie_inside_the_envelope(trained, data):

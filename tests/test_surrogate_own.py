@@ -44,7 +44,7 @@ def clean():
 def folder(tmp_path_factory, box):
     """A researcher's, outside the packages: data, the brain, and a copy of the example."""
     path = tmp_path_factory.mktemp("own")
-    fem = Fem(box, (Elasticity(), Held(), Slide(), ToolForce(), NodalForce()), TRAIN, "cpu")
+    fem = Fem(box, (Elasticity(), Held(), Slide(), ToolForce(), NodalForce()), TRAIN, "cpu", element="p1")
     simulate(path / "data.h5", fem, draw("palpation", box, 100, 0), {"preset": "palpation"})
     write_anatomy(path / "box.vtu", box)
     (path / "my_learner.py").write_text(NEAREST.read_text())
