@@ -11,18 +11,27 @@ import pytest
 from conftest import make_box
 
 from ar.screen import read_png
-from scenes import report, report_learner, report_reference, report_row
+from scenes import report, report_elements, report_learner, report_reference, report_row
 from scenes.cli import main
 from scenes.commands import report as command
 from scenes.peak import peak_memory
 from scenes.report import UNBUILT, every, learners, rows, star
 from scenes.report_adapt import debulked, debulked_study, simulate_debulked, simulating_seconds
-from scenes.report_elements import OWN, Elements
+from scenes.report_elements import HALVED, OWN, Elements
 from scenes.report_learner import Learner, counts, measure_learner
 from scenes.report_page import Section, write_report
 from scenes.report_plots import against_time, front
 from scenes.report_reference import Truth, beyond_of, reference_of, solve_beyond, solve_reference
-from scenes.report_row import Row, against_reference, figures_of, row_from_json, row_to_json
+from scenes.report_row import (
+    DIFFERENCE,
+    ERROR,
+    TOLERANCE_ALONE,
+    Row,
+    against_reference,
+    figures_of,
+    row_from_json,
+    row_to_json,
+)
 from scenes.report_rows import measured
 from scenes.report_series import series_seconds, tabulate_series
 from scenes.report_study import Study
@@ -313,6 +322,19 @@ def test_plans(study):
     product = every(study)
     assert len({spec.name for spec in product}) == len(product) == 4 * 3 * 2 * (3 + 5)
     assert counts(300) == [64, 128, 256] and counts(64) == []
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_what_has_the_reference_s_own_elements_is_off_by_its_tolerance_alone(study, fine):
+    here = replace(study, fine=fine)
+    said = {
+        (element, mesh): report_elements._against(here, Elements("it", element=element, mesh=mesh))
+        for element in ("p1", "p2")
+        for mesh in (OWN, HALVED)
+    }
+    alone = ("p2", HALVED if fine else OWN)
+    assert said.pop(alone) == TOLERANCE_ALONE and set(said.values()) == {ERROR}
+    assert report_elements._against(here, Elements("it", "linear", *alone)) == DIFFERENCE
 
 
 def test_what_cannot_be_had_is_a_row_that_says_why(study, tmp_path):
