@@ -20,7 +20,6 @@ from scenes.report_adapt import debulked, debulked_study, simulate_debulked, sim
 from scenes.report_elements import HALVED, OWN, Elements
 from scenes.report_learner import Learner, counts, measure_learner
 from scenes.report_page import Section, write_report
-from scenes.report_plots import against_time, front
 from scenes.report_reference import Truth, beyond_of, reference_of, solve_beyond, solve_reference
 from scenes.report_row import (
     DIFFERENCE,
@@ -28,7 +27,6 @@ from scenes.report_row import (
     TOLERANCE_ALONE,
     Row,
     against_reference,
-    figures_of,
     row_from_json,
     row_to_json,
 )
@@ -40,7 +38,6 @@ from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
 from sim.loads import Pushed
 from sim.material import Material, tissue_to_json
-from sim.meshfile import write_anatomy
 from sim.threads import one_thread
 from surrogate.dataset import read_dataset
 from surrogate.encode import directions, reduce, tool_features
@@ -217,17 +214,6 @@ def test_only_loads_that_both_converged_for_are_compared(study, box, monkeypatch
     assert against_reference(study, answer, np.array([False, True]), box.tumour_nodes) is None
 
 
-def test_tenths_of_the_force_and_of_no_load_nothing():
-    truth = np.ones((20, 2, 3))
-    force = np.arange(20.0)[::-1]
-    distance = np.column_stack([force, 3.0 * force]) * 1e-3
-    tenths = figures_of(distance, truth, force).tenths
-    assert [(tenth.least, tenth.greatest) for tenth in tenths] == [(2.0 * k, 2.0 * k + 1.0) for k in range(10)]
-    assert [tenth.mean for tenth in tenths] == pytest.approx([4.0 * k + 1.0 for k in range(10)])
-    assert [tenth.largest for tenth in tenths] == pytest.approx([6.0 * k + 3.0 for k in range(10)])
-    assert figures_of(distance[:0], truth[:0], force[:0]) is None
-
-
 def test_only_what_lacks_is_measured_again(study, found, tmp_path):
     """Stopped in the second row, begun again; then with other inputs; then with a file that is not whole."""
     here = replace(study, folder=tmp_path)
@@ -276,20 +262,6 @@ def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path, monkeypat
     coarse, finer = reference_of(one).displacement, reference_of(fine).displacement
     off = np.linalg.norm(coarse - finer, axis=2).mean() / np.linalg.norm(finer, axis=2).mean()
     assert 1e-3 < off < 0.3
-
-
-def test_the_front_is_what_nobody_beats():
-    figures = figures_of(np.ones((1, 1)), np.ones((1, 1, 3)), np.ones(1))
-
-    def row(name, time, error, against="error"):
-        mm = replace(figures.mm, mean=error)
-        return Row(name, "f", against=against, reference=replace(figures, mm=mm), median=time)
-
-    rows = [row("fast", 1.0, 9.0), row("near", 9.0, 1.0), row("between", 3.0, 3.0), row("beaten", 4.0, 3.0)]
-    rows += [row("slow", 10.0, 10.0), row("other law", 0.5, 0.5, "model difference")]
-    rows += [Row("none", "f", state="not built yet")]
-    assert front(rows) == {"fast", "near", "between"}
-    assert against_time(rows).std() > 5.0 and against_time(rows[-1:]) is None
 
 
 def test_the_page_needs_nothing_but_itself(page, found):
@@ -342,22 +314,6 @@ def test_what_cannot_be_had_is_a_row_that_says_why(study, tmp_path):
     assert "no element is called 'cube'" in row.state and row.reference is None and row.family == "finite elements"
 
 
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        (["--loads", "0"], "--loads 0"),
-        (["--device", "abacus"], "abacus"),
-        (["--data", "a/x.h5", "b/x.h5"], "one name"),
-        (["--data", "a.h5", "--anatomy", "b.vtu"], "--anatomy"),
-        (["--data", "a.h5"], "no such file"),
-    ],
-)
-def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["report", *words]) == 2
-    assert reason in capsys.readouterr().err
-
-
 def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, found, monkeypatch, capsys):
     """Everything is solved already; the rows are those found."""
     monkeypatch.setattr(command, "QUICK", (100, study.loads, study.beyond))
@@ -377,19 +333,6 @@ def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, found
     monkeypatch.setattr(report, "rows", stopped)
     assert main(words) == 130
     assert "the same command goes on" in capsys.readouterr().err
-
-
-def test_a_command_without_data_makes_its_own(box, tmp_path, monkeypatch, capsys):
-    """Neo-Hookean, smoothed; what it says goes elsewhere than the line for machines."""
-    monkeypatch.setattr(command, "QUICK", (30, 1, 3))
-    monkeypatch.setattr(report, "rows", lambda study, specs: iter([]))
-    write_anatomy(tmp_path / "box.vtu", box)
-    words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device", "cpu"]
-    assert main([*words, "--json"]) == 0
-    (section,) = json.loads(capsys.readouterr().out)["sections"]
-    assert "30 palpation loads" in section["about"][0] and section["minutes"] > 0.0
-    data = read_dataset(tmp_path / "palpation.h5")
-    assert data.provenance["element"] == "smoothed" and "neo-hookean" in data.provenance["tissue"]
 
 
 class TestAdapting:

@@ -1,0 +1,71 @@
+"""What the report counts and refuses, without a study: tenths of the force, the front, data of its own."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+
+from scenes import report
+from scenes.cli import main
+from scenes.commands import report as command
+from scenes.report_plots import against_time, front
+from scenes.report_row import Row, figures_of
+from sim.meshfile import write_anatomy
+from surrogate.dataset import read_dataset
+
+
+def test_tenths_of_the_force_and_of_no_load_nothing():
+    truth = np.ones((20, 2, 3))
+    force = np.arange(20.0)[::-1]
+    distance = np.column_stack([force, 3.0 * force]) * 1e-3
+    tenths = figures_of(distance, truth, force).tenths
+    assert [(tenth.least, tenth.greatest) for tenth in tenths] == [(2.0 * k, 2.0 * k + 1.0) for k in range(10)]
+    assert [tenth.mean for tenth in tenths] == pytest.approx([4.0 * k + 1.0 for k in range(10)])
+    assert [tenth.largest for tenth in tenths] == pytest.approx([6.0 * k + 3.0 for k in range(10)])
+    assert figures_of(distance[:0], truth[:0], force[:0]) is None
+
+
+def test_the_front_is_what_nobody_beats():
+    figures = figures_of(np.ones((1, 1)), np.ones((1, 1, 3)), np.ones(1))
+
+    def row(name, time, error, against="error"):
+        mm = replace(figures.mm, mean=error)
+        return Row(name, "f", against=against, reference=replace(figures, mm=mm), median=time)
+
+    rows = [row("fast", 1.0, 9.0), row("near", 9.0, 1.0), row("between", 3.0, 3.0), row("beaten", 4.0, 3.0)]
+    rows += [row("slow", 10.0, 10.0), row("other law", 0.5, 0.5, "model difference")]
+    rows += [Row("none", "f", state="not built yet")]
+    assert front(rows) == {"fast", "near", "between"}
+    assert against_time(rows).std() > 5.0 and against_time(rows[-1:]) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--loads", "0"], "--loads 0"),
+        (["--device", "abacus"], "abacus"),
+        (["--data", "a/x.h5", "b/x.h5"], "one name"),
+        (["--data", "a.h5", "--anatomy", "b.vtu"], "--anatomy"),
+        (["--data", "a.h5"], "no such file"),
+    ],
+)
+def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", *words]) == 2
+    assert reason in capsys.readouterr().err
+
+
+def test_a_command_without_data_makes_its_own(tmp_path, monkeypatch, capsys):
+    """Neo-Hookean, smoothed; what it says goes elsewhere than the line for machines."""
+    box = make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
+    monkeypatch.setattr(command, "QUICK", (30, 1, 3))
+    monkeypatch.setattr(report, "rows", lambda study, specs: iter([]))
+    write_anatomy(tmp_path / "box.vtu", box)
+    words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device", "cpu"]
+    assert main([*words, "--json"]) == 0
+    (section,) = json.loads(capsys.readouterr().out)["sections"]
+    assert "30 palpation loads" in section["about"][0] and section["minutes"] > 0.0
+    data = read_dataset(tmp_path / "palpation.h5")
+    assert data.provenance["element"] == "smoothed" and "neo-hookean" in data.provenance["tissue"]
