@@ -50,7 +50,7 @@ def untaught(anatomy: Anatomy, scene: Scene) -> Learned:
     (ball,) = (tool for effect in scene.effects if isinstance(effect, ToolContact) for tool in effect.tools)
     assert isinstance(ball, Ball)
     patch = open_patch(anatomy)
-    fem = Fem(anatomy, (Elasticity(Material("linear", 5000.0, 0.45)), Held(), Slide()), REFERENCE, "cpu", element="p1")
+    fem = Fem(anatomy, (Elasticity(Material("linear", 5000.0, 0.45)), Held(), Slide()), REFERENCE, "cpu")
     contact, bases = condensed(fem, [anatomy.tumour_nodes, np.setdiff1d(patch.nodes, anatomy.tumour_nodes)])
     envelope = Envelope(patch.points, 1.0, 1.0, np.pi, (1e-6, 1.0), (ball.radius, ball.radius), np.inf)
     said = {"effects": repr(scene.effects)}
