@@ -2,6 +2,7 @@
 
 The overlay is composited into the picture before it comes here, and the picture is shown whole, as an image of its own:
 no window shape and no client can bring the two out of register. The 3-D view follows by sending vertices alone.
+Where things are is the business of `ar.page_style`.
 """
 
 from __future__ import annotations
@@ -9,94 +10,22 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import viser
 
 from .guard import bracketed, open_server
+from .page_parts import Body, Choice, Control, Deed, Fold, Playback, Sign, Slider, Toggle, Viewpoint
+from .page_style import PAGE, SAID, STATUS, style
 
 # A client that decodes more slowly than pictures arrive shows none at all.
 PICTURES_PER_SECOND = 15.0
-# Width of the panel with the picture [CSS pixel]: at most, at least, and as a share of the window.
-PANEL = (676, 320, 0.56)
-# Windows under this width [CSS pixel] get the panel as a sheet at the bottom.
-NARROW = 576
+# Width of the docked panel where a browser does not know the page's own rules [CSS pixel].
+PANEL = 676.0
 # Hosts that this machine reaches by the name localhost.
 EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """A surface in the 3-D view: vertices (V, 3) [m], triangles (F, 3), colour (3,) sRGB in [0, 1].
-
-    The browser makes normals anew for each update: some 5,000 vertices for all bodies together stay fluent.
-    """
-
-    name: str
-    vertices: np.ndarray
-    triangles: np.ndarray
-    colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
-    opacity: float = 1.0
-    wireframe: bool = False
-
-
-@dataclass(frozen=True)
-class Slider:
-    """A number that a visitor sets; `changed` takes it, on the page's own thread, and must return at once."""
-
-    label: str
-    low: float
-    high: float
-    step: float
-    start: float
-    changed: Callable[[float], None]
-
-
-@dataclass(frozen=True)
-class Choice:
-    """One of several names; `changed` takes it, on the page's own thread, and must return at once."""
-
-    label: str
-    options: tuple[str, ...]
-    start: str
-    changed: Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Toggle:
-    """Something that is on or off; `changed` takes which, on the page's own thread, and must return at once."""
-
-    label: str
-    start: bool
-    changed: Callable[[bool], None]
-
-
-@dataclass(frozen=True)
-class Playback:
-    """Play, pause and scrub over frames 0 .. frames - 1: `played` takes whether it plays, `sought` a frame number."""
-
-    frames: int
-    played: Callable[[bool], None]
-    sought: Callable[[int], None]
-
-
-@dataclass(frozen=True)
-class Deed:
-    """What a visitor set last: the visitor's number, from 1, and the label of the control."""
-
-    visitor: int
-    label: str
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """Where the 3-D view starts: eye, target and up direction, (3,) [m]."""
-
-    eye: np.ndarray
-    target: np.ndarray
-    up: np.ndarray
 
 
 class Browser:
@@ -111,16 +40,17 @@ class Browser:
         bodies: Sequence[Body],
         viewpoint: Viewpoint,
         playback: Playback,
-        controls: Sequence[Slider | Choice | Toggle] = (),
+        controls: Sequence[Control | Fold] = (),
         title: str = "sulcus",
-        caption: str = "",
+        words: str = "",
         host: str = "127.0.0.1",
         port: int = 8080,
         size: tuple[int, int] = (640, 480),
+        signs: Sequence[Sign] = (),
     ) -> None:
         """Start the server; where `port` is taken, the next free one serves, see `address`.
 
-        `caption` is Markdown under the picture, `size` the picture's width and height [pixel] until the first arrives.
+        `words` is HTML under the picture, `size` the picture's width and height [pixel] until the first arrives.
 
         Raises
         ------
@@ -133,24 +63,57 @@ class Browser:
         """
         check_address(host, port)
         self.server, self.token = open_server(host, port, title)
-        self.dress(title, viewpoint)
+        self.dress(viewpoint, signs)
         gui = self.server.gui
+        gui.add_html(style(size[0] / size[1]))
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
         self.picture = gui.add_image(blank, format="jpeg", jpeg_quality=88)
-        self.add_playback(playback)
-        self.text = gui.add_markdown("")
-        self.inputs = {control.label: self.add_control(control) for control in controls}
-        gui.add_markdown(caption)
-        self.meshes = {body.name: self.add_body(body) for body in bodies}
+        self.words = gui.add_html(held(PAGE, words))
+        self.line = gui.add_html("")
+        self.text = gui.add_html(held(SAID, ""))
         # What the newest message did, as the `changed` that it calls may ask.
         self.deed: Deed | None = None
         # The line that each visitor alone reads, by viser's identifier.
         self.lines: dict[int, viser.GuiMarkdownHandle] = {}
         self.newest: dict[str, Callable[[], object]] = {}
-        self.lock = threading.Lock()
+        self.lock, self.sending = threading.Lock(), threading.Lock()
+        self.meshes: dict[str, viser.MeshHandle] = {}
+        self.folder: viser.GuiFolderHandle | None = None
+        self.fill(bodies, playback, controls, title, words)
         self.closed = threading.Event()
         self.sender = threading.Thread(target=self.send, name="page", daemon=True)
         self.sender.start()
+
+    def fill(
+        self,
+        bodies: Sequence[Body],
+        playback: Playback,
+        controls: Sequence[Control | Fold] = (),
+        title: str = "sulcus",
+        words: str = "",
+    ) -> None:
+        """Put other bodies, playback, controls, title and words in the place of those that are there.
+
+        What was noted for the old ones is dropped.
+        """
+        with self.sending, self.server.atomic():
+            with self.lock:
+                self.newest = {}
+            for mesh in self.meshes.values():
+                mesh.remove()
+            if self.folder is not None:
+                self.folder.remove()
+            self.server.gui.set_panel_label(title)
+            self.title, self.shown = title, (0, self.picture.image)
+            self.words.content, self.text.content, self.line.content = held(PAGE, words), held(SAID, ""), ""
+            self.inputs: dict[str, viser.GuiInputHandle] = {}
+            self.folder = self.server.gui.add_folder(None)
+            with self.folder:
+                self.add_playback(playback)
+                for control in controls:
+                    self.add_control(control)
+                self.add_saver()
+            self.meshes = {body.name: self.add_body(body) for body in bodies}
 
     @property
     def address(self) -> str:
@@ -173,7 +136,7 @@ class Browser:
         """Show the picture (H, W, 3) uint8 of frame `number`, and put the playback slider there."""
 
         def send() -> None:
-            self.picture.image = colour
+            self.picture.image, self.shown = colour, (number, colour)
             self.assign(self.frame, number)
 
         self.note("picture", send)
@@ -189,9 +152,29 @@ class Browser:
 
         self.note(f"body {name}", send)
 
-    def report(self, markdown: str) -> None:
-        """Show Markdown text between playback and controls."""
-        self.note("report", lambda: setattr(self.text, "content", markdown))
+    def tint(self, name: str, colour: tuple[float, float, float]) -> None:
+        """Give a body in the 3-D view another colour (3,), sRGB in [0, 1]."""
+        mesh = self.meshes[name]
+        self.note(f"colour {name}", lambda: setattr(mesh, "color", tuple(round(255 * part) for part in colour)))
+
+    def report(self, words: str) -> None:
+        """Show words, HTML, between playback and controls."""
+        self.note("report", lambda: setattr(self.text, "content", held(SAID, words)))
+
+    def status(self, words: str) -> None:
+        """Show a line, HTML, over the picture, or none."""
+        said = held(STATUS, f"<span>{words}</span>") if words else ""
+        self.note("status", lambda: setattr(self.line, "content", said))
+
+    def plays(self, playing: bool) -> None:
+        """Let the button say whether the scene plays."""
+        button, self.playing = self.button, playing
+
+        def send() -> None:
+            button.label = "Pause" if playing else "Play"
+            button.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
+
+        self.note("button", send)
 
     def tell(self, line: Callable[[int], str]) -> None:
         """Show each visitor a line of Markdown of its own under the report: `line` takes the visitor's number."""
@@ -228,73 +211,87 @@ class Browser:
     def send(self) -> None:
         """Send what is newest until the page is closed; all that came together arrives together."""
         while not self.closed.wait(1.0 / PICTURES_PER_SECOND):
-            with self.lock:
-                newest, self.newest = self.newest, {}
-            with self.server.atomic():
-                for send in newest.values():
-                    send()
+            with self.sending:
+                with self.lock:
+                    newest, self.newest = self.newest, {}
+                with self.server.atomic():
+                    for send in newest.values():
+                        send()
 
     def assign(self, control: viser.GuiInputHandle, value: float | str) -> None:
         """Set a control on the thread that hears the visitors: another could overwrite what is not yet read."""
-        self.server.get_event_loop().call_soon_threadsafe(setattr, control, "value", value)
 
-    def dress(self, title: str, viewpoint: Viewpoint) -> None:
-        """Colours, light, the panel's place and the first view of the 3-D scene."""
+        def put() -> None:
+            # The page may have been filled anew meanwhile.
+            if control is self.frame or control in self.inputs.values():
+                control.value = value
+
+        self.server.get_event_loop().call_soon_threadsafe(put)
+
+    def dress(self, viewpoint: Viewpoint, signs: Sequence[Sign]) -> None:
+        """Colours, light, signs, the panel's place and the first view of the 3-D scene."""
         gui, scene = self.server.gui, self.server.scene
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
-        gui.set_panel_label(title)
         gui.main_panel.dock_left()
+        gui.main_panel.set_width(PANEL)
         # Two soft lights from the first viewpoint's sides: the page's own four wash the colours out.
         scene.configure_default_lights(enabled=False)
-        scene.add_light_ambient("/light/ambient", intensity=0.9)
+        scene.add_light_ambient("/light/ambient", intensity=2.0)
         across = np.cross(np.asarray(viewpoint.target) - viewpoint.eye, viewpoint.up)
-        for name, side, strength in (("left", -1.0, 1.8), ("right", 1.0, 0.6)):
+        for name, side, strength in (("left", -1.0, 2.2), ("right", 1.0, 1.0)):
             place = np.asarray(viewpoint.eye) + side * across / np.linalg.norm(across)
             scene.add_light_directional(f"/light/{name}", intensity=strength, position=tuple(place))
+        for sign in signs:
+            scene.add_label(f"/sign/{sign.word}", sign.word, position=np.asarray(sign.place), anchor="center-center")
         start = self.server.initial_camera
         start.position, start.look_at = tuple(viewpoint.eye), tuple(viewpoint.target)
-        start.up = tuple(viewpoint.up)
-
-        @self.server.on_client_connect
-        def fit(client: viser.ClientHandle) -> None:
-            most, least, share = PANEL
-            client.gui.main_panel.set_width(float(np.clip(share * client.camera.image_width, least, most)))
-            if client.camera.image_width < NARROW:
-                # The panel is a sheet over the lower half there: bring the scene into the upper one.
-                arm = np.asarray(viewpoint.eye) - viewpoint.target
-                target = viewpoint.target - 0.35 * np.linalg.norm(arm) * np.asarray(viewpoint.up)
-                client.camera.position, client.camera.look_at = tuple(target + 1.5 * arm), tuple(target)
+        start.up, start.fov = tuple(viewpoint.up), viewpoint.fov
 
     def add_playback(self, playback: Playback) -> None:
         """A button that plays and pauses, and a slider over the frames."""
         gui = self.server.gui
+        self.playing = True
         self.button = button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self.frame = gui.add_slider("frame", 0, max(playback.frames - 1, 1), 1, 0)
 
         @button.on_click
         def toggle(_: viser.GuiEvent) -> None:
-            plays = button.label == "Play"
-            button.label = "Pause" if plays else "Play"
-            button.icon = viser.Icon.PLAYER_PAUSE if plays else viser.Icon.PLAYER_PLAY
-            playback.played(plays)
+            self.plays(not self.playing)
+            playback.played(self.playing)
 
         # The slider of a single frame has a second place: it must have a length.
         self.hear(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
 
-    def add_control(self, control: Slider | Choice | Toggle) -> viser.GuiInputHandle:
-        """A slider, a list or a box to tick."""
+    def add_saver(self) -> None:
+        """A button that downloads the picture as it is shown."""
+        self.saver = self.server.gui.add_button("Save the picture", icon=viser.Icon.CAMERA, color="gray")
+
+        @self.saver.on_click
+        def save(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                number, colour = self.shown
+                name = f"{self.title.replace(':', '').replace(' ', '-')}-{number}.png"
+                written = cv2.imencode(".png", np.ascontiguousarray(colour[..., ::-1]))[1]
+                event.client.send_file_download(name, written.tobytes(), save_immediately=True)
+
+    def add_control(self, control: Control | Fold) -> None:
+        """A slider, a list, a box to tick, or a folder of them."""
         gui = self.server.gui
-        if isinstance(control, Toggle):
-            box = gui.add_checkbox(control.label, control.start)
-            self.hear(box, control.changed)
-            return box
-        if isinstance(control, Slider):
-            slider = gui.add_slider(control.label, control.low, control.high, control.step, control.start)
-            self.hear(slider, control.changed)
-            return slider
-        menu = gui.add_dropdown(control.label, control.options, initial_value=control.start)
-        self.hear(menu, control.changed)
-        return menu
+        if isinstance(control, Fold):
+            with gui.add_folder(control.label, expand_by_default=False):
+                for inner in control.controls:
+                    self.add_control(inner)
+            return
+        words, hint = control.words or control.label, control.hint
+        match control:
+            case Toggle():
+                handle = gui.add_checkbox(words, control.start, hint=hint)
+            case Slider():
+                handle = gui.add_slider(words, control.low, control.high, control.step, control.start, hint=hint)
+            case Choice():
+                handle = gui.add_dropdown(words, control.options, initial_value=control.start, hint=hint)
+        self.inputs[control.label] = handle
+        self.hear(handle, control.changed)
 
     def hear(self, control: viser.GuiInputHandle, changed: Callable[[Any], None]) -> None:
         """Pass on what visitors set, on the thread that they are heard on, before anything else happens there."""
@@ -317,6 +314,11 @@ class Browser:
             wireframe=body.wireframe,
             side="double",
         )
+
+
+def held(name: str, words: str) -> str:
+    """An element of the page that the rules find by its name."""
+    return f'<div id="{name}">{words}</div>'
 
 
 def check_address(host: str, port: int) -> None:

@@ -12,6 +12,10 @@ Corner = Literal["top left", "top right", "bottom left", "bottom right"]
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 WHITE = (244, 244, 240)
 PAD = 8
+# The patient's sides along the axes of RAS, and against them.
+SIDES = ("RL", "AP", "SI")
+# A direction's second letter is told where it is more than so much of it.
+OBLIQUE = 0.38
 
 
 def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5, ink: Sequence[float] = WHITE) -> None:
@@ -55,4 +59,42 @@ def panel(colour: np.ndarray, lines: Sequence[str], corner: Corner = "top left",
     ground[:] = ground * 0.35 + np.array([6.0, 9.0, 11.0])
     for number, line in enumerate(lines, start=1):
         write(out, line, (left + PAD, top + number * step), scale)
+    return out
+
+
+def towards(direction: np.ndarray) -> str:
+    """Where a direction (3,) of RAS points, in a surgeon's letters: "R", or "AS" between two, the greater part first.
+
+    L left, R right, A anterior, P posterior, S superior, I inferior; of the patient.
+    """
+    part = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    axes = [axis for axis in np.argsort(-np.abs(part), kind="stable")[:2] if abs(part[axis]) > OBLIQUE]
+    return "".join(SIDES[axis][int(part[axis] < 0.0)] for axis in axes)
+
+
+def bearings(rotation: np.ndarray) -> dict[str, str]:
+    """What lies left, right, up and down of a picture: `rotation` (3, 3) turns RAS to x right, y down, z forward."""
+    right, down = np.asarray(rotation)[:2]
+    return {"left": towards(-right), "right": towards(right), "top": towards(-down), "bottom": towards(down)}
+
+
+def marked(colour: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """The picture (H, W, 3) uint8 with the patient's sides at its edges; a copy.
+
+    rotation (3, 3): of the camera, as `bearings` takes it.
+    """
+    out = colour.copy()
+    height, width = out.shape[:2]
+    at = {
+        "left": (8, height // 2),
+        "right": (width, height // 2),
+        "top": (width // 2, 0),
+        "bottom": (width // 2, height),
+    }
+    for edge, letters in bearings(rotation).items():
+        (long, tall), _ = cv2.getTextSize(letters, FONT, 0.6, 1)
+        column, row = at[edge]
+        inset = {"left": 0, "right": -long - 8, "top": -long // 2, "bottom": -long // 2}[edge]
+        rise = {"left": tall // 2, "right": tall // 2, "top": tall + 8, "bottom": -10}[edge]
+        write(out, letters, (column + inset, row + rise), 0.6)
     return out

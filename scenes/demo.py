@@ -3,107 +3,89 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time as clock
 import traceback
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from html import escape
 
 import numpy as np
 
-from ar.browser import Body, Browser, Choice, Playback, Slider, Toggle, Viewpoint
-from sim.effects import Elasticity, Held, Slide
+from ar.browser import Browser
+from ar.hud import marked
+from ar.page_parts import Body, Playback, Sign, Viewpoint
+from sim.deformation import Deformation
 from sim.errors import InputError
+from sim.loads import Loads
 
 from .ablation import without
+from .busy import Busy
 from .holding import holding
-from .paths import AIR, Touch
+from .page_controls import clocked, controls
+from .page_text import deformer_words, effect_words, report, words
+from .paths import Touch
 from .play import Frame, Player
 from .reel import Session
 from .referee import Referee, Truth
-from .scene import Scene
+from .scene import Scene, find_scene
 from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR, Stage
+from .stamp import stamp
 from .tally import Tally
 from .theatre import Theatre
-from .told import told
+from .verdict import Judged, changed, judge, verdict_words
+from .wish import HAND, SCRIPT, Wish
 
-SCRIPT, HAND = "script", "hand"
 FEM_COLOUR = (0.95, 0.35, 0.75)
-CAPTION = """Left: the camera picture with the predicted tumour in register. Right: the same in 3-D, the tumour of the
-finite elements as a pink wire. Research only."""
+STALE_COLOUR = (0.45, 0.45, 0.45)
+"""Of the finite elements' tumour while it belongs to another load than the one that is shown."""
+WAITS = "The finite elements are working on this load."
+# How far the patient's sides stand from the brain in the 3-D view [m].
+BESIDE = 12e-3
 # How long a page that plays shows why a frame is left out [s].
 READING = 2.0
-HANDS = "Moving a slider takes the tool over; **tool: script** gives it back."
+FIRST = Touch(force=0.15, depth=2e-3)
+"""What a hand holds that takes the tool."""
 
 
 @dataclass
-class Wish:
-    """What the visitors ask for, written by the page's threads and read by the loop, under its lock."""
+class Moment:
+    """What the page shows now: the wish, its answer, the frame, and what the finite elements said of it."""
 
-    deformer: str
-    touch: Touch
-    tool: str = SCRIPT
-    holder: int | None = None
-    plays: bool = True
-    number: int = 0
-    off: frozenset[str] = frozenset()
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def set(self, **values: object) -> None:
-        """Change some wishes at once."""
-        with self.lock:
-            for name, value in values.items():
-                setattr(self, name, value)
-
-    def hand(self, right: float | None = None, up: float | None = None, **values: float) -> None:
-        """Take the tool over with some numbers of its touch changed; `right` and `up` tilt its force [rad]."""
-        with self.lock:
-            tilt = self.touch.tilt[0] if right is None else right, self.touch.tilt[1] if up is None else up
-            self.touch, self.tool = replace(self.touch, tilt=tilt, **values), HAND
-
-    def switch(self, effect: str, on: bool) -> None:
-        """Switch an effect on or off."""
-        with self.lock:
-            self.off = self.off - {effect} if on else self.off | {effect}
-
-    def now(self) -> tuple[int, str, Touch | None, frozenset[str]]:
-        """Frame number, deformer, hand-set touch (None: the script's) and effects that are off."""
-        with self.lock:
-            return self.number, self.deformer, self.touch if self.tool == HAND else None, self.off
-
-    def go_on(self, number: int, frames: int) -> None:
-        """A frame was shown: playing goes on to the next, unless a visitor has sought another meanwhile."""
-        with self.lock:
-            if self.plays and self.number == number:
-                self.number = (number + 1) % frames
+    asked: tuple | None = None
+    style: str = ""
+    load: str = ""
+    frame: Frame | None = None
+    truth: Truth | None = None
+    own: Truth | None = None
+    by: tuple | None = None
+    judged: Judged | None = None
+    stale: bool | None = None
 
 
 class Demo:
-    """A scene on a page, for as long as `run` is let run."""
+    """A scene on a page, for as long as `run` is let run; visitors change it for another built-in one."""
 
-    def __init__(self, theatre: Theatre, scene: Scene, deformer: str, host: str, port: int) -> None:
-        self.stage = Stage(scene, theatre.site, theatre.intensity)
-        self.theatre = theatre
-        player = Player(self.stage, theatre.deformer(deformer, scene))
-        self.sessions = {(deformer, frozenset[str]()): Session(player)}
-        self.wish = Wish(deformer, Touch(force=0.15, depth=2e-3))
+    def __init__(
+        self,
+        theatre: Theatre,
+        scene: Scene,
+        deformer: str,
+        host: str,
+        port: int,
+        anatomy: str = "the default",
+        find: Callable[[str], Scene] = find_scene,
+    ) -> None:
+        """Open the page; `anatomy` is whose brain, in words, and `find` makes the scenes that visitors choose."""
+        self.theatre, self.anatomy, self.first, self.find = theatre, anatomy, scene, find
+        self._cast(scene, deformer)
+        size = scene.viewpoint.width, scene.viewpoint.height
+        parts = self._parts(deformer)
         self.browser = Browser(
-            self._bodies(),
-            self._viewpoint(),
-            Playback(
-                len(scene.times),
-                lambda plays: self.wish.set(plays=plays),
-                lambda number: self._give(SCRIPT, number=number),
-            ),
-            self._controls(),
-            title=f"sulcus: {scene.name}",
-            caption=CAPTION if scene.tool is None else f"{CAPTION} {HANDS}",
-            host=host,
-            port=port,
-            size=(scene.viewpoint.width, scene.viewpoint.height),
+            parts[0], self._viewpoint(), *parts[1:], host=host, port=port, size=size, signs=self._signs()
         )
+        self.busy = Busy(lambda line: self.browser.status(escape(line)))
         self.referee = Referee(theatre, scene)
-        self.tally = Tally()
+        self.dismissed: list[Referee] = []
         self.asked, self.drawn = self.wish.now(), 0
 
     def run(self, seconds: float = float("inf")) -> int:
@@ -111,70 +93,45 @@ class Demo:
         self.drawn, end = 0, clock.perf_counter() + seconds
         while (left := end - clock.perf_counter()) > 0.0:
             try:
-                self._play(left)
+                self._run(left)
             except Exception as error:
                 self._leave_out(error, end)
         return self.drawn
 
     def _leave_out(self, error: Exception, end: float) -> None:
         """Say why a frame is not shown, until there is time to read it or a visitor asks for another; then go on."""
+        self.busy.off()
         said = str(error)
         if not isinstance(error, InputError):
             place = traceback.extract_tb(error.__traceback__)[-1]
             said = f"a defect: {type(error).__name__}, {error}"
             print(f"sulcus demo: {said} (line {place.lineno} of {place.filename})", file=sys.stderr)
-        self.browser.report(f"error: this frame is left out ({said})")
+        self.browser.report(f'<p class="warn">error: this frame is left out ({escape(said)})</p>')
         self._tell()
         until = min(end, clock.perf_counter() + READING)
-        while self.wish.now() == self.asked and (clock.perf_counter() < until or not self.wish.plays):
-            if clock.perf_counter() >= end:
-                return
+        while self.wish.now() == self.asked and self.wish.scene == self.stage.scene.name:
+            if clock.perf_counter() >= (until if self.wish.plays else end):
+                break
             clock.sleep(1.0 / self.stage.scene.frames_per_second)
         self.wish.go_on(self.asked[0], len(self.stage.scene.times))
 
-    def _play(self, seconds: float) -> None:
+    def _run(self, seconds: float) -> None:
         """Play until the time is over or something fails."""
-        scene = self.stage.scene
-        frame: Frame | None = None
-        own: Truth | None = None
-        end = clock.perf_counter() + seconds
-        shown: tuple | None = None
-        judged: tuple | None = None
-        verdict = "error: the finite elements are being prepared"
+        now, end = Moment(), clock.perf_counter() + seconds
         while clock.perf_counter() < end:
             begun = clock.perf_counter()
-            number, name, touch, off = asked = self.asked = self.wish.now()
-            name = "fem" if off else name  # nobody else was taught without
-            session = self._session(name, off)
-            player = session.player
-            if asked != shown or frame is None:
-                reached, answer = session.towards(number, touch)
-                if reached != number:
-                    self.browser.report(f"frame {number} depends on those before it: {reached + 1} of them are done")
-                    continue
-                loads, hand = player.loads(number, touch), touch or player.touch(number)
-                frame, shown = player.drawn(number, hand, loads, answer, clock.perf_counter() - begun), asked
-                self.wish.go_on(number, len(scene.times))
-                own = None
-                if name == "fem" and not off:
-                    own = Truth(number, loads, answer, frame.seconds["deform"])
-                else:
-                    self.referee.ask(number, touch)
-                if not off:
-                    self.tally.took(name, answer.cost.total)
-                self._show(frame, player)
-                self.drawn += 1
-            truth = own or self.referee.truth
-            if truth is not None and (truth, name, off) != judged and (not off or truth.number == frame.number):
-                self._wire(truth, player)
-                verdict = changed(self.stage, truth, frame, off) if off else self._judge(truth, name)
-                judged = (truth, name, off)
-            if self.referee.failure is not None:
-                what = "this" if self.referee.thread.is_alive() else "any more"
-                verdict = f"error: the finite elements do not answer {what} ({self.referee.failure})"
-            self.browser.report(self._report(frame, name, verdict))
+            if self.wish.scene != self.stage.scene.name:
+                self._change(self.wish.scene)
+                now = Moment()
+            new = self._answer(now)
+            self.browser.plays(self.wish.plays)
+            if new is None:
+                continue
+            self.drawn += new
+            self._check(now)
             self._tell()
-            clock.sleep(max(0.0, 1.0 / scene.frames_per_second - (clock.perf_counter() - begun)))
+            rest = 1.0 / self.stage.scene.frames_per_second - (clock.perf_counter() - begun)
+            clock.sleep(max(0.0, rest))
 
     def _tell(self) -> None:
         """Tell each visitor who has the tool."""
@@ -183,9 +140,128 @@ class Demo:
             self.browser.tell(lambda visitor: holding(visitor, holder, here))
 
     def close(self) -> None:
-        """Stop the page and the referee."""
+        """Stop the page and the referees."""
+        self.busy.close()
         self.browser.close()
-        self.referee.close()
+        for referee in (self.referee, *self.dismissed):
+            referee.close()
+
+    def _cast(self, scene: Scene, deformer: str) -> None:
+        """Make a stage for a scene, and have a deformer play on it."""
+        stage = Stage(scene, self.theatre.site, self.theatre.intensity)
+        sessions = {(deformer, frozenset[str]()): Session(Player(stage, self.theatre.deformer(deformer, scene)))}
+        self.stage, self.sessions, self.tally = stage, sessions, Tally()
+        self.wish = Wish(deformer, FIRST, scene.name, clocked=clocked(scene, stage.site))
+
+    def _change(self, name: str) -> None:
+        """Play another scene; where this body has none of that name, stay, and say why."""
+        old = self.stage, self.sessions, self.tally, self.wish
+        self.busy.on(f"nothing yet: preparing the scene {name}")
+        try:
+            scene = self.first if name == self.first.name else self.find(name)
+            known = self.theatre.names(scene)
+            deformer = self.wish.deformer if self.wish.deformer in known else self.theatre.best(scene)
+            self._cast(scene, deformer)
+            self.wish.set(style=old[3].style)
+            parts = self._parts(deformer)
+        except InputError as error:
+            self.stage, self.sessions, self.tally, self.wish = old
+            self.wish.set(scene=self.stage.scene.name)
+            self.browser.put("scene", self.stage.scene.name)
+            self.browser.report(f'<p class="warn">{escape(str(error))}</p>')
+            return
+        finally:
+            self.busy.off()
+        self.browser.fill(*parts)
+        self.referee.dismiss()
+        self.dismissed.append(self.referee)
+        self.referee = Referee(self.theatre, scene)
+
+    def _answer(self, now: Moment) -> int | None:
+        """Bring the page nearer to what is wished: 1 where a frame was drawn, 0 where all is shown, None on the way."""
+        begun, scene, style = clock.perf_counter(), self.stage.scene, self.wish.style
+        number, name, touch, off = asked = self.asked = self.wish.now()
+        name = "fem" if off else name  # no model was trained without
+        if asked == now.asked and now.frame is not None:
+            if style != now.style:
+                self._restyle(now, name)
+            return 0
+        self.busy.on(self._work(number, name, touch))
+        session = self._session(name, off)
+        reached, answer = session.towards(number, touch)
+        if reached != number:
+            self.busy.on(f"frame {number}, which depends on those before it: {reached + 1} of them are done")
+            return None
+        self.busy.off()
+        player, hand = session.player, touch or session.player.touch(number)
+        loads, took = player.loads(number, touch), clock.perf_counter() - begun
+        now.asked, now.style, now.own = asked, style, None
+        now.load = stamp(self._whole(number, touch) if off else loads)
+        now.frame = frame = replace(player, style=style).drawn(number, hand, loads, answer, took)
+        self.wish.go_on(number, len(scene.times))
+        if name == "fem" and not off:
+            now.own = Truth(number, loads, answer, frame.seconds["deform"])
+        else:
+            self.referee.ask(number, touch)
+        if not off:
+            self.tally.took(name, now.load, answer.cost.total)
+        self._show(frame, player)
+        return 1
+
+    def _work(self, number: int, name: str, touch: Touch | None) -> str:
+        """What is being solved, in words."""
+        if touch is None:
+            return f"frame {number} ({deformer_words(name)})"
+        how = f"{1e3 * touch.depth:.1f} mm deep" if self.stage.scene.posed else f"{touch.force:.2f} N"
+        return f"the tool in your hand, {how} ({deformer_words(name)})"
+
+    def _restyle(self, now: Moment, name: str) -> None:
+        """Draw the same answer with another overlay."""
+        assert now.frame is not None
+        frame, style = now.frame, self.wish.style
+        player = self._session(name, self.wish.off).player
+        seconds = frame.seconds["deform"]
+        now.style = style
+        now.frame = replace(player, style=style).drawn(
+            frame.number, frame.touch, frame.loads, frame.deformation, seconds
+        )
+        self._picture(now.frame)
+
+    def _check(self, now: Moment) -> None:
+        """Show what the finite elements say of what is shown, and whether it is of the same load."""
+        assert now.frame is not None and now.asked is not None
+        _, name, _, off = now.asked
+        name = "fem" if off else name
+        truth = now.own or self.referee.truth
+        fresh = truth is not None and stamp(truth.loads) == now.load
+        whole = self._session(name).player
+        if truth is not None and (truth is not now.truth or now.by != (name, off)):
+            self._wire(truth, whole)
+            if not off:
+                now.judged = judge(truth, whole, name == "fem")
+                if now.judged.mean is not None:
+                    self.tally.missed(name, stamp(truth.loads), now.judged.mean)
+            now.truth, now.by = truth, (name, off)
+        if now.stale is not (not fresh):
+            now.stale = not fresh
+            self.browser.tint("finite elements", FEM_COLOUR if fresh else STALE_COLOUR)
+        gone = [effect_words(effect) for effect in sorted(off)]
+        if self.referee.failure is not None:
+            what = "this" if self.referee.thread.is_alive() else "any more"
+            why = escape(str(self.referee.failure))
+            verdict = f'<p class="warn">error: the finite elements do not answer {what} ({why})</p>'
+        elif off and truth is not None:
+            answer: Deformation = now.frame.deformation
+            verdict = changed(truth, whole, answer, gone) if fresh else verdict_words(None, True, WAITS)
+        else:
+            verdict = verdict_words(now.judged if truth is not None else None, not fresh, WAITS)
+        scene = self.stage.scene
+        self.browser.report(report(now.frame, self.stage, name, verdict, self.tally.rows, len(scene.times), gone))
+
+    def _whole(self, number: int, touch: Touch | None) -> Loads:
+        """What acts in a frame under all effects of the scene."""
+        scene, time = self.stage.scene, float(self.stage.scene.times[number])
+        return scene.loads(self.stage.site, touch or scene.path(time), time)
 
     def _session(self, name: str, off: frozenset[str] = frozenset()) -> Session:
         """Of who plays the scene without some effects, of the tissue that it has with them."""
@@ -197,37 +273,21 @@ class Demo:
             self.sessions[name, off] = Session(Player(stage, theatre.deformer(name, scene)))
         return self.sessions[name, off]
 
-    def _controls(self) -> list[Slider | Choice | Toggle]:
-        wish, names = self.wish, self.theatre.names(self.stage.scene)
-        return [
-            Choice("deformer", names, wish.deformer, lambda name: wish.set(deformer=name)),
-            *(Toggle(effect, True, partial(wish.switch, effect)) for effect in self._switched()),
-            *(self._hand() if self.stage.scene.tool is not None else []),
-        ]
+    def _parts(self, deformer: str) -> tuple:
+        """What the page is filled with: bodies, playback, controls, title, words."""
+        scene, site = self.stage.scene, self.stage.site
+        wish, names = self.wish, self.theatre.names(scene)
+        playback = Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number))
+        given = controls(scene, site, names, wish, self._give, self._take)
+        return self._bodies(), playback, given, f"sulcus: {scene.name}", words(self.theatre, scene, self.anatomy)
 
-    def _switched(self) -> list[str]:
-        """Effects that a scene can be without: all but those that make it a body at rest."""
-        kinds = (type(effect) for effect in self.stage.scene.effects_on(self.theatre.anatomy))
-        return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Slide)]
-
-    def _hand(self) -> list[Slider | Choice]:
-        """Who has the tool, and where."""
-        return [
-            Choice("tool", (SCRIPT, HAND), SCRIPT, self._give),
-            self._strength(),
-            Slider("direction right [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(right=np.radians(value))),
-            Slider("direction up [deg]", -40.0, 40.0, 1.0, 0.0, lambda value: self._take(up=np.radians(value))),
-            Slider("place right [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(x=1e-3 * value)),
-            Slider("place up [mm]", -14.0, 14.0, 0.5, 0.0, lambda value: self._take(y=1e-3 * value)),
-        ]
-
-    def _strength(self) -> Slider:
-        """How hard the hand pushes, or how deep it goes."""
-        touch = self.wish.touch
-        if self.stage.scene.posed:
-            low, high, now = -1e3 * AIR, 8.0, 1e3 * touch.depth
-            return Slider("depth [mm]", low, high, 0.1, now, lambda value: self._take(depth=1e-3 * value))
-        return Slider("force [N]", 0.0, 0.4, 0.01, touch.force, lambda value: self._take(force=value))
+    def _play(self, plays: bool) -> None:
+        """The button: where nothing moves by itself, playing gives the tool to the script."""
+        self.wish.play(plays)
+        if self.wish.tool == SCRIPT:
+            self.wish.set(holder=None)
+        if self.stage.scene.tool is not None:
+            self.browser.put("tool", self.wish.tool)
 
     def _give(self, tool: str, **wishes: int) -> None:
         """The menu, or the frame slider, gave the tool away; the menu says so after whatever is on its way to it."""
@@ -247,24 +307,39 @@ class Demo:
 
     def _bodies(self) -> list[Body]:
         positions = self.stage.site.anatomy.mesh.nodes
-        tool = self.stage.scene.tool
+        tool, site = self.stage.scene.tool, self.stage.site
         brain, cortex, tumour = self.stage.brain, self.stage.cortex(positions), self.stage.tumour(positions)
-        return [
-            Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.14),
+        bodies = [
+            Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
             Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
             Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
-            Body("finite elements", tumour.vertices, tumour.triangles, FEM_COLOUR, wireframe=True),
-            *([] if tool is None else [Body("tool", tool.mesh.vertices, tool.mesh.faces, TOOL_COLOUR)]),
+            Body("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True),
         ]
+        if tool is not None:
+            pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
+            at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+            bodies.append(Body("tool", at, tool.mesh.faces, TOOL_COLOUR))
+        return bodies
+
+    def _signs(self) -> list[Sign]:
+        """The patient's sides round the brain in the 3-D view."""
+        nodes = self.stage.site.anatomy.mesh.nodes
+        middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + BESIDE
+        ways = zip(("RL", "AP", "SI"), np.diag(half), strict=True)
+        return [Sign(word, middle + way) for (plus, minus), arm in ways for word, way in ((plus, arm), (minus, -arm))]
 
     def _viewpoint(self) -> Viewpoint:
         site = self.stage.site
         eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
-        return Viewpoint(eye, site.origin + 0.015 * site.axis, site.up)
+        return Viewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
+
+    def _picture(self, frame: Frame) -> None:
+        """Show a frame's picture with the patient's sides."""
+        self.browser.show(frame.number, marked(frame.shown, frame.camera.T_camera_world[:3, :3]))
 
     def _show(self, frame: Frame, player: Player) -> None:
         positions = player.positions(frame.deformation)
-        self.browser.show(frame.number, frame.shown)
+        self._picture(frame)
         stage = self.stage.at(frame.loads)
         for layer in (stage.cortex(positions), stage.tumour(positions)):
             self.browser.move(layer.name, layer.vertices, layer.triangles)
@@ -276,46 +351,3 @@ class Demo:
         """Show in the 3-D view where the finite elements, under all effects, have the tumour."""
         seen = self.stage.at(truth.loads).tumour(player.positions(truth.deformation))
         self.browser.move("finite elements", seen.vertices, seen.triangles)
-
-    def _judge(self, truth: Truth, name: str) -> str:
-        """Say how far off a deformer is under the loads that the finite elements answered."""
-        player = self._session(name).player
-        nodes = self.stage.at(truth.loads).anatomy.tumour_nodes
-        right = truth.deformation.at(nodes).displacement[0]
-        said = "this is the finite elements' own answer"
-        if name != "fem":
-            guess = player.deformer.deform(truth.loads, at=nodes).displacement[0]
-            error = 1e3 * np.linalg.norm(guess - right, axis=1)
-            self.tally.missed(name, 1e-3 * float(error.mean()))
-            said = f"error against FEM: mean {error.mean():.3f}, largest {error.max():.3f} mm"
-        motion = 1e3 * float(np.linalg.norm(right, axis=1).mean())
-        return (
-            f"{said}; tumour moved {motion:.2f} mm (frame {truth.number}, FEM {1e3 * truth.seconds:.0f} ms, "
-            f"{truth.deformation.outcome[0].name.lower()})"
-        )
-
-    def _report(self, frame: Frame, name: str, verdict: str) -> str:
-        """The outcome, milliseconds a stage, and the verdict on the frame that the finite elements answered last."""
-        left = self.stage.at(frame.loads).left
-        acts = [told(frame.loads, frame.deformation)] if frame.loads.causes else [f"time {frame.time:.2f} s"]
-        acts += [] if frame.distance is None else [f"tip to tumour {1e3 * frame.distance:.1f} mm"]
-        stages = " · ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-        lines = [
-            f"**{name}**: {frame.deformation.outcome[0].value}",
-            f"frame {frame.number}: {', '.join(acts)}",
-            *([] if left is None else [str(left)]),
-            f"ms a stage: {stages}",
-            verdict,
-        ]
-        bound = frame.deformation.bound[0, 0]
-        if np.isfinite(bound):
-            lines.insert(1, f"in 95 of 100 loads no vertex of the tumour is off by more than {1e3 * bound:.2f} mm")
-        return "\n\n".join([*lines, str(self.tally)])
-
-
-def changed(stage: Stage, truth: Truth, frame: Frame, off: frozenset[str]) -> str:
-    """How far from where all effects together have it a frame without some has the tumour."""
-    nodes = stage.at(truth.loads).anatomy.tumour_nodes
-    apart = truth.deformation.at(nodes).displacement[0] - frame.deformation.at(nodes).displacement[0]
-    mean = 1e3 * float(np.linalg.norm(apart, axis=1).mean())
-    return f"without {', '.join(sorted(off))} the tumour is {mean:.2f} mm from where all effects together have it"

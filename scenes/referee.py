@@ -48,11 +48,15 @@ class Referee:
             self.newest = number, touch
             self.wake.notify()
 
-    def close(self) -> None:
-        """Stop after the solve in hand."""
+    def dismiss(self) -> None:
+        """Ask for no more after the solve in hand, and do not wait for it."""
         with self.wake:
             self.closed.set()
             self.wake.notify()
+
+    def close(self) -> None:
+        """Stop after the solve in hand."""
+        self.dismiss()
         self.thread.join()
 
     def _serve(self, theatre: Theatre, scene: Scene) -> None:

@@ -48,7 +48,7 @@ class Theatre:
 
         A model answers the effects, the tissue and the element that it learned from, and no others.
         """
-        effects, element = scene.effects_on(self.anatomy), self._element(scene)
+        effects, element = scene.effects_on(self.anatomy), self.element_of(scene)
         return {name: refusal(model, effects, element) for name, model in self.models.items()}
 
     def knowing(self, scene: Scene) -> dict[str, Learned]:
@@ -68,14 +68,15 @@ class Theatre:
         """A deformer by name, in words: what solves, or what it learned from."""
         if name != "fem":
             return self.models[name].source
-        return solver_named(self._element(scene), scene.effects)
+        return solver_named(self.element_of(scene), scene.effects)
 
     def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
         """Finite elements for a scene's effects, tissue and element; `live` as `Fem` has it."""
-        effects, element = scene.effects_on(self.anatomy), self._element(scene)
+        effects, element = scene.effects_on(self.anatomy), self.element_of(scene)
         return finite_elements(self.anatomy, effects, accuracy, self.device, batch, element, live)
 
-    def _element(self, scene: Scene) -> str:
+    def element_of(self, scene: Scene) -> str:
+        """The element of a scene, or the one that is recommended for the mesh."""
         return scene.element or recommended(self.anatomy.mesh)
 
     def deformer(self, name: str, scene: Scene) -> Deformer:

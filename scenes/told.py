@@ -7,8 +7,8 @@ import numpy as np
 from sim.deformation import Deformation, Outcome
 from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touching
 
-# Sides of the body along the axes of RAS, and against them.
-SIDES = ("RL", "AP", "SI")
+# Parts of the head along the axes of RAS, and against them.
+SIDES = (("right", "left"), ("front", "back"), ("crown", "feet"))
 # Components of a unit vector under this are not told.
 TOLD = 0.05
 
@@ -26,24 +26,44 @@ def doubt_of(outcome: Outcome) -> str:
     return "" if outcome.good else DOUBTS.get(outcome, "not solved to the end: do not rely on it")
 
 
-def told(loads: Loads, answer: Deformation) -> str:
-    """What acts in the first load case, and its tool reads, as one line; empty where time alone goes on."""
-    return ", ".join(words for words in (_words(cause, answer) for cause in loads.causes) if words)
+def told(loads: Loads, answer: Deformation, nodes: np.ndarray | None = None) -> str:
+    """What acts in the first load case, and its tool reads, as one line; empty where time alone goes on.
+
+    With the vertices (V, 3) [m] of the brain it is said how much of the brain stands in fluid.
+    """
+    return ", ".join(words for words in (_words(cause, answer, nodes) for cause in loads.causes) if words)
 
 
-def _words(cause: Cause, answer: Deformation) -> str:
+def _words(cause: Cause, answer: Deformation, nodes: np.ndarray | None) -> str:
     match cause:
         case Pushed():
             return f"force {np.linalg.norm(cause.force[0]):.2f} N"
         case Posture():
-            down = cause.direction[0] / np.linalg.norm(cause.direction[0])
-            ways = [
-                f"{sides[int(x < 0.0)]} {abs(x):.2f}" for sides, x in zip(SIDES, down, strict=True) if abs(x) > TOLD
-            ]
-            return f"gravity towards {' '.join(ways)}, fluid up to {1e3 * cause.csf_level[0]:.0f} mm"
+            return f"gravity pulls to the {_way(cause.direction[0])}, {_fluid(cause, nodes)}"
         case Resected():
-            return f"resection: {cause.done[0]:.0f} steps done"
+            steps = round(float(cause.done[0]))
+            return f"resection: {steps} step{'' if steps == 1 else 's'} done"
         case Touching() | Retracted() if answer.reaction.shape[1]:  # a learnt model does not know it
             return f"the tool reads {np.linalg.norm(answer.reaction[0, -1, :3]):.2f} N"
         case _:
             return ""
+
+
+def _way(direction: np.ndarray) -> str:
+    """Where a direction (3,) of RAS points, the greatest part first, with its components where there are several."""
+    down = direction / np.linalg.norm(direction)
+    axes = [axis for axis in np.argsort(-np.abs(down), kind="stable") if abs(down[axis]) > TOLD]
+    names = [SIDES[axis][int(down[axis] < 0.0)] for axis in axes]
+    if len(axes) == 1:
+        return names[0]
+    return " and the ".join(f"{name} ({abs(down[axis]):.2f})" for name, axis in zip(names, axes, strict=True))
+
+
+def _fluid(cause: Posture, nodes: np.ndarray | None) -> str:
+    """How high the fluid stands: as a share of the brain's height, or over the origin of the scan's coordinates."""
+    level = float(cause.csf_level[0])
+    if nodes is None:
+        return f"fluid up to {1e3 * level:.0f} mm over the scan's origin"
+    height = -nodes @ (cause.direction[0] / np.linalg.norm(cause.direction[0]))
+    share = float(np.clip((level - height.min()) / np.ptp(height), 0.0, 1.0))
+    return f"fluid up to {100.0 * share:.0f} % of the brain's height"

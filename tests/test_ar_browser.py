@@ -3,11 +3,14 @@
 import time
 import urllib.request
 
+import cv2
 import numpy as np
 import pytest
 from visitor import Visitor, free_port, wait_for
 
-from ar.browser import Body, Browser, Choice, Playback, Slider, Viewpoint
+from ar.browser import Browser
+from ar.page_parts import Body, Choice, Fold, Playback, Sign, Slider, Toggle, Viewpoint
+from ar.page_style import PAGE, SAID, STATUS, style
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 
@@ -33,6 +36,7 @@ def open_page(told: dict[str, list], port: int, host: str = "127.0.0.1") -> Brow
         host=host,
         port=port,
         size=(64, 48),
+        signs=[Sign("R", np.array([0.1, 0.0, 0.0]))],
     )
 
 
@@ -75,9 +79,9 @@ def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, told):
 
 def test_bodies_move_and_reports_change(page):
     page.move("tumour", TRIANGLE + 0.01)
-    page.report("render **12 ms**")
+    page.report("render <b>12 ms</b>")
     page.put("force [N]", 0.35)
-    assert wait_for(lambda: page.inputs["force [N]"].value == 0.35 and page.text.content == "render **12 ms**")
+    assert wait_for(lambda: page.inputs["force [N]"].value == 0.35 and "<b>12 ms</b>" in page.text.content)
     assert np.allclose(page.meshes["tumour"].vertices, TRIANGLE + 0.01)
 
 
@@ -133,3 +137,69 @@ def test_scripts_do_not_take_over_from_themselves(page, told):
     assert wait_for(lambda: page.inputs["force [N]"].value == 0.5)
     time.sleep(0.2)
     assert told["force"] == []
+
+
+def test_the_page_is_filled_anew(page, told):
+    """Another scene: other bodies and controls, nothing of the old ones, and what was on its way to them is dropped."""
+    visitor = Visitor(page, 1200)
+    assert wait_for(lambda: page.visitors == 1)
+    old = page.inputs["force [N]"]
+    page.put("force [N]", 0.9)
+    hidden: list[bool] = []
+    fold = Fold("more", (Toggle("Gravity", True, hidden.append, "gravity and fluid", "off?"),))
+    body = Body("blade", TRIANGLE, np.array([[0, 1, 2]]))
+    page.fill([body], Playback(30, told["play"].append, told["frame"].append), [fold], "sulcus: retract", "<p>seen</p>")
+    assert set(page.inputs) == {"Gravity"} and set(page.meshes) == {"blade"} and page.frame.max == 29
+    assert "<p>seen</p>" in page.words.content and page.inputs["Gravity"].label == "gravity and fluid"
+    with pytest.raises(KeyError):
+        page.move("tumour", TRIANGLE)
+    visitor.set(old, 0.4)
+    visitor.set(page.inputs["Gravity"], False)
+    assert wait_for(lambda: hidden == [False])
+    assert told["force"] == []
+    page.show(3, np.full((48, 64, 3), 3, np.uint8))
+    assert wait_for(lambda: int(page.frame.value) == 3)
+    visitor.wire.close()
+
+
+def test_a_visitor_saves_the_picture_as_it_is_shown(page, monkeypatch):
+    sent: list[tuple] = []
+    monkeypatch.setattr("viser.ClientHandle.send_file_download", lambda client, *file, **how: sent.append(file))
+    shown = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    page.show(7, shown)
+    assert wait_for(lambda: int(page.frame.value) == 7)
+    visitor = Visitor(page, 1200)
+    assert wait_for(lambda: page.visitors == 1)
+    visitor.set(page.saver, True)
+    assert wait_for(lambda: len(sent) == 1)
+    name, content = sent[0]
+    saved = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert saved is not None and name == "sulcus-7.png" and np.array_equal(saved[..., ::-1], shown)
+    visitor.wire.close()
+
+
+def test_the_line_over_the_picture_comes_and_goes(page):
+    page.status("solving ... 3 s")
+    assert wait_for(lambda: "<span>solving ... 3 s</span>" in page.line.content)
+    page.status("")
+    assert wait_for(lambda: page.line.content == "")
+
+
+def test_the_button_says_whether_it_plays(page):
+    page.plays(False)
+    assert wait_for(lambda: page.button.label == "Play")
+    page.plays(True)
+    assert wait_for(lambda: page.button.label == "Pause")
+
+
+def test_a_body_changes_its_colour(page):
+    page.tint("tumour", (0.5, 0.0, 1.0))
+    assert wait_for(lambda: tuple(page.meshes["tumour"].color) == (128, 0, 255))
+
+
+def test_the_rules_know_the_picture_s_shape_and_the_page_s_elements(page):
+    sheet = style(4 / 3)
+    assert "--aspect: 1.3333" in sheet and sheet.startswith("<style>") and sheet.count("{") == sheet.count("}")
+    for name in (PAGE, SAID, STATUS):
+        assert f"#{name}" in sheet
+    assert PAGE in page.words.content and SAID in page.text.content

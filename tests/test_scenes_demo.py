@@ -1,5 +1,6 @@
 """The page alive, without a browser: it plays, listens, is refereed, and goes away."""
 
+import re
 import threading
 import time
 
@@ -9,9 +10,10 @@ from theatres import small, theatre_of
 from visitor import Visitor, free_port, wait_for
 
 from ar.browser import Browser
-from scenes.demo import HAND, SCRIPT, Demo, Wish
+from scenes.demo import FEM_COLOUR, STALE_COLOUR, Demo, Moment
 from scenes.paths import Touch, press
 from scenes.referee import Referee
+from scenes.wish import HAND, SCRIPT, Wish
 from sim.fem import Fem
 from surrogate.learned import Learned
 
@@ -33,7 +35,7 @@ def demo(theatre, scene):
     demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
     yield demo
     demo.close()
-    assert wait_for(lambda: not [t for t in set(threading.enumerate()) - before if t.name in ("page", "fem")])
+    assert wait_for(lambda: not [t for t in set(threading.enumerate()) - before if t.name in ("page", "fem", "busy")])
 
 
 @pytest.fixture
@@ -56,8 +58,23 @@ def running(demo):
     assert sum(drawn) > 5
 
 
+def run_until(demo, monkeypatch, reached):
+    """Let the loop run, once, until it has come to something."""
+    check = Demo._check
+
+    def checked(page, now):
+        check(page, now)
+        if reached():
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Demo, "_check", checked)
+        demo.run(60.0)
+
+
 def report(demo):
-    return demo.browser.text.content
+    """The words of the report, without their marks."""
+    return re.sub("<[^>]*>", "|", demo.browser.text.content)
 
 
 def test_it_plays_by_itself_and_is_refereed(demo, theatre):
@@ -67,9 +84,7 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
     assert wait_for(lambda: demo.run(0.3) and f"(frame {demo.wish.number}, FEM" in report(demo))
     text = report(demo)
     assert "error against FEM: mean" in text
-    assert (
-        "**linear**: predicted by a learnt model" in text and "tip to tumour" in text and "ms a stage: deform" in text
-    )
+    assert "|trained model linear|: inside the range" in text and "tip to tumour" in text and "milliseconds: " in text
     truth = demo.referee.truth
     assert truth.number == demo.wish.number
     nodes = theatre.anatomy.tumour_nodes
@@ -90,15 +105,16 @@ def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypat
     fem = demo.browser.meshes["finite elements"]
     rest = np.array(fem.vertices)
 
-    def later():
-        time.sleep(0.5)
-        Referee.ask(demo.referee, *asked[0])
+    seen = []
 
-    answer = threading.Thread(target=later)
-    answer.start()
-    assert demo.run(3.0) == 1 and len(asked) == 1
-    answer.join()
-    assert wait_for(lambda: np.linalg.norm(fem.vertices - rest, axis=1).max() > 5e-4)
+    def moved():
+        seen.append(demo.referee.truth)
+        if len(seen) == 5:
+            Referee.ask(demo.referee, *asked[0])
+        return np.linalg.norm(fem.vertices - rest, axis=1).max() > 5e-4
+
+    run_until(demo, monkeypatch, moved)
+    assert len(asked) == 1 and seen[:5] == [None] * 5
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
@@ -119,8 +135,7 @@ def test_the_error_is_found_once_for_each_answer(demo, monkeypatch):
         return answer(model, loads, start, at)
 
     monkeypatch.setattr(Learned, "deform", counted)
-    demo.run(1.5)
-    assert wait_for(lambda: "error against FEM: mean" in report(demo))
+    run_until(demo, monkeypatch, lambda: "error against FEM: mean" in report(demo))
     assert len(asked) == 2  # for the picture, and for the error
 
 
@@ -149,19 +164,18 @@ def test_visitors_take_over_scrub_and_switch(running):
     visitor.set(page.inputs["place up [mm]"], -5.0)
     assert wait_for(lambda: demo.wish.touch == Touch(0.0, -5e-3, 0.31, (np.radians(20.0), 0.0), 2e-3))
     visitor.set(page.inputs["deformer"], "fem")
-    assert wait_for(lambda: report(demo).startswith("**fem**: converged"))
+    assert wait_for(lambda: "|finite elements|: solved to its tolerance" in report(demo))
     assert wait_for(lambda: "finite elements' own answer" in report(demo))
     visitor.set(page.inputs["deformer"], "svr")
-    assert wait_for(lambda: report(demo).startswith("**svr**"))
-    visitor.set(page.button, True)
-    assert wait_for(lambda: not demo.wish.plays)
-    assert wait_for(lambda: page.frame.value == demo.wish.number)  # at rest: nothing else moves the slider now
+    assert wait_for(lambda: "|trained model svr|" in report(demo))
+    assert not demo.wish.plays  # nothing moves under a hand that is still
+    assert wait_for(lambda: page.button.label == "Play" and page.frame.value == demo.wish.number)
     number = (demo.wish.number + 7) % 120  # a slider that is there already is not moved
     visitor.set(page.frame, number)
-    assert wait_for(lambda: f"frame {number}:" in report(demo) and page.inputs["tool"].value == SCRIPT)
+    assert wait_for(lambda: f"frame {number} of 120" in report(demo) and page.inputs["tool"].value == SCRIPT)
     assert f"force {demo.stage.scene.path(number / 60).force:.2f} N" in report(demo)
     time.sleep(0.3)
-    assert f"frame {number}:" in report(demo)
+    assert f"frame {number} of 120" in report(demo)
 
 
 def test_the_menu_says_who_has_the_tool(demo):
@@ -240,3 +254,79 @@ def test_a_page_that_cannot_be_served_leaves_nothing_behind(theatre, scene):
         with pytest.raises(kind):
             Browser([], None, None, host=host, port=port)  # type: ignore[arg-type]
     assert set(threading.enumerate()) <= before
+
+
+def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
+    """A hand moves the tool: what the finite elements said of the load before it is greyed until they answer anew."""
+    demo.wish.set(plays=False, number=60)
+    assert wait_for(lambda: demo.run(0.3) and "|error against FEM: mean" in report(demo))
+    assert "earlier load" not in report(demo)
+    tints = []
+    monkeypatch.setattr(demo.browser, "tint", lambda name, colour: tints.append(colour))
+    asked = []
+    monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
+    demo.wish.hand(x=0.004, force=0.25)
+    demo.run(0.5)
+    assert wait_for(lambda: "force 0.25 N" in report(demo))
+    said = demo.browser.text.content
+    assert '<p class="stale">of an earlier load: error against FEM' in said and "<p>error against FEM" not in said
+    assert tints[-1] == STALE_COLOUR and len(asked) == 1
+    Referee.ask(demo.referee, *asked[0])
+    assert wait_for(lambda: demo.run(0.3) and "<p>error against FEM" in demo.browser.text.content)
+    assert "earlier load" not in report(demo) and tints[-1] == FEM_COLOUR
+
+
+def test_the_scene_changes_without_a_new_server(demo):
+    page, address = demo.browser, demo.browser.address
+    assert demo.run(0.3) >= 1 and "tool" in page.meshes
+    demo.wish.set(scene="brain_shift", plays=False)
+    assert wait_for(lambda: demo.run(0.5) and "gravity pulls" in report(demo))
+    assert demo.stage.scene.name == "brain_shift" and "tool" not in page.meshes and "force [N]" not in page.inputs
+    assert "fluid drains" in page.words.content and page.address == address
+    demo.wish.set(scene="press")
+    assert wait_for(lambda: demo.run(0.5) and "force 0." in report(demo))
+    assert demo.stage.scene is demo.first and page.inputs["scene"].value == "press"
+
+
+def test_a_scene_that_this_body_cannot_play_is_said_and_the_old_one_goes_on(demo):
+    demo.wish.set(scene="no such scene")
+    demo.run(0.5)
+    assert demo.stage.scene is demo.first and demo.wish.scene == "press"
+    assert wait_for(lambda: demo.run(0.3) and "force 0." in report(demo))
+
+
+def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
+    demo.wish.set(plays=False, number=30)
+    shown = []
+    monkeypatch.setattr(demo.browser, "show", lambda number, colour: shown.append(colour))
+    asked = []
+    answer = Learned.deform
+    demo.run(0.3)
+    assert wait_for(lambda: demo.run(0.3) and "|error against FEM: mean" in report(demo))
+
+    def counted(model, loads, start=None, at=None):
+        asked.append(loads)
+        return answer(model, loads, start, at)
+
+    before = len(shown)
+    moment = Moment()
+    demo._answer(moment)
+    monkeypatch.setattr(Learned, "deform", counted)
+    demo.wish.set(style="contour")
+    demo._answer(moment)
+    assert len(shown) == before + 2 and (shown[-1] != shown[-2]).any() and asked == []
+
+
+def test_a_long_solve_is_told_while_it_lasts(demo, monkeypatch):
+    answer, said = Learned.deform, []
+    monkeypatch.setattr(demo.browser, "status", said.append)
+
+    def slow(model, loads, start=None, at=None):
+        time.sleep(0.8)
+        return answer(model, loads, start, at)
+
+    monkeypatch.setattr(Learned, "deform", slow)
+    demo.wish.set(plays=False)
+    demo.wish.hand(force=0.2)
+    demo.run(0.2)
+    assert said[0].startswith("solving the tool in your hand, 0.20 N (trained model linear)") and said[-1] == ""

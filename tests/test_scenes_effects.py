@@ -66,9 +66,13 @@ class TestCauses:
     def test_they_are_told_in_words(self, theatre):
         both = replace(short(), effects=(*EFFECTS, Gravity(), ToolForce()))
         words = told(both.loads(theatre.site, Touch(force=0.2), 0.0), STILL)
-        assert "force 0.20 N" in words and "gravity towards P 1.00, fluid up to" in words
+        assert "force 0.20 N" in words and "gravity pulls to the back, fluid up to" in words
         assert told(Loads((), np.zeros(1)), STILL) == ""
-        assert "towards L 0.60 S 0.80, fluid up to -12 mm" in told(posture(np.array([-3.0, 0.0, 4.0]), -0.012), STILL)
+        lying = posture(np.array([-3.0, 0.0, 4.0]), -0.012)
+        way = "gravity pulls to the crown (0.80) and the left (0.60), fluid up to "
+        assert told(lying, STILL) == way + "-12 mm over the scan's origin"
+        height = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.04]])  # from -32 to 0 mm against gravity
+        assert told(lying, STILL, height) == way + "62 % of the brain's height"
 
 
 class TestLying:
@@ -175,7 +179,8 @@ class TestWithoutATool:
         lines = []
         monkeypatch.setattr("scenes.play.panel", lambda colour, text: lines.extend(text) or colour)
         labelled(frames[-1], "fem")
-        assert any("gravity towards L 0.87 P 0.50" in line for line in lines) and not any("0.00 N" in x for x in lines)
+        assert any("gravity pulls to the left (0.87) and the back (0.50)" in line for line in lines)
+        assert not any("0.00 N" in line for line in lines)
 
     def test_it_can_be_checked(self, theatre, frames):
         play = player(theatre, sinking(), "fem")
@@ -193,8 +198,11 @@ class TestWithoutATool:
     def test_the_page_offers_no_hand(self, theatre):
         demo = Demo(theatre, sinking(), "fem", "127.0.0.1", free_port())
         try:
-            assert set(demo.browser.inputs) == {"deformer", "Gravity"} and "tool" not in demo.browser.meshes
-            assert wait_for(lambda: demo.run(0.3) and "gravity towards" in demo.browser.text.content)
+            assert (
+                set(demo.browser.inputs) == {"scene", "deformer", "overlay", "Gravity"}
+                and "tool" not in demo.browser.meshes
+            )
+            assert wait_for(lambda: demo.run(0.3) and "gravity pulls" in demo.browser.text.content)
             assert "tip to tumour" not in demo.browser.text.content
         finally:
             demo.close()
@@ -214,7 +222,7 @@ class TestSwitches:
         assert {"ToolForce", "Gravity"} < set(page.inputs) and not {"Held", "Elasticity"} & set(page.inputs)
         assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.text.content)
         visitor.set(page.inputs["Gravity"], False)
-        assert wait_for(lambda: demo.run(0.3) and "without Gravity the tumour is" in page.text.content)
+        assert wait_for(lambda: demo.run(0.3) and "without gravity and fluid the tumour is" in page.text.content)
         said = float(page.text.content.split("the tumour is ")[1].split(" mm")[0])
         scene, nodes = demo.stage.scene, theatre.anatomy.tumour_nodes
         plain, less = replace(theatre, models={}), without(scene, Gravity())
@@ -224,7 +232,7 @@ class TestSwitches:
         )
         change = 1e3 * np.linalg.norm(one - other, axis=1).mean()
         assert change > 0.1 and said == pytest.approx(change, abs=0.02)
-        assert "gravity" not in page.text.content
+        assert "gravity pulls" not in page.text.content
         visitor.set(page.inputs["Gravity"], True)
         assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.text.content)
         visitor.wire.close()
@@ -232,8 +240,10 @@ class TestSwitches:
     def test_without_any_nothing_moves(self, demo):
         demo.wish.switch("Gravity", False)
         demo.wish.switch("ToolForce", False)
-        assert wait_for(lambda: demo.run(0.3) and "without Gravity, ToolForce the" in demo.browser.text.content)
-        assert "time 0.17 s" in demo.browser.text.content
+        assert wait_for(
+            lambda: demo.run(0.3) and "without gravity and fluid, push of the tool the" in demo.browser.text.content
+        )
+        assert "; 0.17 s; tumour moved" in demo.browser.text.content
         demo.wish.switch("Gravity", True)
         assert demo.wish.off == {"ToolForce"}
 

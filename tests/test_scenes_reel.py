@@ -13,7 +13,7 @@ from theatres import sinking
 from visitor import free_port
 
 from scenes.ablation import without
-from scenes.demo import HAND, SCRIPT, Demo
+from scenes.demo import Demo
 from scenes.lying import drained
 from scenes.paths import Touch, lay, press
 from scenes.play import Player
@@ -22,6 +22,7 @@ from scenes.referee import Referee
 from scenes.scene import SCENES, Scene, Viewpoint, find_scene
 from scenes.surgery import Debulking
 from scenes.theatre import Theatre
+from scenes.wish import HAND, SCRIPT
 from sim.deformation import Deformation
 from sim.effects import Elasticity, Gravity, Held, Inertia, remember
 from sim.material import Material
@@ -214,11 +215,13 @@ class TestPages:
 
     def test_the_way_is_told(self, pages, monkeypatch):
         said: list[str] = []
+        solved: list[str] = []
         monkeypatch.setattr(pages[0].browser, "report", said.append)
+        monkeypatch.setattr(pages[0].busy, "on", solved.append)
         pages[0].wish.set(number=12)
-        while not said or "converged" not in said[-1]:
+        while not said or "solved to its tolerance" not in said[-1]:
             pages[0].run(0.1)
-        assert "frame 12 depends on those before it: 12 of them are done" in said
+        assert "frame 12, which depends on those before it: 12 of them are done" in solved
         assert "finite elements' own answer" in said[-1] and "(frame 12, FEM" in said[-1]
 
 

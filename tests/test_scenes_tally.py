@@ -1,7 +1,10 @@
 """Accuracy against time, live on the page."""
 
+from collections.abc import Iterable
+
+from scenes.page_text import table
 from scenes.pareto import unbeaten
-from scenes.tally import RECENT, Tally
+from scenes.tally import RECENT, Row, Tally
 
 
 def test_the_front_is_whom_nobody_beats_in_both():
@@ -10,22 +13,42 @@ def test_the_front_is_whom_nobody_beats_in_both():
     assert unbeaten({}) == frozenset()
 
 
-def test_medians_of_the_last_frames_fastest_first_and_the_front_in_bold():
+def shown(tally: Tally, name: str, loads: Iterable[str], milliseconds: float, millimetres: float) -> None:
+    for load in loads:
+        tally.took(name, load, 1e-3 * milliseconds)
+        tally.missed(name, load, 1e-3 * millimetres)
+
+
+def test_deformers_are_ranked_over_the_loads_that_all_of_them_had():
     tally = Tally()
-    assert str(tally) == ""
-    for _ in range(RECENT):
-        tally.took("slow", 9.0)  # seconds that must be forgotten
-    for seconds in [4e-3] * RECENT + [1.0] * 3:
-        tally.took("slow", seconds)
-    tally.took("quick", 1e-3)
-    tally.took("lost", 5e-3)
-    tally.took("unjudged", 1e-3)
-    for name, metres in (("slow", 1e-5), ("slow", 3e-5), ("slow", 8e-5), ("quick", 2e-4), ("lost", 2e-4)):
-        tally.missed(name, metres)
-    assert {name: (round(ms, 9), round(mm, 9)) for name, (ms, mm) in tally.places.items()} == {
-        "slow": (4.0, 0.03),
-        "quick": (1.0, 0.2),
-        "lost": (5.0, 0.2),
-    }
-    told = str(tally).partition("): ")[2]
-    assert told.split(" · ") == ["**quick** 1.0 ms, 0.200 mm", "**slow** 4.0 ms, 0.030 mm", "lost 5.0 ms, 0.200 mm"]
+    assert tally.rows == [] and table(tally.rows) == ""
+    shown(tally, "quick", "abc", 1.0, 0.2)
+    shown(tally, "quick", "z", 90.0, 90.0)  # a load that nobody else had does not count against it
+    shown(tally, "slow", "abc", 4.0, 0.03)
+    shown(tally, "lost", "bcd", 5.0, 0.2)
+    tally.took("unjudged", "a", 1e-3)
+    rows = [(row.name, round(row.milliseconds, 9), round(row.millimetres, 9), row.loads) for row in tally.rows]
+    assert rows == [("quick", 1.0, 0.2, 2), ("slow", 4.0, 0.03, 2), ("lost", 5.0, 0.2, 2)]
+    assert [row.best for row in tally.rows] == [True, True, False]
+    words = table(tally.rows)
+    assert "over the same 2 loads" in words and words.count("best") == 2
+
+
+def test_without_a_common_load_nobody_is_ranked():
+    """One on frames without force, the other at full force: the medians are no comparison."""
+    tally = Tally()
+    shown(tally, "resting", "ab", 1.0, 0.002)
+    assert [row.best for row in tally.rows] == [None]
+    shown(tally, "pressing", "c", 1.0, 0.2)
+    assert [row.best for row in tally.rows] == [None, None]
+    words = table(tally.rows)
+    assert "not to be compared" in words and "best" not in words
+
+
+def test_a_load_shown_again_counts_once_and_old_loads_are_forgotten():
+    tally = Tally()
+    for load in range(RECENT):
+        shown(tally, "a", [str(load)], 9.0, 9.0)
+    for load in (*range(1000, 1000 + RECENT - 1), 1000, 1000):
+        shown(tally, "a", [str(load)], 4.0, 1.0)
+    assert tally.rows == [Row("a", 4.0, 1.0, RECENT, None)]

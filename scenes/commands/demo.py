@@ -121,8 +121,9 @@ def play(args: argparse.Namespace, closing: ExitStack) -> int:
     scene = scene_asked(args, args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = deformer_name(args, theatre, scene)
+    anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:
-        demo = Demo(theatre, scene, name, args.host, args.port)
+        demo = Demo(theatre, scene, name, args.host, args.port, anatomy, partial(scene_asked, args))
     except UnguardedError as error:
         raise InputError(str(error)) from error
     closing.callback(demo.close)

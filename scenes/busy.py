@@ -1,0 +1,51 @@
+"""Say what is being waited for, once it has been waited for long enough to be noticed."""
+
+from __future__ import annotations
+
+import threading
+import time as clock
+from collections.abc import Callable
+
+# A wait that is noticed [s], and how often it is looked at.
+NOTICED, LOOK = 0.3, 0.1
+
+
+class Busy:
+    """A thread that tells `say` what is being solved and for how long, and an empty line when it is done."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._since: float | None = None
+        self._what = ""
+        self._told = False
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="busy", daemon=True)
+        self._thread.start()
+
+    def on(self, what: str) -> None:
+        """Work has begun, or goes on, on `what`."""
+        with self._lock:
+            self._what = what
+            self._since = clock.perf_counter() if self._since is None else self._since
+
+    def off(self) -> None:
+        """The work is done."""
+        with self._lock:
+            self._since = None
+            if self._told:
+                self._say("")
+            self._told = False
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._closed.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._closed.wait(LOOK):
+            with self._lock:
+                waited = 0.0 if self._since is None else clock.perf_counter() - self._since
+                if waited >= NOTICED:
+                    self._say(f"solving {self._what} ... {waited:.0f} s")
+                    self._told = True

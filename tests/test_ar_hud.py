@@ -1,0 +1,46 @@
+"""The patient's sides at the edges of a picture."""
+
+import numpy as np
+import pytest
+
+from ar.camera import look_at
+from ar.hud import bearings, marked, towards
+
+
+@pytest.mark.parametrize(
+    ("direction", "letters"),
+    [
+        ((1.0, 0.0, 0.0), "R"),
+        ((-2.0, 0.0, 0.0), "L"),
+        ((0.0, 1.0, 0.0), "A"),
+        ((0.0, -1.0, 0.1), "P"),
+        ((0.0, 0.0, 1.0), "S"),
+        ((0.0, 0.0, -1.0), "I"),
+        ((0.5, 0.0, 0.8), "SR"),
+        ((-0.8, 0.6, 0.1), "LA"),
+    ],
+)
+def test_a_direction_has_the_letters_of_its_greatest_parts(direction, letters):
+    assert towards(np.array(direction)) == letters
+
+
+def test_what_lies_at_the_edges_follows_from_the_camera():
+    """From the patient's right side, crown upwards: the face is on the right."""
+    aside = look_at(np.array([0.3, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    assert bearings(aside.T_camera_world[:3, :3]) == {"left": "P", "right": "A", "top": "S", "bottom": "I"}
+    # From above, face upwards in the picture: the patient's right is on the right; from below it is on the left.
+    above = look_at(np.array([0.0, 0.0, 0.3]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    below = look_at(np.array([0.0, 0.0, -0.3]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    assert bearings(above.T_camera_world[:3, :3]) == {"left": "L", "right": "R", "top": "A", "bottom": "P"}
+    assert bearings(below.T_camera_world[:3, :3]) == {"left": "R", "right": "L", "top": "A", "bottom": "P"}
+
+
+def test_letters_stand_at_the_edges_and_the_line_in_its_corner():
+    plain = np.full((240, 320, 3), 90, np.uint8)
+    turn = np.eye(3)
+    letters, both = marked(plain, turn), marked(plain, turn, "frame 12")
+    changed = (letters != plain).any(axis=2)
+    for edge in (changed[100:140, :30], changed[100:140, -30:], changed[:30, 140:180], changed[-30:, 140:180]):
+        assert edge.any()
+    assert not changed[40:200, 40:280].any() and (plain == 90).all()
+    assert (both != letters).any(axis=2)[-30:, :110].any() and not (both != letters)[:-40].any()

@@ -1,0 +1,174 @@
+"""What the page says and offers: the words of an answer, of a verdict, of a brain; sliders that the opening allows."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from theatres import short, sinking, small, theatre_of
+
+from ar.page_parts import Choice, Fold, Slider
+from scenes.busy import NOTICED, Busy
+from scenes.page_controls import clocked, controls
+from scenes.page_text import RESEARCH, about, fem_words, millimetres, side, trust, words
+from scenes.paths import Touch
+from scenes.scene import find_scene
+from scenes.stamp import stamp
+from scenes.verdict import Judged, verdict_words
+from scenes.wish import Wish
+from sim.deformation import Outcome, guess
+from sim.effects import Elasticity, Held, Slide, ToolForce
+from sim.material import Material
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+def answer(outcome: Outcome, bound: float = 1e-3):
+    return replace(guess(np.zeros((1, 3, 3))), outcome=(outcome,), bound=np.full((2, 1), bound))
+
+
+class TestTrust:
+    def test_a_bound_is_told_of_a_load_inside_the_range(self):
+        said = trust(answer(Outcome.PREDICTED), "svr")
+        assert "In 95 of 100 loads" in said and "1.00 mm" in said and "warn" not in said
+
+    @pytest.mark.parametrize(
+        "outcome", [Outcome.EXTRAPOLATED, Outcome.BUDGET, Outcome.STALLED, Outcome.NOT_FINITE, Outcome.PIERCED]
+    )
+    def test_nothing_is_promised_of_an_answer_that_is_not_good(self, outcome):
+        """It stands in another colour, with the reason."""
+        said = trust(answer(outcome), "svr")
+        assert "95 of 100" not in said and 'class="warn"' in said and "Do not rely on this answer" in said
+
+    def test_code_names_are_not_shown(self):
+        for outcome in Outcome:
+            said = trust(answer(outcome), "fem")
+            assert "_" not in said and outcome.name not in said
+
+    def test_a_length_that_is_something_is_not_told_as_nothing(self):
+        assert [millimetres(length) for length in (0.0, 1e-7, 6e-6, 1.234e-3)] == [
+            "0.00 mm",
+            "0.01 mm",
+            "0.01 mm",
+            "1.23 mm",
+        ]
+
+
+class TestVerdict:
+    JUDGED = Judged(28, 0.35, True, 1e-3, 1e-4, 2e-4)
+
+    def test_of_the_present_load_it_stands_plainly(self):
+        said = verdict_words(self.JUDGED, False, "waits")
+        assert "mean 0.100, largest 0.200 mm" in said and "stale" not in said and "waits" not in said
+
+    def test_of_another_load_it_is_greyed_and_says_so(self):
+        said = verdict_words(self.JUDGED, True, "waits")
+        assert said.startswith('<p class="stale">of an earlier load') and "frame 28" in said and "waits" in said
+
+    def test_before_any_it_says_what_is_waited_for(self):
+        assert verdict_words(None, True, "waits") == '<p class="stale">waits</p>'
+
+
+class TestStamp:
+    def test_it_is_of_the_load_and_not_of_the_frame(self, theatre):
+        scene, site = short(), theatre.site
+        one = stamp(scene.loads(site, Touch(force=0.2), 0.1))
+        assert one == stamp(scene.loads(site, Touch(force=0.2), 0.1))
+        others = [Touch(force=0.21), Touch(force=0.2, x=0.004), Touch(force=0.2, tilt=(0.3, 0.0))]
+        assert one not in {stamp(scene.loads(site, touch, 0.1)) for touch in others}
+        assert one != stamp(scene.loads(site, Touch(force=0.2), 0.2))
+
+
+class TestWords:
+    def test_it_says_what_is_seen_and_that_it_is_research(self, theatre):
+        said = words(theatre, short(), "the <default> brain")
+        assert RESEARCH in said and "&lt;default&gt;" in said and "<default>" not in said
+        assert "tumour now" in said and "tumour in the scan" in said and "tip to tumour" in said
+        assert "tip to tumour" not in words(theatre, sinking(), "brain")
+
+    def test_tissue_and_element_are_those_that_are_solved(self, theatre):
+        default = "linear tetrahedra, stable-neo-hookean tissue of Young's modulus 3 kPa"
+        assert fem_words(theatre, short()).startswith(default)
+        stiff = Elasticity(Material("corotational", 5e3, 0.4, prony=()))
+        plain = replace(theatre, models={})
+        other = replace(short(), effects=(stiff, Held(), Slide(), ToolForce()), element="smoothed")
+        assert fem_words(plain, other) == (
+            "smoothed linear tetrahedra, corotational tissue of Young's modulus 5 kPa and Poisson's ratio 0.4"
+        )
+        assert fem_words(plain, find_scene("retract")).endswith("relaxes under a held load")
+        assert "brain.vtu, opened" in about(theatre, short(), "brain.vtu")
+
+    def test_the_side_is_the_patient_s(self, theatre):
+        site = theatre.site
+        middle = 0.5 * (site.anatomy.mesh.nodes[:, 0].min() + site.anatomy.mesh.nodes[:, 0].max())
+        at = [replace(site, origin=np.array([middle + x, 0.0, 0.0])) for x in (0.02, -0.02, 0.0)]
+        assert [side(place) for place in at] == [
+            "on the patient's right",
+            "on the patient's left",
+            "near the midline",
+        ]
+
+
+class TestControls:
+    def test_the_sliders_end_where_the_bone_stops_the_tool(self, theatre):
+        scene, site = short(), theatre.site
+        assert scene.tool is not None
+        found = controls(scene, site, ("svr", "fem"), Wish("svr", Touch()), print, print)
+        places = [control for control in found if isinstance(control, Slider) and control.label.startswith("place")]
+        room = site.clearance - scene.tool.radius
+        assert len(places) == 2 and all(0.5 <= control.high <= max(0.5, 1e3 * room) for control in places)
+        assert all(control.low == -control.high and control.hint for control in places)
+        assert all(any(f"to {letter}" in control.words for letter in "LRAPSI") for control in places)
+
+    def test_no_code_name_is_shown(self, theatre):
+        for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
+            found = controls(small(name), theatre.site, ("fem",), Wish("fem", Touch()), print, print)
+            switches = [inner for control in found if isinstance(control, Fold) for inner in control.controls]
+            assert switches and all(inner.words and inner.words != inner.label for inner in switches)
+
+    def test_every_overlay_style_is_offered(self, theatre):
+        wish = Wish("fem", Touch())
+        found = controls(short(), theatre.site, ("fem",), wish, print, print)
+        overlay = next(control for control in found if isinstance(control, Choice) and control.label == "overlay")
+        seen = []
+        for option in overlay.options:
+            overlay.changed(option)
+            seen.append(wish.style)
+        assert seen[:3] == ["window", "contour", "fill"] and overlay.start == overlay.options[0]
+
+    def test_which_scenes_go_on_by_themselves(self, theatre):
+        found = {name: clocked(find_scene(name), theatre.site) for name in ("press", "palpate", "retract", "pulsation")}
+        assert found == {"press": False, "palpate": False, "retract": True, "pulsation": True}
+
+
+class TestHand:
+    def test_a_still_hand_pauses_the_script_and_play_takes_the_tool_back(self):
+        wish = Wish("svr", Touch())
+        wish.hand(force=0.2)
+        assert not wish.plays and wish.now()[2] == Touch(force=0.2)
+        wish.play(True)
+        assert wish.plays and wish.now()[2] is None
+
+    def test_where_time_goes_on_the_hand_keeps_the_tool(self):
+        wish = Wish("fem", Touch(), clocked=True)
+        wish.hand(depth=1e-3)
+        wish.play(True)
+        assert wish.plays and wish.now()[2] == Touch(depth=1e-3)
+
+
+def test_a_long_wait_is_told_and_a_short_one_is_not():
+    said: list[str] = []
+    busy = Busy(said.append)
+    busy.on("a quick load")
+    busy.off()
+    time.sleep(NOTICED + 0.3)
+    assert said == []
+    busy.on("the first half")
+    busy.on("the second half")
+    time.sleep(NOTICED + 0.3)
+    busy.off()
+    busy.close()
+    assert said[0].startswith("solving the second half") and said[-1] == "" and "" not in said[:-1]
