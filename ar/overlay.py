@@ -37,18 +37,25 @@ SURROUND = 24
 class Gauge:
     """The number asked for first: how far the tool is from the hidden surface.
 
-    tip, nearest (3,) world points [m]: the tool's tip and the point of the hidden surface that is nearest to it; error
-    [m]: how far off the number may be, None where nobody knows.
+    Parameters
+    ----------
+    tip, nearest
+        (3,) [m] world points: the tool's tip and the point of the hidden surface that is nearest to it.
+    read
+        The distance [m], where it is known better than by the line between the two.
+    error
+        How far off the number may be [m]; None where nobody knows.
     """
 
     tip: np.ndarray
     nearest: np.ndarray
+    read: float | None = None
     error: float | None = None
 
     @property
     def distance(self) -> float:
         """[m]."""
-        return float(np.linalg.norm(np.asarray(self.tip) - self.nearest))
+        return float(np.linalg.norm(np.asarray(self.tip) - self.nearest)) if self.read is None else self.read
 
     def __str__(self) -> str:
         """As it is printed beside the line."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ar.overlay import DOUBTFUL, GAUGE, ink_of, iou, silhouette
 from ar.raycast import raycast
 from ar.refind import outline_gap, stands
 from sim.deformation import Deformation
+from surrogate.learned import Learned
 from surrogate.patch import barycentric_lattice
 
 from .play import SMALL, Frame, Player
@@ -143,10 +144,21 @@ def _printed(player: Player, frame: Frame) -> bool:
         return False
     if frame.tip is None:
         return True
-    corners = player.positions(frame.deformation)[player.stage.at(frame.loads).anatomy.tumour_surface]
-    share = barycentric_lattice(SAMPLES)
-    distance = np.linalg.norm(np.einsum("qc,scx->sqx", share, corners) - frame.tip, axis=2).min()
+    distance = _distance(player, frame, frame.tip)
     error = None if frame.doubt else frame.distance_error
     # Samples are never nearer than the surface: by less than what is printed.
     near = {millimetres(distance - off, error) for off in (0.0, 0.5e-4, 1e-4)}
     return any(stands(frame.shown, text, GAUGE) for text in near)
+
+
+def _distance(player: Player, frame: Frame, tip: np.ndarray) -> float:
+    """From tip to tumour [m] by samples of the drawn surfaces, with what the model knows it to be off by."""
+    positions = player.positions(frame.deformation)
+    share = barycentric_lattice(SAMPLES)
+    corners = positions[player.stage.at(frame.loads).anatomy.tumour_surface]
+    apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", share, corners) - tip, axis=2).min())
+    model = player.deformer
+    if not isinstance(model, Learned) or model.tip is None or model.tip.correction is None:
+        return apart
+    uncorrected = replace(model, tip=None).distance(frame.loads, frame.deformation).value[0]
+    return apart + float(model.distance(frame.loads, frame.deformation).value[0] - uncorrected)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import trimesh
 
 from ar.camera import Camera
 from ar.hud import PAD, panel, write
 from ar.layer import Layer
 from ar.overlay import Gauge, Style, composite
 from ar.view import Picture, render
+from sim.closest import closest
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
 from sim.loads import Loads
@@ -22,6 +22,7 @@ from sim.resting import resting_tip
 from surrogate.learned import Learned
 
 from .paths import AIR, Touch
+from .reading import reading
 from .scene import Scene
 from .site import Site
 from .stage import TOOL, Stage
@@ -90,10 +91,14 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class HeldTool:
-    """Where a tool is drawn: tip (3,) [m], T_world_tool pose (4, 4), and whether bone is where its load needs it."""
+    """Where a tool is drawn: tip (3,) [m], and T_world_tool pose (4, 4).
+
+    lift [m]: how far an idle one is off the tissue; blocked: whether bone is where its load needs it.
+    """
 
     tip: np.ndarray
     pose: np.ndarray
+    lift: float
     blocked: bool
 
 
@@ -157,7 +162,7 @@ class Player:
         rendered = clock.perf_counter()
         tumour, rest = (stage.tumour(at) for at in (positions, self.site.anatomy.mesh.nodes))
         doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.blocked else "")
-        gauge = None if held is None else gauged(held.tip, tumour)
+        gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
         over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt).colour
         remark = self.scene.stopped(self.site, touch)
         annotate(over, number, remark)
@@ -169,6 +174,13 @@ class Player:
             float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()),
             doubt, remark, dict(zip(STAGES, spent, strict=True)),
         )  # fmt: skip
+
+    def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
+        """From the tip to the tumour, and how far off that may be as far as the deformer knows."""
+        told = None if held.blocked else reading(self.deformer, loads, answer, self.scene.tool, held.lift)
+        if told is None:
+            return gauged(held.tip, tumour)
+        return replace(gauged(held.tip, tumour), read=told.distance, error=told.bound)
 
     def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
         """How far each vertex of the drawn tumour may be off [m]: what the model promises of this load, if it does."""
@@ -197,22 +209,22 @@ class Player:
         It is lifted off where it is idle. Tissue that is drawn aside may carry it to the bone's edge, which stops it.
         """
         if self.scene.posed:
-            return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), False)
+            return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), 0.0, False)
         inward = self.site.axis
         carried = self.scene.contact(self.site, touch).carried(positions)
         through = self.site.within(carried, tool.radius)
         tip = through
         if isinstance(tool, Probe):
             tip = resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
-        tip = tip - AIR * max(0.0, 1.0 - touch.force / 0.02) * inward
+        lift = AIR * max(0.0, 1.0 - touch.force / 0.02)
+        tip = tip - lift * inward
         pose = tool.pose(tip, inward, self.site.right)
-        return HeldTool(tip, pose, bool(np.linalg.norm(through - carried) > CARRIED))
+        return HeldTool(tip, pose, lift, bool(np.linalg.norm(through - carried) > CARRIED))
 
 
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
     """From a tip (3,) [m] to the nearest point of a hidden surface."""
-    surface = trimesh.Trimesh(hidden.vertices, hidden.triangles, process=False)
-    return Gauge(tip, trimesh.proximity.closest_point_naive(surface, tip[None])[0][0])
+    return Gauge(tip, closest(tip[None], hidden.vertices[hidden.triangles]).point[0])
 
 
 def annotate(colour: np.ndarray, number: int, remark: str) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ar.hud import millimetres
 from sim.deformation import Deformation, Deformer
 from sim.loads import Loads, Pushed, Touching
 from sim.tip import tip_gauge
 from surrogate.learned import Learned
 
-from .tool import Blade, Probe
+from .tool import Instrument, Probe
 
 
 @dataclass(frozen=True)
@@ -28,14 +29,13 @@ class Reading:
     bound: float | None
 
     def __str__(self) -> str:
-        promised = "" if self.bound is None else f" +- {1e3 * self.bound:.1f}"
-        return f"{1e3 * self.distance:.1f}{promised} mm"
+        return millimetres(self.distance, self.bound)
 
 
 def reading(
-    deformer: Deformer, loads: Loads, answer: Deformation, tool: Probe | Blade | None, lift: float = 0.0
+    deformer: Deformer, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float = 0.0
 ) -> Reading | None:
-    """Read the distance in the first load case of a deformer's answer; None where no round tool pushes or is moved.
+    """Read the distance in the first load case of a deformer's answer; None where no single ball pushes or is moved.
 
     Of finite elements it is their own and has no bound. A learnt model promises nothing outside what it was taught.
 
@@ -51,7 +51,7 @@ def reading(
     InputError
         An answer without open cortex or tumour.
     """
-    if not isinstance(tool, Probe) or (loads.of(Pushed) is None and loads.of(Touching) is None):
+    if not isinstance(tool, Probe) or len(loads.every(Pushed)) + len(loads.every(Touching)) != 1:
         return None
     if not isinstance(deformer, Learned):
         gauge = tip_gauge(deformer.anatomy)
