@@ -75,6 +75,11 @@ def is_our_film(path: Path) -> bool:
     return path.read_bytes().endswith(END)
 
 
+def shrunk(colour: np.ndarray, width: int, height: int) -> np.ndarray:
+    """A picture (H, W, 3) uint8 as one of fewer pixels (height, width, 3): means of those that it covers."""
+    return cv2.resize(colour, (width, height), interpolation=cv2.INTER_AREA)
+
+
 def read_png(path: Path) -> np.ndarray:
     """The picture (H, W, 3) uint8 sRGB in a file; ValueError when it holds none."""
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)

@@ -14,14 +14,14 @@ from ar.raycast import raycast
 from ar.refind import outline_gap, stands
 from sim.deformation import Deformation
 from surrogate.learned import Learned
-from surrogate.patch import barycentric_lattice
 
 from .play import SMALL, Frame, Player
 from .scene import Bounds
 from .stage import TOOL, TUMOUR_COLOUR
 
-# The tumour's triangles are sampled in the square of so many points each.
-SAMPLES = 12
+# Barycentric weights (q, 3) at which the tumour's triangles are sampled: corners, edges and insides.
+STEPS = 24
+SAMPLES = np.array([(i, j, STEPS - i - j) for i in range(STEPS + 1) for j in range(STEPS + 1 - i)]) / STEPS
 
 NOWHERE = 0.0, np.inf, np.inf
 """How far off a tumour is whose place is no number: overlap, distance [m], distance in the picture [pixel]."""
@@ -100,7 +100,7 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
         motion_mm=1e3 * float(max(moved)),
         pixels=max(pixels),
         drawn=max(drawn),
-        printed=all(_printed(player, frame) for frame in frames),
+        printed=all(good and _printed(player, frame) for good, frame in zip(finite, frames, strict=True)),
         finite=all(finite),
         answered=all(frame.deformation.outcome[0].good for frame in frames) and all(o.good for o in truth.outcome),
         in_step=all(
@@ -154,9 +154,8 @@ def _printed(player: Player, frame: Frame) -> bool:
 def _distance(player: Player, frame: Frame, tip: np.ndarray) -> float:
     """From tip to tumour [m] by samples of the drawn surfaces, with what the model knows it to be off by."""
     positions = player.positions(frame.deformation)
-    share = barycentric_lattice(SAMPLES)
     corners = positions[player.stage.at(frame.loads).anatomy.tumour_surface]
-    apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", share, corners) - tip, axis=2).min())
+    apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", SAMPLES, corners) - tip, axis=2).min())
     model = player.deformer
     if not isinstance(model, Learned) or model.tip is None or model.tip.correction is None:
         return apart

@@ -212,14 +212,15 @@ class Player:
             return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), 0.0, False)
         inward = self.site.axis
         carried = self.scene.contact(self.site, touch).carried(positions)
-        through = self.site.within(carried, tool.radius)
-        tip = through
+        inside = self.site.within(carried, tool.radius)
+        blocked = bool(np.linalg.norm(inside - carried) > CARRIED)
+        tip = through = inside if blocked else carried
         if isinstance(tool, Probe):
             tip = resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
         lift = AIR * max(0.0, 1.0 - touch.force / 0.02)
         tip = tip - lift * inward
         pose = tool.pose(tip, inward, self.site.right)
-        return HeldTool(tip, pose, lift, bool(np.linalg.norm(through - carried) > CARRIED))
+        return HeldTool(tip, pose, lift, blocked)
 
 
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:

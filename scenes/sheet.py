@@ -7,11 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ar.hud import panel
+from ar.screen import shrunk
 
 from .play import Frame, Player, labelled
 
 # Frames that are drawn of each scene, evenly spaced; the first loads kernels and is not timed.
 DRAWN = 8
+# Width and height of a picture of the sheet [pixel].
+SIZE = (320, 240)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +32,12 @@ class Thumbnail:
 
 
 def thumbnail(player: Player, name: str) -> Thumbnail:
-    """The frame in which the tumour has moved most, of those after the last cut, at half its size; deformer `name`."""
+    """The frame of a deformer `name` in which the tumour has moved most, of those after the last cut, small."""
     every = max(1, (len(player.scene.times) - 1) // (DRAWN - 1))
     frames = list(player.frames(every))
     best = max(frames, key=lambda frame: (_cuts(player, frame), frame.moved))
     picture = panel(labelled(best, name), [player.scene.name], "bottom left", 0.9)
-    return Thumbnail(halved(picture), _medians(frames[1:] or frames), 1e3 * max(frame.moved for frame in frames))
+    return Thumbnail(shrunk(picture, *SIZE), _medians(frames[1:] or frames), 1e3 * max(frame.moved for frame in frames))
 
 
 def _cuts(player: Player, frame: Frame) -> int:
@@ -44,13 +47,6 @@ def _cuts(player: Player, frame: Frame) -> int:
 
 def _medians(frames: list[Frame]) -> dict[str, float]:
     return {stage: 1e3 * float(np.median([frame.seconds[stage] for frame in frames])) for stage in frames[0].seconds}
-
-
-def halved(colour: np.ndarray) -> np.ndarray:
-    """A picture (H, W, 3) uint8 at half its width and height: means of four pixels."""
-    high, wide = (size - size % 2 for size in colour.shape[:2])
-    blocks = colour[:high, :wide].reshape(high // 2, 2, wide // 2, 2, 3).astype(np.float32)
-    return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
 
 
 def sheet(pictures: list[np.ndarray], columns: int = 3) -> np.ndarray:

@@ -12,9 +12,8 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.device import find_device
 from sim.discretisation import recommended
-from sim.effects import solver_named
 from sim.errors import InputError
-from sim.fem import Fem
+from sim.fem import Fem, solver_named
 from sim.intensity import Intensity, read_intensity, sidecar
 from sim.meshfile import read_anatomy
 from sim.operated import Operated, finite_elements

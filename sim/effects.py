@@ -396,9 +396,3 @@ def _remembers(effect: Effect) -> bool:
             return effect.remembers
         case _:
             return False
-
-
-def solver_named(element: str, effects: Iterable[Effect]) -> str:
-    """Finite elements in words: their element and tissue, as every answer, picture and file names them."""
-    tissue = next((str(effect) for effect in effects if isinstance(effect, Elasticity)), "no elasticity")
-    return f"finite elements ({element}; {tissue})"

@@ -23,7 +23,7 @@ from .correction import step_from
 from .deformation import LEARNT_KEY, Cost, Deformation, check_start, joined
 from .device import find_device
 from .discretisation import discretise
-from .effects import Effect, solver_named
+from .effects import Effect, Elasticity
 from .elimination import eliminating
 from .errors import InputError
 from .following import Following
@@ -384,3 +384,9 @@ def _joined(parts: list[Deformation]) -> Deformation:
         return parts[0]
     kept = [{key: value for key, value in part.history.items() if not key.startswith(LEARNT_KEY)} for part in parts]
     return joined([replace(part, history=history) for part, history in zip(parts, kept, strict=True)])
+
+
+def solver_named(element: str, effects: Iterable[Effect]) -> str:
+    """Finite elements in words: their element and tissue, as every answer, picture and file names them."""
+    tissue = next((str(effect) for effect in effects if isinstance(effect, Elasticity)), "no elasticity")
+    return f"finite elements ({element}; {tissue})"

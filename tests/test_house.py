@@ -52,7 +52,7 @@ TIERS = (
     },
     {
         "precondition",
-        "resting",
+        "at_rest",
         "condensation",
         "elimination",
         "patching",
@@ -70,7 +70,7 @@ TIERS = (
 OWNERS = {
     "torch": {"sim/dense.py", "sim/pivots.py", "sim/product.py", "surrogate/ann.py"},
     "sklearn": {"surrogate/svr.py"},
-    "trimesh": {"scenes/play.py", "scenes/tool.py"},
+    "trimesh": {"scenes/tool.py"},
     "meshio": {"sim/meshfile.py"},
     "viser": {"ar/browser.py", "ar/guard.py", "ar/messages.py"},
     "nilearn": {"sim/template.py"},

@@ -10,7 +10,7 @@ from theatres import PUSHING, on_template, small, template_theatre
 from ar.camera import project_cv2
 from scenes.lying import Lying
 from scenes.paths import AIR, Touch, draw, lay, palpate, press, slide, smooth
-from scenes.scene import SCENES, Viewpoint, find_scene
+from scenes.scene import SCENES, UNDER, Viewpoint, find_scene
 from scenes.site import site_of
 from scenes.stage import CORTEX, DRAPE, TOOL, Stage, clipped
 from scenes.tool import Probe
@@ -156,7 +156,7 @@ class TestSite:
         for x, y in ((0.1, 0.0), (-0.03, 0.03), (0.0, -0.02)):
             point = site.contact(x, y, 0.007).point[None]
             assert open_patch(site.anatomy).rim_distance(point)[0] > 0.007 * 0.999
-            assert site.across(point)[0] > 0.95 * (site.clearance - 0.007)
+            assert site.across(point)[0] > 0.95 * site.reach(0.007)
         assert np.allclose(site.contact(0.1, 0.1, 1.0).point, site.origin, atol=1e-9)
 
     def test_direction_tilts_as_asked(self, site):
@@ -197,19 +197,21 @@ class TestCamera:
     def test_looks_at_the_open_cortex_from_outside(self, site):
         camera = Viewpoint().camera(site)
         assert (camera.centre - site.origin) @ site.axis < -0.1
-        middle = project_cv2(camera, site.origin[None])[0]
+        middle = project_cv2(camera, (site.origin + UNDER * site.axis)[None])[0]
         assert np.allclose(middle, [319.5, 239.5], atol=1e-6)
         a, b, c = (site.anatomy.mesh.nodes[site.anatomy.open_surface[:, k]] for k in range(3))
         facing = np.einsum("si,si->s", np.cross(b - a, c - a), camera.centre - a) > 0.0
         assert facing.mean() > 0.97
-        above = project_cv2(camera, (site.origin + 0.01 * site.up)[None])[0]
-        aside = project_cv2(camera, (site.origin + 0.01 * site.right)[None])[0]
+        above, aside = (
+            project_cv2(camera, (site.origin + UNDER * site.axis + 0.01 * way)[None])[0]
+            for way in (site.up, site.right)
+        )
         assert above[1] < middle[1] - 10.0 and aside[0] > middle[0] + 10.0
 
     @pytest.mark.parametrize("tilt", [-0.35, 0.0, 0.5])
     def test_it_stands_as_far_and_as_high_as_asked(self, site, tilt):
         camera = Viewpoint(distance=0.15, tilt=tilt, fov=0.4, width=200, height=100).camera(site)
-        away = camera.centre - site.origin
+        away = camera.centre - site.origin - UNDER * site.axis
         along = [away @ way for way in (-site.axis, site.up, site.right)]
         assert along == pytest.approx([0.15 * np.cos(tilt), 0.15 * np.sin(tilt), 0.0], abs=1e-12)
         assert (camera.vertical_fov, camera.width, camera.height) == (pytest.approx(0.4), 200, 100)

@@ -11,10 +11,11 @@ import pytest
 import warp as wp
 from theatres import PUSHING, put, short, sinking, theatre_of
 
+from ar.screen import shrunk
 from scenes.ablation import ALL, device_arrays, rows, run, without
 from scenes.cli import main
 from scenes.scene import SCENES, find_scene
-from scenes.sheet import halved, sheet
+from scenes.sheet import sheet
 from sim.effects import Gravity, Held, ToolForce
 from sim.errors import InputError
 
@@ -118,8 +119,8 @@ class TestScenes:
 
 
 def test_half_a_picture_keeps_its_light():
-    colour = np.random.default_rng(0).integers(0, 256, (7, 10, 3), dtype=np.uint8)
-    small = halved(colour)
-    assert small.shape == (3, 5, 3)
+    colour = np.random.default_rng(0).integers(0, 256, (8, 10, 3), dtype=np.uint8)
+    small = shrunk(colour, colour.shape[1] // 2, colour.shape[0] // 2)
+    assert small.shape == (4, 5, 3)
     assert small[1, 2].tolist() == np.rint(colour[2:4, 4:6].reshape(4, 3).mean(axis=0)).tolist()
-    assert sheet([small] * 4).shape == (6, 15, 3) and (sheet([small] * 4)[3:, 5:] == 12).all()
+    assert sheet([small] * 4).shape == (8, 15, 3) and (sheet([small] * 4)[4:, 5:] == 12).all()

@@ -93,9 +93,10 @@ def drawn(play, frame, positions, camera=None, tip=None):
     """A frame whose picture was drawn from other positions, by another camera, or with another tip."""
     stage, at = play.stage, frame.tip if tip is None else tip
     tumour, rest = (stage.tumour(each) for each in (positions, play.site.anatomy.mesh.nodes))
-    shown = composite(
-        frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauged(at, tumour), before=rest
-    ).colour
+    gauge = gauged(at, tumour)
+    if tip is None:
+        gauge = replace(gauge, read=frame.distance, error=frame.distance_error)
+    shown = composite(frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauge, before=rest).colour
     annotate(shown, frame.number, frame.remark)
     return replace(frame, shown=shown)
 

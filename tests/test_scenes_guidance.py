@@ -100,7 +100,7 @@ def test_frames_of_another_run_are_refused_or_removed(folder, tmp_path, monkeypa
     assert f"film {tmp_path / 'press.gif'}" in capsys.readouterr().out
     first = {path: path.read_bytes() for path in tmp_path.glob("frame_*.png")}
     assert len(first) == 3 and len({signature(path) for path in first}) == 1
-    assert all(read_png(path).shape == (480, 640, 3) for path in first)
+    assert all(read_png(path).shape == (600, 800, 3) for path in first)
     (tmp_path / "frame_mine.png").write_bytes(b"mine")
     assert main([*words, "--every", "120"]) == 2
     assert "holds 3 frames of another run" in capsys.readouterr().err

@@ -36,9 +36,11 @@ class Demo:
         self.solve.join()
         print("all closed", flush=True)
 
-theatre = Names(models={"linear"}, best=lambda scene: "linear", knowing=lambda scene: True)
+theatre = Names(models={"linear"}, best=lambda scene: "linear", knowing=lambda scene: True,
+                refusals=lambda scene: {}, described=lambda name, scene: name)
 sys.modules["scenes.demo"] = Names(Demo=Demo)
-sys.modules["scenes.scene"] = Names(find_scene=lambda name: None)
+scene = Names(name="none", made_of=lambda tissue, element: scene)
+sys.modules["scenes.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",))
 sys.modules["scenes.theatre"] = Names(open_theatre=lambda *words: theatre)
 from scenes.commands.demo import add_arguments, run
 parser = argparse.ArgumentParser()

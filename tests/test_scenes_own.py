@@ -23,7 +23,7 @@ OWN = '''"""The tool nods twice."""
 from own_strokes import nod
 from scenes.scene import Scene, Viewpoint
 
-SCENE = Scene("nod", __doc__, nod(0.2), duration=0.07, viewpoint=Viewpoint(width=160, height=120))
+SCENE = Scene("nod", __doc__, nod(0.2), duration=0.07, viewpoint=Viewpoint(width=400, height=300))
 '''
 STROKES = """from scenes.paths import press
 

@@ -90,7 +90,7 @@ class TestWords:
         assert "tip to tumour" not in words(theatre, sinking(), "brain")
 
     def test_tissue_and_element_are_those_that_are_solved(self, theatre):
-        default = "linear tetrahedra, stable-neo-hookean tissue of Young's modulus 3 kPa"
+        default = "smoothed linear tetrahedra, neo-hookean tissue of Young's modulus 3 kPa"
         assert fem_words(theatre, short()).startswith(default)
         stiff = Elasticity(Material("corotational", 5e3, 0.4, prony=()))
         plain = replace(theatre, models={})

@@ -182,7 +182,7 @@ class TestRender:
             assert np.array_equal(cv2.imread(str(tmp_path / f"frame_{number:04d}.png"))[..., ::-1], colour)
 
     def test_doubtful_answers_are_told_by_the_exit_code(self, anatomy, tmp_path, monkeypatch, capsys):
-        strong = replace(short(), path=press(3.0, rise=0.1, hold=0.0))
+        strong = replace(short(), path=press(0.8, rise=0.1, hold=0.0))
         monkeypatch.setattr("scenes.scene.find_scene", lambda name: strong)
         words = ["render", "press", "--anatomy", str(anatomy), "--out", str(tmp_path), "--json"]
         assert main(words) == 1

@@ -5,10 +5,10 @@ import json
 import re
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 from conftest import make_box
+from poison import poisoned
 
 from ar.screen import read_png
 from scenes import report, report_elements, report_learner, report_reference, report_row
@@ -127,13 +127,7 @@ def test_a_learner_is_held_to_loads_that_it_was_not_taught(study, box, tmp_path,
     """Fitted here to the taught rows; in the file that the report reads, answers to the discs' loads are wild."""
     taught, pushed, nodes = study.discs.taught, study.pushed, Learner(name).vertices(box)
     truth = study.dataset.displacement(nodes)[study.dataset.good]
-    path = tmp_path / "data.h5"
-    path.write_bytes(study.data.read_bytes())
-    with h5py.File(path, "r+") as file:
-        stored = file["answers/displacement"]
-        wild = np.random.default_rng(0).normal(scale=1e-2, size=stored.shape[1:])
-        for load in np.flatnonzero(study.dataset.good)[study.discs.test]:
-            stored[load] = wild
+    path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
     monkeypatch.setattr(report_learner, "counts", lambda most: [])
     monkeypatch.setattr(report_learner, "_covered", lambda *known: {})
     with one_thread():

@@ -39,7 +39,11 @@ def test_a_row_for_each_tissue_and_set(words, capsys):
     sets = [(row["poisson"], row["preset"]) for row in said["rows"]]
     assert sets == [(nu, preset) for nu in (0.4, 0.45) for preset in ("bipolar", "mixed")]
     for row in said["rows"]:
-        assert (row["law"], row["element"], row["preconditioner"]) == ("stable-neo-hookean", "p1", "sparse factor")
+        assert (row["law"], row["element"], row["preconditioner"]) == (
+            "stable-neo-hookean",
+            "smoothed",
+            "sparse factor",
+        )
         assert row["nodes"] == 9 * 9 * 6 and row["loads"] == row["converged"] == 6
         assert len(row["seconds"]) == 2 and min(*row["seconds"], row["draw_seconds"], row["set_up"]) > 0.0
         assert row["rate"] == pytest.approx(12 / sum(row["seconds"]))

@@ -113,7 +113,7 @@ class TestMemory:
         effects = (Elasticity(RELAXING), Held(), Gravity(direction=(0.0, 0.0, -1.0)), Inertia())
         plain, made = (
             Fem(BODY, effects, TIGHT, "cpu", element="p1"),
-            finite_elements(BODY, (*effects, STEPS), TIGHT, "cpu"),
+            finite_elements(BODY, (*effects, STEPS), TIGHT, "cpu", element="p1"),
         )
         one = other = None
         for time in (0.01, 0.02, 0.05):
@@ -125,7 +125,7 @@ class TestMemory:
                 np.testing.assert_array_equal(value, other.history[name])
 
     def test_a_history_of_another_body_is_a_sentence(self) -> None:
-        made = finite_elements(BODY, (Elasticity(RELAXING), Held(), STEPS), TIGHT, "cpu")
+        made = finite_elements(BODY, (Elasticity(RELAXING), Held(), STEPS), TIGHT, "cpu", element="p1")
         strange = replace(
             guess(np.zeros((1, len(MESH.nodes), 3))), history={"viscoelasticity neo-hookean": np.ones((1, 7, 18))}
         )

@@ -387,13 +387,6 @@ def test_presets_hold_their_promise() -> None:
     assert errors[2] < 5e-2
 
 
-def test_an_accuracy_that_a_type_cannot_reach_is_refused() -> None:
-    with pytest.raises(InputError, match="float32 reaches 2e-05"):
-        Accuracy(tolerance=1e-6, precision="float32")
-    with pytest.raises(InputError, match="no precision is called"):
-        Accuracy(precision="float16")  # pyright: ignore[reportArgumentType]
-
-
 def test_deformations_never_hold_what_is_not_finite() -> None:
     good = built("fem float64").deform(loads())
     with pytest.raises(AssertionError, match="not finite"):

@@ -94,7 +94,7 @@ def test_arguments_of_push_and_posture_are_refused_by_name(wrong: str) -> None:
         (lambda: push(POINT, FORCE, 1e-12), r"a radius of 1e-12 m.* from 0\.0001 to 0\.1"),
         (lambda: posture(np.ones((2, 3)), np.zeros(3)), "rows of direction 2, csf_level 3"),
         (lambda: posture(np.array([1e-200, 0.0, 0.0]), 0.0), "row of zeros"),
-        (lambda: Loads((5,)), r"Loads\.causes is \(5,\): give a tuple of Pushed, "),  # pyright: ignore[reportArgumentType]
+        (lambda: Loads((5,)), r"int is no cause: choose from Pushed, "),  # pyright: ignore[reportArgumentType]
         (lambda: Loads(PUSH), r"Loads\.causes is Loads"),  # pyright: ignore[reportArgumentType]
         (lambda: Loads(PUSH.causes, "now"), r"Loads\.time has the type"),  # pyright: ignore[reportArgumentType]
         (lambda: Loads(PUSH.causes, np.array([1e300])), r"Loads\.time .* beyond"),
@@ -250,3 +250,10 @@ def test_no_load_at_all_from_a_start_is_no_answer_at_all() -> None:
     body = Fem(BODY, (Elasticity(), Held(), ToolForce(), Inertia()), LIVE, "cpu", element="p1")
     none = PUSH.rows(np.arange(0))
     assert len(body.deform(none, guess(np.zeros((0, 64, 3))))) == 0
+
+
+def test_an_accuracy_that_a_type_cannot_reach_is_refused() -> None:
+    with pytest.raises(InputError, match="float32 reaches 2e-05"):
+        Accuracy(tolerance=1e-6, precision="float32")
+    with pytest.raises(InputError, match="no precision is called"):
+        Accuracy(precision="float16")  # pyright: ignore[reportArgumentType]

@@ -64,7 +64,7 @@ class Hard:
         first = next(iter(self.tissues.values()))
         fem = Fem(
             self.anatomy, [Elasticity(first, self.tissues), Held(), NodalForce()], self.accuracy, "cpu",
-            element=self.element,
+            element=self.element or ("p1" if self.mesh.middles is None else "p2"),
         )  # fmt: skip
         return fem.deform(Loads((Nodal(self.force[None]),)), None if self.start is None else guess(self.start[None]))
 

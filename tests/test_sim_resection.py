@@ -78,7 +78,7 @@ def test_a_mesh_with_middles_of_its_own_loses_them_too() -> None:
     made = finite_elements(body, (*effects, Resection((within((1, 1, 1), (2, 2, 2), curved),))), TIGHT, "cpu")
     assert isinstance(made, Operated)
     left, used = compact(made.remains(1).anatomy)
-    alone = Fem(left, effects, TIGHT, "cpu", element="p1").deform(posture(DOWN, -1.0))
+    alone = Fem(left, effects, TIGHT, "cpu").deform(posture(DOWN, -1.0))
     answer = made.deform(posture(DOWN, -1.0))
     assert 0 < len(used) < len(curved.nodes)
     np.testing.assert_allclose(

@@ -181,7 +181,7 @@ def teacher(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> Stiffening:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory, teacher: Stiffening) -> Dataset:
     path = tmp_path_factory.mktemp("touched") / "data.h5"
-    said = {"ball": repr(BALL.radius), "tissue": tissue_to_json(SOFT), "effects": "as told"}
+    said = {"ball": repr(BALL.radius), "tissue": tissue_to_json(SOFT), "effects": "as told", "element": "p1"}
     simulate(path, teacher, draw_poses("palpation", teacher.anatomy, 160, 0), said)
     return read_dataset(path)
 

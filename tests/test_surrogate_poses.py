@@ -229,7 +229,7 @@ def test_the_command_makes_poses_that_finite_elements_answer(
     assert data.good.all()
     assert data.ball == ball.radius
     assert "NodalForce" not in data.provenance["effects"]
-    fem = Fem(read_anatomy(mesh), (Elasticity(), Held(), ToolContact((ball,))), device="cpu", batch=1, element="p1")
+    fem = Fem(read_anatomy(mesh), (Elasticity(), Held(), ToolContact((ball,))), device="cpu", batch=1)
     truth = fem.deform(data.loads)
     stored = data.displacement(np.arange(len(box.mesh.nodes)))
     assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)

@@ -153,6 +153,12 @@ def test_declared_sizes_are_held_against_what_there_is(stored, box, tmp_path):
         load(path, box)
 
 
+def test_a_learner_that_nobody_registered_is_a_sentence(stored, box, tmp_path):
+    path = rewritten(stored, tmp_path / "model.npz", lambda text: text.replace('"svr"', '"forest"'))
+    with pytest.raises(InputError, match=r"made by the learner 'forest'.*--plugin"):
+        load(path, box)
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -161,7 +167,6 @@ def test_declared_sizes_are_held_against_what_there_is(stored, box, tmp_path):
         lambda text: "[]",
         lambda text: json.dumps({**json.loads(text), "models": []}),
         lambda text: json.dumps({**json.loads(text), "models": {"a": {}}}),
-        lambda text: text.replace('"regressor": "svr"', '"regressor": "forest"'),
         lambda text: text.replace('"nodes": "', '"nodes": "0'),
         lambda text: text.replace('"reach": ', '"reach": "far", "r": '),
     ],
@@ -204,3 +209,18 @@ def test_random_damage_is_a_sentence_or_no_damage(stored, models, box, tmp_path)
         path.write_bytes(raw.tobytes())
         with pytest.raises(InputError):
             load(path, box)
+
+
+def test_bad_model_files_are_sentences(box, tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        load(tmp_path / "none.npz", box)
+    for name, content in (("text.npz", b"text"), ("zip.npz", b"PK\x03\x04broken"), ("empty.npz", b"")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match="cannot be read as a model"):
+            load(tmp_path / name, box)
+    np.savez(tmp_path / "arrays.npz", header=np.array("[]"))
+    with pytest.raises(InputError, match="cannot be read as a model"):
+        load(tmp_path / "arrays.npz", box)
+    np.savez(tmp_path / "old.npz", header=np.array(json.dumps({"format": "sulcus model 0"})))
+    with pytest.raises(InputError, match="train it anew"):
+        load(tmp_path / "old.npz", box)

@@ -49,8 +49,8 @@ def run(args: argparse.Namespace) -> int:
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
         name = deformer_name(args, theatre, scene)
-        print(f"{scene.name} by {theatre.described(name, scene)}", file=table)
         player = theatre.player(name, scene)
+        print(f"{scene.name} by {theatre.described(name, scene)}", file=table)
         total = len(scene.times[:: args.every])
         with tqdm(total=2 * total, unit="frame", desc=scene.name, leave=False, file=sys.stderr) as bar:
             frames = []

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from sim.accuracy import TRAIN
 from sim.device import find_device
+from sim.discretisation import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS
 from sim.stages import listened
@@ -82,8 +83,14 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"anatomy": str(args.out), "model": str(model), "seconds": seconds, "total": whole}))
     else:
-        print(f"{_shares(seconds, whole)}\nready: sulcus demo --anatomy {args.out}")
+        print(f"{_shares(seconds, whole)}\nready: sulcus demo --anatomy {args.out}{_physics(args)}")
     return 0
+
+
+def _physics(args: argparse.Namespace) -> str:
+    """What a scene must be told so that it is played with the tissue and the element of these data."""
+    tissue = "" if args.material == BRAIN.law else f" --material {args.material}"
+    return tissue + ("" if args.element in (None, RECOMMENDED) else f" --element {args.element}")
 
 
 def _shares(seconds: Mapping[str, float], whole: float) -> str:

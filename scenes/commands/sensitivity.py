@@ -70,7 +70,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
     from ..bench import machine
-    from ..scene import find_scene
     from ..sensitivity import Study, rows
     from ..theatre import open_theatre
     from ..variant import Body, variants
@@ -79,7 +78,8 @@ def run(args: argparse.Namespace) -> int:
         claimed(args.out, ".csv", "a table of `sulcus sensitivity`", args.force)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     anatomy = theatre.anatomy
-    model = theatre.models.get(theatre.best(find_scene("press")))
+    pushed = (model for model in theatre.models.values() if model.ball is None)
+    model = min(pushed, key=lambda model: model.bound, default=None)
     loads = draw(args.preset, anatomy, args.count, args.seed)
     body = Body(element=args.element or ("smoothed" if anatomy.mesh.middles is None else "p2"))
     study = Study(anatomy, loads, body, device=args.device)
