@@ -16,8 +16,10 @@ from .raster import Fragments, rasterise
 from .view import Picture
 
 Style = Literal["window", "contour", "fill", "none"]
-# What may not be relied on is drawn in amber, and broken; what was believed before in grey, and dotted.
+# What may not be relied on is drawn in amber, and broken, with words in a paler one, so that pixels of the outline are
+# the outline's alone; what was believed before in grey, and dotted.
 DOUBTFUL = (1.0, 0.68, 0.16)
+WARNING = (1.0, 0.84, 0.5)
 BEFORE = (0.86, 0.88, 0.90)
 # Of the outline's brightness: that of the margin round it, which is no place of the surface.
 FAINT = 0.75
@@ -146,7 +148,7 @@ def composite(
         error = float(np.max(margin)) or None
         write(out, f"moved {millimetres(motion, error)}", (box[1].start + SURROUND, box[0].stop - PAD), 0.5)
     if doubt:
-        write(out, doubt, (PAD, camera.height - PAD), 0.5, ink_of(DOUBTFUL))
+        write(out, doubt, (PAD, camera.height - PAD), 0.5, ink_of(WARNING))
     return replace(picture, colour=out)
 
 

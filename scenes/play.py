@@ -30,8 +30,9 @@ from .told import doubt_of, told
 from .tool import Instrument, Probe
 
 IN_BONE = "the bone is where this push needs the tool: do not rely on it"
-# Tissue may carry a tool into the bone's edge by so much before it counts [m].
-CARRIED = 0.5e-3
+# Tissue may carry a tool into the bone's edge by so much before it is drawn elsewhere, and before its load counts as
+# none that a tool can make [m].
+CARRIED, BLOCKED = 0.5e-3, 2e-3
 SMALL = 0.45
 STAGES = ("deform", "render", "overlay")
 """What the time of a frame is spent on."""
@@ -93,13 +94,13 @@ class Frame:
 class HeldTool:
     """Where a tool is drawn: tip (3,) [m], and T_world_tool pose (4, 4).
 
-    lift [m]: how far an idle one is off the tissue; blocked: whether bone is where its load needs it.
+    lift [m]: how far an idle one is off the tissue; beyond [m]: how far inside the bone its load needs it.
     """
 
     tip: np.ndarray
     pose: np.ndarray
     lift: float
-    blocked: bool
+    beyond: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +162,7 @@ class Player:
         picture = render(self.camera, stage.layers(positions, None if held is None else held.pose), stage.lamp)
         rendered = clock.perf_counter()
         tumour, rest = (stage.tumour(at) for at in (positions, self.site.anatomy.mesh.nodes))
-        doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.blocked else "")
+        doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
         over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt).colour
         remark = self.scene.stopped(self.site, touch)
@@ -177,7 +178,7 @@ class Player:
 
     def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
         """From the tip to the tumour, and how far off that may be as far as the deformer knows."""
-        told = None if held.blocked else reading(self.deformer, loads, answer, self.scene.tool, held.lift)
+        told = None if held.beyond > CARRIED else reading(self.deformer, loads, answer, self.scene.tool, held.lift)
         if told is None:
             return gauged(held.tip, tumour)
         return replace(gauged(held.tip, tumour), read=told.distance, error=told.bound)
@@ -209,18 +210,18 @@ class Player:
         It is lifted off where it is idle. Tissue that is drawn aside may carry it to the bone's edge, which stops it.
         """
         if self.scene.posed:
-            return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), 0.0, False)
+            return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), 0.0, 0.0)
         inward = self.site.axis
         carried = self.scene.contact(self.site, touch).carried(positions)
         inside = self.site.within(carried, tool.radius)
-        blocked = bool(np.linalg.norm(inside - carried) > CARRIED)
-        tip = through = inside if blocked else carried
+        beyond = float(np.linalg.norm(inside - carried))
+        tip = through = inside if beyond > CARRIED else carried
         if isinstance(tool, Probe):
             tip = resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
         lift = AIR * max(0.0, 1.0 - touch.force / 0.02)
         tip = tip - lift * inward
         pose = tool.pose(tip, inward, self.site.right)
-        return HeldTool(tip, pose, lift, blocked)
+        return HeldTool(tip, pose, lift, beyond)
 
 
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:

