@@ -7,6 +7,7 @@ from html import escape
 
 import numpy as np
 
+from ar import hud
 from sim.deformation import Deformation, Outcome
 from sim.effects import Elasticity
 from sim.material import Material, Tissue
@@ -141,7 +142,7 @@ def report(
     acts = told(frame.loads, frame.deformation, nodes) if frame.loads.causes else ""
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([acts] if acts else [])]
     facts += [f"tumour moved {1e3 * frame.moved:.2f} mm"]
-    parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {1e3 * frame.distance:.1f} mm</p>']
+    parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {read(frame)}</p>']
     parts += [trust(frame.deformation, name), f"<p>{escape('; '.join(facts))}</p>"]
     if without:
         parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
@@ -150,6 +151,12 @@ def report(
     spent = {"deform": "answer", "render": "camera picture", "overlay": "overlay"}
     took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
     return "".join([*parts, verdict, table(rows), f'<p class="dim">milliseconds: {took}</p>'])
+
+
+def read(frame: Frame) -> str:
+    """The distance from tip to tumour, with what it may be off by in 5 of 100 loads where that is known."""
+    assert frame.distance is not None
+    return hud.millimetres(frame.distance, frame.distance_error).replace("+-", "\N{PLUS-MINUS SIGN}")
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -39,6 +39,15 @@ Path = Callable[[float], Touch]
 AIR = 4e-3
 
 
+# A push weaker than this lifts its tool off [N].
+FAINT = 0.02
+
+
+def lifted(force: float) -> float:
+    """How far [m] a tool that pushes with a force [N] is drawn off the tissue: an idle one by `AIR`."""
+    return AIR * max(0.0, 1.0 - force / FAINT)
+
+
 def smooth(t: float) -> float:
     """From 0 to 1 while t goes from 0 to 1, at rest at both ends: 6 t^5 - 15 t^4 + 10 t^3, least jerk.
 

@@ -21,7 +21,7 @@ from sim.loads import Loads
 from sim.resting import resting_tip
 from surrogate.learned import Learned
 
-from .paths import AIR, Touch
+from .paths import Touch, lifted
 from .reading import reading
 from .scene import Scene
 from .site import Site
@@ -218,7 +218,7 @@ class Player:
         tip = through = inside if beyond > CARRIED else carried
         if isinstance(tool, Probe):
             tip = resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
-        lift = AIR * max(0.0, 1.0 - touch.force / 0.02)
+        lift = lifted(touch.force)
         tip = tip - lift * inward
         pose = tool.pose(tip, inward, self.site.right)
         return HeldTool(tip, pose, lift, beyond)

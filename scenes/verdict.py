@@ -8,9 +8,13 @@ from html import escape
 
 import numpy as np
 
+from ar.hud import millimetres
 from sim.deformation import Deformation
+from sim.loads import Pushed
 
+from .paths import lifted
 from .play import Player
+from .reading import measured
 from .referee import Truth
 
 
@@ -18,7 +22,7 @@ from .referee import Truth
 class Judged:
     """How far off a deformer is where the finite elements have answered: mean and largest, and the motion [m].
 
-    mean and largest are None where the answer is the finite elements' own.
+    mean and largest are None where the answer is the finite elements' own; distance is theirs from tip to tumour [m].
     """
 
     number: int
@@ -27,6 +31,7 @@ class Judged:
     motion: float
     mean: float | None
     largest: float | None
+    distance: float | None = None
 
 
 def judge(truth: Truth, player: Player, own: bool) -> Judged:
@@ -38,7 +43,11 @@ def judge(truth: Truth, player: Player, own: bool) -> Judged:
         error = np.linalg.norm(player.deformer.deform(truth.loads, at=nodes).displacement[0] - right, axis=1)
     motion = float(np.linalg.norm(right, axis=1).mean())
     off = (None, None) if error is None else (float(error.mean()), float(error.max()))
-    return Judged(truth.number, truth.seconds, truth.deformation.outcome[0].good, motion, *off)
+    pushed = truth.loads.every(Pushed)
+    lift = lifted(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
+    told = measured(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
+    distance = None if told is None else told.distance
+    return Judged(truth.number, truth.seconds, truth.deformation.outcome[0].good, motion, *off, distance)
 
 
 def verdict_words(judged: Judged | None, stale: bool, waits: str) -> str:
@@ -48,7 +57,9 @@ def verdict_words(judged: Judged | None, stale: bool, waits: str) -> str:
     said = "this is the finite elements' own answer"
     if judged.mean is not None and judged.largest is not None:
         said = f"error against FEM: mean {1e3 * judged.mean:.3f}, largest {1e3 * judged.largest:.3f} mm"
-    tail = f"tumour moved {1e3 * judged.motion:.2f} mm by FEM (frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
+    tip = "" if judged.distance is None else f"tip to tumour {millimetres(judged.distance)}, "
+    tail = f"{tip}tumour moved {1e3 * judged.motion:.2f} mm by FEM"
+    tail += f" (frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
     tail += ")" if judged.good else ", which did not reach its tolerance: do not rely on it)"
     if stale:
         return f'<p class="stale">of an earlier load: {said}; {tail}. {escape(waits)}</p>'
