@@ -14,7 +14,12 @@ from scenes.cli import main
 from scenes.collect import DEPTH_SCALE, collect
 from scenes.paths import press
 from scenes.stage import CORTEX, DRAPE, TOOL
+from sim.accuracy import TRAIN
+from sim.effects import Elasticity, Held, ToolForce
 from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import push
+from sim.material import tissue_from_json
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +66,25 @@ class TestEpisode:
             assert np.abs(depth * DEPTH_SCALE - frame.picture.depth).max() <= 0.51 * DEPTH_SCALE
             assert np.array_equal(depth == 0, frame.picture.depth == 0.0)
             assert np.array_equal(decoded(file, "segmentation", frame.number), frame.picture.segmentation)
+
+    def test_a_frame_is_recomputed_from_its_attributes_alone(self, episode, box):
+        """Tissue, element, tool and load are those that the file names; so is what solved it."""
+        _, file, _, _ = episode
+        said, number = file.attrs, 3
+        effects = (Elasticity(tissue_from_json(said["tissue"])), Held(), ToolForce())
+        fem = Fem(box, effects, TRAIN, "cpu", element=said["element"])
+        assert said["anatomy"] == box.digest and said["finite_elements"] == fem.description
+        load = push(file["contact"][number], file["force"][number], float(said["footprint_m"]))
+        moved = fem.deform(load, at=file["tumour_nodes"][:]).displacement[0]
+        found = file["tumour_fem"][number] - file["tumour_rest"][:]
+        assert np.linalg.norm(moved - found) < 2e-3 * np.linalg.norm(found) > 0.0
+        assert len(said["model_digest"]) == 16 and said["date"][:2] == "20" and "Probe" in said["tool"]
+
+    def test_every_data_set_has_a_unit(self, episode):
+        _, file, _, _ = episode
+        bare = []
+        file.visititems(lambda name, item: bare.append(name) if "unit" not in item.attrs else None)
+        assert bare == ["pictures"]  # a group
 
     def test_camera_projects_the_tumour_onto_its_mask(self, episode):
         _, file, _, _ = episode
@@ -110,7 +134,8 @@ class TestEpisode:
         assert units == {
             "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
             "tumour_predicted": "m", "tumour_fem": "m", "seconds": "s", "tumour_rest": "m", "bound": "m",
-            "reaction_fem": "N, N m",
+            "reaction_fem": "N, N m", "K": "pixel", "tumour_nodes": "1", "tumour_left": "1",
+            "outcome_predicted": "text", "outcome_fem": "text",
         }  # fmt: skip
         assert "1e-05 m" in file["pictures/depth"].attrs["unit"]
         assert file.attrs["anatomy"] == theatre.anatomy.digest and file.attrs["deformer"] == "linear"
