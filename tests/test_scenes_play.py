@@ -195,6 +195,15 @@ def test_the_label_tells_name_force_and_error(play):
     assert (plain != frame.shown).any() and (plain != told).any() and (plain[-60:] == frame.shown[-60:]).all()
 
 
+def test_the_label_tells_the_error_in_millimetres(play, monkeypatch):
+    told = []
+    monkeypatch.setattr("scenes.play.panel", lambda colour, lines: told.extend(lines) or colour)
+    frame = play.draw(51, 1.7, play.scene.path(1.7))
+    labelled(frame, "linear", 1.2e-4)
+    assert "error against FEM: 0.120 mm (frame 51)" in told and told[0] == frame.deformation.source
+    assert told[1] == f"t 1.70 s   tumour moved {1e3 * frame.moved:.2f} mm"
+
+
 def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
     told = []
     monkeypatch.setattr("scenes.play.panel", lambda colour, lines: told.append(list(lines)) or colour)
