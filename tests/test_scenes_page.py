@@ -12,10 +12,14 @@ from scenes.busy import NOTICED, Busy
 from scenes.page_controls import clocked, controls
 from scenes.page_text import RESEARCH, about, fem_words, millimetres, side, trust, words
 from scenes.paths import Touch
+from scenes.play import Player
+from scenes.referee import Truth
 from scenes.scene import find_scene
+from scenes.stage import Stage
 from scenes.stamp import stamp
-from scenes.verdict import Judged, verdict_words
+from scenes.verdict import Judged, judge, verdict_words
 from scenes.wish import Wish
+from sim.accuracy import LIVE
 from sim.deformation import Outcome, guess
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.material import Material
@@ -172,3 +176,23 @@ def test_a_long_wait_is_told_and_a_short_one_is_not():
     busy.off()
     busy.close()
     assert said[0].startswith("solving the second half") and said[-1] == "" and "" not in said[:-1]
+
+
+def test_a_verdict_is_the_error_in_millimetres(theatre):
+    """Of a model whose answer is 0.2 mm off everywhere, and of the finite elements' own distance."""
+    scene = short()
+    whole = Player(Stage(scene, theatre.site), theatre.fem(scene, LIVE))
+    loads = whole.loads(3)
+    answer = whole.answer(loads)
+
+    class Off:
+        def deform(self, loads, start=None, at=None):
+            found = whole.deformer.deform(loads, at=at)
+            return replace(found, displacement=found.displacement + [0.0, 0.2e-3, 0.0])
+
+    found = judge(Truth(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
+    said = verdict_words(found, stale=False, waits="")
+    assert "error against FEM: mean 0.200, largest 0.200 mm; tip to tumour " in said
+    tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
+    assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
+    assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">of an earlier load: ')
