@@ -8,6 +8,7 @@ from conftest import make_box
 
 from scenes.cli import main
 from scenes.commands.bench_solver import NAMES
+from scenes.served import fem_of
 from scenes.solver_bench import OWN, PEERS, TOLERANCE, Engine, case_of, compare
 from sim.meshfile import write_anatomy
 
@@ -112,3 +113,7 @@ def test_a_peer_finds_the_same_field(case):
 def test_bad_input_is_a_sentence(words, capsys):
     assert main(["bench", "solver", *words]) == 2
     assert words[1] in capsys.readouterr().err
+
+
+def test_ours_and_the_judge_solve_the_peers_linear_tetrahedra(case):
+    assert fem_of(case).space.element == fem_of(case, live=True).space.element == "p1"
