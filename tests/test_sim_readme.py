@@ -1,4 +1,4 @@
-"""The README's Python example runs as it stands, on any anatomy."""
+"""The README's Python example runs as it stands; what the pages name is there."""
 
 import re
 from pathlib import Path
@@ -10,10 +10,13 @@ from scenes.shipped import template_path
 from sim.deformation import Outcome
 from sim.meshfile import read_anatomy, write_anatomy
 
+HOUSE = Path(__file__).parents[1]
+PAGES = [HOUSE / "README.md", *sorted((HOUSE / "docs").glob("*.md"))]
+
 
 def example():
     """The code of the README's one Python block."""
-    (code,) = re.findall(r"```python\n(.*?)```", (Path(__file__).parents[1] / "README.md").read_text(), re.DOTALL)
+    (code,) = re.findall(r"```python\n(.*?)```", (HOUSE / "README.md").read_text(), re.DOTALL)
     return code
 
 
@@ -29,3 +32,16 @@ def test_the_example_runs_as_it_stands(body, box, tmp_path, monkeypatch, capsys)
     # The tumour goes in, with the tool.
     assert 1e-4 < (answer.displacement[0] @ names["place"].inward).mean() < 5e-3
     assert "converged" in capsys.readouterr().out
+
+
+def test_the_readme_is_read_in_two_minutes():
+    assert len((HOUSE / "README.md").read_bytes()) <= 8192
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_and_file_that_a_page_names_is_there(page):
+    text = page.read_text()
+    links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]+)\)", text)]
+    missing = [link for link in links if link and not (page.parent / link).exists()]
+    files = re.findall(r"`((?:sim|surrogate|ar|scenes|tests|examples)/[\w/]+\.py)`", text)
+    assert not missing + [file for file in files if not (HOUSE / file).exists()]
