@@ -16,6 +16,7 @@ from sim.fem import Fem
 from sim.files import written_whole
 from sim.loads import Pushed
 from sim.material import tissue_from_json
+from sim.reading import read_as
 
 from .ann import Ann
 from .condense import condensed, side_by_side
@@ -181,7 +182,11 @@ class Expansion:
         """
         nodes = [some for some in (self.tumour, self.cortex) if len(some)]
         if self.kept is not None and self.kept.exists():
-            with np.load(self.kept) as file:
+            with (
+                read_as(self.kept, "a table of the series", "Delete it: it is made anew."),
+                self.kept.open("rb") as raw,
+                np.load(raw) as file,
+            ):
                 modes = [file[f"arr_{k}"] for k in range(1, len(nodes) + 1)]
                 return [Basis(*each) for each in zip(nodes, modes, strict=True)], file["arr_0"]
         fem, wide = self._fem(), self._wide()

@@ -212,3 +212,29 @@ class TestRender:
         words = ["render", "press", "--anatomy", str(anatomy), "--out", str(tmp_path), "--json"]
         assert main(words) == 1
         assert 2 <= json.loads(capsys.readouterr().out)["not_good"] <= 5
+
+
+def test_an_episode_that_no_file_may_hold_is_told_before_the_work(theatre, tmp_path):
+    resource = pytest.importorskip("resource")
+    before, play = resource.getrlimit(resource.RLIMIT_FSIZE), player(theatre, short(), "linear")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        with pytest.raises(InputError, match=r"files are limited to 0\.1 MB"):
+            collect(tmp_path / "press.h5", theatre, play, "linear", iter)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_episode_that_does_not_fit_after_all_is_told(theatre, tmp_path, monkeypatch):
+    """HDF5 ends the process where a write of its own fails."""
+    resource = pytest.importorskip("resource")
+    monkeypatch.setattr("scenes.collect.PIXEL_BYTES", 0.0)
+    before, play = resource.getrlimit(resource.RLIMIT_FSIZE), player(theatre, short(), "linear")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        with pytest.raises(InputError, match="File too large"):
+            collect(tmp_path / "press.h5", theatre, play, "linear", iter)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())

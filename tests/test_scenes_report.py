@@ -35,6 +35,7 @@ from scenes.report_series import series_seconds, tabulate_series
 from scenes.report_study import Study
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import NodalForce, pushed_effects
+from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Pushed
 from sim.material import Material, tissue_to_json
@@ -245,6 +246,19 @@ def test_a_reference_goes_on_load_by_load(study, monkeypatch):
 
 
 deform = Fem.deform
+
+
+def test_a_damaged_answer_is_named(study):
+    """So is a damaged table of the series: both are numpy's, and a stopped run goes on from them."""
+    reference_of(study)
+    answer = sorted((study.folder / "answers").glob("reference-*"))[0]
+    table = study.folder / "answers" / f"series-{study.digest}.npz"
+    whole = answer.read_bytes()
+    for path, ask in ((answer, lambda: reference_of(study)), (table, lambda: replace(study).expansion.coefficients)):
+        path.write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(InputError, match=f"{path.name}.*Delete it: it is made anew"):
+            ask()
+        path.unlink()
 
 
 def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path, monkeypatch):
