@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ar.camera import look_at
-from ar.hud import bearings, marked, towards
+from ar.hud import bearings, marked, millimetres, towards
 
 
 @pytest.mark.parametrize(
@@ -43,3 +43,15 @@ def test_letters_stand_at_the_edges():
     for edge in (changed[100:140, :30], changed[100:140, -30:], changed[:30, 140:180], changed[-30:, 140:180]):
         assert edge.any()
     assert not changed[40:200, 40:280].any() and (plain == 90).all()
+
+
+@pytest.mark.parametrize(
+    ("length", "error", "text"),
+    [
+        (12.34e-3, None, "12.3 mm"),
+        (12.34e-3, 2.46e-3, "12.3 +- 2.5 mm"),
+        (0.0, 1e-6, "0.0 +- 0.1 mm"),  # nothing is known to be without error
+    ],
+)
+def test_a_length_is_read_in_millimetres_with_what_it_may_be_off_by(length, error, text):
+    assert millimetres(length, error) == text

@@ -8,7 +8,8 @@ import pytest
 from ar.camera import look_at
 from ar.hud import panel, write
 from ar.layer import Layer, Solid, vertex_normals
-from ar.overlay import Gauge, composite, iou, silhouette
+from ar.overlay import BEFORE, DOUBTFUL, GAUGE, WARNING, Gauge, composite, ink_of, iou, silhouette
+from ar.refind import stands
 from ar.view import Lamp, lamp_beside, render
 
 CORTEX, TOOL, TUMOUR = 1, 2, 3
@@ -213,6 +214,48 @@ def test_a_deeper_tumour_shines_less():
 
 def test_the_gauge_is_the_distance():
     assert Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.003, 0.004, 0.0])).distance == pytest.approx(0.005)
+
+
+def test_the_picture_says_how_far_the_tumour_moved_and_how_far_off_that_may_be():
+    """The mean motion of the surface, and the largest margin."""
+    here, now = camera(400, 300), tumour()
+    picture = render(here, [cortex()], LAMP)
+    far = np.linspace(0.002, 0.004, len(now.vertices))[:, None] * [1.0, 0.0, 0.0]
+    margin = np.linspace(0.0005, 0.0015, len(now.vertices))
+    before = replace(now, vertices=now.vertices - far)
+    assert stands(composite(picture, here, now, margin=margin, before=before).colour, "moved 3.0 +- 1.5 mm", 0.5)
+    assert stands(composite(picture, here, now, before=before).colour, "moved 3.0 mm", 0.5)
+
+
+def test_the_arrow_points_to_where_the_tumour_is_now():
+    here, before, now = camera(400, 300), tumour((-0.012, 0.0, -0.02), 0.006), tumour((0.012, 0.0, -0.02), 0.006)
+    picture = render(here, [cortex()], LAMP)
+    shown = composite(picture, here, now, style="contour", before=before).colour
+    grey = np.argwhere((np.abs(shown.astype(int) - ink_of(BEFORE)) <= 2).all(axis=2))[:, ::-1]
+    near = [
+        np.count_nonzero(np.linalg.norm(grey - here.project(np.array([x, 0.0, -0.02]))[0], axis=1) < 8)
+        for x in (-0.012, 0.012)
+    ]
+    assert near[1] > 1.5 * near[0] > 0
+
+
+def test_of_what_may_not_be_relied_on_nothing_is_promised():
+    """The reason stands in the picture, the outline is amber, and there is neither margin nor +-."""
+    here = camera(400, 300)
+    picture = render(here, [cortex()], LAMP)
+    gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
+    sure = composite(picture, here, tumour(), margin=0.004, gauge=gauge).colour
+    assert stands(sure, "8.0 +- 1.2 mm", GAUGE) and not stands(sure, "do not rely on it", 0.5, ink_of(WARNING))
+    unsure, plain = (
+        composite(picture, here, tumour(), margin=margin, gauge=gauge, doubt="do not rely on it").colour
+        for margin in (0.004, 0.0)
+    )
+    assert stands(unsure, "8.0 mm", GAUGE) and stands(unsure, "do not rely on it", 0.5, ink_of(WARNING))
+    assert np.array_equal(unsure, plain)
+    amber, green = (
+        (np.abs(unsure.astype(int) - ink) <= 2).all(axis=2).sum() for ink in map(ink_of, (DOUBTFUL, (0.2, 0.9, 0.3)))
+    )
+    assert amber > 20 and green == 0
 
 
 def test_a_tumour_out_of_the_picture_leaves_it_alone():

@@ -10,7 +10,7 @@ from theatres import short, sinking, small, theatre_of
 from ar.page_parts import Choice, Fold, Slider
 from scenes.busy import NOTICED, Busy
 from scenes.page_controls import clocked, controls
-from scenes.page_text import RESEARCH, about, fem_words, millimetres, side, trust, words
+from scenes.page_text import RESEARCH, about, fem_words, millimetres, report, side, trust, words
 from scenes.paths import Touch
 from scenes.play import Player
 from scenes.referee import Truth
@@ -196,3 +196,20 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
     tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
     assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
     assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">of an earlier load: ')
+
+
+def test_the_page_reads_what_the_frame_holds(theatre):
+    """Distance with its bound, motion, force and milliseconds, each as a person reads it."""
+    player = theatre.player("linear", short())
+    seconds = {"deform": 12.3e-3, "render": 4.5e-3, "overlay": 0.7e-3}
+    known = {"distance": 12.34e-3, "distance_error": 2.46e-3, "moved": 1.234e-3, "seconds": seconds}
+    frame = replace(player.draw(3, 0.1, Touch(force=0.25)), **known)
+    said = report(frame, player.stage, "linear", "", (), 7)
+    for line in (
+        "tip to tumour 12.3 \N{PLUS-MINUS SIGN} 2.5 mm<",
+        "<p>frame 3 of 6; 0.10 s; force 0.25 N; tumour moved 1.23 mm</p>",
+        "milliseconds: answer 12.3, camera picture 4.5, overlay 0.7<",
+    ):
+        assert line in said
+    plain = report(replace(frame, distance_error=None), player.stage, "linear", "", (), 7)
+    assert "tip to tumour 12.3 mm<" in plain

@@ -46,6 +46,7 @@ from surrogate.envelope import envelope_of
 from surrogate.parts import COARSE, EXPANDED
 from surrogate.published import from_angles, published_nodes, sites_of, thirteen, to_angles
 from surrogate.sampling import draw
+from surrogate.sectors import leave_sectors_out
 from surrogate.simulate import simulate
 from surrogate.svr import Svr
 from surrogate.train import train
@@ -112,14 +113,15 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
         assert np.allclose([stored[0]["reference"][kind][name] for name in names], values, rtol=2e-3)
         assert np.allclose([float(lines[0][f"reference.{kind}.{name}"]) for name in names], values, rtol=2e-3)
     data = read_dataset(study.data)
-    test = study.discs.test
-    model = train(data, ["linear"], split=study.discs).models["linear"]
-    truth = data.displacement(box.tumour_nodes)[test]
-    guess = model.deform(data.loads.rows(np.flatnonzero(test)), at=box.tumour_nodes).displacement
-    wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
-    discs = stored[2]["teacher"]["discs"]
-    assert np.allclose([*discs["mm"].values(), *discs["percent"].values()], wanted, rtol=1e-5)
-    assert discs["loads"] == test.sum() and discs["values"] == test.sum() * len(box.tumour_nodes)
+    for name, split in (("discs", study.discs), ("sectors", leave_sectors_out(study.pushed, study.patch))):
+        test = split.test
+        model = train(data, ["linear"], split=split).models["linear"]
+        truth = data.displacement(box.tumour_nodes)[test]
+        guess = model.deform(data.loads.rows(np.flatnonzero(test)), at=box.tumour_nodes).displacement
+        wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
+        held = stored[2]["teacher"][name]
+        assert np.allclose([*held["mm"].values(), *held["percent"].values()], wanted, rtol=1e-5)
+        assert held["loads"] == test.sum() and held["values"] == test.sum() * len(box.tumour_nodes)
     assert stored[2]["taught"] == study.discs.taught.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
 
 
