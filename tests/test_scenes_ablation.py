@@ -61,9 +61,11 @@ def test_the_change_is_that_between_the_answers(theatre):
     """By another way: an effect that does all that is done."""
     scene = sinking()
     found = {row.effect: row for row in rows(theatre, scene, 2)}
-    whole = run(replace(theatre, models={}), scene, 2).displacement[:, theatre.anatomy.tumour_nodes]
+    alone = run(replace(theatre, models={}), scene, 2)
+    whole = alone.displacement[:, theatre.anatomy.tumour_nodes]
     largest = 1e3 * np.linalg.norm(whole, axis=2).mean(axis=1).max()
     assert found["Gravity"].tumour_mm == found[ALL].tumour_mm == pytest.approx(largest, rel=1e-6)
+    assert found[ALL].held_mb == pytest.approx(1e-6 * alone.held, rel=0.01)
 
 
 def test_a_frame_that_is_not_answered_is_a_sentence(theatre):
@@ -87,7 +89,10 @@ def test_the_command_tells_rows(theatre, anatomy, capsys):
     asked = [type(effect).__name__ for effect in find_scene("brain_shift").effects_on(theatre.anatomy)]
     assert out.count("\n") == 1 and told["scene"] == "brain_shift"
     assert [row["effect"] for row in told["effects"]] == [ALL, *asked]
-    assert "| Gravity | " in error and "MB on the device" in error
+    found = next(row for row in told["effects"] if row["effect"] == "Gravity")
+    cells = [f"{found[name]:.2f}" for name in ("milliseconds", "held_mb", "tumour_mm", "cortex_mm")]
+    assert f"| Gravity | {' | '.join(cells)} |" in error and cells[2] != cells[3]
+    assert "| effect | ms a frame | MB on the device | tumour mm | cortex mm |" in error
     assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "0"]) == 2
     assert "give a whole number" in capsys.readouterr().err
 

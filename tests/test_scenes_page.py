@@ -72,6 +72,10 @@ class TestVerdict:
         said = verdict_words(self.JUDGED, True, "waits")
         assert said.startswith('<p class="stale">of an earlier load') and "frame 28" in said and "waits" in said
 
+    def test_an_answer_short_of_its_tolerance_is_not_relied_on(self):
+        said = [verdict_words(replace(self.JUDGED, good=good), False, "waits") for good in (True, False)]
+        assert ["do not rely on it" in each for each in said] == [False, True]
+
     def test_before_any_it_says_what_is_waited_for(self):
         assert verdict_words(None, True, "waits") == '<p class="stale">waits</p>'
 

@@ -13,6 +13,7 @@ from ar.camera import Camera, project_cv2
 from scenes.cli import main
 from scenes.collect import DEPTH_SCALE, collect
 from scenes.paths import press
+from scenes.play import STAGES
 from scenes.stage import CORTEX, DRAPE, TOOL
 from sim.accuracy import TRAIN
 from sim.effects import Elasticity, Held, ToolForce
@@ -126,7 +127,8 @@ class TestEpisode:
         assert np.linalg.norm(alone, axis=1).mean() > 3e-4
         assert np.linalg.norm(truth - alone, axis=1).max() < 2e-5
         np.testing.assert_allclose(file["reaction_fem"][:, 0, :3], file["force"][:], atol=1e-12)
-        assert file["seconds"].shape == (7, len(file["seconds"].attrs["stages"]))
+        assert file["seconds"].shape == (7, 3) and tuple(file["seconds"].attrs["stages"]) == STAGES
+        assert file["tumour_left"][:].all()  # nothing is cut in this scene
 
     def test_everything_says_what_it_is(self, episode, theatre):
         report, file, _, _ = episode
@@ -142,7 +144,8 @@ class TestEpisode:
         assert "RAS" in file.attrs["world_frame"] and "OpenCV" in file.attrs["camera_frame"]
         for label in (f"{CORTEX} cortex", f"{DRAPE} drape", f"{TOOL} tool"):
             assert label in file.attrs["segmentation"]
-        assert [name.decode() for name in file["outcome_predicted"][:]] == 7 * ["PREDICTED"]
+        for who, outcome in (("predicted", "PREDICTED"), ("fem", "CONVERGED")):
+            assert [name.decode() for name in file[f"outcome_{who}"][:]] == 7 * [outcome]
         assert file["bound"].shape == (7, 2) and (np.diff(file["bound"][:]) >= 0.0).all()
         assert report["frames"] == 7 and report["fem"] == {"converged": 7}
 
