@@ -18,6 +18,7 @@ from websockets.sync.client import connect
 
 from ar import guard
 from ar.browser import Browser, Choice, Playback, Slider, Toggle, Viewpoint
+from ar.messages import MessageError, checked
 
 PROTOCOL = [f"viser-v{viser.__version__}"]
 
@@ -113,14 +114,23 @@ class TestSharing:
 
 class TestDoor:
     @pytest.mark.parametrize(
-        "origin", ["http://evil.example", "null", "https://127.0.0.1:{port}", "http://127.0.0.1:1"]
+        "origin",
+        [
+            "http://evil.example",
+            "null",
+            "https://127.0.0.1:{port}",
+            "http://127.0.0.1:1",
+            "http://127.0.0.1:{port}0",  # a page on another port of this machine
+            "http://127.0.0.1:{port}.evil.example",
+        ],
     )
     def test_another_page_is_refused(self, page, origin):
         assert knock(page, origin=origin.format(port=page.port)) == 403
         assert ask(page, Origin=origin.format(port=page.port))[0] == 403
 
     @pytest.mark.parametrize(
-        "host", ["evil.example:{port}", "127.0.0.1:1", "127.0.0.1", "localhost.evil.example:{port}"]
+        "host",
+        ["evil.example:{port}", "127.0.0.1:1", "127.0.0.1", "localhost.evil.example:{port}", "localhost:{port}0"],
     )
     def test_a_foreign_name_for_this_machine_is_refused(self, page, host):
         host = host.format(port=page.port)
@@ -129,6 +139,12 @@ class TestDoor:
             shake = f"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Protocol: {PROTOCOL[0]}\r\n"
             keys = "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
             wire.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\n{shake}{keys}\r\n".encode())
+            assert b" 403 " in wire.recv(4096).split(b"\r\n")[0]
+
+    def test_a_second_origin_is_no_help(self, page):
+        with socket.create_connection(("127.0.0.1", page.port), timeout=10) as wire:
+            own = f"Host: localhost:{page.port}\r\nOrigin: http://localhost:{page.port}\r\n"
+            wire.sendall(f"GET / HTTP/1.1\r\n{own}Origin: http://evil.example\r\n\r\n".encode())
             assert b" 403 " in wire.recv(4096).split(b"\r\n")[0]
 
     @pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "LOCALHOST", "[::1]"])
@@ -189,6 +205,11 @@ class TestToken:
         assert (
             page.token is None and guard.Door.of("localhost").token is None and guard.Door.of("127.0.0.2").token is None
         )
+
+    def test_a_host_that_others_reach_too_asks_for_one(self, monkeypatch):
+        found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.1", "192.0.2.1")]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *words: found)
+        assert guard.Door.of("both.example").token is not None
 
     def test_the_address_carries_the_token_and_nothing_else_gets_in(self, far):
         token = far.token
@@ -255,6 +276,11 @@ class TestMessages:
         say(visitor, type="GuiUpdateMessage", uuid=[uuid], updates={"value": 0.3})
         assert still_heard(page, visitor)
 
+    def test_a_control_that_is_not_there_is_refused(self):
+        said = msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "none such", "updates": {"value": 1.0}})
+        with pytest.raises(MessageError, match="a control that is not there"):
+            checked(said, lambda identifier: None)
+
     def test_messages_of_other_kinds_are_not_heard(self, page, visitor, capfd):
         kinds = ("FileTransferStartUpload", "GuiFormDirtyMessage", "GuiCloseModalMessage", "Message", "no such", 3)
         for kind in kinds:
@@ -264,7 +290,17 @@ class TestMessages:
         assert still_heard(page, visitor)
         assert "Traceback" not in capfd.readouterr().err
 
-    @pytest.mark.parametrize("bad", [{"position": [math.nan] * 3}, {"image_width": -1}, {"fov": 0.0}, {"wxyz": [1.0]}])
+    @pytest.mark.parametrize(
+        "bad",
+        [
+            {"position": [math.nan] * 3},
+            {"image_width": -1},
+            {"image_width": 1e9},
+            {"fov": 0.0},
+            {"fov": 4.0},
+            {"wxyz": [1.0]},
+        ],
+    )
     def test_a_camera_that_cannot_be_is_not_heard(self, page, visitor, bad, capfd):
         axes = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "look_at": [0, 0, 0], "up_direction": [0, 1, 0]}
         good = axes | {"fov": 1.0, "near": 0.01, "far": 10.0, "image_height": 600, "image_width": 777}

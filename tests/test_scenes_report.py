@@ -153,6 +153,13 @@ def test_a_learner_is_held_to_loads_that_it_was_not_taught(study, box, tmp_path,
     mm = row.teacher["discs"].mm
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
     assert row.taught == taught.sum()
+    if name == "svr":  # of loads that point into the sectors, by a model of those that do not
+        told, sectors = read_dataset(path), leave_sectors_out(pushed, study.patch)
+        asked = told.loads.rows(np.flatnonzero(told.good)[sectors.test])
+        guess = train(told, [name], split=sectors).models[name].deform(asked, at=nodes).displacement
+        wanted = 1e3 * np.linalg.norm(guess - told.displacement(nodes)[told.good][sectors.test], axis=2)
+        mm = row.teacher["sectors"].mm
+        assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
 
 
 def test_what_is_played_lies_in_the_discs_alone(study):

@@ -16,7 +16,7 @@ from sim.loads import Loads, Pushed, Touching
 from sim.meshfile import read_anatomy
 from sim.open_cortex import open_cortex
 from sim.tip import tip_gauge
-from surrogate.bound import features_of
+from surrogate.bound import features_of, fitted_bound
 from surrogate.coverage import distance_coverage
 from surrogate.dataset import read_dataset
 from surrogate.envelope import measured
@@ -27,7 +27,7 @@ from surrogate.sampling import draw
 from surrogate.simulate import simulate
 from surrogate.store import load, save
 from surrogate.tip import TipModel
-from surrogate.tip_training import calibrated_distance, distance_errors, measured_distances
+from surrogate.tip_training import CLASS, calibrated_distance, distance_errors, measured_distances
 from surrogate.train import train
 
 
@@ -37,10 +37,15 @@ def gauge(box):
 
 
 @pytest.fixture(scope="module")
-def trained(pretender, tmp_path_factory):
+def data(pretender, tmp_path_factory):
     path = tmp_path_factory.mktemp("tip") / "data.h5"
     simulate(path, pretender, draw("palpation", pretender.anatomy, 800, 0), {"preset": "palpation"})
-    return train(read_dataset(path), ["linear"])
+    return read_dataset(path)
+
+
+@pytest.fixture(scope="module")
+def trained(data):
+    return train(data, ["linear"])
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +147,29 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
     bounded = calibrated_distance(model, (features(scale), distance_errors(model, scale)), features(kept), kept)
     found = distance_coverage(bounded, later.loads, later.distance)
     assert 0.93 <= found.held[0] <= 0.97 and min(found.tenths) > 0.87 and found.held[1] > 0.975
+
+
+def test_how_its_bound_holds_in_the_discs_left_out_is_told_of_a_model_that_knows_neither(trained, data, gauge):
+    """Recomputed: the scored model, a bound from two halves of the loads that are apart and outside every disc."""
+    good, split = data.loads.rows(np.flatnonzero(data.good)), trained.split
+    distance = gauge.distances(good, data.displacement(gauge.nodes)[data.good], gauge.nodes)
+    place = np.linalg.norm(only_pushed(good).point[:, None] - split.centres, axis=2).min(axis=1)
+    beside = np.flatnonzero((np.arange(len(good)) >= len(good) - trained.calibrated) & (place > split.radius))
+    scored = train(data, ["linear"], split=split).models["linear"]
+
+    def told(rows):
+        loads = good.rows(rows)
+        known = measured(open_patch(data.anatomy), only_pushed(loads))
+        within = known._replace(magnitude=np.clip(known.magnitude, *scored.envelope.force))
+        error = np.abs(scored.distance(loads).value - distance[rows])
+        return features_of(only_pushed(loads), within), known.magnitude, error[:, None]
+
+    (features, _, error), discs = told(beside[::2]), np.flatnonzero(split.test)
+    bound = fitted_bound((features, error[:, 0]), *told(beside[1::2]), CLASS)
+    bounded = replace(scored, tip=replace(scored.tip, bound=bound))
+    held = told(discs)[2][:, 0] <= bounded.distance(good.rows(discs)).bound
+    found = trained.distance_left_out["linear"]
+    assert found.loads == len(discs) and found.held == pytest.approx(held.mean(axis=1))
 
 
 def test_the_correction_brings_distances_nearer(model, fresh):
