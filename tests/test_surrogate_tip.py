@@ -237,6 +237,10 @@ def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender,
     told = model.distance(loads)
     assert found == Reading(told.value[0], told.bound[0, 0])
     assert reading(pretender, loads, truth, tool) == Reading(fresh[1][2], None)
+    high = gauge.distances(loads, truth.displacement, truth.nodes, lift=2e-3)[0]
+    assert reading(pretender, loads, truth, tool, 2e-3).distance == high > fresh[1][2] + 1e-3
+    high = model.distance(loads, answer, 2e-3).value[0]
+    assert reading(model, loads, answer, tool, 2e-3).distance == high > told.value[0] + 1e-3
     plain = replace(model, tip=None).distance(loads).value[0]
     outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
     assert reading(model, loads, outside, tool) == Reading(told.value[0], None)
