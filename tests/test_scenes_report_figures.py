@@ -1,6 +1,7 @@
 """What the report counts and refuses, without a study: tenths of the force, the front, data of its own."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,9 @@ from conftest import make_box
 from scenes import report
 from scenes.cli import main
 from scenes.commands import report as command
+from scenes.report_page import Section, write_report
 from scenes.report_plots import against_time, front
-from scenes.report_row import Row, figures_of
+from scenes.report_row import Row, figures_of, of_times
 from sim.meshfile import write_anatomy
 from surrogate.dataset import read_dataset
 
@@ -39,6 +41,40 @@ def test_the_front_is_what_nobody_beats():
     rows += [Row("none", "f", state="not built yet")]
     assert front(rows) == {"fast", "near", "between"}
     assert against_time(rows).std() > 5.0 and against_time(rows[-1:]) is None
+
+
+def test_times_are_milliseconds_and_p99_takes_a_thousand():
+    seconds = 1e-3 * np.arange(1.0, 1001.0)
+    assert of_times(seconds) == pytest.approx({"median": 500.5, "p99": np.percentile(1e3 * seconds, 99), "timed": 1000})
+    assert of_times(seconds[:999])["p99"] is None
+
+
+def test_every_figure_stands_under_its_head(tmp_path):
+    """Read back from the page: sets of loads, shares of them, minutes of solves and fitting."""
+    one = figures_of(np.full((4, 2), 1e-3), np.full((4, 2, 3), 1e-2), np.arange(4.0))
+    sets = {
+        name: replace(one, mm=replace(one.mm, mean=mean), loads=loads)
+        for name, mean, loads in (("discs", 0.1, 7), ("sectors", 0.2, 8), ("beyond", 0.3, 9))
+    }
+    shares = {"flagged": {"discs": 0.01, "sectors": 0.02, "beyond": 1.0}, "covered": {"discs": 0.94, "beyond": 0.53}}
+    row = Row("svr", "learnt", reference=one, teacher=sets, **shares, median=1.5, p99=2.5, set_up=3.5, memory=0.25)
+    row = replace(row, taught=600, units=60, learning=120.0, timed=1000)
+    write_report(tmp_path, "a machine", [Section("data", (), (row,), 3.0)])
+    tables = [
+        [re.findall("<t[hd]>(.*?)</t[hd]>", line) for line in table.split("</tr>")]
+        for table in re.findall("<table>(.*?)</table>", (tmp_path / "index.html").read_text(), re.S)
+    ]
+    (heads, cells, *_), (others, *taught, _), *_ = tables
+    told = dict(zip(heads, cells, strict=True))
+    assert [told[head] for head in ("median ms", "set-up s", "memory GiB", "solves", "minutes")] == [
+        "1.5", "3.5", "0.25", "600 + 60 unit", "5",
+    ]  # fmt: skip
+    asked = ("loads of", "loads", "mean mm", "called extrapolated", "within 95 % bound")
+    assert [[line[others.index(head)] for head in asked] for line in taught] == [
+        ["whole discs of cortex left out", "7", "0.1", "1 %", "94 %"],
+        ["whole sectors of direction left out", "8", "0.2", "2 %", ""],
+        ["beyond the taught range", "9", "0.3", "100 %", "53 %"],
+    ]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from scenes.sensitivity import Study, change, moved_alike, rows, with_skull
 from scenes.variant import Aim, Body, aimed, variants
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL
-from sim.deformation import Outcome
+from sim.deformation import Outcome, guess
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
@@ -143,6 +143,16 @@ def test_a_load_counts_where_it_and_its_default_converged(pretender):
     assert found.percent == pytest.approx(100.0)
     assert found.motion == pytest.approx(2.0)
     assert found.mean_mm == pytest.approx(1e3 * np.linalg.norm(default.displacement[0], axis=1).mean())
+
+
+def test_a_change_has_the_percentiles_that_it_says():
+    """p95 over every load x vertex; worst95 over the loads, each by its farthest vertex."""
+    field = np.random.default_rng(0).normal(size=(40, 7, 3))
+    default = replace(guess(np.ones((40, 7, 3))), outcome=40 * (Outcome.CONVERGED,))
+    found = change(replace(default, displacement=1.0 + 1e-3 * field), default, default.displacement)
+    off = np.linalg.norm(field, axis=2)
+    wanted = off.mean(), np.percentile(off, 95), np.percentile(off.max(axis=1), 95), off.max()
+    assert (found.mean_mm, found.p95_mm, found.worst95_mm, found.largest_mm) == pytest.approx(wanted)
 
 
 def test_tools_are_off_by_what_is_asked(anatomy):
