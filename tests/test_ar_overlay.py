@@ -272,6 +272,13 @@ def test_words_stay_inside_the_picture():
         assert np.count_nonzero(colour[2:-2, 2:-2].max(axis=-1) > 200) > 20
 
 
+def test_a_line_of_text_is_found_whole():
+    colour = np.full((80, 200, 3), 90, np.uint8)
+    write(colour, "11.5 mm", (60, 40))
+    found = {text for text in ("11.5 mm", "1.5 mm", "11.6 mm", "5 mm") if stands(colour, text, 0.5)}
+    assert found == {"11.5 mm"} and not stands(colour, "11.5 mm", 0.45)
+
+
 def test_the_panel_is_a_copy_in_its_corner():
     colour = np.full((150, 200, 3), 90, np.uint8)
     shown = panel(colour, ["render 12 ms", "error 0.1 mm"], "bottom right")
