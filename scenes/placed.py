@@ -79,5 +79,7 @@ def opened(subject: Subject, args: argparse.Namespace) -> Subject:
         place = pieces[over - 1].centre
     else:
         place = 1e-3 * np.array(over)
-    depth = -float(subject.brain(place[None])[0])
+    # Some voxels off the surface the field of a volume tells the side alone.
+    apart = float(np.linalg.norm(subject.cortex - place, axis=1).min())
+    depth = -apart if subject.brain(place[None])[0] > 0.0 else apart
     return replace(subject, site=opening_over(subject.cortex, place, depth))

@@ -140,6 +140,10 @@ def test_the_skull_is_opened_over_the_piece_that_is_asked_for(tmp_path):
     assert site @ small.centre > 0.99 * np.linalg.norm(site) * np.linalg.norm(small.centre)
     at = opened(subject, SimpleNamespace(**asked | {"opening_at": (-50.0, 0.0, 20.0)})).site
     assert np.linalg.norm(at - [-0.05, 0.0, 0.02]) < 5e-3
+    site = opened(subject, SimpleNamespace(**asked | {"opening_over": (-25.0, 25.0, 20.0)})).site
+    assert site[0] < -0.02 and site[1] > 0.02
+    with pytest.raises(InputError, match=r"lies \d+ mm outside the brain"):
+        opened(subject, SimpleNamespace(**asked | {"opening_over": (-90.0, 0.0, 20.0)}))
     with pytest.raises(InputError, match="has 2 pieces: choose 1 to 2"):
         opened(subject, SimpleNamespace(**asked | {"opening_over": 3}))
 
