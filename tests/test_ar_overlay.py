@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -9,7 +10,7 @@ from ar.camera import look_at
 from ar.hud import panel, write
 from ar.layer import Layer, Solid, vertex_normals
 from ar.overlay import BEFORE, DOUBTFUL, GAUGE, WARNING, Gauge, composite, ink_of, iou, silhouette
-from ar.refind import stands
+from ar.refind import outline_gap, stands
 from ar.view import Lamp, lamp_beside, render
 
 CORTEX, TOOL, TUMOUR = 1, 2, 3
@@ -270,6 +271,26 @@ def test_words_stay_inside_the_picture():
         colour = np.full((80, 200, 3), 90, np.uint8)
         write(colour, "12.3 mm", at)
         assert np.count_nonzero(colour[2:-2, 2:-2].max(axis=-1) > 200) > 20
+
+
+def test_an_outline_is_off_by_what_is_astray_and_by_what_is_missing():
+    """One that stands 12 pixels off beside the true one, and one of which the right half is not drawn."""
+    here, ink = camera(400, 300), (20.0, 240.0, 60.0)
+    true = silhouette(here, tumour().vertices, tumour().triangles)
+    nothing = np.zeros(true.shape, bool)
+
+    def gap(*masks, left=400):
+        colour = np.zeros((*true.shape, 3), np.uint8)
+        for mask in masks:
+            colour[mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3))).astype(bool)] = ink
+        colour[:, left:] = 0
+        return outline_gap(colour, ink, true, nothing)
+
+    middle = int(np.nonzero(true)[1].mean())
+    assert gap(true) <= 1.0
+    assert 9.0 < gap(true, np.roll(true, 12, axis=1)) <= 12.0
+    assert gap(true, left=middle) > 15.0
+    assert gap(nothing) == np.inf
 
 
 def test_a_line_of_text_is_found_whole():

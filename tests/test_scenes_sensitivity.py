@@ -143,6 +143,8 @@ def test_a_load_counts_where_it_and_its_default_converged(pretender):
     assert found.percent == pytest.approx(100.0)
     assert found.motion == pytest.approx(2.0)
     assert found.mean_mm == pytest.approx(1e3 * np.linalg.norm(default.displacement[0], axis=1).mean())
+    all_good = change(pretender.deform(loads, at=nodes), default, default.displacement)
+    assert (all_good.solves, all_good.failed) == (2, 1)
 
 
 def test_a_change_has_the_percentiles_that_it_says():

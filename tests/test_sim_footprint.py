@@ -72,6 +72,14 @@ def test_a_small_tool_on_large_triangles() -> None:
     np.testing.assert_allclose(weight, [0.5, 0.3, 0.2, 0.0], atol=2e-3)
 
 
+def test_what_was_pressed_last_is_kept_for_the_same_place_and_radius_alone() -> None:
+    nodes, triangles = sheet(300)
+    skin = Skin(nodes, triangles, find_device("cpu", "float64"))
+    for point, radius in ((POINT, RADIUS), (POINT, 0.5 * RADIUS), (-POINT, 0.5 * RADIUS), (POINT, RADIUS)):
+        found = skin.press(point[None], np.array([radius])).rows(len(nodes)).toarray()[0]
+        np.testing.assert_allclose(found, weights(nodes, triangles, point, radius), atol=1e-15)
+
+
 def test_the_edge_of_the_surface_cuts_the_footprint() -> None:
     """Half of the disc lies outside: the force stays, and moves inwards by the half disc's centroid."""
     nodes, triangles = sheet(6000)
