@@ -31,7 +31,7 @@ def theatre(box):
 
 
 def answer(outcome: Outcome, bound: float = 1e-3):
-    return replace(guess(np.zeros((1, 3, 3))), outcome=(outcome,), bound=np.full((2, 1), bound))
+    return replace(guess(np.zeros((1, 3, 3))), outcome=(outcome,), bound=np.array([[bound], [2.0 * bound]]))
 
 
 class TestTrust:

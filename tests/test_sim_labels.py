@@ -120,6 +120,7 @@ def test_components_and_holes(tmp_path):
     text = " ".join(subject.notes)
     for part in ("of brain that is not connected", "of holes", "of tumour outside", "of tumour in specks"):
         assert part in text
+    assert subject.tumour_volume == pytest.approx(sum(piece.volume for piece in subject.pieces))
     anatomy = make_anatomy(subject, Plan(nodes=4000))
     inside = anatomy.mesh.nodes[anatomy.tumour_nodes]
     assert KDTree(inside).query(np.stack([TUMOUR, second]))[0].max() < 0.006
