@@ -237,3 +237,10 @@ def test_the_command_makes_poses_that_finite_elements_answer(
     shaft = data.loads.of(Touching).pose[:, 0, :3, 2]  # pyright: ignore[reportOptionalMemberAccess]
     assert (np.einsum("bi,bi->b", force, shaft) < 0.0).all()
     assert NodalForce not in {type(effect) for effect in fem.effects}
+
+
+def test_a_ball_half_in_the_tissue_presses_inward(box: Anatomy) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 0.0, -BALL.radius]  # its middle is on the box's top
+    pushed = indented(Loads((Touching(pose[None, None]),)), BALL.radius, open_patch(box))
+    np.testing.assert_allclose(pushed.force[0], [0.0, 0.0, -BALL.radius], atol=1e-9)

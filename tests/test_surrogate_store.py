@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
+from surrogate.archive import Archive
 from surrogate.bound import Bound
 from surrogate.dataset import read_dataset
 from surrogate.encode import Basis
@@ -224,3 +225,13 @@ def test_bad_model_files_are_sentences(box, tmp_path):
     np.savez(tmp_path / "old.npz", header=np.array(json.dumps({"format": "sulcus model 0"})))
     with pytest.raises(InputError, match="train it anew"):
         load(tmp_path / "old.npz", box)
+
+
+def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("surrogate.archive.LARGEST_MODEL", 1000)
+    np.savez_compressed(tmp_path / "m.npz", few=np.zeros(10), many=np.zeros(1000))
+    with (tmp_path / "m.npz").open("rb") as raw:
+        archive = Archive(raw)
+        assert len(archive.arrays(["few"])["few"]) == 10
+        with pytest.raises(InputError, match="MB are the most"):
+            archive.arrays(["few", "many"])
