@@ -110,9 +110,10 @@ class Browser:
             self.folder = self.server.gui.add_folder(None)
             with self.folder:
                 self.add_playback(playback)
+                # Before the controls: a window of 1280 x 720 does not hold them all.
+                self.add_saver()
                 for control in controls:
                     self.add_control(control)
-                self.add_saver()
             self.meshes = {body.name: self.add_body(body) for body in bodies}
 
     @property

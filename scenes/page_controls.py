@@ -55,8 +55,8 @@ def controls(
             "answered by",
             "fem: finite elements, solved anew; the others: models that were trained on them",
         ),
-        *([] if scene.tool is None else hand(scene, site, wish, give, take)),
         Choice("overlay", tuple(styles), shown, lambda words: wish.set(style=styles[words]), hint="how it is drawn"),
+        *([] if scene.tool is None else hand(scene, site, wish, give, take)),
         *([Fold("more: switch parts of the physics off", switches)] if switches else []),
     ]
 

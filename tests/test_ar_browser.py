@@ -178,6 +178,11 @@ def test_a_visitor_saves_the_picture_as_it_is_shown(page, monkeypatch):
     visitor.wire.close()
 
 
+def test_saving_comes_before_the_controls_which_a_low_window_cuts_off(page):
+    after = [handle.order for handle in page.inputs.values()]
+    assert page.frame.order < page.saver.order < min(after)
+
+
 def test_the_line_over_the_picture_comes_and_goes(page):
     page.status("solving ... 3 s")
     assert wait_for(lambda: "<span>solving ... 3 s</span>" in page.line.content)

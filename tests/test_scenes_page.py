@@ -137,6 +137,12 @@ class TestControls:
             switches = [inner for control in found if isinstance(control, Fold) for inner in control.controls]
             assert switches and all(inner.words and inner.words != inner.label for inner in switches)
 
+    def test_the_overlay_comes_before_the_tool_s_sliders(self, theatre):
+        labels = [
+            control.label for control in controls(short(), theatre.site, ("fem",), Wish("fem", Touch()), print, print)
+        ]
+        assert labels[:4] == ["scene", "deformer", "overlay", "tool"]
+
     def test_every_overlay_style_is_offered(self, theatre):
         wish = Wish("fem", Touch())
         found = controls(short(), theatre.site, ("fem",), wish, print, print)
