@@ -52,7 +52,7 @@ def reading(
     InputError
         An answer without open cortex or tumour.
     """
-    if not isinstance(tool, Probe) or len(loads.every(Pushed)) + len(loads.every(Touching)) != 1:
+    if _ball(loads, tool) is None:
         return None
     if not isinstance(deformer, Learned):
         return measured(deformer.anatomy, loads, answer, tool, lift)
@@ -66,7 +66,14 @@ def measured(
     anatomy: Anatomy, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float
 ) -> Reading | None:
     """Measure the distance in an answer, whoever gave it, as `reading` does; nothing is said of its error."""
-    if not isinstance(tool, Probe) or len(loads.every(Pushed)) + len(loads.every(Touching)) != 1:
+    ball = _ball(loads, tool)
+    if ball is None:
         return None
-    found = tip_gauge(anatomy).distances(loads, answer.displacement, answer.nodes, tool.radius, lift)
+    found = tip_gauge(anatomy).distances(loads, answer.displacement, answer.nodes, ball.radius, lift)
     return Reading(float(found[0]), None)
+
+
+def _ball(loads: Loads, tool: Instrument | None) -> Probe | None:
+    """Return the tool where it is the only thing that pushes or is moved, and a ball; else None."""
+    alone = len(loads.every(Pushed)) + len(loads.every(Touching)) == 1
+    return tool if alone and isinstance(tool, Probe) else None
