@@ -12,12 +12,13 @@ from ar.overlay import DASHED, composite, dash, outlines, silhouette
 from ar.view import render
 from sim.intensity import read_intensity, sidecar
 from sim.loads import Pushed
+from sim.resting import resting_tip
 
 from .report_reference import reference_of
 from .report_study import Study
 from .scene import Viewpoint, find_scene
 from .shipped import template_path
-from .site import site_of
+from .site import Site, site_of
 from .stage import TOOL, Stage
 from .tool import Probe
 
@@ -45,8 +46,8 @@ def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
     scan = read_intensity(sidecar(template_path())) if study.of_template else None
     middle = there[anatomy.tumour_nodes].mean(axis=0)
     camera = look_at(VIEW.camera(site).centre, middle, site.up, VIEW.fov, VIEW.width, VIEW.height)
-    place, radius = pushed.point[worst] - site.origin, float(pushed.footprint[worst])
-    tip = site.contact(float(place @ site.right), float(place @ site.up), radius).carried(there)
+    radius = float(pushed.footprint[worst])
+    tip = rested(site, pushed.point[worst], there, radius)
     tool = Probe(radius)
     stage = Stage(replace(find_scene("press"), viewpoint=VIEW, tool=tool), site, scan)
     picture = render(camera, stage.layers(there, tool.pose(tip, site.axis, site.right)), stage.lamp)
@@ -57,3 +58,13 @@ def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
     force = float(np.linalg.norm(pushed.force[worst]))
     lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"off by up to {1e3 * distance[worst]:.3f} mm"]
     return panel(shown, lines)
+
+
+def rested(site: Site, point: np.ndarray, positions: np.ndarray, radius: float) -> np.ndarray:
+    """Return the tip (3,) [m] of a ball that pushes at a point: it touches the deformed cortex, and pierces it nowhere.
+
+    point (3,): at rest [m]; positions (V, 3): of all mesh vertices now [m]; radius of the ball [m].
+    """
+    place = point - site.origin
+    carried = site.contact(float(place @ site.right), float(place @ site.up), radius).carried(positions)
+    return resting_tip(positions, site.anatomy.open_surface, carried, site.axis, radius)
