@@ -49,6 +49,9 @@ class Figures:
         Whether every number and picture is finite, and every answer, drawn or by finite elements, a good one.
     in_step
         Whether every picture shows the answer to its own moment.
+    leaked
+        The volume that passes the closed skull in the finite elements' answers, as a share of what the opening takes
+        in and gives out. Told, and held to nothing: see docs/verification.md.
     """
 
     overlap: float
@@ -60,6 +63,7 @@ class Figures:
     finite: bool
     answered: bool
     in_step: bool
+    leaked: float
 
     def broken(self, bounds: Bounds) -> list[str]:
         """A sentence for each bound that is not kept."""
@@ -107,6 +111,7 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
             bool(frame.deformation.time[0] == frame.time == time)
             for frame, time in zip(frames, truth.time, strict=True)
         ),
+        leaked=float(truth.leaked.max()),
     )
 
 

@@ -85,6 +85,9 @@ class Deformation:
         merely the last accepted state. NaN from a deformer that does not know.
     inverted
         (B,) whole numbers: tetrahedra that lie inside out, or collapsed; -1 from a deformer that does not know.
+    leaked
+        (B,): the volume that passes out through the closed skull, as a share of what the opening takes in and gives out
+        (`leak.py`). NaN from a deformer that does not know, as a live frame on a card or a learnt model.
     bound
         (2, B) [m]: with probability 0.95, and 0.99, no tumour vertex is farther off what the deformer was taught; NaN
         from one that promises nothing.
@@ -103,12 +106,13 @@ class Deformation:
     cost: Cost = Cost()
     reached: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     inverted: np.ndarray = field(default_factory=lambda: np.array(-1))
+    leaked: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     bound: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     source: str = ""
 
     def __post_init__(self) -> None:
         count = len(self.displacement)
-        for name, shape in (("reached", (count,)), ("inverted", (count,)), ("bound", (2, count))):
+        for name, shape in (("reached", (count,)), ("inverted", (count,)), ("leaked", (count,)), ("bound", (2, count))):
             given = getattr(self, name)
             if given.shape != shape:
                 object.__setattr__(self, name, np.broadcast_to(given, shape))
@@ -130,6 +134,7 @@ class Deformation:
             reaction=self.reaction[index],
             reached=self.reached[index],
             inverted=self.inverted[index],
+            leaked=self.leaked[index],
             bound=self.bound[:, index],
             history={name: value[index] for name, value in self.history.items()},
         )
@@ -176,6 +181,7 @@ def joined(parts: Sequence[Deformation]) -> Deformation:
         cost=Cost({stage: sum(part.cost.seconds[stage] for part in parts) for stage in stages}),
         reached=stacked("reached"),
         inverted=stacked("inverted"),
+        leaked=stacked("leaked"),
         bound=np.concatenate([part.bound for part in parts], axis=1),
         source=parts[0].source,
     )

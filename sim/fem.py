@@ -34,6 +34,7 @@ from .heading import moved_on, pushes_of, way_of
 from .inversion import Inversion
 from .ladder import FEWEST, Answer, Ladder, shortfall
 from .lbfgs import TAUGHT
+from .leak import Leak
 from .loads import Displaced, Loads, Nodal, Pushed
 from .memory import check_fits, fitting_batch
 from .pace import KEPT, alike
@@ -113,6 +114,7 @@ class Fem:
         patching_pays = live and plain and vicinity is None
         patch = patching(problem, preconditioner, self.effects, self.space) if patching_pays else None
         inversion = Inversion(self.space, problem.device)
+        self._leak = Leak(anatomy, self.space, problem.device)
         self._ladder = Ladder(problem, preconditioner, inversion, accuracy, near, vicinity or patch)
         self._paced = lru_cache(KEPT)(self._ladder_over)
         self._resting = Resting(problem, preconditioner, accuracy.inner)
@@ -362,6 +364,7 @@ class Fem:
             cost=Cost({**seconds, "reactions": time.perf_counter() - solved}),
             reached=found.reached,
             inverted=found.inverted,
+            leaked=self._leak.share(found.u),
             source=self.description,
         )
 

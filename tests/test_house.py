@@ -42,6 +42,7 @@ TIERS = (
         "multigrid",
         "amg",
         "inversion",
+        "leak",
         "patch",
         "rim",
         "compliance",

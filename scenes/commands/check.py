@@ -64,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
         rows.append({**played, "frames": len(frames), **figures.row(), "broken": broken})
         print(
             f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}  overlap {figures.overlap:.4f}  "
-            f"error {figures.error_mm:.3f} mm of {figures.motion_mm:.2f} mm  projection {figures.pixels:.1e} px",
+            f"error {figures.error_mm:.3f} mm of {figures.motion_mm:.2f} mm  projection {figures.pixels:.1e} px  "
+            f"through the skull {figures.leaked:.0%}",
             file=table,
         )
         if args.certify:

@@ -76,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
     outcome, residual = deformation.outcome[0], float(deformation.residual[0])
     reached, inverted = float(deformation.reached[0]), int(deformation.inverted[0])
+    leaked = float(deformation.leaked[0])
     if reached < 1.0:
         what = f"in equilibrium under {reached:.1%} of the load" if reached else "the last state, in no equilibrium"
         print(f"{args.mesh}: {outcome.value}; what is written is {what}", file=sys.stderr)
@@ -92,6 +93,7 @@ def run(args: argparse.Namespace) -> int:
         "nodes": fem.space.count,
         "seconds": round(seconds, 4),
         "inverted_tetrahedra": inverted,
+        "leaked": leaked if np.isfinite(leaked) else None,
         "largest_displacement_mm": round(1e3 * float(np.linalg.norm(deformation.displacement[0], axis=1).max()), 6),
         "out": str(out),
     }

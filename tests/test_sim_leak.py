@@ -1,0 +1,103 @@
+"""The volume that passes the closed skull: the surface's vectors, and what answers say of it."""
+
+import numpy as np
+import pytest
+import trimesh
+from boxes import box, quadratic
+from scipy.spatial import Delaunay
+
+from sim.accuracy import TRAIN
+from sim.anatomy import Anatomy
+from sim.device import find_device
+from sim.discretisation import discretise
+from sim.effects import pushed_effects
+from sim.element import quadratic_elements
+from sim.fem import MIDDLES, Fem
+from sim.leak import Leak, surface_vectors
+from sim.loads import push
+from sim.material import BRAIN
+from sim.mesh import TetMesh, oriented
+from sim.normals import unit, vertex_normals
+
+GRADIENT = 1e-3 * np.array([[3.0, 1.0, -2.0], [0.5, -1.0, 4.0], [2.0, -3.0, 5.0]])
+
+
+@pytest.mark.parametrize("kind", ["linear", "quadratic", "curved"])
+def test_the_surface_sweeps_the_volume_that_the_body_gains(kind):
+    """Of a uniform strain the body's volume times its trace; of the positions themselves three times the volume."""
+    mesh = box((3, 2, 2), distortion=0.2)
+    if kind != "linear":
+        mesh = quadratic(mesh)
+    if kind == "curved":
+        nodes = mesh.nodes + 0.3 * mesh.nodes[:, [1, 2, 0]] ** 2 / mesh.nodes.max()
+        mesh = TetMesh(nodes, mesh.tets, mesh.region, mesh.middles)
+    space = discretise(mesh, "p1" if kind == "linear" else "p2")
+    every = np.ones(len(mesh.tets), bool)
+    volume = mesh.volumes.sum()
+    if kind != "linear":
+        volume = quadratic_elements(space.nodes, space.table, every).weight.sum()
+    vectors = surface_vectors(space.nodes, space.surface)
+    assert np.abs(vectors.sum(axis=0)).max() < 1e-15
+    assert np.einsum("ni,ni->", vectors, space.nodes) == pytest.approx(3.0 * volume, rel=1e-12)
+    swept = np.einsum("ni,ni->", vectors, space.nodes @ GRADIENT.T)
+    assert swept == pytest.approx(volume * np.trace(GRADIENT), rel=1e-9)
+
+
+@pytest.fixture(scope="module")
+def egg():
+    """An egg of 80 to 100 mm whose upper cap is open, its lowest nodes held; the rest slides along its own normals."""
+    shell = trimesh.creation.icosphere(subdivisions=3, radius=0.045).vertices
+    grid = np.stack(np.meshgrid(*[np.arange(-0.04, 0.041, 0.013)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    nodes = np.vstack([shell, grid[np.linalg.norm(grid, axis=1) < 0.037]])
+    tets, _ = oriented(nodes, Delaunay(nodes).simplices)
+    nodes = nodes * [0.9, 1.1, 1.0]
+    size = np.abs(np.linalg.det(nodes[tets[:, 1:]] - nodes[tets[:, :1]]))
+    thick = size > 1e-3 * np.median(size)
+    mesh = TetMesh(nodes, tets[thick], np.ones(thick.sum(), int))
+    surface = np.zeros(len(nodes), bool)
+    surface[mesh.surface] = True
+    opened, held = surface & (nodes[:, 2] > 0.033), surface & (nodes[:, 2] < -0.04)
+    normal = np.where((surface & ~opened & ~held)[:, None], vertex_normals(nodes, mesh.surface), 0.0)
+    return Anatomy(mesh, np.repeat(held[:, None], 3, axis=1), normal, opened)
+
+
+def pressed(anatomy, element):
+    fem = Fem(anatomy, pushed_effects(anatomy, BRAIN), TRAIN, "cpu", element=element)
+    top = anatomy.mesh.nodes[anatomy.mesh.nodes[:, 2].argmax()]
+    return fem.deform(push(top, np.array([0.05, 0.0, -0.15]), 8e-3))
+
+
+@pytest.mark.parametrize("element", ["p1", "smoothed"])
+def test_nothing_passes_a_skull_whose_normals_are_the_surface_s_own(egg, element):
+    assert pressed(egg, element).leaked[0] < 1e-5
+
+
+def test_through_a_skull_on_other_normals_tissue_passes(egg):
+    """Counted by hand: what the surface's vectors sweep at nodes that slide, beside what it sweeps where it is open."""
+    slides = egg.slide_normal.any(axis=1)
+    tilted = unit(egg.slide_normal + 0.15 * np.random.default_rng(1).normal(size=egg.slide_normal.shape))
+    other = Anatomy(egg.mesh, egg.held, np.where(slides[:, None], tilted, 0.0), egg.craniotomy)
+    answer = pressed(other, "p1")
+    swept = np.einsum("ni,ni->n", surface_vectors(egg.mesh.nodes, egg.mesh.surface), answer.displacement[0])
+    wanted = swept[slides].clip(0.0).sum() / np.abs(swept[egg.craniotomy]).sum()
+    assert answer.leaked[0] == pytest.approx(wanted, rel=1e-4) and wanted > 0.02
+    assert answer.rows(np.array([0])).leaked[0] == answer.leaked[0]
+
+
+def test_mid_edge_nodes_count(egg):
+    answer = pressed(egg, "p2")
+    space = discretise(egg.mesh, "p2")
+    u = space.interpolated(answer.displacement[0])
+    u[len(egg.mesh.nodes) :] += answer.history[MIDDLES][0]
+    device = find_device("cpu", "float64")
+    assert Leak(egg, space, device).share(device.array(u.reshape(-1, 1)))[0] == pytest.approx(
+        answer.leaked[0], rel=1e-3
+    )
+    swept = np.einsum("ni,ni->n", surface_vectors(space.nodes, space.surface), u)
+    assert np.abs(swept[: len(egg.mesh.nodes)]).max() < 1e-12 < np.abs(swept).max()
+
+
+def test_a_body_at_rest_lets_nothing_pass(egg):
+    device = find_device("cpu", "float64")
+    leak = Leak(egg, discretise(egg.mesh, "p1"), device)
+    assert leak.share(device.zeros(3 * len(egg.mesh.nodes), 2)).tolist() == [0.0, 0.0]
