@@ -1,6 +1,6 @@
 """The fluid has partly drained; the tumour is debulked through a corridor, and what is left of it settles."""
 
-from sim.effects import Elasticity, Gravity, Held, Slide
+from sim.effects import Elasticity, Gravity, Held, SkullContact
 
 from .lying import drained
 from .scene import Scene
@@ -11,7 +11,7 @@ SCENE = Scene(
     "resection",
     __doc__ or "",
     duration=5.0,
-    effects=(Elasticity(), Held(), Slide(), Gravity()),
+    effects=(Elasticity(), Held(), SkullContact(), Gravity()),
     tool=None,
     lying=drained(1.5, to=0.3),
     surgery=Debulking(times=(2.0, 2.7, 3.4, 4.1)),
