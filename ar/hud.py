@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -35,9 +36,14 @@ def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5
 
 
 def millimetres(length: float, error: float | None = None) -> str:
-    """A length [m] as it is read: in millimetres, with what it may be off by [m] where that is known."""
-    beside = "" if error is None else f" +- {max(1e3 * error, 0.1):.1f}"
+    """A length [m] as it is read: in millimetres, with what it may be off by [m], rounded up, where that is known."""
+    beside = "" if error is None else f" +- {max(rounded_up(1e3 * error, 1), 0.1):.1f}"
     return f"{1e3 * length:.1f}{beside} mm"
+
+
+def rounded_up(value: float, digits: int) -> float:
+    """The least number of so many decimals that is no smaller, for bounds: they may not be told too small."""
+    return math.ceil(round(value * 10**digits, 6)) / 10**digits
 
 
 def panel(colour: np.ndarray, lines: Sequence[str], corner: Corner = "top left", scale: float = 0.45) -> np.ndarray:

@@ -123,15 +123,13 @@ def trust(answer: Deformation, name: str) -> str:
     if not outcome.good:
         return f'<p>{who}</p><p class="warn">Do not rely on this answer: {escape(outcome.value)}.</p>'
     how = "inside the range that it was trained on" if outcome is Outcome.PREDICTED else "solved to its tolerance"
+    if not answer.displacement.any():
+        return f"<p>{who}: {how}. Nothing moves the tumour.</p>"
     bound = float(answer.bound[0, 0])
     if not np.isfinite(bound):
         return f"<p>{who}: {how}.</p>"
-    return f"<p>{who}: {how}. In 95 of 100 loads no point of the tumour is off by more than {millimetres(bound)}.</p>"
-
-
-def millimetres(metres: float) -> str:
-    """A length that is never told as nothing where it is something."""
-    return f"{1e3 * metres:.2f} mm" if metres >= 5e-6 or metres == 0.0 else "0.01 mm"
+    most = f"{hud.rounded_up(1e3 * bound, 2):.2f} mm"
+    return f"<p>{who}: {how}. In 95 of 100 loads no point of the tumour is off by more than {most}.</p>"
 
 
 def report(

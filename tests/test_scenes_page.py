@@ -10,7 +10,7 @@ from theatres import short, sinking, small, theatre_of
 from ar.page_parts import Choice, Fold, Slider
 from scenes.busy import NOTICED, Busy
 from scenes.page_controls import clocked, controls
-from scenes.page_text import RESEARCH, about, fem_words, millimetres, report, side, trust, words
+from scenes.page_text import RESEARCH, about, fem_words, report, side, trust, words
 from scenes.paths import Touch
 from scenes.play import Player
 from scenes.referee import Truth
@@ -31,7 +31,7 @@ def theatre(box):
 
 
 def answer(outcome: Outcome, bound: float = 1e-3):
-    return replace(guess(np.zeros((1, 3, 3))), outcome=(outcome,), bound=np.array([[bound], [2.0 * bound]]))
+    return replace(guess(np.full((1, 3, 3), 1e-3)), outcome=(outcome,), bound=np.array([[bound], [2.0 * bound]]))
 
 
 class TestTrust:
@@ -52,13 +52,16 @@ class TestTrust:
             said = trust(answer(outcome), "fem")
             assert "_" not in said and outcome.name not in said
 
-    def test_a_length_that_is_something_is_not_told_as_nothing(self):
-        assert [millimetres(length) for length in (0.0, 1e-7, 6e-6, 1.234e-3)] == [
-            "0.00 mm",
-            "0.01 mm",
-            "0.01 mm",
-            "1.23 mm",
-        ]
+    @pytest.mark.parametrize(("bound", "words"), [(1e-7, "0.01 mm"), (6e-6, "0.01 mm"), (1.231e-3, "1.24 mm")])
+    def test_a_bound_is_not_told_too_small(self, bound, words):
+        told = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
+        assert f"is off by more than {words}." in trust(told, "svr")
+
+    def test_where_nothing_moves_nothing_is_promised(self):
+        still = answer(Outcome.PREDICTED)
+        still = replace(still, displacement=0.0 * still.displacement)
+        said = trust(still, "svr")
+        assert "Nothing moves the tumour." in said and "95 of 100" not in said
 
 
 class TestVerdict:
