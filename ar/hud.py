@@ -36,8 +36,10 @@ def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5
 
 
 def millimetres(length: float, error: float | None = None) -> str:
-    """A length [m] as it is read: in millimetres, with what it may be off by [m], rounded up, where that is known."""
-    beside = "" if error is None else f" +- {max(rounded_up(1e3 * error, 1), 0.1):.1f}"
+    """A length [m] as it is read: in millimetres, with what it may be off by [m], rounded up, where that is finite."""
+    beside = ""
+    if error is not None and math.isfinite(error):
+        beside = f" +- {max(rounded_up(1e3 * error, 1), 0.1):.1f}"
     return f"{1e3 * length:.1f}{beside} mm"
 
 

@@ -37,7 +37,7 @@ from .surgery import Debulking
 from .tool import Instrument, Probe
 
 # So far under the cortex a camera looks: between the tool and the tumour [m].
-UNDER = 6e-3
+UNDER = 10e-3
 
 
 @dataclass(frozen=True)
