@@ -42,11 +42,18 @@ MEANINGS = {
     "pictures/overlay": "JPEG bytes: the same with the predicted tumour drawn into it",
     "pictures/segmentation": "PNG bytes, 8 bit: the id of what is seen, see the root's `segmentation`",
     "pictures/tumour_mask": "PNG bytes, 8 bit: 1 where the predicted tumour would be seen were nothing in front of it",
-    "K": "pinhole camera matrix (3, 3) [pixel]", "bound": "(frames, 2): largest error in 95, and in 99, of 100 loads",
+    "K": "pinhole camera matrix (3, 3) [pixel]",
+    "bound": "(frames, 2): the largest error of a tumour vertex, in 95 and in 99 of 100 loads; NaN: none is stated",
     "tumour_nodes": "mesh vertices of the rows of tumour_*", "tumour_left": "which of them are not cut out",
     "outcome_predicted": "how the deformer's answer came about", "outcome_fem": "the same of the finite elements",
-    "tumour_predicted": "by the deformer", "tumour_fem": "by the finite elements", "tumour_rest": "in the scan",
+    "tumour_predicted": "positions, by the deformer", "tumour_fem": "positions, by the finite elements",
+    "tumour_rest": "positions in the scan",
     "reaction_fem": "(frames, tools, 6): force that each tool exerts, and its moment about the tool's lowest point",
+    "time": "since the scene began", "seconds": "what each stage of the picture took",
+    "T_camera_world": "(frames, 4, 4): takes points of the world to the camera's frame: x_camera = T x_world",
+    "T_world_tool": "(frames, 4, 4): takes points of the tool's own frame to the world: x_world = T x_tool",
+    "force": "of the tool on the brain, in the world's frame",
+    "pictures/depth": "PNG bytes, 16 bit: distance along the camera's z axis; 0 where nothing is seen",
     "contact": "where the tool pushes, on the cortex of the scan",
     "tip": "the tool's lowest point, against the open cortex's mean outward normal",
 }  # fmt: skip
@@ -90,6 +97,8 @@ def collect(
         for frame in progress(player.frames()):
             for name, code in encoded(frame, player).items():
                 stores[name][frame.number] = code
+            if stream.failure is not None:  # no frame after it would be kept
+                raise stream.failure
             rows.append(motion(frame, player))
             loads.append(frame.loads)
         outcomes = write_motion(file, player, rows, truth_of(theatre, player.scene, loads, solved))

@@ -81,7 +81,11 @@ def written_stream(path: str | Path, suffix: str) -> Iterator[Stream]:
     """
     with written_whole(path, suffix) as partial, partial.open("w+b", buffering=0) as raw:
         stream = Stream(raw)
-        yield stream
+        try:
+            yield stream
+        except (OSError, RuntimeError):  # what HDF5 makes of the failure when it reads again
+            if stream.failure is None:
+                raise
         if stream.failure is not None:
             raise stream.failure
 

@@ -173,6 +173,32 @@ class TestEpisode:
         with pytest.raises(InputError, match="Choose another folder"):
             collect(tmp_path / "file" / "a.h5", theatre, player(theatre, short(), "linear"), "linear", iter)
 
+    @pytest.mark.parametrize(("size", "most"), [(40_000, 4), (150_000, 7)])
+    def test_a_full_disk_is_a_sentence(self, theatre, tmp_path, size, most, monkeypatch):
+        """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
+        resource = pytest.importorskip("resource")
+        monkeypatch.setattr("scenes.collect.PIXEL_BYTES", 0.0)  # as if there had been room at first
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        drawn = []
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            with pytest.raises(InputError, match=r"press\.h5: cannot be written \(File too large\)"):
+                collect(
+                    tmp_path / "press.h5", theatre, player(theatre, short(), "linear"), "linear",
+                    lambda frames: (drawn.append(1) or frame for frame in frames),
+                )  # fmt: skip
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert not list(tmp_path.iterdir())
+        assert len(drawn) <= most  # the rest is not drawn in vain
+
+    def test_every_data_set_says_what_it_is(self, episode):
+        _, file, _, _ = episode
+        mute = []
+        file.visititems(lambda name, item: mute.append(name) if isinstance(item, h5py.Dataset) and not
+                        {"meaning", "unit"} <= set(item.attrs) else None)  # fmt: skip
+        assert not mute
+
     def test_the_command(self, brief, anatomy, tmp_path, capsys):
         out = tmp_path / "new" / "press.h5"
         words = ["collect", "press", "--anatomy", str(anatomy), "--deformer", "fem", "--out", str(out), "--json"]
@@ -223,20 +249,6 @@ def test_an_episode_that_no_file_may_hold_is_told_before_the_work(theatre, tmp_p
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
     try:
         with pytest.raises(InputError, match=r"files are limited to 0\.1 MB"):
-            collect(tmp_path / "press.h5", theatre, play, "linear", iter)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert not list(tmp_path.iterdir())
-
-
-def test_an_episode_that_does_not_fit_after_all_is_told(theatre, tmp_path, monkeypatch):
-    """HDF5 ends the process where a write of its own fails."""
-    resource = pytest.importorskip("resource")
-    monkeypatch.setattr("scenes.collect.PIXEL_BYTES", 0.0)
-    before, play = resource.getrlimit(resource.RLIMIT_FSIZE), player(theatre, short(), "linear")
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-    try:
-        with pytest.raises(InputError, match="File too large"):
             collect(tmp_path / "press.h5", theatre, play, "linear", iter)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
