@@ -64,7 +64,31 @@ class Trained:
 def learners_for(data: Dataset) -> tuple[str, ...]:
     """All that a data set can teach: series and contact need finite elements, of a tissue that the data names."""
     told = "tissue" in data.provenance
-    return tuple(name for name in _kinds(data)[0] if told or name not in (*EXPANDED, *TOUCHED))
+    kinds = LEARNERS if data.ball is None else OF_POSES
+    return tuple(name for name in kinds if told or name not in (*EXPANDED, *TOUCHED))
+
+
+def check_learners(names: Sequence[str], of_poses: bool, where: str) -> None:
+    """Refuse learners that data of pushes, or of poses, cannot teach. `where` names the data in the sentence.
+
+    Raises
+    ------
+    InputError
+        No name, an unknown one, or one of the other kind of data.
+    """
+    kinds, others, held = (OF_POSES, LEARNERS, "poses") if of_poses else (LEARNERS, OF_POSES, "pushes")
+    unknown = [name for name in names if name not in (*kinds, *others) and find_own(name) is None]
+    if unknown or not names:
+        allowed = ", ".join((*kinds, *OWN))
+        raise InputError(
+            f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {allowed}; "
+            "a file with one of your own is named by --plugin."
+        )
+    strange = [name for name in names if name in others and name not in kinds]
+    if strange:
+        raise InputError(
+            f"{where}: holds {held}, of which {', '.join(strange)} cannot be had: choose from {', '.join(kinds)}."
+        )
 
 
 def train(
@@ -102,19 +126,7 @@ def train(
         not converge.
     """
     wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
-    kinds, others, held = _kinds(data)
-    unknown = [name for name in wanted if name not in (*kinds, *others) and find_own(name) is None]
-    if unknown or not wanted:
-        allowed = ", ".join((*kinds, *OWN))
-        raise InputError(
-            f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {allowed}; "
-            "a file with one of your own is named by --plugin."
-        )
-    strange = [name for name in wanted if name in others and name not in kinds]
-    if strange:
-        raise InputError(
-            f"{data.path}: holds {held}, of which {', '.join(strange)} cannot be had: choose from {', '.join(kinds)}."
-        )
+    check_learners(wanted, of_poses=data.ball is not None, where=str(data.path))
     if most is not None and most < 1:
         raise InputError(f"{most} loads teach nothing: give at least 1.")
     if not data.unit_good.all():
@@ -198,11 +210,6 @@ def train(
         left_out,
         distance_left_out,
     )
-
-
-def _kinds(data: Dataset) -> tuple[tuple[str, ...], tuple[str, ...], str]:
-    """Learners that loads of the data's kind can teach, those of the other kind, and what the kind is called."""
-    return (LEARNERS, OF_POSES, "pushes") if data.ball is None else (OF_POSES, LEARNERS, "poses")
 
 
 def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> Learned:

@@ -64,6 +64,9 @@ def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsy
         (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "labels.nii.gz/a.vtu"], "folder"),
         (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--count", "3"], "--count 3"),
         (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--device", "abacus"], "abacus"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "ann,owl"], "called owl"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "contact"], "contact"),
+        (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "ann,"], "--learners"),
         (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--nodes", "3"], "3 nodes"),
     ],
 )

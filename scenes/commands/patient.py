@@ -46,8 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; an interrupted run goes on when the same command is given again."""
+    from surrogate.train import check_learners
+
     from ..cli import main
     from ..theatre import model_path
+    from .train import asked_learners
 
     # Said now, not after minutes of meshing.
     data, model = args.out.with_suffix(".h5"), model_path(args.out)
@@ -55,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
     claimed(data, ".h5", "a data set of `sulcus simulate`", args.force)
     claimed(model, ".npz", "a model of `sulcus train`", args.force)
     find_device(args.device, TRAIN.precision)
+    check_learners(asked_learners(args.learners), of_poses=False, where=str(data))
     if args.count - args.count // APART < FEWEST + 1:
         raise InputError(f"--count {args.count} is too few to learn from and to leave {FEWEST} discs out: give more.")
     force = ["--force"] if args.force else []

@@ -45,11 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Returns 0 when the models are written."""
     out = claimed(args.out, ".npz", "a model of `sulcus train`", args.force)
-    asked = None if args.learners is None else [name.strip() for name in args.learners.split(",")]
-    if asked is not None and not all(asked):
-        raise InputError(
-            f"--learners {args.learners!r}: name each learner, with one comma between two, or leave it out."
-        )
+    asked = None if args.learners is None else asked_learners(args.learners)
     with stage("read the data"):
         data = read_dataset(args.data)
     learners = asked or list(learners_for(data))
@@ -67,6 +63,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def asked_learners(words: str) -> list[str]:
+    """The names in `--learners`, of which none is empty."""
+    names = [name.strip() for name in words.split(",")]
+    if not all(names):
+        raise InputError(f"--learners {words!r}: name each learner, with one comma between two, or leave it out.")
+    return names
+
+
 def _warnings(data: Dataset, learners: Sequence[str]) -> list[str]:
     """What takes long, and what too few loads cannot give, in sentences."""
     notes, good = [], int(data.good.sum())
@@ -79,7 +83,8 @@ def _warnings(data: Dataset, learners: Sequence[str]) -> list[str]:
     if good // APART < FEWEST_APART:
         notes.append(
             f"of {good} loads {good // APART} are kept to calibrate error bounds, and {FEWEST_APART} are needed: the "
-            f"models will state no bound for a load. `sulcus simulate --count {APART * FEWEST_APART}` is the least."
+            "models will know no bound for each load by itself, only one for all. "
+            f"`sulcus simulate --count {APART * FEWEST_APART}` is the least."
         )
     return notes
 
@@ -110,7 +115,8 @@ def _for_people(trained: Trained, out: str, failed: int) -> str:
 
 def _calibration(trained: Trained) -> str:
     if trained.calibrated < FEWEST_APART:
-        return f"{trained.calibrated} others are too few to calibrate bounds, so none is stated"
+        few = f"{trained.calibrated} others are too few to calibrate a bound for each load"
+        return f"{few}: pictures show the one of the worst vertex above for every load, which is not calibrated"
     return f"{trained.calibrated} others calibrated bounds"
 
 
