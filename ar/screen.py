@@ -56,8 +56,11 @@ def write_png(path: Path, colour: np.ndarray, source: str = "") -> None:
     code = cv2.imencode(".png", colour[..., ::-1])[1].tobytes()
     text = KEYWORD + f" {source}".encode("ascii")
     chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
-    part.write_bytes(code[:START] + chunk + code[START:])
-    part.rename(path)
+    try:
+        part.write_bytes(code[:START] + chunk + code[START:])
+        part.rename(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def signature(path: Path) -> str | None:

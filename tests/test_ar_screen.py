@@ -63,6 +63,18 @@ def test_a_film_that_fails_leaves_nothing(tmp_path, suffix):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_full_disk_leaves_no_part_of_a_frame(tmp_path):
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(OSError, match="large"):
+            Film(tmp_path).show(0, picture())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+
+
 def test_bad_places_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="folder"):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ar.screen import Film, read_png, write_film
 from sim.errors import InputError
+from sim.files import REMEDY, why
 
 from ..output import add_force, claimed, claimed_folder, claimed_frames
 from .demo import add_theatre, deformer_name, scene_asked
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
             args.film.parent.mkdir(parents=True, exist_ok=True)
             write_film(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
     except OSError as error:
-        raise InputError(f"{args.out}: the frames cannot be written ({error}). Choose another folder.") from error
+        raise InputError(f"{args.out}: the frames cannot be written ({why(error)}). {REMEDY}") from error
     film, who = None if args.film is None else str(args.film), theatre.described(name, scene)
     report = {"scene": scene.name, "deformer": name, "solver": who, "frames": len(written), "not_good": bad}
     report |= {"out": str(args.out), "film": film}

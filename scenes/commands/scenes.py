@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from sim.errors import InputError
+from sim.files import REMEDY, why
 
 from ..output import add_force, claimed, claimed_folder
 
@@ -64,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
                 write_png(args.out / f"{name}.png", picture)
             write_png(args.out / "sheet.png", sheet(pictures))
         except OSError as error:
-            raise InputError(f"{args.out}: the pictures cannot be written ({error}). Choose another folder.") from error
+            raise InputError(f"{args.out}: the pictures cannot be written ({why(error)}). {REMEDY}") from error
     if args.json:
         print(json.dumps({"scenes": told, "out": None if args.out is None else str(args.out)}))
     return 0
