@@ -52,6 +52,7 @@ from .loads import (
     Retracted,
     Touching,
     check_field,
+    check_loads,
 )
 from .material import Tissue, coefficients_of, functions_of, portion
 from .problem import Imposed, Problem
@@ -88,6 +89,9 @@ def compile_problem(
         an effect of the caller's own that makes no term, or one of a name that is taken.
     """
     effects = tuple(effects)
+    for effect in effects:
+        if isinstance(effect, type):
+            raise InputError(f"{effect.__name__} is a class, and no effect yet: write {effect.__name__}(...).")
     kinds = [type(effect) for effect in effects]
     for kind in kinds:
         if kinds.count(kind) > 1:
@@ -183,8 +187,9 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
     Raises
     ------
     InputError
-        Naming the cause and the effect that it needs.
+        Naming the cause and the effect that it needs; or what is given instead of loads.
     """
+    check_loads(loads)
     effects = tuple(effects)
     answered = {CAUSES[type(effect)] for effect in effects if type(effect) in CAUSES}
     answered |= {effect.cause for effect in effects if isinstance(effect, OwnEffect)}

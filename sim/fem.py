@@ -91,6 +91,8 @@ class Fem:
         element: str | None = None,
         live: bool = False,
     ):
+        if not isinstance(anatomy, Anatomy):
+            raise InputError(f"anatomy is {anatomy!r:.80}: give an Anatomy, such as read_anatomy(FILE.vtu) returns.")
         if not isinstance(accuracy, Accuracy):
             raise InputError(f"accuracy is {accuracy!r:.80}: give an Accuracy, such as LIVE, TRAIN or REFERENCE.")
         if not isinstance(effects, Iterable):

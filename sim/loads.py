@@ -243,6 +243,18 @@ def stacked(parts: Sequence[Loads]) -> Loads:
     return Loads(causes, np.concatenate([part.times for part in parts]))
 
 
+def check_loads(loads: object) -> None:
+    """Refuse what is no `Loads`.
+
+    Raises
+    ------
+    InputError
+        Naming what is given.
+    """
+    if not isinstance(loads, Loads):
+        raise InputError(f"loads is {loads!r:.80}: give Loads, such as push(...) makes.")
+
+
 def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) -> Loads:
     """Loads of one pushing tool: point (3,) or (B, 3) [m], force (3,) or (B, 3) [N], footprint radius [m].
 

@@ -16,7 +16,7 @@ from .deformation import Deformation, check_start, joined
 from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
 from .fem import MIDDLES, Fem
-from .loads import Loads, Resected
+from .loads import Loads, Resected, check_loads
 from .resection import Remains, bodies
 from .term import Remembering
 
@@ -71,6 +71,7 @@ class Operated:
         InputError
             As `Fem.deform`; more steps done than there are.
         """
+        check_loads(loads)
         if start is not None:
             check_start(start, len(loads), len(self.anatomy.mesh.nodes))
         done, most = self._done(loads), len(self._bodies) - 1

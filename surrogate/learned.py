@@ -15,7 +15,7 @@ from sim.anatomy import Anatomy
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
 from sim.given import whole_numbers
-from sim.loads import Loads, Pushed
+from sim.loads import Loads, Pushed, check_loads
 from sim.material import tissue_from_json
 from sim.threads import one_thread
 from sim.tip import tip_gauge
@@ -193,6 +193,7 @@ class Learned:
             Loads of another kind, or that do not touch the open cortex, or are more than `FARTHEST` times as strong
             or as wide as any that was taught; a start with other rows; a vertex in `at` that the model does not know.
         """
+        check_loads(loads)
         if start is not None and not isinstance(start, Deformation):
             raise InputError(f"the start is a {type(start).__name__}: give a Deformation, or none.")
         if start is not None and len(start) != len(loads):

@@ -144,6 +144,13 @@ def test_vertices_that_are_none(fem: Fem, cut: Any, at: Any, sentence: str) -> N
         answer.at(at)
 
 
+@pytest.mark.parametrize("loads", [None, [PUSH], "push"])
+def test_what_is_no_load_is_refused(fem: Fem, cut: Any, loads: Any) -> None:
+    for body in (fem, cut):
+        with pytest.raises(InputError, match=r"loads is .*: give Loads, such as push\(...\) makes"):
+            body.deform(loads)
+
+
 def test_lists_of_vertices_will_do(fem: Fem, cut: Any) -> None:
     for body in (fem, cut):
         whole = body.deform(PUSH)
@@ -169,6 +176,8 @@ def test_batches_of_none(batch: Any) -> None:
     ("made", "sentence"),
     [
         ({"accuracy": "live"}, "accuracy is 'live': give an Accuracy"),
+        ({"anatomy": "patient.vtu"}, r"anatomy is 'patient.vtu': give an Anatomy, such as read_anatomy\(FILE.vtu\)"),
+        ({"effects": (Elasticity, Held)}, r"Elasticity is a class, and no effect yet: write Elasticity\(...\)"),
         ({"element": "p7"}, "no element is called 'p7'"),
         ({"element": ["p1"]}, r"no element is called \['p1'\]"),
         ({"effects": Elasticity()}, "effects is Elasticity.*: give a tuple of effects"),

@@ -192,6 +192,8 @@ def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(train
     with pytest.raises(InputError, match="poses of one ball"):
         model.deform(Loads((two,)))
     forces = Learned(box, model.parts, model.envelope)
+    with pytest.raises(InputError, match="loads is None: give Loads"):
+        forces.deform(None)
     with pytest.raises(InputError, match="taught pushing forces only"):
         forces.deform(draw_poses("palpation", box, 2, 0))
     assert refusal(model, EFFECTS) is None
