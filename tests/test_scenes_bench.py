@@ -112,6 +112,7 @@ def test_an_interrupted_trial_goes_on(tmp_path, anatomy, capsys):
         (["robust", "--out", "loads.txt"], ".csv"),
         (["robust", "--anatomy", "none.vtu"], "no such file"),
         (["elements", "none.vtu"], "no such file"),
+        (["solvers"], "`sulcus bench --help`"),
         (["palpate"], "in the scene palpate no tool pushes, which is what is measured: choose press, slide, draw."),
     ],
 )

@@ -31,7 +31,10 @@ def run(args: argparse.Namespace) -> int:
 
     if args.batch < 1:
         raise InputError(f"--batch {args.batch} solves nothing: give a whole number from 1 up.")
-    scene = scene_asked(args, args.scene)
+    try:
+        scene = scene_asked(args, args.scene)
+    except InputError as error:
+        raise InputError(f"{error} What else is measured has a word of its own: `sulcus bench --help`.") from error
     if not any(isinstance(effect, ToolForce) for effect in scene.effects):
         pushing = ", ".join(name for name in SCENES if ToolForce() in find_scene(name).effects)
         raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")
