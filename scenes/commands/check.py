@@ -63,9 +63,9 @@ def run(args: argparse.Namespace) -> int:
         played = {"scene": scene.name, "deformer": name, "solver": theatre.described(name, scene)}
         rows.append({**played, "frames": len(frames), **figures.row(), "broken": broken})
         print(
-            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}  overlap {figures.overlap:.4f}  "
-            f"error {figures.error_mm:.3f} mm of {figures.motion_mm:.2f} mm  projection {figures.pixels:.1e} px  "
-            f"through the skull {figures.leaked:.0%}",
+            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}: the tumour is off by {figures.error_mm:.3f} "
+            f"mm of the {figures.motion_mm:.2f} mm that it moves; its outline by {figures.drawn:.1f} px, overlap "
+            f"{figures.overlap:.3f} (1 is best); {figures.leaked:.0%} passes the skull",
             file=table,
         )
         if args.certify:
