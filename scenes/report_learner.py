@@ -15,6 +15,7 @@ from surrogate.published import MACHINES, published_nodes, taught
 from surrogate.score import single_seconds
 from surrogate.sectors import leave_sectors_out
 from surrogate.split import Split
+from surrogate.told import Told
 from surrogate.train import train
 
 from .report_adapt import debulked_study, simulating_seconds
@@ -56,15 +57,15 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
 
     discs, sectors = study.discs, leave_sectors_out(study.pushed, study.patch)
     begun = clock.perf_counter()
-    model = _taught(study, spec, discs, truth)
-    learning = clock.perf_counter() - begun + series_seconds(study, spec.name)
+    model, told = _taught(study, spec, discs, truth)
+    learning = clock.perf_counter() - begun
     order = np.flatnonzero(discs.taught)
     curve = []
     for count in counts(len(order)):
         left_aside = np.isin(np.arange(len(discs.disc)), order[count:])
         fewer = replace(discs, disc=np.where(left_aside, -2, discs.disc))
-        curve.append((count, judged(_taught(study, spec, fewer, truth), discs)[0]))
-    of_discs, of_sectors = judged(model, discs), judged(_taught(study, spec, sectors, truth), sectors)
+        curve.append((count, judged(_taught(study, spec, fewer, truth)[0], discs)[0]))
+    of_discs, of_sectors = judged(model, discs), judged(_taught(study, spec, sectors, truth)[0], sectors)
     beyond = beyond_of(study)
     outside = study.outside.rows(np.flatnonzero(beyond.good))
     sets = {
@@ -82,8 +83,11 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         teacher={name: figures for name, (figures, _) in sets.items() if figures is not None},
         flagged={name: share for name, (_, share) in sets.items()},
         covered=covered,
-        taught=len(order),
-        units=len(study.dataset.unit_good),
+        taught=told.loads,
+        units=told.units,
+        series=told.series,
+        inside=told.inside,
+        solving=told.seconds,
         learning=learning,
         adapt=adapt,
         adapted=adapted,
@@ -119,18 +123,22 @@ def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]
     nodes = spec.vertices(after.anatomy)
     truth = after.answers[:, np.isin(after.anatomy.tumour_nodes, nodes)]
     begun = clock.perf_counter()
-    model = _taught(after, spec, after.discs, truth)
+    model, _ = _taught(after, spec, after.discs, truth)
     seconds += clock.perf_counter() - begun + series_seconds(after, spec.name)
     rows = np.flatnonzero(after.discs.test)
     return seconds, _held(model, after.converged.rows(rows), truth[rows], nodes)[0]
 
 
-def _taught(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> Deformer:
-    """Fitted to the loads that a split teaches; truth (B, k, 3) [m] of all loads that converged."""
+def _taught(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> tuple[Deformer, Told]:
+    """Fitted to the loads that a split teaches, and what it was told; truth (B, k, 3) [m] of all that converged."""
     if spec.name not in MACHINES:
-        return train(study.dataset, [spec.name], split=split, expansion=study.expansion).models[spec.name]
-    rows, held_out = np.flatnonzero(split.taught), study.converged.rows(np.flatnonzero(split.test))
-    return taught(spec.name, study.anatomy, study.converged.rows(rows), truth[rows], held_out)
+        trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
+        told = trained.scores[0].told
+        assert told is not None
+        return trained.models[spec.name], told
+    rows = np.flatnonzero(split.taught)
+    told = Told(len(rows), 0, 0, 0, study.dataset.seconds("load", len(rows)))
+    return taught(spec.name, study.anatomy, study.converged.rows(rows), truth[rows]), told
 
 
 def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> tuple[Figures | None, float]:

@@ -44,12 +44,16 @@ class Tenth:
 
 @dataclass(frozen=True)
 class Figures:
-    """Distances between answers: how many loads and values, in mm and in % of each load's motion, by force."""
+    """Distances between answers: how many loads and values, in mm and in % of each load's motion, by force.
+
+    `worst` is of each load's worst vertex, over the loads [mm].
+    """
 
     loads: int
     values: int
     motion: float
     mm: Spread
+    worst: Spread
     percent: Spread
     tenths: tuple[Tenth, ...]
 
@@ -73,6 +77,7 @@ def figures_of(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> Fi
         distance.size,
         1e3 * float(motion.mean()),
         Spread(*spread(mm)),
+        Spread(*spread(mm.max(axis=1))),
         Spread(*spread(percent)),
         tuple(tenths),
     )
@@ -130,8 +135,12 @@ class Row:
         Seconds before the first load.
     memory, card
         Of its process, and of the graphics card, at the peak [GiB].
-    taught, units
-        Solves that it was taught with: loads, and unit responses of the open cortex.
+    taught, units, series
+        Solves of finite elements that it was told: loads, unit responses of the open cortex, terms of the series.
+    inside
+        Those of them inside the discs left out that tell of the tumour.
+    solving
+        Seconds of all these solves, if the data say.
     learning
         Seconds of fitting; the solves' are not among them.
     adapt
@@ -161,6 +170,9 @@ class Row:
     card: float | None = None
     taught: int | None = None
     units: int | None = None
+    series: int | None = None
+    inside: int | None = None
+    solving: float | None = None
     learning: float | None = None
     adapt: float | None = None
     adapted: Figures | None = None
@@ -186,5 +198,5 @@ def row_from_json(text: str) -> Row:
 def _figures(stored: dict[str, Any] | None) -> Figures | None:
     if stored is None:
         return None
-    spreads = {name: Spread(**stored[name]) for name in ("mm", "percent")}
+    spreads = {name: Spread(**stored[name]) for name in ("mm", "worst", "percent")}
     return Figures(**{**stored, **spreads, "tenths": tuple(Tenth(**each) for each in stored["tenths"])})

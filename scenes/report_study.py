@@ -17,7 +17,7 @@ from sim.mesh import digest_of
 from sim.meshfile import read_anatomy
 from surrogate.dataset import Dataset, read_dataset
 from surrogate.encode import directions
-from surrogate.parts import Expansion
+from surrogate.expansion import Expansion
 from surrogate.patch import Patch, open_patch
 from surrogate.split import Split, leave_discs_out
 

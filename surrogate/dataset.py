@@ -115,6 +115,14 @@ class Dataset:
         """(n,) bool: the cases that converged."""
         return np.array([outcome.good for outcome in self.outcome], bool)
 
+    def seconds(self, each: str, count: int) -> float | None:
+        """What `count` solves took of `each` kind, "load" or "unit response" [s]; None where the data do not say."""
+        try:
+            found = count * float(self.provenance[f"seconds a {each}"])
+        except (KeyError, ValueError):
+            return None
+        return found if 0.0 <= found < np.inf else None
+
     def displacement(self, nodes: np.ndarray) -> np.ndarray:
         """Displacements (n, k, 3) float32 [m] of the vertices `nodes` (k,).
 

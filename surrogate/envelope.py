@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from sim.loads import Pushed
 
@@ -33,9 +34,9 @@ class Envelope:
     points
         (n, 3) taught points [m].
     reach
-        The farthest from a taught point that the held-out loads lay [m]: so far the errors are known.
+        The farthest that a taught point lies from the nearest other one [m]: so densely the cortex was taught.
     overhang
-        Greatest footprint radius less distance to the rim [m], held-out loads included.
+        Greatest footprint radius less distance to the rim [m].
     angle
         Greatest angle [rad] between force and inward normal.
     force
@@ -79,19 +80,25 @@ class Envelope:
         return np.maximum(beyond.max(axis=0), 0.0)
 
 
-def envelope_of(patch: Patch, taught: Pushed, held_out: Pushed) -> Envelope:
-    """The envelope of the `taught` loads, as far in place as the `held_out` loads on which errors were measured."""
+def envelope_of(patch: Patch, taught: Pushed) -> Envelope:
+    """The envelope of the `taught` loads, of which nothing but these loads tells."""
     magnitude, angle, overhang = measured(patch, taught)
-    overhang = np.append(overhang, measured(patch, held_out).overhang)
     return Envelope(
         taught.point.astype(np.float32),
-        float(nearest(held_out.point, taught.point)[1].max()),
+        _reach(taught.point),
         float(overhang.max()),
         float(angle.max()),
         (float(magnitude.min()), float(magnitude.max())),
         (float(taught.footprint.min()), float(taught.footprint.max())),
         float((magnitude / taught.footprint).max()),
     )
+
+
+def _reach(point: np.ndarray) -> float:
+    """The greatest distance [m] of a point (n, 3) from the nearest other one: zero of one alone."""
+    if len(point) < 2:
+        return 0.0
+    return float(KDTree(point).query(point, 2)[0][:, 1].max())
 
 
 def measured(patch: Patch, pushed: Pushed) -> Measured:

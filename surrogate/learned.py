@@ -237,6 +237,30 @@ class Learned:
         promised = self._promised(self.bounds, pushed, known, excess)
         return predicted(displacement, nodes, loads, excess > 0.0, begun, promised, self.source)
 
+    @cached_property
+    def _of_tumour(self) -> tuple[tuple[tuple[Part, ...], np.ndarray], ...]:
+        """Parts of one basis that know of the tumour, and its modes there (r, 3 n)."""
+        tumour, found = self.anatomy.tumour_nodes, []
+        for parts, row in self._by_basis:
+            if (row[tumour] >= 0).all():
+                modes = parts[0].basis.modes
+                found.append((tuple(parts), modes.reshape(len(modes), -1, 3)[:, row[tumour]].reshape(len(modes), -1)))
+        return tuple(found)
+
+    def bare(self, pushed: Pushed) -> np.ndarray:
+        """Displacements (B, n, 3) [m] of the tumour by the model alone, in NumPy: no limits, no bound, no kernel.
+
+        Learners are timed by it: all in one kind of implementation. Forces must lie in the envelope.
+        """
+        magnitude, features = directions(pushed)[0], {}
+        total = np.zeros((len(magnitude), 3 * len(self.anatomy.tumour_nodes)), np.float32)
+        for parts, modes in self._of_tumour:
+            for part in parts:
+                if part.encoder not in features:
+                    features[part.encoder] = ENCODERS[part.encoder](self._patch, pushed)
+                total += part.regressor.predict(features[part.encoder]) @ modes
+        return (magnitude[:, None] * total).reshape(len(magnitude), -1, 3)
+
     def _promised(self, bound: Bound | None, pushed: Pushed, known: Measured, excess: np.ndarray) -> np.ndarray:
         """What a bound (2, B) [m] says of loads; NaN where there is none."""
         if bound is None:

@@ -130,7 +130,6 @@ def taught(
     anatomy: Anatomy,
     loads: Loads,
     truth: np.ndarray,
-    held_out: Loads,
     progress: Callable[[], object] = lambda: None,
 ) -> Published:
     """Fit a learner of `MACHINES` to displacements `truth` (B, k, 3) [m] of `published_nodes`; vertices side by side.
@@ -150,7 +149,7 @@ def taught(
         progress()
         return machine
 
-    envelope = envelope_of(open_patch(anatomy), pushed, only_pushed(held_out))
+    envelope = envelope_of(open_patch(anatomy), pushed)
     # Matrices of 61 rows are no work for several cores: their threads would wait for each other, twelve times as long.
     with one_thread(), ThreadPoolExecutor() as pool:
         machines = pool.map(learn, thirteen(*sites_of(anatomy, nodes), pushed), angular.transpose(1, 0, 2))

@@ -19,6 +19,8 @@ BLOCK, NUMBERS = 8192, 8
 DEEPEST, HARDEST = 15e-3, 8e3
 # E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) judges a load before it is solved.
 PLANE_MODULUS = 3000.0 / (1.0 - 0.45**2)
+# Radii and forces of a tool at which its nominal loads are counted.
+LATTICE = 200
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,32 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
     rows = np.concatenate([_drawn(tools, patch, key, block) for block in blocks])
     return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
+
+
+def refused_share(preset: str) -> float:
+    """The share of a preset's nominal loads, by radius and force, that are not drawn: they press too hard or too deep.
+
+    Nothing is taught of them. Zero of what is no preset of tools.
+    """
+    tools = {**{name: [tool] for name, tool in TOOLS.items()}, "mixed": list(TOOLS.values())}.get(preset, [])
+    middles = (np.arange(LATTICE) + 0.5) / LATTICE
+    first, second = (axis.ravel() for axis in np.meshgrid(middles, middles))
+    shares = [
+        1.0 - tool.admits(np.exp(_between(np.log(tool.force), first)), _between(tool.footprint, second)).mean()
+        for tool in tools
+    ]
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def refused_words(preset: str) -> str:
+    """The same for people, empty where none are refused."""
+    share = refused_share(preset)
+    return (
+        f"{100.0 * share:.0f} % of the nominal loads of {preset} (its forces on its radii) have a pressure or depth "
+        "that surgery has not: they are not drawn, and lie outside the taught range."
+        if share > 0.0
+        else ""
+    )
 
 
 def _drawn(tools: list[Tool], patch: Patch, key: int, block: range) -> np.ndarray:

@@ -26,6 +26,10 @@ class Sectors(Split):
     number of the sector that a load's force lies in, and `share` a part of the circle.
     """
 
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """No place is left out, but directions are. (n,) bool."""
+        return np.zeros(len(points), bool)
+
     def summary(self) -> str:
         """What was left out, in one line for people (degrees)."""
         return (

@@ -180,7 +180,7 @@ def simulate(
     with listened() as seconds, opened(partial, said) as journal:
         solved = _fill(journal, work, finished, progress)
         with stage(STAGES["answers"]):
-            _write(path, work, stated, journal)
+            _write(path, work, {**stated, **_rates(path, solved, seconds)}, journal)
     partial.unlink(missing_ok=True)
     return Solved(solved["unit"], solved["answers"], *(seconds[name] for name in STAGES.values()))
 
@@ -213,6 +213,21 @@ def _fill(journal: Journal, work: Work, finished: set[Batch], progress: Callable
                 if written is not None:
                     written.result()
     return solved
+
+
+def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
+    """Wall seconds a solve, of each kind that was solved just now; of others as the finished file has it."""
+    before: dict[str, str] = {}
+    if path.exists():
+        with h5py.File(path, "r") as file:
+            before = provenance_of(file)
+    rates = {}
+    for name, words in (("unit", "seconds a unit response"), ("answers", "seconds a load")):
+        if solved[name]:
+            rates[words] = f"{seconds[STAGES[name]] / solved[name]:.6g}"
+        elif words in before:
+            rates[words] = before[words]
+    return rates
 
 
 def _write(path: Path, work: Work, stated: Mapping[str, str], journal: Journal) -> None:

@@ -48,6 +48,10 @@ class Split:
         """(B,) bool."""
         return self.disc == -1
 
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (n, 3) [m] lie in a disc: nothing may be told there of a model that is scored. (n,) bool."""
+        return nearest(points, self.centres)[1] <= self.radius
+
     def summary(self) -> str:
         """What was left out, in one line for people (mm)."""
         return (

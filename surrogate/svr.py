@@ -1,8 +1,9 @@
-"""Support vector regression, one machine per mode of the reduced basis, with the published settings."""
+"""Support vector regression, one machine per mode of the reduced basis."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
@@ -11,19 +12,28 @@ from scipy.spatial.distance import cdist
 from .regressor import filled, standardisation
 
 
+@dataclass(eq=False)
 class Svr:
-    """Gaussian kernel, standardised features, C = iqr(y) / 1.349 and epsilon = iqr(y) / 13.49 per output.
+    """Gaussian kernel exp(-gamma |x - x'|^2), gamma = 1 / f, of standardised features.
 
-    These are MATLAB's defaults, which Tonutti, Gras, Yang 2017 used (Artif. Intell. Med. 80:39-47); they trained one
-    machine per tumour node and component, which takes hours where one per mode takes seconds. Kernel:
-    exp(-gamma |x - x'|^2), gamma = 1 / f.
+    By default C = iqr(y) / 1.349 and epsilon = iqr(y) / 13.49 per output. These are MATLAB's defaults, which Tonutti,
+    Gras, Yang 2017 used (Artif. Intell. Med. 80:39-47); they trained one machine per tumour node and component, which
+    takes hours where one per mode takes seconds.
+
+    Parameters
+    ----------
+    penalty, tube
+        C and epsilon, in quartile ranges of the output.
     """
 
-    mean_: np.ndarray
-    deviation_: np.ndarray
-    support_: np.ndarray
-    dual_: np.ndarray
-    intercept_: np.ndarray
+    penalty: float = 1.0 / 1.349
+    tube: float = 1.0 / 13.49
+
+    mean_: np.ndarray = field(init=False, repr=False)
+    deviation_: np.ndarray = field(init=False, repr=False)
+    support_: np.ndarray = field(init=False, repr=False)
+    dual_: np.ndarray = field(init=False, repr=False)
+    intercept_: np.ndarray = field(init=False, repr=False)
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Learn from rows X (n, f), Y (n, r)."""
@@ -36,7 +46,7 @@ class Svr:
         intercept = np.zeros(Y.shape[1])
         for mode in np.flatnonzero(spread > 0.0):
             # In units of its quartile range an output meets libsvm's absolute stopping tolerance at any scale.
-            machine = SVR(C=1.0 / 1.349, epsilon=1.0 / 13.49, gamma=1.0 / X.shape[1])
+            machine = SVR(C=self.penalty, epsilon=self.tube, gamma=1.0 / X.shape[1])
             machine.fit(scaled, Y[:, mode] / spread[mode])
             dual[machine.support_, mode] = spread[mode] * machine.dual_coef_[0]
             intercept[mode] = spread[mode] * machine.intercept_[0]

@@ -27,16 +27,15 @@ def radii_between(least: float, greatest: float) -> np.ndarray:
 
 def tabulated(
     fem: Fem,
-    patch: Patch,
+    places: np.ndarray,
     radii: np.ndarray,
     reading: Reading,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> np.ndarray:
-    """What `forms` are multiplied by at each place of `with_middles` and each radius: (P, R, 19, r) float32.
+    """What `forms` are multiplied by at each of the places (P, 3) [m] and each radius: (P, R, 19, r) float32.
 
     Of the r shares that a `reading` takes of the answers; `progress` hears places done and all.
     """
-    places = with_middles(patch)[1]
     table = np.empty((len(places), len(radii), TERMS, reading.count), np.float32)
     some = max(1, fem.batch // (len(radii) * FACTORS[-1].shape[1]))
     for first in range(0, len(places), some):

@@ -17,11 +17,12 @@ from .coverage import TENTHS, Coverage, coverage, distance_coverage
 from .dataset import Dataset
 from .encode import directions
 from .envelope import Envelope, envelope_of, measured
+from .expansion import EXPANDED, TOUCHED, Classroom, Expansion, Lesson
 from .indentation import indented
 from .learned import Learned, only_pushed
 from .learner import OWN, find_own
-from .parts import EXPANDED, LEARNT, POSED, TOUCHED, Classroom, Expansion, Lesson, parts_of
-from .patch import Patch, nearest
+from .parts import LEARNT, POSED, parts_of
+from .patch import Patch
 from .score import Score, errors, score
 from .split import APART, MOST_APART, Split, leave_discs_out
 from .tip_training import (
@@ -156,14 +157,14 @@ def train(
 
     chosen = [_first(split.taught, most), *([_first(~apart, most)] if apart.any() else [])]
     lessons = [lesson(rows) for rows in chosen]
-    rooms = [Classroom(each, shared) for each in lessons]
+    rooms = [Classroom(each, shared, left) for each, left in zip(lessons, (split, None), strict=False)]
     test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
     tested, left = (_rows(pushed, rows) for rows in (split.test, apart))
     beside = np.zeros(0, int)
-    envelopes = [envelope_of(patch, lessons[0].loads, tested)]
+    envelopes = [envelope_of(patch, lessons[0].loads)]
     if apart.any():
-        beside = np.flatnonzero(nearest(left.point, split.centres)[1] > split.radius)
-        envelopes.append(envelope_of(patch, lessons[1].loads, left))
+        beside = np.flatnonzero(~split.covers(left.point))
+        envelopes.append(envelope_of(patch, lessons[1].loads))
     models, scores, left_out, distance_left_out = {}, [], {}, {}
     for name in wanted:
         with stage(f"learn {name}"):
@@ -175,7 +176,8 @@ def train(
                 ball=data.ball,
             )
         with stage("score"):
-            scores.append(score(name, model, test, truth[split.test], nodes))
+            solves = rooms[0].told(name, lessons[0])
+            scores.append(score(name, model, test, truth[split.test], nodes, solves))
             held_out = errors(model, test, truth[split.test], nodes).max(axis=1)
             model, off = corrected_if_better(model, patch, told.rows(chosen[0]), told.rows(split.test))
         features = _features(patch, tested, envelopes[0])

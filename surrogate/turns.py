@@ -88,6 +88,6 @@ def taught_in_turn(
     turn = nearest(only_pushed(loads).point, positions)[0]
     models = []
     for which in range(len(positions)):
-        left, others = np.flatnonzero(turn == which), np.flatnonzero(turn != which)
-        models.append(taught(name, anatomy, loads.rows(others), truth[others], loads.rows(left), progress))
+        others = np.flatnonzero(turn != which)
+        models.append(taught(name, anatomy, loads.rows(others), truth[others], progress))
     return InTurn(positions, tuple(models))

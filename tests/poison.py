@@ -9,14 +9,14 @@ from surrogate.dataset import read_rows
 from surrogate.rows import checksums
 
 
-def poisoned(source: Path, target: Path, rows: np.ndarray) -> tuple[Path, np.ndarray]:
-    """A copy of a data set with wild displacements (V, 3) [m] in some rows (numbers), and those."""
+def poisoned(source: Path, target: Path, rows: np.ndarray, group: str = "answers") -> tuple[Path, np.ndarray]:
+    """A copy of a data set with wild displacements (V, 3) [m] in some rows (numbers) of a group, and those."""
     target.write_bytes(source.read_bytes())
     with h5py.File(target, "r+") as file:
-        stored = file["answers/displacement"]
+        stored = file[f"{group}/displacement"]
         wild = np.random.default_rng(0).normal(scale=1e-2, size=stored.shape[1:])
         for row in rows:
             stored[row] = wild
-        whole, _ = read_rows(file, "answers", stored.shape[1], 0, len(stored))
-        file["answers/checksum"][:] = checksums(whole)
+        whole, _ = read_rows(file, group, stored.shape[1], 0, len(stored))
+        file[f"{group}/checksum"][:] = checksums(whole)
     return target, wild

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import make_box
 from poison import poisoned
+from studies import TISSUE, nothing, study_of
 
 from ar.screen import read_png
 from scenes import report, report_elements, report_learner, report_reference, report_row
@@ -20,7 +21,7 @@ from scenes.report_adapt import debulked, debulked_study, simulate_debulked, sim
 from scenes.report_elements import HALVED, OWN, Elements
 from scenes.report_learner import Learner, counts, measure_learner
 from scenes.report_page import Section, write_report
-from scenes.report_reference import Truth, beyond_of, reference_of, solve_beyond, solve_reference
+from scenes.report_reference import Truth, beyond_of, reference_of, solve_reference
 from scenes.report_row import (
     DIFFERENCE,
     ERROR,
@@ -32,31 +33,22 @@ from scenes.report_row import (
 )
 from scenes.report_rows import measured
 from scenes.report_series import series_seconds, tabulate_series
-from scenes.report_study import Study
 from sim.accuracy import REFERENCE, TRAIN
-from sim.effects import NodalForce, pushed_effects
+from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Pushed
-from sim.material import Material, tissue_to_json
 from sim.threads import one_thread
 from surrogate.dataset import read_dataset
 from surrogate.encode import directions, reduce, tool_features
 from surrogate.envelope import envelope_of
-from surrogate.parts import COARSE, EXPANDED
+from surrogate.expansion import COARSE, EXPANDED
 from surrogate.published import from_angles, published_nodes, sites_of, thirteen, to_angles
-from surrogate.sampling import draw
 from surrogate.sectors import leave_sectors_out
-from surrogate.simulate import simulate
 from surrogate.svr import Svr
 from surrogate.train import train
 
-TISSUE = Material("neo-hookean", 3000.0, 0.45)
 SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"), Learner("published-svr"))
-
-
-def nothing(count):
-    """No progress is shown."""
 
 
 @pytest.fixture(scope="module")
@@ -66,15 +58,7 @@ def box():
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory, box):
-    """280 palpation loads on a small box; two of them are played."""
-    folder = tmp_path_factory.mktemp("report")
-    fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
-    said = {"tissue": tissue_to_json(TISSUE), "element": "p1", "preset": "palpation"}
-    simulate(folder / "data.h5", fem, draw("palpation", box, 280, 0), said)
-    study = Study(folder / "data.h5", folder, "cpu", loads=2, beyond=12, timed=30)
-    solve_reference(study, nothing)
-    solve_beyond(study, nothing)
-    return study
+    return study_of(tmp_path_factory.mktemp("report"), box, 280)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +68,7 @@ def found(study):
 
 @pytest.fixture(scope="module")
 def page(study, found):
-    write_report(study.folder, "this machine", [Section("data", ("About <this>.",), found, 2.0)])
+    write_report(study.folder, "this machine", [Section("data", ("About <this>.",), found)])
     return study.folder
 
 
@@ -121,8 +105,13 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
         wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
         held = stored[2]["teacher"][name]
         assert np.allclose([*held["mm"].values(), *held["percent"].values()], wanted, rtol=1e-5)
+        miss = 1e3 * np.linalg.norm(guess - truth, axis=2).max(axis=1)
+        worst = [miss.mean(), *np.percentile(miss, (95.0, 99.9)), miss.max()]
+        assert np.allclose([*held["worst"].values()], worst, rtol=1e-5)
         assert held["loads"] == test.sum() and held["values"] == test.sum() * len(box.tumour_nodes)
     assert stored[2]["taught"] == study.discs.taught.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
+    # A published learner is told no unit responses.
+    assert stored[3]["taught"] == study.discs.taught.sum() and stored[3]["units"] == stored[3]["series"] == 0
 
 
 @pytest.mark.parametrize("name", ["svr", "published-svr"])
@@ -198,11 +187,12 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     told = []
     tabulate_series(study, lambda done, total: told.append((done, total)))
     assert told and told[-1][0] == told[-1][1]
-    monkeypatch.setattr("surrogate.parts.Expansion._fem", None)
+    monkeypatch.setattr("surrogate.expansion.Expansion._fem", None)
     tabulate_series(study, lambda done, total: told.append(None))
     assert None not in told
     row = measured(replace(study), Learner("series"), tmp_path / "series.png")
-    assert row.state == "measured" and row.learning > series_seconds(study, "series") > 0.0
+    assert row.state == "measured" and row.solving > 0.1 * series_seconds(study, "series") > 0.0
+    assert row.series > 19 and row.inside == 0
     assert series_seconds(study, "linear") == 0.0
     assert row.teacher["discs"].mm.mean < 0.5 * measured(study, SPECS[2], tmp_path / "l.png").teacher["discs"].mm.mean
     assert {spec.name for spec in learners()} > set(EXPANDED)
@@ -260,7 +250,7 @@ def test_a_damaged_answer_is_named(study):
     reference_of(study)
     kept = study.folder / "answers"
     answer, table = min(kept.glob("reference-*")), kept / f"series-{study.digest}.npz"
-    for path, ask in ((answer, lambda: reference_of(study)), (table, lambda: replace(study).expansion.coefficients)):
+    for path, ask in ((answer, lambda: reference_of(study)), (table, lambda: replace(study).expansion.tabulated)):
         path.write_bytes(b"PK" * 100)
         with pytest.raises(InputError, match=f"{path.name}.*Delete it: it is made anew"):
             ask()
@@ -291,9 +281,9 @@ def test_the_page_needs_nothing_but_itself(page, found):
 
 
 def test_what_lies_beyond_is_outside_the_envelope(study):
-    taught, test = (study.converged.rows(np.flatnonzero(r)).of(Pushed) for r in (study.discs.taught, study.discs.test))
+    taught = study.converged.rows(np.flatnonzero(study.discs.taught)).of(Pushed)
     outside = study.outside.of(Pushed)
-    assert not envelope_of(study.patch, taught, test).holds(study.patch, outside).any()
+    assert not envelope_of(study.patch, taught).holds(study.patch, outside).any()
     size = np.linalg.norm(outside.force, axis=1)
     assert (size[::3] > 1.19 * np.linalg.norm(taught.force, axis=1).max()).all()
     assert (study.patch.rim_distance(outside.point[2::3]) < outside.footprint[2::3]).all()

@@ -27,6 +27,8 @@ def test_tenths_of_the_force_and_of_no_load_nothing():
     assert [tenth.mean for tenth in tenths] == pytest.approx([4.0 * k + 1.0 for k in range(10)])
     assert [tenth.largest for tenth in tenths] == pytest.approx([6.0 * k + 3.0 for k in range(10)])
     assert figures_of(distance[:0], truth[:0], force[:0]) is None
+    worst = figures_of(distance, truth, force).worst
+    assert (worst.mean, worst.p95, worst.largest) == pytest.approx((28.5, 3.0 * np.percentile(force, 95), 57.0))
 
 
 def test_the_front_is_what_nobody_beats():
@@ -58,17 +60,19 @@ def test_every_figure_stands_under_its_head(tmp_path):
     }
     shares = {"flagged": {"discs": 0.01, "sectors": 0.02, "beyond": 1.0}, "covered": {"discs": 0.94, "beyond": 0.53}}
     row = Row("svr", "learnt", reference=one, teacher=sets, **shares, median=1.5, p99=2.5, set_up=3.5, memory=0.25)
-    row = replace(row, taught=600, units=60, learning=120.0, timed=1000)
-    write_report(tmp_path, "a machine", [Section("data", (), (row,), 3.0)])
+    row = replace(row, taught=600, units=60, series=9000, inside=12, solving=180.0, learning=120.0, timed=1000)
+    row = replace(row, reference=replace(one, worst=replace(one.worst, mean=7.5)))
+    write_report(tmp_path, "a machine", [Section("data", (), (row,))])
     tables = [
         [re.findall("<t[hd]>(.*?)</t[hd]>", line) for line in table.split("</tr>")]
         for table in re.findall("<table>(.*?)</table>", (tmp_path / "index.html").read_text(), re.S)
     ]
     (heads, cells, *_), (others, *taught, _), *_ = tables
     told = dict(zip(heads, cells, strict=True))
-    assert [told[head] for head in ("median ms", "set-up s", "memory GiB", "solves", "minutes")] == [
-        "1.5", "3.5", "0.25", "600 + 60 unit", "5",
+    assert [told[head] for head in ("median ms", "set-up s", "memory GiB", "solves", "in discs", "minutes")] == [
+        "1.5", "3.5", "0.25", "600 + 60 unit + 9000 series", "12", "5",
     ]  # fmt: skip
+    assert told["worst vertex mm: mean"] == "7.5"
     asked = ("loads of", "loads", "mean mm", "called extrapolated", "within 95 % bound")
     assert [[line[others.index(head)] for head in asked] for line in taught] == [
         ["whole discs of cortex left out", "7", "0.1", "1 %", "94 %"],
@@ -102,6 +106,7 @@ def test_a_command_without_data_makes_its_own(tmp_path, monkeypatch, capsys):
     words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device", "cpu"]
     assert main([*words, "--json"]) == 0
     (section,) = json.loads(capsys.readouterr().out)["sections"]
-    assert "30 palpation loads" in section["about"][0] and section["minutes"] > 0.0
+    assert "30 palpation loads" in section["about"][0]
     data = read_dataset(tmp_path / "palpation.h5")
+    assert data.seconds("load", 30) > 0.0
     assert data.provenance["element"] == "smoothed" and "neo-hookean" in data.provenance["tissue"]

@@ -218,7 +218,7 @@ def taught(anatomy):
     part = Part("nodal", Linear().fit(np.eye(width), np.zeros((width, 1))), Basis(nodes, np.zeros((1, 3 * len(nodes)))))
     pushed = draw("palpation", anatomy, 2, 0).of(Pushed)
     training = {"learner": "table", "preset": "bipolar", "element": "p2"}
-    return Learned(anatomy, (part,), envelope_of(patch, pushed, pushed), 1.23e-4, training=training)
+    return Learned(anatomy, (part,), envelope_of(patch, pushed), 1.23e-4, training=training)
 
 
 def test_the_command(tmp_path, capsys):

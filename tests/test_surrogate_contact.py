@@ -20,8 +20,8 @@ from surrogate.condense import condensed, unit_responses
 from surrogate.contact import THICKER, Contact, nearest_shares
 from surrogate.dataset import Dataset, read_dataset
 from surrogate.encode import Basis, tool_features
+from surrogate.expansion import TOUCHED
 from surrogate.indentation import indented
-from surrogate.parts import TOUCHED
 from surrogate.patch import barycentric_lattice, open_patch
 from surrogate.poses import ball_of, draw_poses
 from surrogate.score import errors

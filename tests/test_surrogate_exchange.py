@@ -27,7 +27,8 @@ from surrogate.bayesian import Bayesian
 from surrogate.bound import LEVELS
 from surrogate.dataset import read_dataset
 from surrogate.exchange import onnx_model
-from surrogate.parts import LEARNT, Expansion
+from surrogate.expansion import Expansion
+from surrogate.parts import LEARNT
 from surrogate.patch import open_patch
 from surrogate.sampling import draw
 from surrogate.series import Series

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import make_box
+from poison import poisoned
 
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import NodalForce, pushed_effects
@@ -14,7 +15,8 @@ from sim.loads import Loads, Pushed
 from sim.material import Material, tissue_to_json
 from surrogate.dataset import read_dataset
 from surrogate.encode import directions, tool_features
-from surrogate.parts import COARSE, EXPANDED, FINE, Expansion, Lesson
+from surrogate.expansion import COARSE, EXPANDED, FINE, Expansion, Lesson
+from surrogate.left_out import filled
 from surrogate.patch import open_patch
 from surrogate.series import ORDERS, SPANS, Series, forms
 from surrogate.simulate import simulate
@@ -95,7 +97,7 @@ def test_the_table_is_the_finite_elements_series(box, patch):
     exact = fem.series(Loads((loads,)), ORDERS, reading)
     (triangles, places), radii = with_middles(patch), np.array([7e-3])
     heard = []
-    table = tabulated(fem, patch, radii, reading, lambda done, total: heard.append((done, total)))
+    table = tabulated(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
     series = Series(patch.points, triangles, radii, table)
     assert heard[-1] == (len(places), len(places))
     size, _ = directions(loads)
@@ -144,9 +146,10 @@ def test_the_basis_of_a_lesson_lies_in_that_of_the_table(data, box, patch):
     places = np.array([0, 17, 60, 120, 198])
     point = np.repeat(with_middles(patch)[1][places], 3, axis=0)
     units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
-    for at, basis, found in zip(nodes, bases, expansion.on(bases), strict=True):
+    told = expansion.on(bases, np.zeros(len(expansion.places), bool))
+    for at, basis, found, orders in zip(nodes, bases, told, (SPANS, SPANS[1:]), strict=True):
         wanted = fem.series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
-        for terms in SPANS:
+        for terms in orders:
             miss = np.linalg.norm((found.table[places, 0] - wanted)[:, terms])
             assert miss < 1e-3 * np.linalg.norm(wanted[:, terms])  # half precision has eleven bits
 
@@ -162,9 +165,56 @@ def test_on_known_cortex_the_process_halves_what_the_series_leaves(tmp_path):
     small = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=15e-3)
     data = simulated(tmp_path / "data.h5", small)
     fourth = np.where(np.arange(data.good.sum()) % 4 == 3, 0, -1)
-    split = Split(np.zeros((1, 3)), 1.0, fourth, 1.0)
+    split = Split(np.full((1, 3), 1.0), 1e-3, fourth, 1.0)
     series, learnt = train(data, EXPANDED, split=split, expansion=Expansion(data, "cpu")).scores
     assert learnt.mean_percent < 0.6 * series.mean_percent
+
+
+def test_nothing_inside_the_discs_left_out_is_told_of_the_series(trained, data, box, tmp_path):
+    """Bit for bit: wild answers to all loads that were not taught, and wild series at all places of the discs."""
+    split = trained.split
+    rows = np.flatnonzero(data.good)[~split.taught]
+    wild = read_dataset(poisoned(data.path, tmp_path / "wild.h5", rows)[0])
+    known, again = Expansion(data, "cpu"), Expansion(wild, "cpu")
+    inside = split.covers(again.places)
+    assert 0 < inside.sum() < len(inside)
+    again.tabulated.table[inside] = np.random.default_rng(0).normal(size=again.tabulated.table[inside].shape)
+    before, after = (train(each.data, EXPANDED, split=split, expansion=each) for each in (known, again))
+    for name in EXPANDED:
+        for one, other in zip(before.models[name].parts, after.models[name].parts, strict=True):
+            assert np.array_equal(one.basis.modes, other.basis.modes)
+            states = one.regressor.state(), other.regressor.state()
+            assert all(np.array_equal(states[0][key], states[1][key]) for key in states[0])
+    assert [row.mean_mm for row in before.scores] == [row.mean_mm for row in trained.scores[1:]]
+    assert min(row.mean_mm for row in after.scores) > 1.0
+
+
+def test_every_solve_is_counted(trained, data):
+    """By hand: 19 terms at each place and radius outside the discs, 3 unit forces a node, and the loads."""
+    linear, series, learnt = (row.told for row in trained.scores)
+    taught, units = int(trained.split.taught.sum()), len(data.unit_good)
+    outside = int((~trained.split.covers(with_middles(open_patch(data.anatomy))[1])).sum())
+    assert (linear.loads, linear.units, linear.series, linear.inside) == (taught, units, 0, 0)
+    assert series == learnt and (series.loads, series.units) == (taught, units)
+    assert series.series == outside * 19 and series.solves == taught + units + outside * 19
+    rates = [float(data.provenance[f"seconds a {each}"]) for each in ("load", "unit response")]
+    assert linear.seconds == pytest.approx(taught * rates[0] + units * rates[1]) and min(rates) > 0.0
+    assert series.seconds > linear.seconds
+    said = {name: text for name, text in data.provenance.items() if not name.startswith("seconds")}
+    silent = train(replace(data, provenance=said), ["linear"])
+    assert silent.scores[0].told == replace(linear, seconds=None)
+
+
+def test_what_is_left_out_is_interpolated(patch):
+    """Fields that are linear in the place are met, on a flat cortex too; what is left out has no say."""
+    places = with_middles(patch)[1]
+    left_out = np.linalg.norm(places[:, :2] - [5e-3, 0.0], axis=1) < 6e-3
+    wanted = (places @ np.random.default_rng(0).normal(size=(3, 4)) + 2.0).reshape(-1, 2, 2)
+    wild = np.where(left_out[:, None, None], 1e9, wanted)
+    assert 0 < left_out.sum() < len(places)
+    np.testing.assert_allclose(filled(places, wild, left_out), wanted, rtol=1e-9)
+    with pytest.raises(InputError, match="hold all places"):
+        filled(places, wild, np.ones(len(places), bool))
 
 
 def test_the_cortex_moves_as_the_finite_elements_say(trained, data, box, patch):

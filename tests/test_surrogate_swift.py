@@ -13,7 +13,7 @@ from surrogate.bound import features_of, fitted_bound
 from surrogate.encode import Basis, tool_features
 from surrogate.envelope import envelope_of, measured
 from surrogate.learned import Learned, Part
-from surrogate.patch import open_patch
+from surrogate.patch import nearest, open_patch
 from surrogate.remainder import Remainder
 from surrogate.sampling import draw
 from surrogate.series import Series
@@ -69,7 +69,8 @@ def made(dome, taught, inside):
         error = np.abs(random.normal(1e-5, 1e-5, (len(told), len(nodes))))
         bounds = fitted_bound((told, error.max(axis=1)), told, X[:, 6], error)
         parts = (Part("tool", series, basis), Part("tool", learnt, basis))
-        return Learned(dome, parts, envelope_of(patch, taught, inside.of(Pushed)), bounds=bounds)
+        envelope = replace(envelope_of(patch, taught), reach=nearest(inside.of(Pushed).point, taught.point)[1].max())
+        return Learned(dome, parts, envelope, bounds=bounds)
 
     return model
 

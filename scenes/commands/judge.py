@@ -12,6 +12,7 @@ from sim.errors import InputError
 from sim.tip import tip_gauge
 from surrogate.coverage import coverage, distance_coverage
 from surrogate.dataset import read_dataset
+from surrogate.sampling import refused_share, refused_words
 from surrogate.score import score, table
 from surrogate.store import load
 
@@ -60,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
         if model.tip is not None and model.tip.bound is not None
     }
     motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())
+    preset = "" if data.ball is not None else data.provenance.get("preset", "")
     if args.json:
         told, of_tip = ({name: asdict(found) for name, found in held.items()} for held in (promised, ranged))
         print(
@@ -69,11 +71,14 @@ def run(args: argparse.Namespace) -> int:
                     "coverage": told,
                     "distance_coverage": of_tip,
                     "motion_mm": motion,
+                    "nominal_refused": refused_share(preset),
                 }
             )
         )
     else:
         print(f"{len(loads)} loads, against the finite elements that answered them:\n{table(scores, motion)}")
+        if refused_words(preset):
+            print(refused_words(preset))
         print("\n".join(f"{name}: bounds held for {found}" for name, found in promised.items()))
         of_tip = (
             f"{name}: bounds of the distance from tip to tumour held for {found}" for name, found in ranged.items()

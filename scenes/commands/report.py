@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time as clock
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict
@@ -90,11 +89,10 @@ def _measured(args: argparse.Namespace) -> list[Section]:
         raise InputError("--anatomy says nothing beside --data, which brings its own: leave one of them out.")
     if len({path.stem for path in args.data}) < len(args.data):
         raise InputError("two of the data sets have one name, which their rows would share: rename one.")
-    minutes = {}
     paths = args.data
     if not paths:
         paths = [args.out / "palpation.h5"]
-        minutes = {paths[0]: _simulated(paths[0], args, count)}
+        _simulated(paths[0], args, count)
     studies = [Study(path, args.out, args.device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
     sections = []
     for study in studies:
@@ -112,7 +110,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
             for row in rows(study, specs):
                 found.append(row)
                 bar.update()
-        sections.append(Section(study.data.stem, _about(study), tuple(found), minutes.get(study.data)))
+        sections.append(Section(study.data.stem, _about(study), tuple(found)))
         write_report(args.out, machine(args.device), sections)
     return sections
 
@@ -124,24 +122,17 @@ def _tabulate(study: Study, bar: tqdm) -> None:
     bar.set_postfix_str("")
 
 
-def _simulated(path: Path, args: argparse.Namespace, count: int) -> float | None:
-    """Make a data set; the minutes that it took, or None where an earlier run did some of it."""
-    from ..report_took import note_seconds, noted_seconds
+def _simulated(path: Path, args: argparse.Namespace, count: int) -> None:
+    """Make a data set, or go on with it."""
     from . import simulate
 
-    whole = not path.with_name(path.name + ".partial").exists() and not path.exists()
     parser = argparse.ArgumentParser()
     simulate.add_arguments(parser)
     words = ["--out", str(path), "--count", str(count), "--material", "neo-hookean", "--element", "smoothed"]
-    begun = clock.perf_counter()
     asked = parser.parse_args([*([args.anatomy] if args.anatomy else []), *words, "--device", args.device])
     with redirect_stdout(sys.stderr):
         if simulate.run(asked) != 0:
             raise KeyboardInterrupt
-    if whole:
-        note_seconds(path, clock.perf_counter() - begun)
-    seconds = noted_seconds(path)
-    return None if seconds is None else seconds / 60.0
 
 
 def _about(study: Study) -> tuple[str, ...]:

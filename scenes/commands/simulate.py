@@ -25,7 +25,7 @@ from sim.stages import stage
 from sim.tools import Ball
 from surrogate.dataset import read_outcomes
 from surrogate.poses import ball_of, draw_poses
-from surrogate.sampling import PRESETS, draw
+from surrogate.sampling import PRESETS, draw, refused_share, refused_words
 from surrogate.simulate import Solved, simulate
 
 from ..beside import remove_data
@@ -136,6 +136,7 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Solved) -
             "outcome": counts,
             "seconds": {"unit responses": solved.unit_seconds, "loads": solved.load_seconds},
             "loads_per_second": rate,
+            "nominal_refused": 0.0 if args.poses else refused_share(args.preset),
         }
         print(json.dumps(said))
         return
@@ -150,5 +151,7 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Solved) -
     print(f"Solved by {solver}.")
     if rate is not None:
         print(f"{rate:.4g} loads a second, from their footprints to the file.")
+    if not args.poses and refused_words(args.preset):
+        print(refused_words(args.preset))
     if failed:
         print(f"{failed} cases did not converge; they stay in the file, marked, and are not learnt from.")

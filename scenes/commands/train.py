@@ -14,7 +14,8 @@ from tqdm import tqdm
 from sim.errors import InputError
 from sim.stages import stage
 from surrogate.dataset import Dataset, read_dataset
-from surrogate.parts import EXPANDED, Expansion
+from surrogate.expansion import EXPANDED, Expansion
+from surrogate.sampling import refused_share, refused_words
 from surrogate.score import table, winner
 from surrogate.split import APART
 from surrogate.store import save
@@ -59,7 +60,9 @@ def run(args: argparse.Namespace) -> int:
     with stage("save"):
         save(out, trained.models)
     failed = int(np.sum(~data.good))
-    print(_for_machines(trained, args.out, failed) if args.json else _for_people(trained, args.out, failed))
+    preset = "" if data.ball is not None else data.provenance.get("preset", "")
+    show = _for_machines if args.json else _for_people
+    print(show(trained, args.out, failed, preset))
     return 0
 
 
@@ -89,8 +92,9 @@ def _warnings(data: Dataset, learners: Sequence[str]) -> list[str]:
     return notes
 
 
-def _for_people(trained: Trained, out: str, failed: int) -> str:
+def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
     notes = [f"{failed} cases that did not converge were left aside."] if failed else []
+    notes += [words for words in [refused_words(preset)] if words]
     bounds = ", ".join(f"{name} {1e3 * model.bound:.3f}" for name, model in trained.models.items())
     return "\n".join(
         [
@@ -120,7 +124,7 @@ def _calibration(trained: Trained) -> str:
     return f"{trained.calibrated} others calibrated bounds"
 
 
-def _for_machines(trained: Trained, out: str, failed: int) -> str:
+def _for_machines(trained: Trained, out: str, failed: int, preset: str) -> str:
     split = trained.split
     return json.dumps(
         {
@@ -137,5 +141,6 @@ def _for_machines(trained: Trained, out: str, failed: int) -> str:
             "left_out": {name: asdict(found) for name, found in trained.left_out.items()},
             "distance_left_out": {name: asdict(found) for name, found in trained.distance_left_out.items()},
             "not_converged": failed,
+            "nominal_refused": refused_share(preset),
         }
     )

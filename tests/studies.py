@@ -1,0 +1,27 @@
+"""A small report's study: palpation of a box, of which two loads are played."""
+
+from scenes.report_reference import solve_beyond, solve_reference
+from scenes.report_study import Study
+from sim.accuracy import TRAIN
+from sim.effects import NodalForce, pushed_effects
+from sim.fem import Fem
+from sim.material import Material, tissue_to_json
+from surrogate.sampling import draw
+from surrogate.simulate import simulate
+
+TISSUE = Material("neo-hookean", 3000.0, 0.45)
+
+
+def nothing(count):
+    """No progress is shown."""
+
+
+def study_of(folder, box, count):
+    """`count` loads on a box, and what the reference answers, in a folder."""
+    fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
+    said = {"tissue": tissue_to_json(TISSUE), "element": "p1", "preset": "palpation"}
+    simulate(folder / "data.h5", fem, draw("palpation", box, count, 0), said)
+    study = Study(folder / "data.h5", folder, "cpu", loads=2, beyond=12, timed=30)
+    solve_reference(study, nothing)
+    solve_beyond(study, nothing)
+    return study

@@ -1,0 +1,39 @@
+"""`sulcus report`: what a row knows of the loads that it is held to, which is nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+from poison import poisoned
+from studies import study_of
+
+from scenes import report_learner
+from scenes.report_learner import Learner, measure_learner
+from sim.threads import one_thread
+from surrogate.expansion import Expansion
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    box = make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
+    return study_of(tmp_path_factory.mktemp("report"), box, 100)
+
+
+@pytest.mark.parametrize("name", ["linear", "series-gp"])
+def test_no_answer_to_a_load_of_the_discs_reaches_a_row(study, tmp_path, name, monkeypatch):
+    """Bit for bit, the table of the series made anew: wild answers to the loads of the discs change figures alone."""
+    monkeypatch.setattr(report_learner, "counts", lambda most: [])
+    monkeypatch.setattr(report_learner, "_covered", lambda *known: {})
+    path, _ = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
+    found = []
+    for data, folder in ((study.data, "as-it-is"), (path, "wild")):
+        here = replace(study, data=data)
+        kept = tmp_path / folder / "series.npz"
+        vars(here)["expansion"] = Expansion(here.dataset, "cpu", kept=kept)
+        with one_thread():
+            found.append(measure_learner(here, Learner(name)))
+    (row, field), (wild, again) = found
+    assert np.array_equal(field, again)
+    assert wild.teacher["discs"].mm.mean > 1.0 > row.teacher["discs"].mm.mean
+    assert replace(wild.teacher["beyond"], percent=None) == replace(row.teacher["beyond"], percent=None)
