@@ -19,7 +19,7 @@ next: open moved.vtu in ParaView; `displacement` is in metres""",
   sulcus simulate brain.vtu --out brain.h5 --count 1000
 next: sulcus train brain.h5 --out brain.model.npz""",
     "train": """example:
-  sulcus train brain.h5 --out brain.model.npz --learners linear,series-gp
+  sulcus train brain.h5 --out brain.model.npz --learners linear,series,series-gp
 next: sulcus demo --anatomy brain.vtu, which finds brain.model.npz beside the mesh; or sulcus judge""",
     "judge": """example:
   sulcus simulate brain.vtu --out fresh.h5 --count 200 --seed 1

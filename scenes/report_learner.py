@@ -12,7 +12,7 @@ from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
 from surrogate.coverage import TENTHS, coverage
 from surrogate.published import MACHINES, published_nodes, taught
-from surrogate.score import single_seconds
+from surrogate.score import bare_microseconds, single_seconds
 from surrogate.sectors import leave_sectors_out
 from surrogate.split import Split
 from surrogate.told import Told
@@ -76,6 +76,8 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
     field = model.deform(study.played, at=nodes).displacement
     covered = _covered(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _adapted(study, spec)
+    held_out = study.converged.rows(np.flatnonzero(discs.test))
+    bare = bare_microseconds(model, held_out)
     row = Row(
         spec.name,
         "learnt",
@@ -87,12 +89,13 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         units=told.units,
         series=told.series,
         inside=told.inside,
+        bare=None if bare is None else 1e-3 * bare,
         solving=told.seconds,
         learning=learning,
         adapt=adapt,
         adapted=adapted,
         curve=tuple((count, each) for count, each in [*curve, (len(order), of_discs[0])] if each is not None),
-        **of_times(single_seconds(model, study.converged.rows(np.flatnonzero(discs.test)), nodes, study.timed)),
+        **of_times(single_seconds(model, held_out, nodes, study.timed)),
     )
     return row, field
 

@@ -129,6 +129,8 @@ class Row:
         Played loads that it found no answer to; they are in none of the figures.
     median, p99
         Milliseconds a load, one at a time; p99 of at least 1,000.
+    bare
+        Milliseconds a load of a learned model alone in NumPy: no bound, no limits, one kind of code for all learners.
     timed
         How many loads were timed.
     set_up
@@ -164,6 +166,7 @@ class Row:
     failed: int = 0
     median: float | None = None
     p99: float | None = None
+    bare: float | None = None
     timed: int = 0
     set_up: float | None = None
     memory: float | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -18,17 +19,21 @@ from .learned import Part
 from .learner import find_own, name_of
 from .patch import Patch
 from .pcr import Pcr
-from .regressor import Regressor
+from .regressor import Fitted, Teachable
 from .remainder import Remainder
 from .svr import Svr
+from .tuned import Tuned
 
+# Settings to choose from, the usual ones first: units in a layer and weight decay; C and epsilon in quartile ranges.
+ANN = tuple(partial(Ann, hidden, decay) for hidden in (64, 128) for decay in (1e-2, 3e-3))
+SVR = tuple(partial(Svr, c, tube) for c in (1.0 / 1.349, 10.0, 100.0) for tube in (1.0 / 13.49, 1e-2, 3e-3, 1e-3))
 # Encoder and regressor of each but the table itself; principal components are those of the forces at the nodes.
-LEARNT: dict[str, tuple[str, Callable[[], Regressor]]] = {
+LEARNT: dict[str, tuple[str, Callable[[], Teachable]]] = {
     "pcr": ("nodal", Pcr),
-    "ann": ("tool", Ann),
-    "svr": ("tool", Svr),
+    "ann": ("tool", partial(Tuned, ANN)),
+    "svr": ("tool", partial(Tuned, SVR)),
     "gp": ("tool", Gp),
-    "residual": ("tool", Ann),
+    "residual": ("tool", partial(Tuned, ANN)),
 }
 # Those that poses teach: where the ball is stands for what it presses with.
 POSED = ("gp", "ann", "svr")
@@ -64,7 +69,7 @@ def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
     return (*before, learnt, *known.cortex_table)
 
 
-def _learnt(name: str) -> tuple[str, Callable[[], Regressor]]:
+def _learnt(name: str) -> tuple[str, Callable[[], Teachable]]:
     """Encoder and regressor of a learner, a user's own too."""
     if name in LEARNT:
         return LEARNT[name]
@@ -86,7 +91,7 @@ def _touched(known: Expansion, lesson: Lesson) -> tuple[Part, list[tuple[np.ndar
 
 
 def _taught(
-    kind: tuple[str, Callable[[], Regressor]],
+    kind: tuple[str, Callable[[], Teachable]],
     before: tuple[Part, ...],
     on: Basis | np.ndarray,
     patch: Patch,
@@ -106,7 +111,7 @@ def _taught(
     return Part(encoder, regressor, basis)
 
 
-def _check_own(regressor: Regressor, X: np.ndarray, Y: np.ndarray) -> None:
+def _check_own(regressor: Fitted, X: np.ndarray, Y: np.ndarray) -> None:
     """Refuse a user's regressor that does not answer what it was taught with finite coefficients of its shape."""
     found = np.asarray(regressor.predict(X))
     if found.shape != Y.shape or not np.isfinite(found).all():

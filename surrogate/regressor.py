@@ -25,6 +25,14 @@ class Fitted(Protocol):
         ...
 
 
+class Teachable(Protocol):
+    """What makes a map of rows: a regressor itself, or what chooses one."""
+
+    def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
+        """The map learnt from rows X (n, f), Y (n, r)."""
+        ...
+
+
 class Regressor(Fitted, Protocol):
     """A map that is learnt from rows. `fit` sets attributes that end in an underscore."""
 

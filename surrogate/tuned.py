@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .patch import nearest
-from .regressor import Fitted, Regressor
+from .regressor import Fitted, Teachable
 from .sampling import spread
 
 # The loads nearest to so many places far apart are left out of the inner fits: about this share of all.
@@ -29,7 +29,7 @@ class Tuned:
         Regressors to choose from; the first is taken where there are few rows.
     """
 
-    settings: tuple[Callable[[], Regressor], ...]
+    settings: tuple[Callable[[], Teachable], ...]
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
         """The best of the regressors, taught rows X (n, f) of `tool_features`, Y (n, r)."""

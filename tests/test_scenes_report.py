@@ -43,10 +43,12 @@ from surrogate.dataset import read_dataset
 from surrogate.encode import directions, reduce, tool_features
 from surrogate.envelope import envelope_of
 from surrogate.expansion import COARSE, EXPANDED
+from surrogate.parts import SVR
 from surrogate.published import from_angles, published_nodes, sites_of, thirteen, to_angles
 from surrogate.sectors import leave_sectors_out
 from surrogate.svr import Svr
 from surrogate.train import train
+from surrogate.tuned import Tuned
 
 SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"), Learner("published-svr"))
 
@@ -128,7 +130,7 @@ def test_a_learner_is_held_to_loads_that_it_was_not_taught(study, box, tmp_path,
     if name == "svr":
         size, (every, direction) = directions(lesson)[0], directions(pushed)
         basis = reduce(nodes, truth[taught] / size[:, None, None], *COARSE)
-        machine = Svr().fit(tool_features(study.patch, lesson), basis.encode(truth[taught] / size[:, None, None]))
+        machine = Tuned(SVR).fit(tool_features(study.patch, lesson), basis.encode(truth[taught] / size[:, None, None]))
         within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
         guess = every[:, None, None] * basis.decode(machine.predict(tool_features(study.patch, within)))
     else:

@@ -22,7 +22,7 @@ from surrogate.expansion import EXPANDED
 from surrogate.learned import Learned
 from surrogate.patch import open_patch
 from surrogate.sampling import draw
-from surrogate.score import score, winner
+from surrogate.score import winner
 from surrogate.simulate import simulate
 from surrogate.split import APART
 from surrogate.store import load, save
@@ -78,8 +78,8 @@ def test_no_force_no_motion_and_weak_loads_in_proportion(model, fresh):
 def test_learners_are_as_near_as_they_were(trained):
     """Each within a fifth to a third of what it scored when this was written; the table does not depend on luck."""
     mean = {row.name: row.mean_percent for row in trained.scores}
-    assert mean["linear"] == pytest.approx(6.88, rel=0.01)
-    known = {"pcr": 16.0, "ann": 3.0, "svr": 13.5, "gp": 1.3, "residual": 0.4}
+    assert mean["linear"] == pytest.approx(6.90, rel=0.01)
+    known = {"pcr": 16.0, "ann": 2.4, "svr": 8.5, "gp": 1.3, "residual": 0.5}
     assert {name for name, most in known.items() if mean[name] > most} == set()
     assert winner(trained.scores).mean_mm == min(row.mean_mm for row in trained.scores)
 
@@ -246,11 +246,11 @@ def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
     assert found.tenths == tuple((weakest[k : k + 6] % 4 == 0).mean() for k in range(0, 60, 6))
 
 
-def test_score_sees_a_shift(pretender, box, fresh):
-    truth = pretender.deform(fresh, at=box.tumour_nodes).displacement
-    nothing = score("same", pretender, fresh, truth, box.tumour_nodes)
-    shifted = score("shifted", pretender, fresh, truth + [0.0, 3e-3, 4e-3], box.tumour_nodes)
-    assert nothing.max_mm == 0.0 and shifted.mean_mm == pytest.approx(5.0) and shifted.max_mm == pytest.approx(5.0)
+def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh):
+    size = np.linalg.norm(fresh.of(Pushed).force, axis=1)
+    within = fresh.rows((size >= model.envelope.force[0]) & (size <= model.envelope.force[1]))
+    wanted = model.deform(within, at=box.tumour_nodes).displacement
+    assert np.allclose(model.bare(model.asked(within)), wanted, atol=1e-5 * np.abs(wanted).max())
 
 
 def test_outside_the_taught_range_is_said(trained, box):
@@ -332,8 +332,7 @@ def test_an_envelope_reaches_as_far_as_taught_loads_lie_apart(box):
 
 def test_fresh_loads_lie_inside_the_envelope_and_those_of_left_out_discs_outside(trained, scored, data, fresh):
     inside = [outcome is Outcome.PREDICTED for outcome in trained.models["linear"].deform(fresh).outcome]
-    # A few exceed the taught extremes of force, radius or angle by a hair, or lie in a gap between taught places.
-    assert np.mean(inside) > 0.9
+    assert np.mean(inside) > 0.9  # a few exceed the taught extremes, or lie in a gap
     held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
     strange = [outcome is Outcome.EXTRAPOLATED for outcome in scored.models["linear"].deform(held_out).outcome]
     assert np.mean(strange) > 0.3

@@ -118,10 +118,10 @@ def _first_order(series, loads, patch):
     return series.predict(tool_features(patch, weak)) * size[:, None]
 
 
-def simulated(path, box):
-    """160 pushes of one ball on a box."""
+def simulated(path, box, count=160):
+    """Pushes of one width on a box."""
     fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
-    loads = Loads((pushes(open_patch(box), 160, 5, (7e-3, 7e-3), 0.25),))
+    loads = Loads((pushes(open_patch(box), count, 5, (7e-3, 7e-3), 0.25),))
     simulate(path, fem, loads, {"tissue": tissue_to_json(TISSUE), "element": "p1"})
     return read_dataset(path)
 
@@ -160,14 +160,17 @@ def test_a_series_beats_the_table_of_first_order(trained):
     assert series.mean_mm < 0.2 * linear.mean_mm and learnt.mean_mm < 1.5 * series.mean_mm
 
 
-def test_on_known_cortex_the_process_halves_what_the_series_leaves(tmp_path):
-    """Nine open nodes and 120 loads among them: every fourth load is tested, wherever it lies."""
+def test_on_known_cortex_the_process_beats_the_series_by_a_factor_of_two(tmp_path):
+    """What `series-gp` is there for: nine open nodes, 300 loads among them, every fourth tested wherever it lies.
+
+    A process that has lost its units leaves the series as it is.
+    """
     small = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=15e-3)
-    data = simulated(tmp_path / "data.h5", small)
+    data = simulated(tmp_path / "data.h5", small, 300)
     fourth = np.where(np.arange(data.good.sum()) % 4 == 3, 0, -1)
-    split = Split(np.full((1, 3), 1.0), 1e-3, fourth, 1.0)
-    series, learnt = train(data, EXPANDED, split=split, expansion=Expansion(data, "cpu")).scores
-    assert learnt.mean_percent < 0.6 * series.mean_percent
+    nowhere = Split(np.full((1, 3), 1.0), 1e-3, fourth, 1.0)
+    series, learnt = train(data, EXPANDED, split=nowhere, expansion=Expansion(data, "cpu")).scores
+    assert learnt.mean_percent < 0.5 * series.mean_percent and learnt.mean_mm < 0.5 * series.mean_mm
 
 
 def test_nothing_inside_the_discs_left_out_is_told_of_the_series(trained, data, box, tmp_path):

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law (default %(default)s)")
     add_element_argument(parser)
     parser.add_argument(
-        "--learners", default="linear,series-gp", help="as `sulcus train` has them (default %(default)s)"
+        "--learners", default="linear,series,series-gp", help="as `sulcus train` has them (default %(default)s)"
     )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
     add_force(parser)
