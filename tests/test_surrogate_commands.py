@@ -65,8 +65,14 @@ def test_training_prints_every_figure_and_writes_every_model(folder, box, capsys
     assert report["winner"] == min(rows.values(), key=lambda row: row["mean_mm"])["name"]
     assert report["discs"] >= 6 and report["share_of_patch"] >= 0.15
     assert report["taught"] + report["held_out"] + report["calibrated"] == 150
+    assert report["nominal_refused"] == pytest.approx(0.12, abs=0.005)
+    solves = {name: row["told"] for name, row in rows.items()}
+    assert {told["loads"] for told in solves.values()} == {report["taught"]}
+    assert solves["series"]["series"] > 0 == solves["svr"]["series"] and solves["series"]["seconds"] > 0.0
     assert main(["train", str(folder / "data.h5"), "--out", str(folder / "table.npz"), "--learners", "linear"]) == 0
-    assert "linear wins" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "linear wins" in printed and "12 % of the nominal loads of palpation" in printed
+    assert "worst vertex of a load" in printed and "model in NumPy" in printed
 
 
 def test_the_same_command_again_solves_nothing(folder, capsys):

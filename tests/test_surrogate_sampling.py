@@ -6,7 +6,16 @@ import pytest
 from sim.errors import InputError
 from sim.loads import Pushed
 from surrogate.patch import Patch, open_patch
-from surrogate.sampling import HARDEST, PLANE_MODULUS, PUBLISHED_FOOTPRINT, TOOLS, draw, spread
+from surrogate.sampling import (
+    HARDEST,
+    PLANE_MODULUS,
+    PUBLISHED_FOOTPRINT,
+    TOOLS,
+    draw,
+    refused_share,
+    refused_words,
+    spread,
+)
 from surrogate.split import leave_discs_out
 
 
@@ -153,3 +162,20 @@ def test_discs_shrink_where_they_would_take_more_than_half(patch):
 def test_too_few_positions_are_refused(patch):
     with pytest.raises(InputError, match="simulate more"):
         leave_discs_out(np.repeat(np.eye(3)[:2] * 0.01, 5, axis=0), patch)
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_the_share_of_nominal_loads_that_are_not_drawn(name):
+    """Recounted on random ones, with the limits written out here."""
+    tool, random = TOOLS[name], np.random.default_rng(0)
+    radius = random.uniform(*tool.footprint, 40_000)
+    force = np.exp(random.uniform(*np.log(tool.force), 40_000))
+    pressure, depth = force / (np.pi * radius**2), 3.0 * force / (4.0 * PLANE_MODULUS * radius)
+    refused = (pressure < tool.pressure[0]) | (pressure > tool.pressure[1]) | (depth > tool.depth)
+    assert refused_share(name) == pytest.approx(refused.mean(), abs=0.01)
+
+
+def test_nominal_loads_of_palpation_are_refused_in_words():
+    assert refused_words("palpation").startswith("12 % of the nominal loads of palpation")
+    assert refused_share("mixed") == pytest.approx(np.mean([refused_share(name) for name in TOOLS]))
+    assert refused_share("seed") == refused_share("anything") == 0.0 and refused_words("seed") == ""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surrogate.sampling import draw
-from surrogate.score import score, table
+from surrogate.score import score, table, winner
 from surrogate.told import Told
 
 
@@ -23,6 +23,7 @@ def test_score_sees_a_shift(pretender, box, fresh):
     bent[:, 3, 1] += 1e-3 * np.arange(60)
     one = score("one vertex", pretender, fresh, bent, box.tumour_nodes)
     assert (one.worst_mean_mm, one.worst_p95_mm) == pytest.approx((29.5, np.percentile(np.arange(60), 95)))
+    assert winner([shifted, one, nothing]) is nothing
     assert one.mean_mm == pytest.approx(29.5 / len(box.tumour_nodes)) and one.max_mm == pytest.approx(59.0)
 
 
