@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         print(
             f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}: the tumour is off by {figures.error_mm:.3f} "
             f"mm of the {figures.motion_mm:.2f} mm that it moves; its outline by {figures.drawn:.1f} px, overlap "
-            f"{figures.overlap:.3f} (1 is best); {figures.leaked:.0%} passes the skull",
+            f"{figures.overlap:.3f} (1 is best); {figures.leaked:.0%} leaks out of the skull",
             file=table,
         )
         if args.certify:
