@@ -75,7 +75,7 @@ class Figures:
             "a picture does not say its frame's number or the distance to the tumour": self.printed,
             "the tumour never moves: nothing was shown": self.motion_mm > 0.0,
             "a number is not finite": self.finite,
-            "an answer is not good: see its outcome": self.answered,
+            "an answer may not be relied on": self.answered,
             "a picture shows the answer to another moment": self.in_step,
         }
         return [sentence for sentence, kept in rules.items() if not kept]

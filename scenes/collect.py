@@ -56,9 +56,12 @@ MEANINGS = {
     "pictures/depth": "PNG bytes, 16 bit: distance along the camera's z axis; 0 where nothing is seen",
     "contact": "where the tool pushes, on the cortex of the scan",
     "tip": "the tool's lowest point, against the open cortex's mean outward normal",
+    "distance": "from the tool's tip to the predicted tumour, as the picture says it (a model may correct it)",
+    "distance_error": "what `distance` may be off by, exceeded in 5 of 100 loads; NaN where it is not known",
 }  # fmt: skip
 UNITS = {
     "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
+    "distance": "m", "distance_error": "m",
     "direction": "1", "csf_level": "m", "share": "1", "done": "1",
     "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "bound": "m", "seconds": "s",
     "reaction_fem": "N, N m", "K": "pixel", "pose": "m", "displacement": "m", "tumour_nodes": "1", "tumour_left": "1",
@@ -128,13 +131,23 @@ def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
     return {
         "time": frame.time,
         "T_camera_world": frame.camera.T_camera_world,
-        **({} if frame.pose is None or frame.tip is None else {"T_world_tool": frame.pose, "tip": frame.tip}),
+        **({} if frame.pose is None or frame.tip is None else held(frame, frame.pose, frame.tip)),
         **caused(frame.loads),
         "tumour_predicted": player.positions(frame.deformation)[nodes],
         "tumour_left": ~player.stage.at(frame.loads).anatomy.orphaned[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],
         "seconds": np.array([frame.seconds[stage] for stage in STAGES]),
+    }
+
+
+def held(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, np.ndarray | float]:
+    """Where the tool is, and what the picture says of its distance to the tumour; NaN where it says nothing."""
+    return {
+        "T_world_tool": pose,
+        "tip": tip,
+        "distance": np.nan if frame.distance is None else frame.distance,
+        "distance_error": np.nan if frame.distance_error is None else frame.distance_error,
     }
 
 

@@ -30,7 +30,7 @@ SENTENCES = {
     "drawn": (2.5, "the drawn outline is 2.5 pixels off, more than 2"),
     "printed": (False, "does not say its frame's number"),
     "finite": (False, "not finite"),
-    "answered": (False, "answer is not good"),
+    "answered": (False, "may not be relied on"),
     "in_step": (False, "another moment"),
 }
 
@@ -214,9 +214,9 @@ def test_what_is_not_finite_fails(play, frames, truth):
 def test_a_bad_outcome_fails_on_either_side(play, frames, truth):
     doubtful = replace(frames[1].deformation, outcome=(Outcome.EXTRAPOLATED,))
     off = [frames[0], replace(frames[1], deformation=doubtful), *frames[2:]]
-    assert broken(play, off, truth)[0] == {"an answer is not good: see its outcome"}
+    assert broken(play, off, truth)[0] == {"an answer may not be relied on"}
     stopped = replace(truth, outcome=(*truth.outcome[:-1], Outcome.BUDGET))
-    assert broken(play, frames, stopped)[0] == {"an answer is not good: see its outcome"}
+    assert broken(play, frames, stopped)[0] == {"an answer may not be relied on"}
 
 
 def test_nothing_but_idle_frames_prove_nothing(play, frames, truth):

@@ -81,6 +81,13 @@ class TestEpisode:
         assert np.linalg.norm(moved - found) < 2e-3 * np.linalg.norm(found) > 0.0
         assert len(said["model_digest"]) == 16 and said["date"][:2] == "20" and "Probe" in said["tool"]
 
+    def test_the_distance_is_that_of_the_picture(self, episode):
+        _, file, _, frames = episode
+        for name in ("distance", "distance_error"):
+            told = [np.nan if getattr(frame, name) is None else getattr(frame, name) for frame in frames]
+            np.testing.assert_allclose(file[name][:], told, rtol=1e-12)
+        assert np.isfinite(file["distance"][:]).all()
+
     def test_every_data_set_has_a_unit(self, episode):
         _, file, _, _ = episode
         bare = []
@@ -137,7 +144,7 @@ class TestEpisode:
             "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
             "tumour_predicted": "m", "tumour_fem": "m", "seconds": "s", "tumour_rest": "m", "bound": "m",
             "reaction_fem": "N, N m", "K": "pixel", "tumour_nodes": "1", "tumour_left": "1",
-            "outcome_predicted": "text", "outcome_fem": "text",
+            "outcome_predicted": "text", "outcome_fem": "text", "distance": "m", "distance_error": "m",
         }  # fmt: skip
         assert "1e-05 m" in file["pictures/depth"].attrs["unit"]
         assert file.attrs["anatomy"] == theatre.anatomy.digest and file.attrs["deformer"] == "linear"
