@@ -48,6 +48,7 @@ STAGES = {"unit": "unit responses", "answers": "loads"}
 UNITS = {"unit": UNIT_FORCE, "answers": 1.0}
 # From this version of HDF5 on, whatever says where arrays lie has checksums.
 READERS = ("v108", "v108")
+UNTIMED = "not known"  # as wide as a number
 T = TypeVar("T")
 
 
@@ -216,7 +217,10 @@ def _fill(journal: Journal, work: Work, finished: set[Batch], progress: Callable
 
 
 def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
-    """Wall seconds a solve, of each kind that was solved just now; of others as the finished file has it."""
+    """Wall seconds a solve, of each kind that was solved just now; of others as the finished file has it.
+
+    All of one width, so that files made in one run or in several are of one shape.
+    """
     before: dict[str, str] = {}
     if path.exists():
         with h5py.File(path, "r") as file:
@@ -224,9 +228,9 @@ def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) 
     rates = {}
     for name, words in (("unit", "seconds a unit response"), ("answers", "seconds a load")):
         if solved[name]:
-            rates[words] = f"{seconds[STAGES[name]] / solved[name]:.6g}"
-        elif words in before:
-            rates[words] = before[words]
+            rates[words] = f"{seconds[STAGES[name]] / solved[name]:.3e}"
+        else:
+            rates[words] = before.get(words, UNTIMED)
     return rates
 
 

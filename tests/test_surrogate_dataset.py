@@ -125,12 +125,15 @@ simulate(path, tools["Pretender"](box), draw("palpation", box, 20, 0), {"preset"
 
 
 def undated(path):
-    """The bytes of a data set, but for its date and the hash of it."""
+    """The bytes of a data set, but for its date, the seconds that solves took, and the hash of these."""
     with h5py.File(path) as file:
         dates = [file.attrs[name].encode() for name in ("date", SEAL)]
+        times = [file.attrs[f"seconds a {each}"].encode() for each in ("load", "unit response")]
     raw = path.read_bytes()
-    assert all(raw.count(date) == 1 for date in dates)
-    return raw.replace(dates[0], b"").replace(dates[1], b"")
+    assert all(raw.count(date) == 1 for date in dates) and all(len(time) == 9 for time in times)
+    for text in (*dates, *times):
+        raw = raw.replace(text, b"")
+    return raw
 
 
 def test_a_killed_run_ends_with_the_bytes_of_an_uninterrupted_one(tmp_path, pretender, loads):
@@ -147,6 +150,7 @@ def test_a_killed_run_ends_with_the_bytes_of_an_uninterrupted_one(tmp_path, pret
         read_dataset(killed)
     assert [path.name.startswith(".sulcus-") for path in sorted(tmp_path.iterdir())] == [True, False, False]
     assert simulate(killed, pretender, loads, SAID, 8).rows == 0
+    assert read_dataset(killed).seconds("unit response", 3) is None  # none was solved by the run that ended
     assert sorted(tmp_path.iterdir()) == [killed, whole] and undated(killed) == undated(whole)
 
 
@@ -159,6 +163,7 @@ def test_a_finished_file_is_left_alone_and_extended(tmp_path, box, pretender, lo
     assert simulate(path, pretender, more, SAID, 8).rows == 30 - 16  # the last, short batch is solved again
     simulate(direct, pretender, more, SAID, 8)
     assert undated(path) == undated(direct)
+    assert read_dataset(path).seconds("load", 30) > 0.0 and read_dataset(path).seconds("unit response", 1) > 0.0
     after = path.read_bytes()
     assert simulate(path, pretender, loads, SAID, 8).rows == 0 and path.read_bytes() == after
 
