@@ -85,7 +85,7 @@ def test_a_patient_hands_tissue_and_element_on(tmp_path, monkeypatch, words, tol
     assert [step[0] for step in steps] == ["anatomy", "simulate", "train"]
     element = [] if told[1] is None else ["--element", told[1]]
     assert steps[1][steps[1].index("--material") :] == ["--material", told[0], *element]
-    assert steps[2][-4:] == ["--learners", "linear,series-gp", "--device", "cpu"]
+    assert steps[2][-4:] == ["--learners", "linear,series,series-gp", "--device", "cpu"]
 
 
 def physics(theatre: Theatre, scene: Scene) -> tuple[str, Tissue | None]:
