@@ -18,14 +18,18 @@ import viser
 
 from .guard import bracketed, open_server
 from .page_parts import Body, Choice, Control, Deed, Fold, Playback, Sign, Slider, Toggle, Viewpoint
-from .page_style import PAGE, SAID, STATUS, style
+from .page_sight import PICTURE, SAID, coded, sight
+from .page_style import PAGE, STATUS, style
 
-# A client that decodes more slowly than pictures arrive shows none at all.
 PICTURES_PER_SECOND = 15.0
 # Width of the docked panel where a browser does not know the page's own rules [CSS pixel].
 PANEL = 676.0
 # Hosts that this machine reaches by the name localhost.
 EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")
+
+
+Sight = tuple[int, np.ndarray, str]
+"""A frame's number, its picture (H, W, 3) uint8 and the words, HTML, beside it."""
 
 
 class Browser:
@@ -67,10 +71,15 @@ class Browser:
         gui = self.server.gui
         gui.add_html(style(size[0] / size[1]))
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
-        self.picture = gui.add_image(blank, format="jpeg", jpeg_quality=88)
+        gui.add_html(held(PICTURE, ""))
         self.words = gui.add_html(held(PAGE, words))
         self.line = gui.add_html("")
         self.text = gui.add_html(held(SAID, ""))
+        # What is shown, newest first asked for: frame, picture and words; the picture as it is sent, and how many were.
+        self.shown: Sight = (0, blank, "")
+        self.wanted: Sight = self.shown
+        self.coded, self.sent = coded(blank), 0
+        self.sight = gui.add_html(sight(0, self.coded, ""))
         # What the newest message did, as the `changed` that it calls may ask.
         self.deed: Deed | None = None
         # The line that each visitor alone reads, by viser's identifier.
@@ -104,8 +113,10 @@ class Browser:
             if self.folder is not None:
                 self.folder.remove()
             self.server.gui.set_panel_label(title)
-            self.title, self.shown = title, (0, self.picture.image)
-            self.words.content, self.text.content, self.line.content = held(PAGE, words), held(SAID, ""), ""
+            self.title = title
+            self.words.content, self.line.content = held(PAGE, words), ""
+            self.wanted, self.shown = (0, self.shown[1], ""), (0, self.shown[1], self.shown[2])
+            self.report("")
             self.inputs: dict[str, viser.GuiInputHandle] = {}
             self.folder = self.server.gui.add_folder(None)
             with self.folder:
@@ -133,14 +144,31 @@ class Browser:
         """Numbers of the visitors who look at the page now, from 1 in the order that they came."""
         return {identifier + 1 for identifier in self.server.get_clients()}
 
-    def show(self, number: int, colour: np.ndarray) -> None:
-        """Show the picture (H, W, 3) uint8 of frame `number`, and put the playback slider there."""
+    def show(self, number: int, colour: np.ndarray, words: str) -> None:
+        """Show the picture (H, W, 3) uint8 of frame `number` and its words, HTML; the playback slider goes there."""
+        with self.lock:
+            self.wanted = number, colour, words
+            self.newest["sight"] = self.send_sight
 
-        def send() -> None:
-            self.picture.image, self.shown = colour, (number, colour)
+    def report(self, words: str) -> None:
+        """Show other words, HTML, beside the picture."""
+        with self.lock:
+            self.wanted = self.wanted[0], self.wanted[1], words
+            self.newest["sight"] = self.send_sight
+
+    def send_sight(self) -> None:
+        """Send the picture with its words, unless both are there."""
+        with self.lock:
+            number, colour, words = wanted = self.wanted
+        if colour is not self.shown[1]:
+            self.coded = coded(colour)
+        if colour is not self.shown[1] or words != self.shown[2]:
+            self.sent += 1
+            self.sight.content = sight(self.sent, self.coded, words)
+        # Not oftener: a visitor may be moving it.
+        if number != self.shown[0]:
             self.assign(self.frame, number)
-
-        self.note("picture", send)
+        self.shown = wanted
 
     def move(self, name: str, vertices: np.ndarray, triangles: np.ndarray | None = None) -> None:
         """Put the vertices (V, 3) [m] of a body in the 3-D view elsewhere; triangles (F, 3) where they are others."""
@@ -157,10 +185,6 @@ class Browser:
         """Give a body in the 3-D view another colour (3,), sRGB in [0, 1]."""
         mesh = self.meshes[name]
         self.note(f"colour {name}", lambda: setattr(mesh, "color", tuple(round(255 * part) for part in colour)))
-
-    def report(self, words: str) -> None:
-        """Show words, HTML, between playback and controls."""
-        self.note("report", lambda: setattr(self.text, "content", held(SAID, words)))
 
     def status(self, words: str) -> None:
         """Show a line, HTML, over the picture, or none."""
@@ -270,7 +294,7 @@ class Browser:
         @self.saver.on_click
         def save(event: viser.GuiEvent) -> None:
             if event.client is not None:
-                number, colour = self.shown
+                number, colour, _ = self.shown
                 name = f"{self.title.replace(':', '').replace(' ', '-')}-{number}.png"
                 written = cv2.imencode(".png", np.ascontiguousarray(colour[..., ::-1]))[1]
                 event.client.send_file_download(name, written.tobytes(), save_immediately=True)

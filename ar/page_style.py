@@ -6,11 +6,12 @@ hold. A browser that knows no `:has()` leaves the rules aside and shows picture 
 
 from __future__ import annotations
 
-PAGE, STATUS, SAID = "sulcus", "sulcus-status", "sulcus-said"
-"""Names of the elements that hold the words under the picture, the line over it, and the report."""
+from .page_sight import PICTURE, SAID
+
+PAGE, STATUS = "sulcus", "sulcus-status"
+"""Names of the elements that hold the words under the picture, and the line over it."""
 PANEL = f"div:has(canvas) ~ div:has(#{PAGE})"
 VIEW = f"div:has(canvas):has(~ div #{PAGE})"
-PICTURE = f'{PANEL} div:has(> div > img[src^="blob:"])'
 NOTES = ".mantine-Notifications-root"
 
 RULES = """
@@ -30,8 +31,9 @@ RULES = """
 #SAID td, #SAID th { padding: 0 0.9rem 0 0; text-align: left; font-weight: inherit }
 #STATUS { position: fixed; top: 0.6rem; left: 0.6rem; z-index: 7; pointer-events: none }
 #STATUS span { background: #e8590c; color: #fff; border-radius: 0.3rem; padding: 0.2rem 0.6rem; font-size: 0.9rem }
-PICTURE { position: fixed; left: 0; top: 0; width: var(--w); padding: 0 !important; z-index: 6 }
-PICTURE img { width: 100%; display: block }
+PANEL #PICTURE { position: fixed; left: 0; top: 0; width: var(--w); aspect-ratio: var(--aspect); background: #181818;
+  z-index: 6 }
+#PICTURE img { width: 100%; display: block }
 NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !important }
 #webgl-software-rendering { display: none }
 @media (min-width: 36.01em) {
@@ -63,7 +65,7 @@ def style(aspect: float) -> str:
     """An element of rules for a picture of width / height `aspect`."""
     rules = RULES
     for name, value in (
-        ("PICTURE", PICTURE),
+        ("#PICTURE", f"#{PICTURE}"),
         ("PANEL", PANEL),
         ("VIEW", VIEW),
         ("NOTES", NOTES),

@@ -55,6 +55,7 @@ class Moment:
     style: str = ""
     load: str = ""
     frame: Frame | None = None
+    picture: np.ndarray | None = None
     truth: Truth | None = None
     own: Truth | None = None
     by: tuple | None = None
@@ -205,6 +206,7 @@ class Demo:
             self.referee.ask(number, touch)
         if not off:
             self.tally.took(name, now.load, answer.cost.total)
+        now.picture = pictured(frame)
         self._show(frame, player)
         return 1
 
@@ -225,7 +227,7 @@ class Demo:
         now.frame = replace(player, style=style).drawn(
             frame.number, frame.touch, frame.loads, frame.deformation, seconds
         )
-        self._picture(now.frame)
+        now.picture = pictured(now.frame)
 
     def _check(self, now: Moment) -> None:
         """Show what the finite elements say of what is shown, and whether it is of the same load."""
@@ -256,7 +258,9 @@ class Demo:
         else:
             verdict = verdict_words(now.judged if truth is not None else None, not fresh, WAITS)
         scene = self.stage.scene
-        self.browser.report(report(now.frame, self.stage, name, verdict, self.tally.rows, len(scene.times), gone))
+        said = report(now.frame, self.stage, name, verdict, self.tally.rows, len(scene.times), gone)
+        assert now.picture is not None
+        self.browser.show(now.frame.number, now.picture, said)
 
     def _whole(self, number: int, touch: Touch | None) -> Loads:
         """What acts in a frame under all effects of the scene."""
@@ -333,13 +337,8 @@ class Demo:
         eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
         return Viewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
 
-    def _picture(self, frame: Frame) -> None:
-        """Show a frame's picture with the patient's sides."""
-        self.browser.show(frame.number, marked(frame.shown, frame.camera.T_camera_world[:3, :3]))
-
     def _show(self, frame: Frame, player: Player) -> None:
         positions = player.positions(frame.deformation)
-        self._picture(frame)
         stage = self.stage.at(frame.loads)
         for layer in (stage.cortex(positions), stage.tumour(positions)):
             self.browser.move(layer.name, layer.vertices, layer.triangles)
@@ -351,3 +350,8 @@ class Demo:
         """Show in the 3-D view where the finite elements, under all effects, have the tumour."""
         seen = self.stage.at(truth.loads).tumour(player.positions(truth.deformation))
         self.browser.move("finite elements", seen.vertices, seen.triangles)
+
+
+def pictured(frame: Frame) -> np.ndarray:
+    """A frame's picture (H, W, 3) uint8 with the patient's sides."""
+    return marked(frame.shown, frame.camera.T_camera_world[:3, :3])

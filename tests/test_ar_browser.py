@@ -1,5 +1,6 @@
 """The page: served, shared by several visitors, told what they do. A visitor here is a bare web socket."""
 
+import re
 import time
 import urllib.request
 
@@ -10,7 +11,8 @@ from visitor import Visitor, free_port, wait_for
 
 from ar.browser import Browser
 from ar.page_parts import Body, Choice, Fold, Playback, Sign, Slider, Toggle, Viewpoint
-from ar.page_style import PAGE, SAID, STATUS, style
+from ar.page_sight import PICTURE, SAID, coded
+from ar.page_style import PAGE, STATUS, style
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 
@@ -71,17 +73,57 @@ def test_a_port_that_is_taken_is_left_to_its_owner(page, told):
 
 def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, told):
     for number in range(50):
-        page.show(number, np.full((48, 64, 3), number, np.uint8))
+        page.show(number, np.full((48, 64, 3), number, np.uint8), f"frame {number}")
     assert wait_for(lambda: int(page.frame.value) == 49)
-    assert (page.picture.image == 49).all()
+    assert (page.shown[1] == 49).all()
     assert told["frame"] == []
+
+
+def test_picture_and_words_travel_as_one(page):
+    """A slow browser shows the two of one frame, or neither; words alone bring the picture that they are beside."""
+    visitor = Visitor(page, 1600)
+    assert wait_for(lambda: page.visitors == 1)
+    pictures = [np.full((48, 64, 3), number, np.uint8) for number in range(40)]
+    for number, picture in enumerate(pictures):
+        page.show(number, picture, f"said of frame {number}")
+        time.sleep(0.02)
+    page.report("said later")
+
+    def sights() -> list[str]:
+        return [each["content"] for each in visitor.updates if "sulcus-next" in each.get("content", "")]
+
+    assert wait_for(lambda: "said later" in "".join(sights()))
+    visitor.wire.close()
+    assert len(sights()) > 3
+    numbers = [int(re.findall(r'data-number="(\d+)"', each)[0]) for each in sights()]
+    assert numbers == sorted(set(numbers))
+    for each in sights()[:-1]:
+        number = int(re.findall(r"said of frame (\d+)", each)[0])
+        assert coded(pictures[number]) in each
+    assert coded(pictures[39]) in sights()[-1]
+    assert not any("said" in str(each) for each in visitor.updates if "sulcus-next" not in str(each))
+
+
+def test_what_is_shown_already_is_not_sent_again(page):
+    """A paused page says the same thirty times a second; the slider is left to the visitor who may be moving it."""
+    visitor, picture = Visitor(page, 1600), np.full((48, 64, 3), 7, np.uint8)
+    page.show(7, picture, "said")
+    assert wait_for(lambda: page.visitors == 1 and int(page.frame.value) == 7)
+    time.sleep(0.3)
+    before = len(visitor.updates)
+    for _ in range(20):
+        page.show(7, picture, "said")
+        time.sleep(0.02)
+    time.sleep(0.2)
+    assert len(visitor.updates) == before
+    visitor.wire.close()
 
 
 def test_bodies_move_and_reports_change(page):
     page.move("tumour", TRIANGLE + 0.01)
     page.report("render <b>12 ms</b>")
     page.put("force [N]", 0.35)
-    assert wait_for(lambda: page.inputs["force [N]"].value == 0.35 and "<b>12 ms</b>" in page.text.content)
+    assert wait_for(lambda: page.inputs["force [N]"].value == 0.35 and "<b>12 ms</b>" in page.shown[2])
     assert np.allclose(page.meshes["tumour"].vertices, TRIANGLE + 0.01)
 
 
@@ -96,7 +138,7 @@ def test_several_visitors_see_the_page_and_are_heard(page, told):
     assert wait_for(lambda: wide.received > 0 and narrow.received > 0)
     time.sleep(0.3)
     before = wide.received, narrow.received
-    page.show(7, np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8))
+    page.show(7, np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8), "")
     assert wait_for(lambda: wide.received > before[0] + 1000 and narrow.received > before[1] + 1000)
     wide.set(page.inputs["force [N]"], 0.4)
     narrow.set(page.inputs["deformer"], "FEM")
@@ -114,7 +156,7 @@ def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(told, monkeyp
     assert wait_for(lambda: page.visitors == 1)
     sought = list(range(50, 100)) * 4
     for place, number in enumerate(sought):
-        page.show(place % 50, np.zeros((48, 64, 3), np.uint8))
+        page.show(place % 50, np.zeros((48, 64, 3), np.uint8), "")
         visitor.set(page.frame, number)
         time.sleep(1e-3)
     assert wait_for(lambda: len(told["frame"]) == len(sought))
@@ -157,7 +199,7 @@ def test_the_page_is_filled_anew(page, told):
     visitor.set(page.inputs["Gravity"], False)
     assert wait_for(lambda: hidden == [False])
     assert told["force"] == []
-    page.show(3, np.full((48, 64, 3), 3, np.uint8))
+    page.show(3, np.full((48, 64, 3), 3, np.uint8), "")
     assert wait_for(lambda: int(page.frame.value) == 3)
     visitor.wire.close()
 
@@ -166,7 +208,7 @@ def test_a_visitor_saves_the_picture_as_it_is_shown(page, monkeypatch):
     sent: list[tuple] = []
     monkeypatch.setattr("viser.ClientHandle.send_file_download", lambda client, *file, **how: sent.append(file))
     shown = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    page.show(7, shown)
+    page.show(7, shown, "")
     assert wait_for(lambda: int(page.frame.value) == 7)
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
@@ -205,6 +247,6 @@ def test_a_body_changes_its_colour(page):
 def test_the_rules_know_the_picture_s_shape_and_the_page_s_elements(page):
     sheet = style(4 / 3)
     assert "--aspect: 1.3333" in sheet and sheet.startswith("<style>") and sheet.count("{") == sheet.count("}")
-    for name in (PAGE, SAID, STATUS):
+    for name in (PAGE, PICTURE, SAID, STATUS):
         assert f"#{name}" in sheet
     assert PAGE in page.words.content and SAID in page.text.content

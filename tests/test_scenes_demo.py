@@ -10,8 +10,10 @@ from theatres import small, theatre_of
 from visitor import Visitor, free_port, wait_for
 
 from ar.browser import Browser
+from ar.refind import stands
 from scenes.demo import FEM_COLOUR, STALE_COLOUR, Demo, Moment
 from scenes.paths import Touch, press
+from scenes.play import SMALL
 from scenes.referee import Referee
 from scenes.wish import HAND, SCRIPT, Wish
 from sim.fem import Fem
@@ -74,7 +76,7 @@ def run_until(demo, monkeypatch, reached):
 
 def report(demo):
     """The words of the report, without their marks."""
-    return re.sub("<[^>]*>", "|", demo.browser.text.content)
+    return re.sub("<[^>]*>", "|", demo.browser.shown[2])
 
 
 def test_it_plays_by_itself_and_is_refereed(demo, theatre):
@@ -93,8 +95,19 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
     assert np.array_equal(loads.causes[0].force, truth.loads.causes[0].force)
     off = theatre.models["linear"].deform(loads, at=nodes).displacement[0] - truth.deformation.at(nodes).displacement[0]
     assert f"mean {1e3 * np.linalg.norm(off, axis=1).mean():.3f}" in text
-    assert demo.browser.picture.image.shape == (240, 320, 3)
-    assert len(np.unique(demo.browser.picture.image)) > 50
+    assert demo.browser.shown[1].shape == (240, 320, 3)
+    assert len(np.unique(demo.browser.shown[1])) > 50
+
+
+def test_the_words_beside_a_picture_are_of_its_frame(demo, monkeypatch):
+    shown = []
+    monkeypatch.setattr(demo.browser, "show", lambda number, colour, words: shown.append((number, colour, words)))
+    demo.run(1.0)
+    assert len({number for number, _, _ in shown}) > 3
+    pictures = {}
+    for number, colour, words in shown:
+        assert f"frame {number} of" in words and stands(colour, f"frame {number}", SMALL)
+        assert pictures.setdefault(number, colour) is colour
 
 
 def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypatch):
@@ -268,11 +281,11 @@ def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
     demo.wish.hand(x=0.004, force=0.25)
     demo.run(0.5)
     assert wait_for(lambda: "force 0.25 N" in report(demo))
-    said = demo.browser.text.content
+    said = demo.browser.shown[2]
     assert '<p class="stale">of an earlier load: error against FEM' in said and "<p>error against FEM" not in said
     assert tints[-1] == STALE_COLOUR and len(asked) == 1
     Referee.ask(demo.referee, *asked[0])
-    assert wait_for(lambda: demo.run(0.3) and "<p>error against FEM" in demo.browser.text.content)
+    assert wait_for(lambda: demo.run(0.3) and "<p>error against FEM" in demo.browser.shown[2])
     assert "earlier load" not in report(demo) and tints[-1] == FEM_COLOUR
 
 
@@ -297,8 +310,6 @@ def test_a_scene_that_this_body_cannot_play_is_said_and_the_old_one_goes_on(demo
 
 def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
     demo.wish.set(plays=False, number=30)
-    shown = []
-    monkeypatch.setattr(demo.browser, "show", lambda number, colour: shown.append(colour))
     asked = []
     answer = Learned.deform
     demo.run(0.3)
@@ -308,13 +319,13 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
         asked.append(loads)
         return answer(model, loads, start, at)
 
-    before = len(shown)
     moment = Moment()
     demo._answer(moment)
+    before = moment.picture
     monkeypatch.setattr(Learned, "deform", counted)
     demo.wish.set(style="contour")
     demo._answer(moment)
-    assert len(shown) == before + 2 and (shown[-1] != shown[-2]).any() and asked == []
+    assert before is not None and (moment.picture != before).any() and asked == []
 
 
 def test_a_long_solve_is_told_while_it_lasts(demo, monkeypatch):

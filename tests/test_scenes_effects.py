@@ -202,8 +202,8 @@ class TestWithoutATool:
                 set(demo.browser.inputs) == {"scene", "deformer", "overlay", "Gravity"}
                 and "tool" not in demo.browser.meshes
             )
-            assert wait_for(lambda: demo.run(0.3) and "gravity pulls" in demo.browser.text.content)
-            assert "tip to tumour" not in demo.browser.text.content
+            assert wait_for(lambda: demo.run(0.3) and "gravity pulls" in demo.browser.shown[2])
+            assert "tip to tumour" not in demo.browser.shown[2]
         finally:
             demo.close()
 
@@ -220,10 +220,10 @@ class TestSwitches:
     def test_effects_go_off_and_on_and_the_change_is_told(self, demo, theatre):
         page, visitor = demo.browser, Visitor(demo.browser, 1200)
         assert {"ToolForce", "Gravity"} < set(page.inputs) and not {"Held", "Elasticity"} & set(page.inputs)
-        assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.text.content)
+        assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.shown[2])
         visitor.set(page.inputs["Gravity"], False)
-        assert wait_for(lambda: demo.run(0.3) and "without gravity and fluid the tumour is" in page.text.content)
-        said = float(page.text.content.split("the tumour is ")[1].split(" mm")[0])
+        assert wait_for(lambda: demo.run(0.3) and "without gravity and fluid the tumour is" in page.shown[2])
+        said = float(page.shown[2].split("the tumour is ")[1].split(" mm")[0])
         scene, nodes = demo.stage.scene, theatre.anatomy.tumour_nodes
         plain, less = replace(theatre, models={}), without(scene, Gravity())
         one, other = (
@@ -232,18 +232,18 @@ class TestSwitches:
         )
         change = 1e3 * np.linalg.norm(one - other, axis=1).mean()
         assert change > 0.1 and said == pytest.approx(change, abs=0.02)
-        assert "gravity pulls" not in page.text.content
+        assert "gravity pulls" not in page.shown[2]
         visitor.set(page.inputs["Gravity"], True)
-        assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.text.content)
+        assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.shown[2])
         visitor.wire.close()
 
     def test_without_any_nothing_moves(self, demo):
         demo.wish.switch("Gravity", False)
         demo.wish.switch("ToolForce", False)
         assert wait_for(
-            lambda: demo.run(0.3) and "without gravity and fluid, push of the tool the" in demo.browser.text.content
+            lambda: demo.run(0.3) and "without gravity and fluid, push of the tool the" in demo.browser.shown[2]
         )
-        assert "; 0.17 s; tumour moved" in demo.browser.text.content
+        assert "; 0.17 s; tumour moved" in demo.browser.shown[2]
         demo.wish.switch("Gravity", True)
         assert demo.wish.off == {"ToolForce"}
 

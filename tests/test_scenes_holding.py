@@ -72,7 +72,7 @@ def running(demo):
 
 
 def report(demo):
-    return demo.browser.text.content
+    return demo.browser.shown[2]
 
 
 def refuse(monkeypatch, refused, error):

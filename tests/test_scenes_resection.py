@@ -131,7 +131,7 @@ def test_the_page_shows_the_rest(theatre, scene):
         demo.wish.set(plays=False, number=0)
         whole = len(demo.browser.meshes["tumour"].faces)
         demo.wish.set(number=6)
-        assert wait_for(lambda: demo.run(0.3) and "resection: 3 steps done" in demo.browser.text.content)
+        assert wait_for(lambda: demo.run(0.3) and "resection: 3 steps done" in demo.browser.shown[2])
         assert wait_for(lambda: len(demo.browser.meshes["tumour"].faces) < whole)
         rest = demo.stage.at(scene.loads(theatre.site, Touch(), 0.2)).tumour(theatre.anatomy.mesh.nodes)
         assert np.array_equal(demo.browser.meshes["tumour"].faces, rest.triangles)

@@ -8,6 +8,7 @@ from contextlib import suppress
 
 import msgspec
 import viser
+import zstandard
 from viser import _messages
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
@@ -35,6 +36,8 @@ class Visitor:
         address = page.address.replace("http", "ws")
         self.wire = connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None)
         self.received = 0
+        # What the page's elements were set to, in that order.
+        self.updates: list[dict] = []
         threading.Thread(target=self.listen, daemon=True).start()
         axes = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 1.0), "look_at": (0.0, 0.0, 0.0)}
         self.say(
@@ -47,6 +50,10 @@ class Visitor:
         with suppress(ConnectionClosed):
             for message in self.wire:
                 self.received += len(message)
+                assert isinstance(message, bytes)
+                packed = int.from_bytes(message[8:16], "little")
+                window = msgspec.msgpack.decode(zstandard.decompress(message[16 : 16 + packed]))
+                self.updates += [each["updates"] for each in window["messages"] if "updates" in each]
 
     def say(self, message: _messages.Message) -> None:
         self.wire.send(msgspec.msgpack.encode(message.as_serializable_dict()))
