@@ -22,6 +22,8 @@ from .page_sight import PICTURE, SAID, coded, sight
 from .page_style import PAGE, STATUS, style
 
 PICTURES_PER_SECOND = 15.0
+# Behind all that is added later.
+LAST = 1e9
 # Width of the docked panel where a browser does not know the page's own rules [CSS pixel].
 PANEL = 676.0
 # Hosts that this machine reaches by the name localhost.
@@ -72,7 +74,8 @@ class Browser:
         gui.add_html(style(size[0] / size[1]))
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
         gui.add_html(held(PICTURE, ""))
-        self.words = gui.add_html(held(PAGE, words))
+        # Last: where a low window has no room for them under the picture, the controls come before them.
+        self.words = gui.add_html(held(PAGE, words), order=LAST)
         self.line = gui.add_html("")
         self.text = gui.add_html(held(SAID, ""))
         # What is shown, newest first asked for: frame, picture and words; the picture as it is sent, and how many were.

@@ -56,6 +56,7 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   PANEL div[style*="20em"] { width: 100% !important }
   VIEW { position: absolute !important; inset: auto 0 0 0 !important; height: var(--low) !important }
   #PAGE { font-size: 0.78rem }
+  #SAID { max-height: 8.2rem; overflow-y: auto }
   NOTES { left: 0.5rem !important }
 }
 """

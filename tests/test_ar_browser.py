@@ -225,6 +225,16 @@ def test_saving_comes_before_the_controls_which_a_low_window_cuts_off(page):
     assert page.frame.order < page.saver.order < min(after)
 
 
+def test_on_a_phone_distance_and_playback_come_before_what_explains_the_picture(page):
+    """There all stands in one column: the report, which scrolls by itself, then playback and controls, then words."""
+    assert page.folder is not None
+    assert page.text.order < page.folder.order < page.words.order
+    phone = style(4 / 3).split("@media (max-width: 36em)")[1]
+    assert re.search(rf"#{SAID} {{ max-height: [0-9.]+rem; overflow-y: auto }}", phone)
+    page.fill([], Playback(30, print, print), [Slider("force [N]", 0.0, 1.0, 0.01, 0.2, print)])
+    assert page.folder.order < page.words.order
+
+
 def test_the_line_over_the_picture_comes_and_goes(page):
     page.status("solving ... 3 s")
     assert wait_for(lambda: "<span>solving ... 3 s</span>" in page.line.content)
