@@ -47,6 +47,8 @@ class Figures:
         Whether the picture says the frame's number and the distance from tip to tumour, as they are computed here.
     finite, answered
         Whether every number and picture is finite, and every answer, drawn or by finite elements, a good one.
+    doubt
+        The first answer that is not: frame, whose it is, and its outcome; how many more there are.
     in_step
         Whether every picture shows the answer to its own moment.
     leaked
@@ -64,6 +66,7 @@ class Figures:
     answered: bool
     in_step: bool
     leaked: float
+    doubt: str = ""
 
     def broken(self, bounds: Bounds) -> list[str]:
         """A sentence for each bound that is not kept."""
@@ -75,14 +78,15 @@ class Figures:
             "a picture does not say its frame's number or the distance to the tumour": self.printed,
             "the tumour never moves: nothing was shown": self.motion_mm > 0.0,
             "a number is not finite": self.finite,
-            "an answer may not be relied on": self.answered,
+            f"an answer is not good: {self.doubt}": self.answered,
             "a picture shows the answer to another moment": self.in_step,
         }
         return [sentence for sentence, kept in rules.items() if not kept]
 
-    def row(self) -> dict[str, float | bool | None]:
+    def row(self) -> dict[str, float | bool | str | None]:
         """For machines: JSON knows no infinity, so None is a figure that could not be measured."""
-        return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
+        told = asdict(self)
+        return {name: value if name == "doubt" or np.isfinite(value) else None for name, value in told.items()}
 
 
 def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Deformation) -> Figures:
@@ -90,6 +94,7 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
 
     `camera` is the one that should have drawn them.
     """
+    doubts = _doubts(frames, truth)
     moved = [
         np.linalg.norm(truth.at(player.stage.at(frame.loads).anatomy.tumour_nodes).displacement[row], axis=1).mean()
         for row, frame in enumerate(frames)
@@ -106,13 +111,23 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
         drawn=max(drawn),
         printed=all(good and _printed(player, frame) for good, frame in zip(finite, frames, strict=True)),
         finite=all(finite),
-        answered=all(frame.deformation.outcome[0].good for frame in frames) and all(o.good for o in truth.outcome),
+        answered=not doubts,
         in_step=all(
             bool(frame.deformation.time[0] == frame.time == time)
             for frame, time in zip(frames, truth.time, strict=True)
         ),
         leaked=float(truth.leaked.max()),
+        doubt="" if not doubts else doubts[0] + (f" ({len(doubts) - 1} more)" if doubts[1:] else ""),
     )
+
+
+def _doubts(frames: Sequence[Frame], truth: Deformation) -> list[str]:
+    """Which frames, drawn or by finite elements, are not answered well, and why."""
+    found = []
+    for frame, true in zip(frames, truth.outcome, strict=True):
+        told = {"as drawn": frame.deformation.outcome[0], "by the finite elements": true}
+        found += [f"frame {frame.number} {whose}, {one.value}" for whose, one in told.items() if not one.good]
+    return found
 
 
 def _finite(frame: Frame) -> bool:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from numbers import Real
+from pathlib import Path as FilePath
 from typing import Any, cast
 
 import numpy as np
@@ -28,7 +30,7 @@ from sim.errors import InputError
 from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
 from sim.material import Tissue
 from sim.open_cortex import Place
-from sim.script import run_script
+from sim.script import run_script, told
 
 from .lying import Lie, supine
 from .paths import AIR, Path, Touch, idle
@@ -108,7 +110,7 @@ class Scene:
     Raises
     ------
     InputError
-        A tool's force or pose without a tool.
+        A tool's force or pose without a tool; a duration or a frame rate that is no number, or not above 0.
     """
 
     name: str
@@ -126,6 +128,10 @@ class Scene:
     frames_per_second: float = 30.0
 
     def __post_init__(self) -> None:
+        for what in ("duration", "frames_per_second"):
+            number = getattr(self, what)
+            if not isinstance(number, Real) or not 0.0 < float(number) < np.inf:
+                raise InputError(f"the scene {self.name} has {what} {number!r}: give a number above 0.")
         needs = [type(effect).__name__ for effect in self.effects if isinstance(effect, HANDLED)]
         if self.tool is None and needs:
             raise InputError(
@@ -241,7 +247,7 @@ def find_scene(name: str) -> Scene:
     Raises
     ------
     InputError
-        No scene of that name; a file that is missing, does not run, or has no SCENE.
+        No scene of that name; a file that is missing, does not run, has no SCENE, or one whose path gives no Touch.
     """
     if name.endswith(".py"):
         return _own_scene(name)
@@ -258,4 +264,12 @@ def _own_scene(path: str) -> Scene:
         raise InputError(f"{path}: has no SCENE. Let it say SCENE = Scene(...), as the built-in scenes do.")
     if not isinstance(found, Scene):
         raise InputError(f"{path}: its SCENE is a {type(found).__name__}. Make it a scenes.scene.Scene.")
+    for time in found.times.tolist():
+        try:
+            touch = found.path(time)
+        except Exception as error:
+            raise InputError(told(FilePath(path).absolute(), error)) from error
+        if not isinstance(touch, Touch):
+            what = type(touch).__name__
+            raise InputError(f"{path}: at {time:g} s its path gives a {what}. Make it a scenes.paths.Touch.")
     return found

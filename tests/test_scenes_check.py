@@ -30,7 +30,7 @@ SENTENCES = {
     "drawn": (2.5, "the drawn outline is 2.5 pixels off, more than 2"),
     "printed": (False, "does not say its frame's number"),
     "finite": (False, "not finite"),
-    "answered": (False, "may not be relied on"),
+    "answered": (False, "answer is not good"),
     "in_step": (False, "another moment"),
 }
 
@@ -73,7 +73,7 @@ def shifted(frame, by):
 
 def test_every_bound_has_its_sentence():
     assert GOOD.broken(Bounds()) == []
-    assert set(SENTENCES) == set(GOOD.row()) - {"leaked"}  # told, and held to nothing
+    assert set(SENTENCES) == set(GOOD.row()) - {"leaked", "doubt"}  # told, and held to nothing
     for name, (value, words) in SENTENCES.items():
         (sentence,) = replace(GOOD, **{name: value}).broken(Bounds())
         assert words in sentence
@@ -214,9 +214,12 @@ def test_what_is_not_finite_fails(play, frames, truth):
 def test_a_bad_outcome_fails_on_either_side(play, frames, truth):
     doubtful = replace(frames[1].deformation, outcome=(Outcome.EXTRAPOLATED,))
     off = [frames[0], replace(frames[1], deformation=doubtful), *frames[2:]]
-    assert broken(play, off, truth)[0] == {"an answer may not be relied on"}
+    why = Outcome.EXTRAPOLATED.value
+    assert broken(play, off, truth)[0] == {f"an answer is not good: frame {frames[1].number} as drawn, {why}"}
     stopped = replace(truth, outcome=(*truth.outcome[:-1], Outcome.BUDGET))
-    assert broken(play, frames, stopped)[0] == {"an answer may not be relied on"}
+    why, last = Outcome.BUDGET.value, frames[-1].number
+    assert broken(play, frames, stopped)[0] == {f"an answer is not good: frame {last} by the finite elements, {why}"}
+    assert broken(play, off, stopped)[0].pop().endswith(" (1 more)")
 
 
 def test_nothing_but_idle_frames_prove_nothing(play, frames, truth):

@@ -94,6 +94,12 @@ class TestEpisode:
         file.visititems(lambda name, item: bare.append(name) if "unit" not in item.attrs else None)
         assert bare == ["pictures"]  # a group
 
+    def test_every_data_set_says_what_it_means(self, episode):
+        _, file, _, _ = episode
+        bare = []
+        file.visititems(lambda name, item: bare.append(name) if "meaning" not in item.attrs else None)
+        assert bare == ["pictures"]
+
     def test_camera_projects_the_tumour_onto_its_mask(self, episode):
         _, file, _, _ = episode
         width, height = int(file.attrs["width"]), int(file.attrs["height"])

@@ -157,6 +157,14 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, box, capsy
     assert found["bound_mm"] == pytest.approx(1e3 * np.median(guess.bound[0])) and found["loads"] == 60
     assert main(["judge", model, fresh]) == 0
     assert "bounds held for" in capsys.readouterr().out
+    little, few = str(folder / "little.h5"), str(folder / "few.npz")
+    count = ["--count", "40", "--device", "cpu", "--json"]  # of which too few calibrate
+    assert main(["simulate", str(folder / "box.vtu"), "--out", little, *count]) == 0
+    assert main(["train", little, "--out", few, "--learners", "linear", "--json"]) == 0
+    capsys.readouterr()
+    assert main(["judge", few, fresh]) == 0
+    told = capsys.readouterr().out
+    assert "linear: states no bounds\n" in told and "bounds held for" not in told
     other = str(folder / "other.h5")
     assert main(["simulate", str(folder / "box.vtu"), "--out", other, "--seed", "9", "--young", "6000", *words]) == 0
     assert main(["judge", model, other]) == 2

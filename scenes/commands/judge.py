@@ -79,9 +79,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{len(loads)} loads, against the finite elements that answered them:\n{table(scores, motion)}")
         if refused_words(preset):
             print(refused_words(preset))
-        print("\n".join(f"{name}: bounds held for {found}" for name, found in promised.items()))
-        of_tip = (
-            f"{name}: bounds of the distance from tip to tumour held for {found}" for name, found in ranged.items()
-        )
-        print("\n".join(of_tip))
+        for name in models:
+            for what, held in (("bounds", promised), ("bounds of the distance from tip to tumour", ranged)):
+                print(f"{name}: {what} held for {held[name]}" if name in held else f"{name}: states no {what}")
     return 0

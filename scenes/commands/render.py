@@ -71,8 +71,8 @@ def run(args: argparse.Namespace) -> int:
     report = {"scene": scene.name, "deformer": name, "solver": who, "frames": len(written), "not_good": bad}
     report |= {"out": str(args.out), "film": film}
     beside = "" if film is None else f", film {film}"
-    unanswered = f"; {bad} of them show an answer that did not converge or is extrapolated" if bad else ""
-    said = f"{len(written)} frames by {who} in {args.out}{beside}{unanswered}"
+    unanswered = f"; answers that did not converge or are extrapolated: {bad}" if bad else ""
+    said = f"{len(written)} frame{'s' * (len(written) != 1)} by {who} in {args.out}{beside}{unanswered}"
     print(json.dumps(report) if args.json else said)
     return 1 if bad else 0
 
