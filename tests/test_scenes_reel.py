@@ -216,7 +216,7 @@ class TestPages:
     def test_the_way_is_told(self, pages, monkeypatch):
         said: list[str] = []
         solved: list[str] = []
-        monkeypatch.setattr(pages[0].browser, "report", said.append)
+        monkeypatch.setattr(pages[0].browser, "show", lambda number, picture, words: said.append(words))
         monkeypatch.setattr(pages[0].busy, "on", solved.append)
         pages[0].wish.set(number=12)
         while not said or "solved to its tolerance" not in said[-1]:

@@ -246,4 +246,4 @@ def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender,
     assert reading(model, loads, outside, tool) == Reading(told.value[0], None)
     assert reading(replace(model, tip=None), loads, answer, tool) == Reading(plain, None)
     assert reading(model, loads, answer, Blade()) is None and reading(model, loads, answer, None) is None
-    assert str(Reading(5.53e-3, 0.62e-3)) == "5.5 +- 0.6 mm" and str(Reading(5.53e-3, None)) == "5.5 mm"
+    assert str(Reading(5.53e-3, 0.62e-3)) == "5.5 +- 0.7 mm" and str(Reading(5.53e-3, None)) == "5.5 mm"
