@@ -14,7 +14,7 @@ import trimesh
 
 from scenes.paths import lay
 from scenes.scene import Scene
-from sim.effects import Elasticity, Held, Slide, ToolContact
+from sim.effects import Bonded, Elasticity, Held, ToolContact
 from sim.tools import Core
 
 MM = 1e-3
@@ -84,6 +84,6 @@ SCENE = Scene(
     __doc__ or "",
     lay(depth=4.0 * MM, rise=1.5),
     duration=3.0,
-    effects=(Elasticity(), Held(), Slide(), ToolContact((SUCKER.shape,))),
+    effects=(Elasticity(), Held(), Bonded(), ToolContact((SUCKER.shape,))),
     tool=SUCKER,
 )

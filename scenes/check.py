@@ -54,6 +54,9 @@ class Figures:
     leaked
         The volume that passes the closed skull in the finite elements' answers, as a share of what the opening takes
         in and gives out. Told, and held to nothing: see docs/verification.md.
+    bond
+        The largest traction between brain and skull, as a share of what their bond bears: above 1 it would tear. NaN
+        where nothing is bonded. Told, and held to nothing.
     """
 
     overlap: float
@@ -66,6 +69,7 @@ class Figures:
     answered: bool
     in_step: bool
     leaked: float
+    bond: float
     doubt: str = ""
 
     def broken(self, bounds: Bounds) -> list[str]:
@@ -117,6 +121,7 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
             for frame, time in zip(frames, truth.time, strict=True)
         ),
         leaked=float(truth.leaked.max()),
+        bond=float(truth.bond.max()),
         doubt="" if not doubts else doubts[0] + (f" ({len(doubts) - 1} more)" if doubts[1:] else ""),
     )
 

@@ -39,7 +39,7 @@ COMMANDS = {
 PLUGGED = ("train", "judge", "scenes", "demo", "render", "collect", "check")
 
 # Commands with commands of their own; the first is meant where none is named.
-INNER = {"bench": ("stages", "elements", "robust", "live", "growth", "throughput", "published", "solver")}
+INNER = {"bench": ("stages", "elements", "skull", "robust", "live", "growth", "throughput", "published", "solver")}
 
 
 POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+")

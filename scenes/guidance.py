@@ -13,7 +13,7 @@ EXAMPLES = {
   sulcus anatomy --labels labels.nii.gz --brain 1,2 --tumour 3 --opening-over 2 --out patient.vtu
 next: sulcus simulate brain.vtu --out brain.h5""",
     "solve": """example:
-  sulcus solve mesh.vtu --material neo-hookean --young 3000 --poisson 0.45 --out moved.vtu
+  sulcus solve mesh.vtu --material neo-hookean --young 3000 --poisson 0.49 --out moved.vtu
 next: open moved.vtu in ParaView; `displacement` is in metres""",
     "simulate": """example:
   sulcus simulate brain.vtu --out brain.h5 --count 1000

@@ -192,6 +192,7 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "a model of `sulcus train`": _is_model,
     "a graph of `sulcus export`": _is_graph,
     "a table of `sulcus sensitivity`": _begins(b"what,default,now,"),
+    "a table of `sulcus sensitivity --factorial`": _begins(b"opening [mm],depth [mm],"),
     "a page of `sulcus report`": _begins(b"<title>What accuracy costs in time</title>"),
     "a picture of sulcus": _is_picture,
     "a film of `sulcus render`": _is_film,

@@ -11,7 +11,7 @@ import numpy as np
 from ar.hud import bearings
 from ar.overlay import Style
 from ar.page_parts import Choice, Fold, Slider, Toggle
-from sim.effects import Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
+from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
 
 from .page_text import effect_words
 from .paths import AIR
@@ -64,7 +64,7 @@ def controls(
 def switched(scene: Scene, site: Site) -> list[str]:
     """Effects that a scene can be without: all but those that make it a body at rest."""
     kinds = (type(effect) for effect in scene.effects_on(site.anatomy))
-    return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Slide)]
+    return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Bonded, Slide)]
 
 
 def clocked(scene: Scene, site: Site) -> bool:

@@ -1,6 +1,6 @@
 """Heartbeat and breath lift the open brain under a ball that rests on it."""
 
-from sim.effects import Elasticity, Held, Pulsation, Slide, ToolContact
+from sim.effects import Bonded, Elasticity, Held, Pulsation, ToolContact
 
 from .paths import lay
 from .scene import PALPATION, Scene
@@ -10,5 +10,5 @@ SCENE = Scene(
     __doc__ or "",
     lay(depth=0.5e-3, rise=1.0),
     duration=6.0,
-    effects=(Elasticity(), Held(), Slide(), Pulsation(), ToolContact((PALPATION.shape,))),
+    effects=(Elasticity(), Held(), Bonded(), Pulsation(), ToolContact((PALPATION.shape,))),
 )

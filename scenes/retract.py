@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim.effects import Elasticity, Held, Retraction, Slide
+from sim.effects import Bonded, Elasticity, Held, Retraction
 from sim.material import BRAIN
 
 from .paths import lay
@@ -20,6 +20,6 @@ SCENE = Scene(
     __doc__ or "",
     lay(depth=8e-3, tilt=np.radians(30.0), rise=1.5),
     duration=4.0,
-    effects=(Elasticity(RELAXING), Held(), Slide(), Retraction(BLADE.shape)),
+    effects=(Elasticity(RELAXING), Held(), Bonded(), Retraction(BLADE.shape)),
     tool=BLADE,
 )

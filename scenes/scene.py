@@ -15,6 +15,7 @@ from ar.camera import Camera, look_at
 from sim.accuracy import LIVE, Accuracy
 from sim.anatomy import Anatomy
 from sim.effects import (
+    Bonded,
     Effect,
     Elasticity,
     Gravity,
@@ -22,7 +23,6 @@ from sim.effects import (
     Resection,
     Retraction,
     SkullContact,
-    Slide,
     ToolContact,
     ToolForce,
 )
@@ -117,7 +117,7 @@ class Scene:
     title: str
     path: Path = idle
     duration: float = 4.0
-    effects: tuple[Effect, ...] = (Elasticity(), Held(), Slide(), ToolForce())
+    effects: tuple[Effect, ...] = (Elasticity(), Held(), Bonded(), ToolForce())
     tool: Instrument | None = PALPATION
     lying: Lie = supine
     surgery: Debulking | None = None

@@ -15,7 +15,6 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.footprint import footprint_weights
 from sim.loads import Displaced, Loads, Pushed
-from sim.normals import blurred_normals
 from surrogate.patch import open_patch
 
 from .variant import Body, Variant, aimed
@@ -68,11 +67,11 @@ class Study:
 
     def fem(self, body: Body) -> Fem:
         """The finite elements of a body, for tools of either kind."""
-        tissue, anatomy = body.tissue, with_skull(self.anatomy, body)
-        _, *others = pushed_effects(anatomy, tissue)
+        tissue = body.tissue
+        _, *others = pushed_effects(self.anatomy, tissue, body.skull)
         elasticity = Elasticity(tissue, {TUMOUR_LABEL: replace(tissue, young=body.tumour * tissue.young)})
         effects = (elasticity, *others, ToolDisplacement())
-        return Fem(anatomy, effects, self.accuracy, self.device, element=body.element)
+        return Fem(self.anatomy, effects, self.accuracy, self.device, element=body.element)
 
 
 def rows(study: Study, changed: Sequence[Variant]) -> Iterator[Row]:
@@ -148,15 +147,3 @@ def moved_alike(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
     weight = footprint_weights(mesh.nodes, mesh.surface, cause.point, cause.footprint).toarray()
     motion = np.einsum("bv,bvi->bi", weight, answer.displacement)
     return Loads((Displaced(cause.point, motion, cause.footprint),), loads.time)
-
-
-def with_skull(anatomy: Anatomy, body: Body) -> Anatomy:
-    """The same anatomy whose sliding nodes are held, or slide along normals seen through a blur, as a body says."""
-    slides, normal = (anatomy.slide_normal != 0.0).any(axis=1), np.zeros_like(anatomy.slide_normal)
-    if body.held:
-        return replace(anatomy, held=anatomy.held | slides[:, None], slide_normal=normal)
-    if body.blur is None:
-        return anatomy
-    nodes, surface = anatomy.mesh.nodes, anatomy.mesh.surface
-    normal[slides] = blurred_normals(nodes, surface, nodes[slides], body.blur)
-    return replace(anatomy, slide_normal=normal)

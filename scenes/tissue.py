@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 
 from sim.discretisation import ELEMENTS, RECOMMENDED
+from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
 
@@ -32,6 +33,19 @@ def add_tissue_arguments(parser: argparse.ArgumentParser) -> None:
         "where mu and alpha are given with 2 mu/alpha^2, C is 2 mu",
     )
     parser.add_argument("--bulk", type=float, metavar="K", help="bulk modulus of --material ogden [Pa]")
+
+
+def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] = tuple(SKULLS)) -> None:
+    """Declare --skull, one of `choices`, the first of which is the default."""
+    words = {
+        "bonded": "the meninges hold the brain",
+        "slide": "it slides without friction and never comes off",
+        "contact": "it slides without friction, and comes off",
+    }
+    said = "; ".join(f"{name}, {words[name]}" for name in choices)
+    parser.add_argument(
+        "--skull", choices=choices, default=choices[0], help=f"how the skull holds the brain: {said} (%(default)s)"
+    )
 
 
 def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMENDED) -> None:

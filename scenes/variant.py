@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim.anatomy import Anatomy
+from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.loads import MAGNITUDE, Displaced, Loads, Pushed, stacked
 from sim.material import BRAIN, Material
@@ -19,14 +20,13 @@ from surrogate.sampling import across
 class Body:
     """What is pressed: the tissue, how many times as stiff the tumour is, the skull, the element.
 
-    The skull side is `held`, or slides: as the anatomy has it, or along normals seen through another `blur` [m]. Linear
-    tetrahedra lock as nu nears 0.5, which would pass for an influence of nu: hence smoothed ones.
+    `skull` is one of `sim.effects.SKULLS`. Linear tetrahedra lock as nu nears 0.5, which would pass for an influence of
+    nu: hence smoothed ones.
     """
 
     tissue: Material = BRAIN
     tumour: float = 1.0
-    held: bool = False
-    blur: float | None = None
+    skull: str = "bonded"
     element: str = "smoothed"
 
 
@@ -54,7 +54,7 @@ class Variant:
 
 
 def variants(anatomy: Anatomy, body: Body, elements: Sequence[str] = ()) -> list[Variant]:
-    """The tool's uncertainty, the tissue's, the skull's where it slides, and other `elements`."""
+    """The tool's uncertainty, the tissue's, the skull's, and other `elements`.""" ""
     tissue = body.tissue
     young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
     changed = [
@@ -77,11 +77,7 @@ def variants(anatomy: Anatomy, body: Body, elements: Sequence[str] = ()) -> list
         ),
     ]
     if anatomy.slide_normal.any():
-        changed.append(Variant("skull side", "slides", "held", replace(body, held=True)))
-        changed += [
-            Variant("skull's smoothness", "as meshed", f"{1e3 * blur:g} mm", replace(body, blur=blur))
-            for blur in (3e-3, 10e-3)
-        ]
+        changed += [Variant("skull", body.skull, skull, replace(body, skull=skull)) for skull in SKULLS]
     changed += [Variant("element", body.element, element, replace(body, element=element)) for element in elements]
     return [variant for variant in changed if variant.body != body or variant.aim != Aim()]
 

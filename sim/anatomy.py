@@ -25,7 +25,8 @@ class Anatomy:
     held
         (V, 3) bool: displacement components that are prescribed (zero, unless a load says otherwise).
     slide_normal
-        (V, 3): unit normal where a node slides along the skull, zero elsewhere.
+        (V, 3): unit outward normal of nodes that a skull covers, zero elsewhere. `Bonded`, `Slide` and `SkullContact`
+        say what it does.
     craniotomy
         (V,) bool: free surface nodes that a tool may touch.
 

@@ -62,7 +62,7 @@ class Bone:
 
 
 def bone_of(anatomy: Anatomy, space: Discretisation, gap: float) -> Bone:
-    """Over what slides, and over the craniotomy near its edge; `gap` [m] at rest. Held nodes do not move against it.
+    """Over what a skull covers, and over the craniotomy near its edge; `gap` [m] at rest. Held nodes stay.
 
     Raises
     ------

@@ -1,8 +1,6 @@
-"""What holds a brain: the brainstem fast, the skull sliding or fast, and the craniotomy open."""
+"""Where a brain is held: at the brainstem; where a skull stands over it; and where it is open."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 import numpy as np
 
@@ -10,22 +8,20 @@ from .anatomy import Anatomy
 from .errors import InputError
 from .geodesic import distances
 from .mesh import TetMesh
-from .normals import blurred_normals
+from .normals import vertex_normals
 from .placing import STEM
 
-Skull = Literal["slide", "held"]
 FEWEST_OPEN = 6  # nodes; fewer do not carry a tool
-# [m], a standard deviation: the skull's inside is smoother than a brain, whose folds must not catch in it.
-BLUR = 6e-3
 
 
-def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) -> Anatomy:
+def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float) -> Anatomy:
     """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
 
     Stem: surface nodes within 0.15 of the brain's height from the lowest one (least superior); held. Craniotomy:
     surface nodes within half of the diameter `craniotomy` [m] along the surface from the point nearest to `site`;
-    free. Skull: the rest of the surface; it slides (no motion along the outward normal of the body seen through a
-    blur of 6 mm) or is held.
+    free. Skull: the rest of the surface, each node with its unit normal n_i, along the integral of grad N_i: a body of
+    linear tetrahedra whose nodes do not move along theirs passes no volume through the skull (Engelman, Sani, Gresho
+    1982, Int. J. Numer. Methods Fluids 2:225-238). Effects say what the skull does.
 
     Raises
     ------
@@ -49,8 +45,5 @@ def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, skull: Skull) ->
     rest &= ~stem & ~opened
     if not rest.any():
         raise InputError(f"a craniotomy of {craniotomy * 1e3:g} mm leaves no skull: ask for a smaller one.")
-    held = stem | (rest & (skull == "held"))
-    normals = np.zeros_like(mesh.nodes)
-    if skull == "slide":
-        normals[rest] = blurred_normals(mesh.nodes, surface, mesh.nodes[rest], BLUR)
-    return Anatomy(mesh, np.repeat(held[:, None], 3, axis=1), normals, opened)
+    normals = np.where(rest[:, None], vertex_normals(mesh.nodes, surface), 0.0)
+    return Anatomy(mesh, np.repeat(stem[:, None], 3, axis=1), normals, opened)

@@ -20,6 +20,7 @@ from .constraint import Constraint
 from .device import Device
 from .discretisation import Discretisation, discretise
 from .effects import (
+    Bonded,
     BuiltIn,
     Effect,
     Elasticity,
@@ -98,8 +99,9 @@ def compile_problem(
             raise InputError(f"the effect {kind.__name__} is asked for {kinds.count(kind)} times: once is enough.")
     if Elasticity not in kinds:
         raise InputError("no effect resists deformation: add Elasticity.")
-    if Slide in kinds and SkullContact in kinds:
-        raise InputError("Slide and SkullContact contradict each other: one keeps the brain on the skull. Choose one.")
+    skulls = [kind.__name__ for kind in (Bonded, Slide, SkullContact) if kind in kinds]
+    if len(skulls) > 1:
+        raise InputError(f"{' and '.join(skulls)} contradict each other: each says what the skull does. Choose one.")
     space = space or discretise(anatomy.mesh, "p1")
     skin = skin or Skin(space.nodes, space.surface, device)
     terms: list[Term] = []
@@ -115,7 +117,9 @@ def compile_problem(
             case Pulsation():
                 pass  # elasticity swells
             case Held():
-                held = anatomy.held
+                held = held | anatomy.held
+            case Bonded():
+                held = held | (anatomy.slide_normal != 0.0).any(axis=1)[:, None]
             case Slide():
                 normal = anatomy.slide_normal
             case ToolForce():

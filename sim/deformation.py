@@ -88,6 +88,9 @@ class Deformation:
     leaked
         (B,): the volume that passes out through the closed skull, as a share of what the opening takes in and gives out
         (`leak.py`). NaN from a deformer that does not know, as a live frame on a card or a learnt model.
+    bond
+        (B,): the largest traction of a `Bonded` skull, as a share of what the bond bears (`bond.py`): above 1 it would
+        tear, and the answer is no longer one of its law. NaN where nothing is bonded, or from a deformer as above.
     bound
         (2, B) [m]: with probability 0.95, and 0.99, no tumour vertex is farther off what the deformer was taught; NaN
         from one that promises nothing.
@@ -107,12 +110,14 @@ class Deformation:
     reached: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     inverted: np.ndarray = field(default_factory=lambda: np.array(-1))
     leaked: np.ndarray = field(default_factory=lambda: np.array(np.nan))
+    bond: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     bound: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     source: str = ""
 
     def __post_init__(self) -> None:
         count = len(self.displacement)
-        for name, shape in (("reached", (count,)), ("inverted", (count,)), ("leaked", (count,)), ("bound", (2, count))):
+        shapes = {name: (count,) for name in ("reached", "inverted", "leaked", "bond")} | {"bound": (2, count)}
+        for name, shape in shapes.items():
             given = getattr(self, name)
             if given.shape != shape:
                 object.__setattr__(self, name, np.broadcast_to(given, shape))
@@ -135,6 +140,7 @@ class Deformation:
             reached=self.reached[index],
             inverted=self.inverted[index],
             leaked=self.leaked[index],
+            bond=self.bond[index],
             bound=self.bound[:, index],
             history={name: value[index] for name, value in self.history.items()},
         )
@@ -182,6 +188,7 @@ def joined(parts: Sequence[Deformation]) -> Deformation:
         reached=stacked("reached"),
         inverted=stacked("inverted"),
         leaked=stacked("leaked"),
+        bond=stacked("bond"),
         bound=np.concatenate([part.bound for part in parts], axis=1),
         source=parts[0].source,
     )

@@ -23,8 +23,7 @@ RECOMMENDED = "smoothed"
 """The element of every scene and command that names none, on meshes of linear tetrahedra."""
 
 
-# The least cosine between slide normals that agree, and between a wall's triangles and one that is theirs: less than
-# the 45 degrees of a box's edge.
+# The least cosine between the normal at the middle of an edge and the normals of its ends: less is another wall's.
 FACING = 0.75
 
 
@@ -118,8 +117,8 @@ class Discretisation:
         """Slide normals (N, 3) from the mesh's own (V, 3); held (V, 3) bool.
 
         An added node slides where its edge lies on a surface triangle whose corners all slide or are held. Its normal
-        is the mean of its ends'. Where these disagree, one that does not face as those triangles do (the edge of a box,
-        say, has another plane's too) does not count beside one that does.
+        is along the integral of its shape function's gradient, as that of the triangles that meet there, so that no
+        volume passes; where these do not face as its ends do (at the edge of a box, say), of those triangles alone.
         """
         out = np.zeros((self.count, 3))
         out[: len(normal)] = normal
@@ -128,18 +127,15 @@ class Discretisation:
         corners = self.mesh.surface
         slides = (normal != 0.0).any(axis=1)
         wall = (slides | held.all(axis=1))[corners].all(axis=1) & slides[corners].any(axis=1)
-        a, b, c = np.moveaxis(self.mesh.nodes[corners[wall]], 1, 0)
-        facing = np.zeros_like(out)
-        np.add.at(facing, self.surface[wall, 3:], np.cross(b - a, c - a)[:, None])
-        facing = unit(facing[len(normal) :])
-        ends = normal[self.edges]
-        counts = np.einsum("nei,ni->ne", ends, facing) > FACING
-        agreed = np.einsum("ni,ni->n", ends[:, 0], ends[:, 1]) > FACING
-        counts |= (agreed | ~counts.any(axis=1))[:, None]
-        mean = np.einsum("ne,nei->ni", counts, ends)
-        # Between ends that are both held it slides along its triangles.
-        mean = np.where((mean != 0.0).any(axis=1, keepdims=True), mean, facing)
-        out[len(normal) :] = np.where((facing != 0.0).any(axis=1, keepdims=True), unit(mean), 0.0)
+        a, b, c = np.moveaxis(self.mesh.nodes[corners], 1, 0)
+        twice = np.cross(b - a, c - a)
+        near, every = np.zeros_like(out), np.zeros_like(out)
+        np.add.at(near, self.surface[wall, 3:], twice[wall, None])
+        np.add.at(every, self.surface[:, 3:], twice[:, None])
+        near, every = unit(near[len(normal) :]), unit(every[len(normal) :])
+        agrees = (np.einsum("nei,ni->ne", normal[self.edges], every) > FACING) | ~slides[self.edges]
+        found = np.where(agrees.all(axis=1, keepdims=True), every, near)
+        out[len(normal) :] = np.where((near != 0.0).any(axis=1, keepdims=True), found, 0.0)
         return out
 
     def interpolated(self, field: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from .anatomy import Anatomy
 from .errors import InputError
 from .material import BRAIN, Tissue, check_described
+from .skull import Bonded, SkullContact, Slide, check_gap
 from .tools import Spatula, Tool, check_tool
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from .term import Term
 
 # Of `Pulsation`: shares of the volume, by which the opened template moves as much as opened brains do.
-CARDIAC, RESPIRATORY = 1.5e-3, 1.5e-3
+CARDIAC, RESPIRATORY = 4.5e-4, 4.5e-4
 LARGEST_WAVE = 0.3
 
 
@@ -56,11 +57,6 @@ class Held:
 
 
 @dataclass(frozen=True)
-class Slide:
-    """Nodes with a normal in `Anatomy.slide_normal` do not move along it; tangentially they are free."""
-
-
-@dataclass(frozen=True)
 class ToolForce:
     """A tool pushes with a known force: `Pushed` loads become dead tractions on its footprint."""
 
@@ -86,7 +82,7 @@ class Gravity:
 
     Left out: tissue that moves through the level, densities of tumour and oedema, fluid that does not surround the
     tissue (ventricles, cysts), tissue that loses water or is cut out, and the gap that opens where the brain sinks away
-    from the skull: with `Slide` it stays on it.
+    from the skull: with `Bonded` and `Slide` it stays on it.
 
     Parameters
     ----------
@@ -232,8 +228,8 @@ class Pulsation:
 
     By the same share at every point, without delay; where the skull is open it bulges. As it was in the scan at t = 0.
     With the default amplitudes and tissue the template's cortex in an opening of 50 mm moves by up to half a millimetre
-    from peak to peak, as is observed. The less tissue gives in volume the more it bulges: where Poisson's ratio is 0.49
-    a quarter of them does, and that is half a millilitre of blood each.
+    from peak to peak, as is observed; that is half a millilitre of blood each. The more tissue gives in volume the less
+    it bulges.
 
     Parameters
     ----------
@@ -267,7 +263,7 @@ class ToolContact:
     """Rigid tools, moved by pose, press and slide without friction on the tissue that they touch: `Touching` loads.
 
     Tissue begins to feel a tool at a distance of `gap` [m], and is never nearer than a few hundredths of that. Only
-    what no bone covers is touched: surface that is neither held nor slides.
+    what no bone covers is touched: surface that is neither held nor under the skull.
 
     Raises
     ------
@@ -284,7 +280,7 @@ class ToolContact:
             raise InputError("ToolContact has no tool: give at least one, such as Ball(7e-3), or leave the effect out.")
         for tool in self.tools:
             check_tool("ToolContact", tool)
-        _check_gap(self)
+        check_gap(type(self).__name__, self.gap)
 
 
 @dataclass(frozen=True)
@@ -305,38 +301,13 @@ class Retraction:
     def __post_init__(self) -> None:
         if not isinstance(self.blade, Spatula):
             raise InputError(f"Retraction has {self.blade!r} for a blade: give a Spatula; ToolContact has other tools.")
-        _check_gap(self)
-
-
-@dataclass(frozen=True)
-class SkullContact:
-    """The skull holds the brain on its side without friction, and lets go of it: where `Slide` would keep it on.
-
-    Nodes with a normal in `Anatomy.slide_normal` stay on their side of a wall across it that bends as the normals round
-    them do, `gap` [m] above where they are at rest; they feel it in the last tenth of a millimetre. Nodes of the
-    craniotomy rise in it freely, but meet bone beyond its edge, which is as round as the mesh is coarse there. The body
-    needs what `Held` holds: bone alone only bars its way.
-
-    Raises
-    ------
-    InputError
-        A gap that is not positive.
-    """
-
-    gap: float = 1e-4
-
-    def __post_init__(self) -> None:
-        _check_gap(self)
-
-
-def _check_gap(effect: ToolContact | Retraction | SkullContact) -> None:
-    if not 0.0 < effect.gap < math.inf:
-        raise InputError(f"{type(effect).__name__}.gap is {effect.gap} m: give a positive number.")
+        check_gap(type(self).__name__, self.gap)
 
 
 BuiltIn = (
     Elasticity
     | Held
+    | Bonded
     | Slide
     | ToolForce
     | ToolDisplacement
@@ -375,10 +346,14 @@ Effect = BuiltIn | OwnEffect
 """Everything that a scene may ask for."""
 
 
-def pushed_effects(anatomy: Anatomy, tissue: Tissue) -> tuple[Effect, ...]:
-    """What a tool that pushes on a body of this tissue calls for; sliding where the anatomy has it."""
-    slide = (Slide(),) if anatomy.slide_normal.any() else ()
-    return (Elasticity(tissue), Held(), *slide, ToolForce())
+SKULLS = {"bonded": Bonded(), "slide": Slide(), "contact": SkullContact()}
+"""What the skull may do, by name; the first is recommended, the others are its brackets."""
+
+
+def pushed_effects(anatomy: Anatomy, tissue: Tissue, skull: str = "bonded") -> tuple[Effect, ...]:
+    """What a tool that pushes on a body of this tissue calls for; one of `SKULLS` where the anatomy has a skull."""
+    covered = (SKULLS[skull],) if anatomy.slide_normal.any() else ()
+    return (Elasticity(tissue), Held(), *covered, ToolForce())
 
 
 def remember(effects: Iterable[Effect]) -> bool:

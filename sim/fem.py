@@ -17,13 +17,14 @@ from .accuracy import TRAIN, Accuracy
 from .alone import alone
 from .anatomy import Anatomy
 from .at_rest import Resting
+from .bond import Bond
 from .columns import unstacked
 from .compile import check_causes, compile_problem
 from .correction import step_from
 from .deformation import LEARNT_KEY, Cost, Deformation, check_start, joined
 from .device import find_device
 from .discretisation import discretise
-from .effects import Effect, Elasticity
+from .effects import Bonded, Effect, Elasticity
 from .elimination import eliminating
 from .errors import InputError
 from .following import Following
@@ -117,6 +118,8 @@ class Fem:
         patch = patching(problem, preconditioner, self.effects, self.space) if patching_pays else None
         inversion = Inversion(self.space, problem.device)
         self._leak = Leak(anatomy, self.space, problem.device)
+        bonded = (effect for effect in self.effects if isinstance(effect, Bonded))
+        self._bond = next((Bond(effect, anatomy, self.space, problem.device) for effect in bonded), None)
         self._ladder = Ladder(problem, preconditioner, inversion, accuracy, near, vicinity or patch)
         self._paced = lru_cache(KEPT)(self._ladder_over)
         self._resting = Resting(problem, preconditioner, accuracy.inner)
@@ -341,17 +344,16 @@ class Fem:
         solved = time.perf_counter()
         self.problem.begin(replace(cases, share=found.gone, anew=found.anew))
         history = {**self.problem.end(found.u), **found.learnt, **more}
-        on_footprint = None
-        if cases.loads.of(Displaced) is not None:
-            on_footprint = self.problem.constraint.force_on_footprint(self.problem.gradient(found.u))
+        displaced = cases.loads.of(Displaced) is not None
+        held = self.problem.gradient(found.u) if displaced or self._bond else None
+        on_footprint = self.problem.constraint.force_on_footprint(held) if displaced else None
         touching = [term.reaction(found.u) for term in self.problem.barriers]
         reaction = np.concatenate([self._reaction(cases.loads, on_footprint), *touching], axis=1)
-        vertices = len(self._anatomy.mesh.nodes)
-        nodes = np.arange(vertices) if at is None else at
+        nodes = np.arange(len(self._anatomy.mesh.nodes)) if at is None else at
         if at is None and len(self.space.edges):
             whole = unstacked(self.problem.device, found.u, np.arange(self.space.count))
-            displacement = np.ascontiguousarray(whole[:, :vertices])
-            history[MIDDLES] = whole[:, vertices:] - self.space.interpolated(displacement)[:, vertices:]
+            displacement = np.ascontiguousarray(whole[:, : len(nodes)])
+            history[MIDDLES] = whole[:, len(nodes) :] - self.space.interpolated(displacement)[:, len(nodes) :]
         else:
             displacement = unstacked(self.problem.device, found.u, nodes)
         return Deformation(
@@ -367,6 +369,7 @@ class Fem:
             reached=found.reached,
             inverted=found.inverted,
             leaked=self._leak.share(found.u),
+            bond=self._bond.share(held) if self._bond else np.array(np.nan),
             source=self.description,
         )
 

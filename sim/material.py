@@ -317,7 +317,7 @@ def coefficients_of(tissues: Sequence[Tissue], carries: str = "whole") -> np.nda
     return np.array([row + (0.0, 1.0) * ((longest - len(row)) // 2) for row in rows])
 
 
-BRAIN = Material("neo-hookean", 3000.0, 0.45)
+BRAIN = Material("neo-hookean", 3000.0, 0.49)
 """The recommended tissue, of every scene and command; the recommended element is `discretisation.RECOMMENDED`."""
 
 
@@ -331,18 +331,26 @@ class MaterialSet:
 
 
 MATERIALS = {
-    "default": MaterialSet(
-        BRAIN, "seconds", "recommended: `seconds`, at a Poisson's ratio that every element can take"
-    ),
+    "default": MaterialSet(BRAIN, "seconds", "recommended: `seconds`"),
     "seed": MaterialSet(
         Material("neo-hookean", 3330.0, 0.4945),
         "seconds",
         "small-strain equivalent of the two-term Ogden law of Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47",
     ),
     "seconds": MaterialSet(
-        Material("neo-hookean", 3000.0, 0.49),
+        BRAIN,
         "seconds",
         "customary in simulating neurosurgery: Wittek, Hawkins, Miller 2009, Biomech. Model. Mechanobiol. 8:77-84",
+    ),
+    "undrained": MaterialSet(
+        Material("neo-hookean", 3000.0, 0.499),
+        "the limit in which no fluid leaves the tissue",
+        "`seconds`, nearer to incompressible",
+    ),
+    "drained": MaterialSet(
+        Material("neo-hookean", 2100.0, 0.45),
+        "minutes to hours: the limit in which fluid has left the tissue; how fast it leaves is not modelled",
+        "E 2.1 kPa, nu 0.45 in brain that consolidates: Miga, Paulsen et al. 1999, IEEE Trans. Med. Imaging 18:866-874",
     ),
     # mu is read as the shear modulus, 2 mu / alpha^2 before the bracket, as in the measurements that the paper compares
     # itself with; if it were FEBio's c_1, the tissue would be half as stiff.

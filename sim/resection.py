@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .anatomy import Anatomy
-from .effects import Effect, Held, Resection, Slide
+from .effects import Bonded, Effect, Held, Resection, Slide
 from .errors import InputError
 from .holding import check_held, loosened
 
@@ -52,7 +52,7 @@ def bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[Remains, ...]:
     kinds = {type(effect) for effect in effects}
     held = Held in kinds or not anatomy.held.any()
     whole = anatomy if held else replace(anatomy, held=np.zeros_like(anatomy.held))
-    return remains(whole, cut, Slide in kinds)
+    return remains(whole, cut, bool(kinds & {Bonded, Slide}))
 
 
 def remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[Remains, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from .anatomy import Anatomy
-from .boundary import Skull, bounded
+from .boundary import bounded
 from .errors import InputError
 from .field import Field
 from .intensity import Intensity
@@ -22,7 +22,7 @@ SMALLEST_CRANIOTOMY, LARGEST_CRANIOTOMY = 0.015, 0.120  # [m]
 
 @dataclass(frozen=True)
 class Plan:
-    """How a subject becomes an anatomy: nodes wanted, diameter of the opening along the cortex [m], the skull's hold.
+    """How a subject becomes an anatomy: nodes wanted, diameter of the opening along the cortex [m].
 
     Raises
     ------
@@ -32,7 +32,6 @@ class Plan:
 
     nodes: int = 5300
     craniotomy: float = 0.050
-    skull: Skull = "slide"
 
     def __post_init__(self) -> None:
         if not FEWEST_NODES <= self.nodes <= MOST_NODES:
@@ -42,8 +41,6 @@ class Plan:
                 f"a craniotomy of {self.craniotomy * 1e3:g} mm is outside {SMALLEST_CRANIOTOMY * 1e3:g} to "
                 f"{LARGEST_CRANIOTOMY * 1e3:g} mm: choose a diameter between."
             )
-        if self.skull not in ("slide", "held"):
-            raise InputError(f"the skull cannot be {self.skull!r}: choose slide or held.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +87,7 @@ def make_anatomy(subject: Subject, plan: Plan) -> Anatomy:
     opening = subject.cortex[np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * plan.craniotomy]
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     solids = Solids(subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening)
-    return bounded(mesh_solids(solids, plan.nodes), subject.site, plan.craniotomy, plan.skull)
+    return bounded(mesh_solids(solids, plan.nodes), subject.site, plan.craniotomy)
 
 
 def rim(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:

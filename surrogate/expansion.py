@@ -31,6 +31,7 @@ from .sampling import spread
 from .series import SPANS, TERMS, Series
 from .split import Split
 from .tabulate import radii_between, tabulated, with_middles
+from .taught import taught_skull
 from .told import Told
 
 # Share of the responses that a learner's basis may lose, and its most modes; the same of the tables, and of the series.
@@ -241,7 +242,7 @@ class Expansion:
                 f"{self.data.path}: does not say what tissue it is of, so no series or contact can be had of it: "
                 "choose other learners, or simulate anew."
             )
-        effects = pushed_effects(self.data.anatomy, tissue_from_json(said["tissue"]))
+        effects = pushed_effects(self.data.anatomy, tissue_from_json(said["tissue"]), taught_skull(said))
         return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=said.get("element"))
 
 

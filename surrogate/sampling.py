@@ -9,6 +9,7 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.loads import Loads, Pushed
+from sim.material import BRAIN
 
 from .patch import Patch, nearest, open_patch
 
@@ -18,7 +19,7 @@ BLOCK, NUMBERS = 8192, 8
 # Deeper than this the tool has gone through the tissue; tissue harm begins at 2.7-4 kPa mean contact pressure.
 DEEPEST, HARDEST = 15e-3, 8e3
 # E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) judges a load before it is solved.
-PLANE_MODULUS = 3000.0 / (1.0 - 0.45**2)
+PLANE_MODULUS = BRAIN.young / (1.0 - BRAIN.poisson**2)
 # Radii and forces of a tool at which its nominal loads are counted.
 LATTICE = 200
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from sim.effects import (
+    SKULLS,
     Effect,
     Elasticity,
     Gravity,
@@ -27,25 +28,31 @@ ON_CALL = {kind.__name__ for kind in (ToolForce, ToolDisplacement, NodalForce, G
 UNSAID = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
 
 
-def taught_effects(model: Learned) -> frozenset[str]:
-    """Names of the effects that a model was taught under, as its file states them."""
-    if "effects" not in model.training:
+def taught_effects(told: Mapping[str, str]) -> frozenset[str]:
+    """Names of the effects that a model was taught under, or a data set was made under, as its file states them."""
+    if "effects" not in told:
         return UNSAID
-    match ast.parse(model.training["effects"], mode="eval").body:  # what `repr` of a tuple of effects gave
+    match ast.parse(told["effects"], mode="eval").body:  # what `repr` of a tuple of effects gave
         case ast.Tuple(elts):
             return frozenset(ast.unparse(one.func) for one in elts if isinstance(one, ast.Call))
     return frozenset()
 
 
+def taught_skull(told: Mapping[str, str]) -> str:
+    """What the skull did while a data set was made: one of `sim.effects.SKULLS`."""
+    names = taught_effects(told)
+    return next((name for name, effect in SKULLS.items() if type(effect).__name__ in names), "bonded")
+
+
 def refusal(model: Learned, effects: Iterable[Effect], element: str | None = None) -> str | None:
     """Why a model may not answer under these effects, on this element, or None if it may.
 
-    A model of poses answers where its ball touches, one of pushes where a tool's force acts. Where nothing slides in
-    its anatomy it is all one whether `Slide` is asked for. Tissue and element must be those that it learned from; an
-    `element` of None is not compared, nor what the model's file does not state.
+    A model of poses answers where its ball touches, one of pushes where a tool's force acts. Where its
+    anatomy has no skull it is all one whether `Bonded` or `Slide` is asked for. Tissue and element must be those that
+    it learned from; an `element` of None is not compared, nor what the model's file does not state.
     """
     effects = tuple(effects)
-    taught, asked = taught_effects(model), frozenset(type(effect).__name__ for effect in effects)
+    taught, asked = taught_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
     if model.ball is not None:
         here = next((effect.tools for effect in effects if isinstance(effect, ToolContact)), ())
         if here != (Ball(model.ball),):
@@ -54,7 +61,7 @@ def refusal(model: Learned, effects: Iterable[Effect], element: str | None = Non
     elif ToolForce.__name__ not in asked:
         others = ", ".join(sorted(asked - taught))
         return f"it was taught what a tool's force does, and here is none{f', but {others}' if others else ''}"
-    idle = set() if model.anatomy.slide_normal.any() else {"Slide"}
+    idle = set() if model.anatomy.slide_normal.any() else {"Bonded", "Slide"}
     strange, missing = asked - taught - idle, taught - asked - ON_CALL - idle
     if not strange and not missing:
         return _other_body(model, effects, element)

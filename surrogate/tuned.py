@@ -13,15 +13,15 @@ from .sampling import spread
 
 # The loads nearest to so many places far apart are left out of the inner fits: about this share of all.
 CENTRES, SHARE = 6, 0.2
-# Fewer loads choose nothing: the first settings are taken. Of the outputs the strongest decide.
-FEWEST, STRONGEST = 40, 8
+# Fewer loads choose nothing: the first settings are taken. So many choose, and of the outputs the strongest decide.
+FEWEST, MOST, STRONGEST = 40, 600, 8
 
 
 @dataclass(frozen=True)
 class Tuned:
     """Settings of a regressor, of which those are taken that are nearest on discs left out of the rows taught.
 
-    One fit for each of the settings, to the strongest outputs of four fifths of the rows, then one to all rows.
+    One fit for each of the settings, to the strongest outputs of four fifths of the first rows, then one to all rows.
 
     Parameters
     ----------
@@ -39,6 +39,7 @@ class Tuned:
         """Which of the settings has the least squared error on the discs; the same rows choose the same."""
         if len(X) < FEWEST or len(self.settings) == 1:
             return 0
+        X, Y = X[:MOST], Y[:MOST]
         left_out = inner_discs(X[:, :3])
         strongest = Y[:, np.sort(np.argsort(-Y.std(axis=0), kind="stable")[:STRONGEST])]
         errors = []

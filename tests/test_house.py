@@ -43,6 +43,7 @@ TIERS = (
         "amg",
         "inversion",
         "leak",
+        "bond",
         "patch",
         "rim",
         "compliance",

@@ -40,11 +40,11 @@ def test_a_scene_is_left_without_one_effect():
 def test_each_effect_has_its_row(theatre):
     both = replace(short(), effects=(*short().effects, Gravity()), lying=sinking().lying)
     found = {row.effect: row for row in rows(theatre, both, 1)}
-    assert list(found) == [ALL, "Elasticity", "Held", "Slide", "ToolForce", "Gravity"]
+    assert list(found) == [ALL, "Elasticity", "Held", "Bonded", "ToolForce", "Gravity"]
     assert "nothing else resists" in found["Elasticity"].refused and found["Elasticity"].milliseconds is None
     assert "can move rigidly" in found["Held"].refused
-    slide = found["Slide"]  # nothing slides in this body
-    assert slide.tumour_mm == slide.cortex_mm == 0.0 and not slide.refused
+    skull = found["Bonded"]  # this body has none
+    assert skull.tumour_mm == skull.cortex_mm == 0.0 and not skull.refused
     # Each moves the tumour, both together no farther than the sum.
     push, weight, whole = found["ToolForce"], found["Gravity"], found[ALL]
     assert push.tumour_mm > 0.1 and weight.tumour_mm > 0.1

@@ -37,6 +37,7 @@ def cost(modules: str = "", kernels: str = "", classes: str = "") -> Cost:
 OF_EFFECT = {
     "Elasticity": cost("elasticity invariants loops source", "loops:add_gradient", "Elasticity Kernels _Part"),
     "Held": cost(),
+    "Bonded": cost(),
     "Slide": cost(),
     "ToolForce": cost("dead_force", "dead_force:spread dead_force:subtract", "DeadForce Forces Kernels"),
     "ToolDisplacement": cost(),

@@ -37,7 +37,7 @@ def asked(*words: str) -> Tissue:
     [
         ((), BRAIN),
         (("--young", "5000"), Material(BRAIN.law, 5000.0, BRAIN.poisson)),
-        (("--material", "linear"), Material("linear", 3000.0, 0.45)),
+        (("--material", "linear"), Material("linear", 3000.0, 0.49)),
         (("--material", "corotational", "--poisson", "0.3"), Material("corotational", 3000.0, 0.3)),
         (("--material", "seconds"), Material("neo-hookean", 3000.0, 0.49)),
         (("--material", "seconds", "--young", "9000"), Material("neo-hookean", 9000.0, 0.49)),

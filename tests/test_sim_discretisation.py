@@ -12,10 +12,11 @@ from boxes import VTK_EDGES, base_held, box, hold, quadratic
 from sim.accuracy import Accuracy
 from sim.compile import compile_problem
 from sim.device import find_device
-from sim.discretisation import Discretisation, discretise
+from sim.discretisation import FACING, Discretisation, discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.errors import InputError
 from sim.fem import MIDDLES, Fem
+from sim.leak import surface_vectors
 from sim.loads import push
 from sim.mesh import TetMesh
 
@@ -86,38 +87,44 @@ def sliding() -> tuple[Discretisation, np.ndarray, np.ndarray, np.ndarray]:
     return space, held, normal, space.sliding(normal, held)
 
 
-def test_an_added_node_slides_where_a_wall_is_as_its_ends_do() -> None:
-    """Brute force over edges; between two held ends as the triangles beside it."""
+def test_an_added_node_slides_along_the_triangles_that_meet_there() -> None:
+    """Brute force over edges: along all of them where they face as its ends do, else along those of the wall."""
     space, held, normal, found = sliding()
     np.testing.assert_array_equal(found[: len(normal)], normal)
     slides = (normal != 0.0).any(axis=1)
-    between_held = 0
+    between_held = astray = 0
     for edge, got in zip(space.edges, found[len(normal) :], strict=True):
         walls = [
             triangle
             for triangle in triangles_round(ROUND, edge)
             if (slides | held.all(axis=1))[triangle].all() and slides[triangle].any()
         ]
-        expected = normal[edge].sum(axis=0)
-        if not slides[edge].any():
-            between_held += len(walls)
+        between_held += not slides[edge].any() and len(walls)
+        corners = ROUND.nodes[triangles_round(ROUND, edge)].reshape(-1, 3, 3)
+        expected = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+        if (normal[edge][slides[edge]] @ expected <= FACING * np.linalg.norm(expected)).any():
+            astray += 1
             corners = ROUND.nodes[walls].reshape(-1, 3, 3)
             expected = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
         expected = expected / np.linalg.norm(expected) if walls else np.zeros(3)
         np.testing.assert_allclose(got, expected, atol=1e-12)
     many = (found[len(normal) :] != 0.0).any(axis=1).sum()
     assert 20 < many < len(space.edges)
-    assert between_held
+    assert between_held and 0 < astray < many
 
 
-def test_on_a_ball_that_slides_every_normal_is_the_balls() -> None:
+def test_through_a_ball_that_slides_nothing_passes() -> None:
+    """Normals are along what a motion of their node sweeps, and as radial as its triangles allow."""
     surface = np.zeros(len(ROUND.nodes), bool)
     surface[ROUND.surface] = True
     space = discretise(ROUND, "p2")
     found = space.sliding(np.where(surface[:, None], ARM / LENGTH, 0.0), np.zeros((len(surface), 3), bool))
     wall = np.unique(space.surface)
     radial = space.nodes / np.maximum(np.linalg.norm(space.nodes, axis=1, keepdims=True), 1e-9)
-    np.testing.assert_allclose(found[wall], radial[wall], atol=1e-12)
+    assert (np.einsum("ni,ni->n", found[wall], radial[wall]) > np.cos(np.radians(20.0))).all()
+    middles = wall[wall >= len(ROUND.nodes)]
+    swept = surface_vectors(space.nodes, space.surface)
+    np.testing.assert_allclose(np.cross(found, swept)[middles], 0.0, atol=1e-12)
     assert not np.delete(found, wall, axis=0).any()
 
 

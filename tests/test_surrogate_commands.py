@@ -60,11 +60,11 @@ def test_training_prints_every_figure_and_writes_every_model(folder, box, capsys
     for row in rows.values():
         assert figures | {"microseconds", "bound_mm"} <= set(row) and all(row[name] > 0 for name in figures)
     # A box so coarse has few nodes outside the discs to interpolate from: the linear share is off too.
-    assert rows["linear"]["mean_percent"] < 14.0 and rows["series"]["mean_percent"] < rows["linear"]["mean_percent"]
+    assert rows["linear"]["mean_percent"] < 16.0 and rows["series"]["mean_percent"] < rows["linear"]["mean_percent"]
     assert report["winner"] == min(rows.values(), key=lambda row: row["mean_mm"])["name"]
     assert report["discs"] >= 6 and report["share_of_patch"] >= 0.15
     assert report["taught"] + report["held_out"] + report["calibrated"] == 150
-    assert report["nominal_refused"] == pytest.approx(0.12, abs=0.005)
+    assert report["nominal_refused"] == pytest.approx(0.10, abs=0.005)
     solves = {name: row["told"] for name, row in rows.items()}
     assert {told["loads"] for told in solves.values()} == {report["taught"]}
     assert solves["series"]["series"] > 0 == solves["svr"]["series"] and solves["series"]["seconds"] > 0.0

@@ -176,6 +176,6 @@ def test_the_share_of_nominal_loads_that_are_not_drawn(name):
 
 
 def test_nominal_loads_of_palpation_are_refused_in_words():
-    assert refused_words("palpation").startswith("12 % of the nominal loads of palpation")
+    assert refused_words("palpation").startswith("10 % of the nominal loads of palpation")
     assert refused_share("mixed") == pytest.approx(np.mean([refused_share(name) for name in TOOLS]))
     assert refused_share("seed") == refused_share("anything") == 0.0 and refused_words("seed") == ""

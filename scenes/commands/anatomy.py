@@ -34,7 +34,6 @@ DEFAULTS = {
     "tumour_shape": "sphere",
     "site": "central",
     "craniotomy": 50.0,
-    "skull": "slide",
 }
 PRESETS = {
     "default": {},
@@ -42,7 +41,7 @@ PRESETS = {
     "subcortical": {"cover": 10.0},
     "deep": {"cover": 25.0},
     # Tonutti et al. 2017: forces from 20 mm off the centre of a tumour of 12 mm radius, 98 cm2 of cortex left free.
-    "seed": {"cover": 8.0, "craniotomy": 110.0, "skull": "held"},
+    "seed": {"cover": 8.0, "craniotomy": 110.0},
 }
 PLACED = ("radius", "cover", "tumour_shape", "site", "tumour_at")
 
@@ -54,7 +53,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--nodes", type=int, default=5300, metavar="N", help="nodes wanted, 2000 to 250000 (%(default)s)"
     )
     parser.add_argument("--craniotomy", type=float, metavar="MM", help="diameter along the cortex [mm] (50)")
-    parser.add_argument("--skull", choices=("slide", "held"), help="how the brain's surface meets the skull (slide)")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="default", help="values of what is not given")
     add_opening_arguments(parser)
     own = parser.add_argument_group("your own brain")
@@ -87,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     beside = sidecar(args.out)
     claimed(beside, ".gz", "a scan that sulcus put beside an anatomy", args.force, read)
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
-    plan = Plan(args.nodes, 1e-3 * chosen["craniotomy"], chosen["skull"])
+    plan = Plan(args.nodes, 1e-3 * chosen["craniotomy"])
     with stage("labels" if args.labels else "template"):
         subject = opened(_subject(args, chosen), args)
     for note in subject.notes:

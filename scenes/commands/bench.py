@@ -8,6 +8,7 @@ import importlib
 BENCHES = {
     "stages": "what each stage costs on this machine (this one if none is named)",
     "elements": "how far each element is from the limit of fine meshes, and what it costs",
+    "skull": "how far the tumour moves under each skull, on meshes of several sizes, and what passes",
     "robust": "how many of thousands of random loads converge",
     "live": "what a frame of a moving tool takes, warm-started, and how far off it is",
     "growth": "what a load takes in seconds and memory, the finer the mesh the more, and what preconditions it",

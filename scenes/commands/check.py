@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         print(
             f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}: the tumour is off by {figures.error_mm:.3f} "
             f"mm of the {figures.motion_mm:.2f} mm that it moves; its outline by {figures.drawn:.1f} px, overlap "
-            f"{figures.overlap:.3f} (1 is best); {figures.leaked:.0%} leaks out of the skull",
+            f"{figures.overlap:.3f} (1 is best); {figures.leaked:.0%} leaks out of the skull{_bond(figures.bond)}",
             file=table,
         )
         if args.certify:
@@ -76,6 +77,11 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"passed": passed, "scenes": rows}))
     return 0 if passed else 1
+
+
+def _bond(share: float) -> str:
+    """How near the skull's bond comes to tearing, where there is one."""
+    return f", whose bond bears {share:.0%} of its strength" if math.isfinite(share) else ""
 
 
 def _certificates(

@@ -31,7 +31,7 @@ from surrogate.simulate import Solved, simulate
 from ..beside import remove_data
 from ..output import add_force, claimed
 from ..shipped import template_path
-from ..tissue import add_element_argument, add_tissue_arguments, tissue_of
+from ..tissue import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
 
 INTERRUPTED = 130
 DATA = "a data set of `sulcus simulate`"
@@ -59,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
     add_tissue_arguments(parser)
     add_element_argument(parser)
+    add_skull_argument(parser, ("bonded", "slide"))
     parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
     parser.add_argument(
         "--batch", type=int, help=f"loads solved together (default: as fit, up to {WIDEST}, on CUDA {WIDEST_ON_CUDA})"
@@ -76,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         ball, loads = _drawn(args, anatomy)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
     tissue = tissue_of(args)
-    effects: tuple[Effect, ...] = (*pushed_effects(anatomy, tissue), NodalForce())
+    effects: tuple[Effect, ...] = (*pushed_effects(anatomy, tissue, args.skull), NodalForce())
     if ball is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
         effects = (*passive, ToolContact((ball,)))

@@ -12,14 +12,14 @@ import numpy as np
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, guess
-from sim.effects import Effect, Elasticity, Held, NodalForce, Slide
+from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Cause, Loads, Nodal, Prescribed
 from sim.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 
 from ..output import add_force, claimed
-from ..tissue import add_element_argument, add_tissue_arguments, regions_of, tissue_of
+from ..tissue import add_element_argument, add_skull_argument, add_tissue_arguments, regions_of, tissue_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", required=True, help=".vtu in metres with point data `displacement` [m]; not the mesh itself"
     )
+    # What the file says: who compares with another program means its constraints.
+    add_skull_argument(parser, ("slide", "bonded", "contact"))
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="changes nothing: the result is one JSON line in any case")
 
@@ -67,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     clock = time.perf_counter()
     effects: list[Effect] = [Elasticity(tissue, regions), Held(), NodalForce()]
     if anatomy.slide_normal.any():
-        effects.append(Slide())
+        effects.append(SKULLS[args.skull])
     # The file's own elements: who compares with another program means the same discretisation.
     element = args.element or ("p1" if anatomy.mesh.middles is None else "p2")
     fem = Fem(anatomy, effects, accuracy, args.device, element=element)
@@ -76,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
     outcome, residual = deformation.outcome[0], float(deformation.residual[0])
     reached, inverted = float(deformation.reached[0]), int(deformation.inverted[0])
-    leaked = float(deformation.leaked[0])
+    leaked, bond = float(deformation.leaked[0]), float(deformation.bond[0])
     if reached < 1.0:
         what = f"in equilibrium under {reached:.1%} of the load" if reached else "the last state, in no equilibrium"
         print(f"{args.mesh}: {outcome.value}; what is written is {what}", file=sys.stderr)
@@ -90,10 +92,12 @@ def run(args: argparse.Namespace) -> int:
         "load_fraction": reached,
         "element": fem.space.element,
         "tissue": str(effects[0]),
+        "skull": args.skull if anatomy.slide_normal.any() else None,
         "nodes": fem.space.count,
         "seconds": round(seconds, 4),
         "inverted_tetrahedra": inverted,
         "leaked": leaked if np.isfinite(leaked) else None,
+        "bond": bond if np.isfinite(bond) else None,
         "largest_displacement_mm": round(1e3 * float(np.linalg.norm(deformation.displacement[0], axis=1).max()), 6),
         "out": str(out),
     }

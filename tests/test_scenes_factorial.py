@@ -1,0 +1,80 @@
+"""Every combination of what is not known: which factors decide, alone and together."""
+
+import csv
+import json
+from itertools import product
+
+import numpy as np
+import pytest
+
+from scenes import factorial
+from scenes.cli import main
+from scenes.factorial import LEVELS, Cell, cells, panels, shares
+
+FEW = {
+    "opening [mm]": (50.0,), "depth [mm]": (10.0,), "skull": ("bonded", "slide"), "nu": (0.45, 0.49),
+    "tumour's stiffness": (1.0,),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def few():
+    return list(cells(FEW, 2000, "cpu"))
+
+
+def made(rule):
+    """Cells of a rule for the motion."""
+    levels = {"opening [mm]": (30.0, 50.0), "nu": (0.45, 0.49), "skull": ("bonded", "slide")}
+    combinations = [dict(zip(levels, each, strict=True)) for each in product(*levels.values())]
+    return [Cell(each, rule(each), 1.0) for each in combinations]
+
+
+def test_a_factor_that_multiplies_acts_alone():
+    """The motion's logarithm is a sum, so that its variance is that of its parts."""
+    found = shares(
+        made(lambda at: 2.0 * (3.0 if at["skull"] == "slide" else 1.0) * (np.e if at["nu"] == 0.45 else 1.0))
+    )
+    a, b = np.log(3.0) ** 2, 1.0
+    assert found["skull"] == pytest.approx(a / (a + b)) and found["nu"] == pytest.approx(b / (a + b))
+    assert list(found)[:2] == ["skull", "nu"] and max(list(found.values())[2:]) < 1e-12
+
+
+def test_what_acts_only_together_is_an_interaction():
+    found = shares(made(lambda at: np.e if (at["skull"] == "slide") == (at["nu"] == 0.45) else 1.0))
+    assert found["nu x skull"] == pytest.approx(1.0) and next(iter(found)) == "nu x skull"
+    assert found["opening [mm]"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_what_did_not_converge_is_left_out():
+    found = made(lambda at: np.nan if at["opening [mm]"] == 30.0 else 1.0 + (at["nu"] == 0.45))
+    assert "opening [mm]" not in shares(found) and shares(found)["nu"] == pytest.approx(1.0)
+
+
+def test_every_combination_is_solved(few):
+    assert [(cell.levels["skull"], cell.levels["nu"]) for cell in few] == list(product(FEW["skull"], FEW["nu"]))
+    motion = {(cell.levels["skull"], cell.levels["nu"]): cell.force for cell in few}
+    assert motion["slide", 0.49] > motion["bonded", 0.49] > 0.1 and motion["bonded", 0.45] > motion["bonded", 0.49]
+    default = few[1]
+    assert default.levels["nu"] == 0.49 and default.motion == pytest.approx(default.force, rel=1e-2)
+
+
+def test_the_command_writes_table_and_plot(few, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(factorial, "cells", lambda nodes, device: iter(few))
+    words = ["sensitivity", "--factorial", "--out", str(tmp_path / "all.csv")]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "| skull " in said and "| nu x skull " not in said and "| skull x nu " in said
+    with open(tmp_path / "all.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["force_mm"]) for row in rows] == [cell.force for cell in few]
+    assert (tmp_path / "all.png").stat().st_size > 10_000
+    assert main([*words[:2], "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["failed"] == 0
+    assert main([*words, "--anatomy", "mine.vtu"]) == 2 and "leave --anatomy out" in capsys.readouterr().err
+
+
+def test_the_plot_has_a_panel_for_each_opening_and_a_curve_for_each_change():
+    whole = [Cell(dict(zip(LEVELS, each, strict=True)), 1.0, 1.0) for each in product(*LEVELS.values())]
+    drawn = panels(whole)
+    assert len(drawn) == 3 and [len(panel.curves) for panel in drawn] == [5, 5, 5]
+    assert [len(curve.points) for curve in drawn[0].curves] == [3] * 5
