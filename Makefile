@@ -19,11 +19,11 @@ lint: $(STAMP)
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/basedpyright
 
-# The anatomy and the models that ship with the package: seconds on a graphics card, half an hour on two cores.
+# The anatomy and the models that ship with the package: some minutes on a graphics card, an hour on two cores.
 template: $(STAMP)
 	$(VENV)/bin/sulcus anatomy --out scenes/data/template.vtu
-	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --count 6000 --out build/template.h5
-	$(VENV)/bin/sulcus train build/template.h5 --learners linear,ann,svr,series-gp --most 2000 --out scenes/data/template.model.npz
+	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --count 5000 --out build/template.h5
+	$(VENV)/bin/sulcus train build/template.h5 --learners linear,ann,svr,series,series-gp --most 2000 --out scenes/data/template.model.npz
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -60,7 +60,7 @@ class Svr:
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of features (B, f)."""
         squared = cdist((X - self.mean_) / self.deviation_, self.support_, "sqeuclidean")
-        return np.exp(squared / -X.shape[1]).astype(np.float32) @ self.dual_ + self.intercept_
+        return (np.exp(squared / -X.shape[1]) @ self.dual_ + self.intercept_).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
         """Standardisation, support vectors (s, f), dual coefficients (s, r), intercepts (r,)."""

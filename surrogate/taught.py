@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 
 from sim.effects import (
     SKULLS,
@@ -32,9 +33,10 @@ def taught_effects(told: Mapping[str, str]) -> frozenset[str]:
     """Names of the effects that a model was taught under, or a data set was made under, as its file states them."""
     if "effects" not in told:
         return UNSAID
-    match ast.parse(told["effects"], mode="eval").body:  # what `repr` of a tuple of effects gave
-        case ast.Tuple(elts):
-            return frozenset(ast.unparse(one.func) for one in elts if isinstance(one, ast.Call))
+    with suppress(SyntaxError):
+        match ast.parse(told["effects"], mode="eval").body:  # what `repr` of a tuple of effects gave
+            case ast.Tuple(elts):
+                return frozenset(ast.unparse(one.func) for one in elts if isinstance(one, ast.Call))
     return frozenset()
 
 

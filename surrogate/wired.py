@@ -36,8 +36,9 @@ def _ann(X: Wire, state: State) -> Wire:
 
 
 def _svr(X: Wire, state: State) -> Wire:
-    squared = squares_between((X - state["mean"]) / state["deviation"], state["support"])
+    squared = squares_between((X.of(np.float64) - state["mean"]) / state["deviation"], state["support"])
     near = (squared / -float(len(state["mean"]))).through("Exp")
+    # Under a large penalty this sum is a thousandth of its terms and less: it stays in double precision.
     return (near @ state["dual"] + state["intercept"]).of(np.float32)
 
 

@@ -53,7 +53,7 @@ def untaught(anatomy: Anatomy, scene: Scene) -> Learned:
     (ball,) = (tool for effect in scene.effects if isinstance(effect, ToolContact) for tool in effect.tools)
     assert isinstance(ball, Ball)
     patch = open_patch(anatomy)
-    fem = Fem(anatomy, (Elasticity(Material("linear", 5000.0, 0.45)), Held(), Slide()), REFERENCE, "cpu")
+    fem = Fem(anatomy, (Elasticity(Material("linear", 5000.0, 0.49)), Held(), Slide()), REFERENCE, "cpu")
     contact, bases = condensed(fem, [anatomy.tumour_nodes, np.setdiff1d(patch.nodes, anatomy.tumour_nodes)])
     envelope = Envelope(patch.points, 1.0, 1.0, np.pi, (1e-6, 1.0), (ball.radius, ball.radius), np.inf)
     said = {"effects": repr(scene.effects)}
@@ -105,7 +105,7 @@ class TestPalpate:
         assert len(pressed) > 3
         for frame in pressed:
             answer = drawn.draw(frame.number, frame.time, frame.touch).deformation
-            for nodes, most in ((anatomy.tumour_nodes, 0.15), (open_patch(anatomy).nodes, 0.2)):
+            for nodes, most in ((anatomy.tumour_nodes, 0.2), (open_patch(anatomy).nodes, 0.25)):
                 theirs = frame.deformation.at(nodes).displacement
                 off = np.linalg.norm(answer.at(nodes).displacement - theirs)
                 assert off < most * np.linalg.norm(theirs)

@@ -77,7 +77,7 @@ def test_no_force_no_motion_and_weak_loads_in_proportion(model, fresh):
 def test_learners_are_as_near_as_they_were(trained):
     """Each within a fifth to a third of what it scored when this was written; the table does not depend on luck."""
     mean = {row.name: row.mean_percent for row in trained.scores}
-    assert mean["linear"] == pytest.approx(6.90, rel=0.01)
+    assert mean["linear"] == pytest.approx(7.15, rel=0.01)
     known = {"pcr": 16.0, "ann": 2.4, "svr": 8.5, "gp": 1.3, "residual": 0.5}
     assert {name for name, most in known.items() if mean[name] > most} == set()
 
