@@ -13,6 +13,8 @@ Corner = Literal["top left", "top right", "bottom left", "bottom right"]
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 WHITE = (244, 244, 240)
 PAD = 8
+# Scale of the lines at the foot of a picture, and from one's baseline to the next [pixel].
+FINE, ROW = 0.45, 18
 # The patient's sides along the axes of RAS, and against them.
 SIDES = ("RL", "AP", "SI")
 # A direction's second letter is told where it is more than so much of it.
@@ -33,6 +35,12 @@ def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5
     halo = cv2.dilate(halo, np.ones((3, 3), np.uint8))[..., None] / 255.0
     colour[box] = colour[box] * (1.0 - halo) + 12.0 * halo
     cv2.putText(colour, text, (column, row), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
+
+
+def foot(colour: np.ndarray, text: str, row: int, right: bool = False, ink: Sequence[float] = WHITE) -> None:
+    """Write a line into the picture's lower left corner, or lower right, so many rows over its foot, in place."""
+    width = cv2.getTextSize(text, FONT, FINE, 1)[0][0]
+    write(colour, text, (colour.shape[1] - PAD - width if right else PAD, colour.shape[0] - PAD - row * ROW), FINE, ink)
 
 
 def millimetres(length: float, error: float | None = None) -> str:
@@ -93,11 +101,12 @@ def marked(colour: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """
     out = colour.copy()
     height, width = out.shape[:2]
+    # Not at the middles of top and foot: tools come in there, and a tumour may reach down to the foot.
     at = {
         "left": (8, height // 2),
         "right": (width, height // 2),
-        "top": (width // 2, 0),
-        "bottom": (width // 2, height),
+        "top": (width // 4, 0),
+        "bottom": (3 * width // 4, height),
     }
     for edge, letters in bearings(rotation).items():
         (long, tall), _ = cv2.getTextSize(letters, FONT, 0.6, 1)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from .camera import Camera
-from .hud import PAD, millimetres, write
+from .hud import foot, millimetres, write
 from .layer import Layer, vertex_normals
 from .raster import Fragments, rasterise
 from .view import Picture
@@ -97,8 +97,9 @@ def composite(
         Where the hidden surface was before, as in the scan: a dotted grey outline, with an arrow from there to here and
         the mean motion in millimetres; what that may be off by is the largest margin.
     doubt
-        Why the surface's place may not be relied on. It is written at the picture's foot, the outline is amber and
-        broken, and nothing is promised: no margin is drawn, and the number beside the line has no error.
+        Why the surface's place may not be relied on. It is written at the picture's foot, see
+        `doubt_lines`, the outline is amber and broken, and nothing is promised: no margin is drawn, and the number
+        beside the line has no error.
 
     Raises
     ------
@@ -145,11 +146,15 @@ def composite(
         write_gauge(out, camera, replace(gauge, error=None) if doubt else gauge)
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
-        error = float(np.max(margin)) or None
-        write(out, f"moved {millimetres(motion, error)}", (box[1].start + SURROUND, box[0].stop - PAD), 0.5)
-    if doubt:
-        write(out, doubt, (PAD, camera.height - PAD), 0.5, ink_of(WARNING))
+        foot(out, f"moved {millimetres(motion, float(np.max(margin)) or None)}", 0)
+    for row, part in enumerate(reversed(doubt_lines(doubt)), start=1):
+        foot(out, part, row, ink=ink_of(WARNING))
     return replace(picture, colour=out)
+
+
+def doubt_lines(doubt: str) -> list[str]:
+    """A doubt as it is written: its reason, and what follows from it; nothing where there is none."""
+    return [part for part in doubt.split(": ") if part]
 
 
 def ink_of(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:

@@ -8,14 +8,14 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from ar.camera import Camera, project_cv2
-from ar.hud import WHITE, millimetres
+from ar.hud import FINE, WHITE, millimetres
 from ar.overlay import DOUBTFUL, GAUGE, ink_of, iou, silhouette
 from ar.raycast import raycast
 from ar.refind import outline_gap, stands
 from sim.deformation import Deformation
 from surrogate.learned import Learned
 
-from .play import SMALL, Frame, Player
+from .play import Frame, Player
 from .scene import Bounds
 from .stage import TOOL, TUMOUR_COLOUR
 
@@ -165,7 +165,7 @@ def _drawn(player: Player, camera: Camera, frame: Frame, truth: Deformation, row
 
 def _printed(player: Player, frame: Frame) -> bool:
     """Whether a picture says its frame's number, and how far the tip is from the tumour: both as found here."""
-    if not stands(frame.shown, f"frame {frame.number}", SMALL):
+    if not stands(frame.shown, f"frame {frame.number}", FINE):
         return False
     if frame.tip is None:
         return True

@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 
 from ar.camera import Camera
-from ar.hud import PAD, panel, write
+from ar.hud import foot, panel
 from ar.layer import Layer
-from ar.overlay import Gauge, Style, composite
+from ar.overlay import Gauge, Style, composite, doubt_lines
 from ar.view import Picture, render
 from sim.closest import closest
 from sim.deformation import Deformation, Deformer
@@ -33,7 +33,6 @@ IN_BONE = "the bone is where this push needs the tool: do not rely on it"
 # Tissue may carry a tool into the bone's edge by so much before it is drawn elsewhere, and before its load counts as
 # none that a tool can make [m].
 CARRIED, BLOCKED = 0.5e-3, 2e-3
-SMALL = 0.45
 STAGES = ("deform", "render", "overlay")
 """What the time of a frame is spent on."""
 
@@ -94,12 +93,11 @@ class Frame:
 class HeldTool:
     """Where a tool is drawn: tip (3,) [m], and T_world_tool pose (4, 4).
 
-    lift [m]: how far an idle one is off the tissue; beyond [m]: how far inside the bone its load needs it.
+    beyond [m]: how far inside the bone its load needs it.
     """
 
     tip: np.ndarray
     pose: np.ndarray
-    lift: float
     beyond: float
 
 
@@ -166,7 +164,7 @@ class Player:
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
         over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt).colour
         remark = self.scene.stopped(self.site, touch)
-        annotate(over, number, remark)
+        annotate(over, number, remark, doubt)
         spent = seconds, rendered - begun, clock.perf_counter() - rendered
         return Frame(
             number, float(loads.times[0]), touch, loads, deformation, self.camera,
@@ -178,10 +176,9 @@ class Player:
 
     def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
         """From the tip to the tumour, and how far off that may be as far as the deformer knows."""
-        told = None if held.beyond > CARRIED else reading(self.deformer, loads, answer, self.scene.tool, held.lift)
-        if told is None:
-            return gauged(held.tip, tumour)
-        return replace(gauged(held.tip, tumour), read=told.distance, error=told.bound)
+        gauge = gauged(held.tip, tumour)
+        told = None if held.beyond > CARRIED else reading(self.deformer, loads, answer, self.scene.tool, gauge.distance)
+        return gauge if told is None else replace(gauge, read=told.distance, error=told.bound)
 
     def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
         """How far each vertex of the drawn tumour may be off [m]: what the model promises of this load, if it does."""
@@ -210,7 +207,7 @@ class Player:
         It is lifted off where it is idle. Tissue that is drawn aside may carry it to the bone's edge, which stops it.
         """
         if self.scene.posed:
-            return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), 0.0, 0.0)
+            return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), 0.0)
         inward = self.site.axis
         carried = self.scene.contact(self.site, touch).carried(positions)
         inside = self.site.within(carried, tool.radius)
@@ -218,10 +215,9 @@ class Player:
         tip = through = inside if beyond > CARRIED else carried
         if isinstance(tool, Probe):
             tip = resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
-        lift = lifted(touch.force)
-        tip = tip - lift * inward
+        tip = tip - lifted(touch.force) * inward
         pose = tool.pose(tip, inward, self.site.right)
-        return HeldTool(tip, pose, lift, beyond)
+        return HeldTool(tip, pose, beyond)
 
 
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
@@ -229,12 +225,10 @@ def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
     return Gauge(tip, closest(tip[None], hidden.vertices[hidden.triangles]).point[0])
 
 
-def annotate(colour: np.ndarray, number: int, remark: str) -> None:
-    """Write a frame's number at the right of the picture's foot, and a remark above its left, in place."""
-    height, width, _ = colour.shape
-    write(colour, f"frame {number}", (width, height - PAD), SMALL)
-    if remark:
-        write(colour, remark, (PAD, height - 4 * PAD), SMALL)
+def annotate(colour: np.ndarray, number: int, remark: str, doubt: str) -> None:
+    """Write a frame's number at the right of the picture's foot, and a remark over the words at its left, in place."""
+    foot(colour, f"frame {number}", 0, right=True)
+    foot(colour, remark, 1 + len(doubt_lines(doubt)))
 
 
 def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from ar.hud import millimetres
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Deformer
@@ -34,11 +36,31 @@ class Reading:
 
 
 def reading(
-    deformer: Deformer, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float = 0.0
+    deformer: Deformer, loads: Loads, answer: Deformation, tool: Instrument | None, apart: float
 ) -> Reading | None:
     """Read the distance in the first load case of a deformer's answer; None where no single ball pushes or is moved.
 
     Of finite elements it is their own and has no bound. A learnt model promises nothing outside what it was taught.
+
+    Parameters
+    ----------
+    apart
+        How far [m] the tip is from the tumour where both are drawn.
+    """
+    if _ball(loads, tool) is None:
+        return None
+    if not isinstance(deformer, Learned):
+        return Reading(apart, None)
+    found = deformer.distance(loads, answer, np.array([apart]))
+    promised = float(found.bound[0, 0])
+    kept = answer.outcome[0].good and promised < float("inf")
+    return Reading(float(found.value[0]), promised if kept else None)
+
+
+def measured(
+    anatomy: Anatomy, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float
+) -> Reading | None:
+    """Measure the distance in an answer, whoever gave it; nothing is said of its error.
 
     Parameters
     ----------
@@ -52,20 +74,6 @@ def reading(
     InputError
         An answer without open cortex or tumour.
     """
-    if _ball(loads, tool) is None:
-        return None
-    if not isinstance(deformer, Learned):
-        return measured(deformer.anatomy, loads, answer, tool, lift)
-    found = deformer.distance(loads, answer, lift)
-    promised = float(found.bound[0, 0])
-    kept = answer.outcome[0].good and promised < float("inf")
-    return Reading(float(found.value[0]), promised if kept else None)
-
-
-def measured(
-    anatomy: Anatomy, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float
-) -> Reading | None:
-    """Measure the distance in an answer, whoever gave it, as `reading` does; nothing is said of its error."""
     ball = _ball(loads, tool)
     if ball is None:
         return None

@@ -270,15 +270,15 @@ class Learned:
         told = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *self.envelope.force)))
         return np.where(weaker > 0.0, bound.of(told, known.magnitude, excess), 0.0) * weaker
 
-    def distance(self, loads: Loads, answer: Deformation | None = None, lift: float = 0.0) -> Distance:
+    def distance(self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None) -> Distance:
         """Predict the distance from the tool's tip to the tumour, both in the deformed brain, see `sim.tip.TipGauge`.
 
         Parameters
         ----------
         answer
             What this model answered the loads with, if that is known: of the open cortex and the tumour at least.
-        lift
-            How far [m] a tool that pushes has been lifted off again, against the open cortex's inward axis.
+        apart
+            (B,) [m]: the distance in that answer, where it is measured already, as of a tool that is lifted off again.
 
         Raises
         ------
@@ -286,13 +286,14 @@ class Learned:
             Loads of another kind, or an answer that does not know the open cortex and the tumour.
         """
         pushed = self.asked(loads)
-        if answer is None:
-            answer = self.deform(loads, at=self.nodes)
-        found = tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.ball, lift)
+        if apart is None:
+            if answer is None:
+                answer = self.deform(loads, at=self.nodes)
+            apart = tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.ball)
         tip = self.tip or TipModel()
         magnitude, direction = directions(pushed)
         within = np.clip(magnitude, *self.envelope.force)[:, None] * direction
-        found = tip.corrected(found, self._patch, replace(pushed, force=within), magnitude)
+        found = tip.corrected(apart, self._patch, replace(pushed, force=within), magnitude)
         known = measured(self._patch, pushed)
         return Distance(found, self._promised(tip.bound, pushed, known, self.envelope.excess(pushed, known)))
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ar.camera import look_at
-from ar.hud import panel, write
+from ar.hud import FINE, panel, write
 from ar.layer import Layer, Solid, vertex_normals
 from ar.overlay import BEFORE, DOUBTFUL, GAUGE, WARNING, Gauge, composite, ink_of, iou, silhouette
 from ar.refind import outline_gap, stands
@@ -224,8 +224,8 @@ def test_the_picture_says_how_far_the_tumour_moved_and_how_far_off_that_may_be()
     far = np.linspace(0.002, 0.004, len(now.vertices))[:, None] * [1.0, 0.0, 0.0]
     margin = np.linspace(0.0005, 0.0015, len(now.vertices))
     before = replace(now, vertices=now.vertices - far)
-    assert stands(composite(picture, here, now, margin=margin, before=before).colour, "moved 3.0 +- 1.5 mm", 0.5)
-    assert stands(composite(picture, here, now, before=before).colour, "moved 3.0 mm", 0.5)
+    assert stands(composite(picture, here, now, margin=margin, before=before).colour, "moved 3.0 +- 1.5 mm", FINE)
+    assert stands(composite(picture, here, now, before=before).colour, "moved 3.0 mm", FINE)
 
 
 def test_the_arrow_points_to_where_the_tumour_is_now():
@@ -240,18 +240,30 @@ def test_the_arrow_points_to_where_the_tumour_is_now():
     assert near[1] > 1.5 * near[0] > 0
 
 
+def test_motion_and_doubt_stand_on_lines_of_their_own():
+    """A margin that nobody knows is not told."""
+    here = camera(400, 300)
+    picture = render(here, [cortex()], LAMP)
+    before, now = tumour((0.0, 0.0, -0.02)), tumour((0.003, 0.0, -0.02))
+    doubt = "outside what the model learned: do not rely on it"
+    shown = composite(picture, here, now, before=before, margin=np.nan, doubt=doubt).colour
+    assert stands(shown, "moved 3.0 mm", FINE)
+    assert all(stands(shown, part, FINE, ink_of(WARNING)) for part in doubt.split(": "))
+    assert stands(composite(picture, here, now, before=before, margin=np.nan).colour, "moved 3.0 mm", FINE)
+
+
 def test_of_what_may_not_be_relied_on_nothing_is_promised():
     """The reason stands in the picture, the outline is amber, and there is neither margin nor +-."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
     sure = composite(picture, here, tumour(), margin=0.004, gauge=gauge).colour
-    assert stands(sure, "8.0 +- 1.2 mm", GAUGE) and not stands(sure, "do not rely on it", 0.5, ink_of(WARNING))
+    assert stands(sure, "8.0 +- 1.2 mm", GAUGE) and not stands(sure, "do not rely on it", FINE, ink_of(WARNING))
     unsure, plain = (
         composite(picture, here, tumour(), margin=margin, gauge=gauge, doubt="do not rely on it").colour
         for margin in (0.004, 0.0)
     )
-    assert stands(unsure, "8.0 mm", GAUGE) and stands(unsure, "do not rely on it", 0.5, ink_of(WARNING))
+    assert stands(unsure, "8.0 mm", GAUGE) and stands(unsure, "do not rely on it", FINE, ink_of(WARNING))
     assert np.array_equal(unsure, plain)
     amber, green = (
         (np.abs(unsure.astype(int) - ink) <= 2).all(axis=2).sum() for ink in map(ink_of, (DOUBTFUL, (0.2, 0.9, 0.3)))

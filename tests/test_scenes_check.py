@@ -103,7 +103,7 @@ def drawn(play, frame, positions, camera=None, tip=None):
     if tip is None:
         gauge = replace(gauge, read=frame.distance, error=frame.distance_error)
     shown = composite(frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauge, before=rest).colour
-    annotate(shown, frame.number, frame.remark)
+    annotate(shown, frame.number, frame.remark, frame.doubt)
     return replace(frame, shown=shown)
 
 

@@ -10,10 +10,10 @@ from theatres import small, theatre_of
 from visitor import Visitor, free_port, wait_for
 
 from ar.browser import Browser
+from ar.hud import FINE
 from ar.refind import stands
 from scenes.demo import FEM_COLOUR, STALE_COLOUR, Demo, Moment
 from scenes.paths import Touch, press
-from scenes.play import SMALL
 from scenes.referee import Referee
 from scenes.wish import HAND, SCRIPT, Wish
 from sim.fem import Fem
@@ -106,7 +106,7 @@ def test_the_words_beside_a_picture_are_of_its_frame(demo, monkeypatch):
     assert len({number for number, _, _ in shown}) > 3
     pictures = {}
     for number, colour, words in shown:
-        assert f"frame {number} of" in words and stands(colour, f"frame {number}", SMALL)
+        assert f"frame {number} of" in words and stands(colour, f"frame {number}", FINE)
         assert pictures.setdefault(number, colour) is colour
 
 

@@ -1,23 +1,27 @@
 """The loop: a tool that rests on the tissue, one picture a moment, and a picture that is a function of its moment."""
 
+import importlib
 import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 from theatres import PUSHING, on_template, player, put, short, small, template_theatre, theatre_of
 
 from ar.camera import project_cv2
-from ar.overlay import WARNING, ink_of
+from ar.hud import FINE, WHITE
+from ar.overlay import WARNING, ink_of, silhouette
 from ar.refind import stands
 from scenes.cli import main
+from scenes.demo import pictured
 from scenes.paths import Touch
-from scenes.play import CARRIED, IN_BONE, SMALL, STAGES, labelled
+from scenes.play import CARRIED, IN_BONE, STAGES, labelled
 from scenes.scene import Viewpoint, find_scene
 from scenes.shipped import template_path
-from scenes.stage import CORTEX, TOOL
+from scenes.stage import CORTEX, TOOL, Stage
 from scenes.theatre import Theatre, model_path, open_theatre
 from sim.deformation import Outcome
 from sim.errors import InputError
@@ -60,15 +64,33 @@ def test_the_pressing_tip_rests_on_the_deformed_surface(play):
     assert heights(play, frame, middle[None])[0] == pytest.approx(radius, abs=1e-8)
 
 
+@pytest.mark.parametrize(("name", "reach"), [("press", 0.0), ("slide", 0.03)])
+def test_no_word_stands_on_the_outline_or_at_the_border(name, reach):
+    """On the body that ships, under the scene's own camera; in the second, of a tool that the bone stops."""
+    scene = replace(find_scene(name), element=None)
+    play = replace(on_template(name), stage=Stage(scene, template_theatre().site, template_theatre().intensity))
+    frame = play.draw(120, 4.0, Touch(-reach))
+    assert bool(frame.remark) is bool(reach)
+    picture = pictured(frame)
+    tumour = play.stage.tumour(play.positions(frame.deformation))
+    mask = silhouette(frame.camera, tumour.vertices, tumour.triangles).astype(np.uint8)
+    near = cv2.dilate(mask, np.ones((9, 9), np.uint8)) > 0
+    words = (picture == np.asarray(WHITE, np.uint8)).all(axis=2)
+    height, width = words.shape
+    assert not (words & near)[height // 2 + 100 :].any() and not words[:, width - 7 :].any()
+    letters = (picture != frame.shown).any(axis=2)
+    assert letters.any() and not (letters & near).any()
+
+
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_place_under_the_bone_is_refused_said_and_shown(play, way):
     radius = play.scene.tool.radius
     frame = play.draw(0, 0.0, Touch(way * 0.1, way * 0.1, force=0.1))
     assert frame.remark.startswith("the bone's edge stops the tool ") and frame.remark.endswith(" mm short")
-    assert stands(frame.shown, frame.remark, SMALL)
+    assert stands(frame.shown, frame.remark, FINE)
     assert play.site.across(frame.tip[None])[0] <= play.site.reach(radius) + CARRIED
     inside = play.draw(0, 0.0, Touch(force=0.1))
-    assert inside.remark == "" and not stands(inside.shown, frame.remark, SMALL)
+    assert inside.remark == "" and not stands(inside.shown, frame.remark, FINE)
 
 
 def test_tissue_that_carries_the_tool_into_the_bone_is_not_relied_on(theatre):
@@ -76,7 +98,9 @@ def test_tissue_that_carries_the_tool_into_the_bone_is_not_relied_on(theatre):
     play = player(theatre, replace(small(), viewpoint=Viewpoint()), "fem")
     reach = play.site.reach(play.scene.tool.radius)
     frame = play.draw(0, 0.0, Touch(reach, 0.0, force=0.4, tilt=(np.radians(40.0), 0.0)))
-    assert frame.doubt == IN_BONE and stands(frame.shown, IN_BONE, 0.5, ink_of(WARNING))
+    assert frame.doubt == IN_BONE and all(
+        stands(frame.shown, part, FINE, ink_of(WARNING)) for part in IN_BONE.split(": ")
+    )
     assert play.site.across(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
 
 
@@ -162,6 +186,25 @@ def test_the_overlay_lies_where_the_tumour_is(play):
     column, row = np.rint(project_cv2(play.camera, corners)).astype(int).T
     seen = frame.picture.segmentation[row, column] != TOOL
     assert seen.sum() > 20 and changed[row, column][seen].mean() > 0.97
+
+
+def test_a_frame_finds_the_resting_tool_and_the_nearest_point_once(play, monkeypatch):
+    found = []
+    for place, name in (
+        ("scenes.play", "resting_tip"),
+        ("sim.tip", "resting_tip"),
+        ("scenes.play", "closest"),
+        ("sim.tip", "closest"),
+    ):
+        whole = getattr(importlib.import_module(place), name)
+
+        def counted(*given, name=name, whole=whole):
+            found.append(name)
+            return whole(*given)
+
+        monkeypatch.setattr(f"{place}.{name}", counted)
+    frame = play.draw(3, 0.1, Touch(force=0.3))
+    assert sorted(found) == ["closest", "resting_tip"] and frame.distance is not None
 
 
 def test_the_distance_is_that_from_tip_to_tumour(play):

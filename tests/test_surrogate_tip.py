@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from scenes.reading import Reading, reading
+from scenes.reading import measured as drawn_distance
 from scenes.shipped import template_path
 from scenes.theatre import model_path
 from scenes.tool import Blade, Probe
@@ -233,17 +234,16 @@ def test_models_of_before_answer_without_a_bound():
 def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender, gauge, fresh):
     loads, tool = fresh[0].rows(slice(2, 3)), Probe()
     answer, truth = model.deform(loads), pretender.deform(loads)
-    found = reading(model, loads, answer, tool)
     told = model.distance(loads)
-    assert found == Reading(told.value[0], told.bound[0, 0])
-    assert reading(pretender, loads, truth, tool) == Reading(fresh[1][2], None)
+    apart = gauge.distances(loads, answer.displacement, answer.nodes)[0]
+    assert reading(model, loads, answer, tool, apart) == Reading(told.value[0], told.bound[0, 0])
+    assert reading(pretender, loads, truth, tool, fresh[1][2]) == Reading(fresh[1][2], None)
     high = gauge.distances(loads, truth.displacement, truth.nodes, lift=2e-3)[0]
-    assert reading(pretender, loads, truth, tool, 2e-3).distance == high > fresh[1][2] + 1e-3
-    high = model.distance(loads, answer, 2e-3).value[0]
-    assert reading(model, loads, answer, tool, 2e-3).distance == high > told.value[0] + 1e-3
+    assert drawn_distance(model.anatomy, loads, truth, tool, 2e-3).distance == high > fresh[1][2] + 1e-3
+    assert reading(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(told.value[0] + 2e-3)
     plain = replace(model, tip=None).distance(loads).value[0]
     outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-    assert reading(model, loads, outside, tool) == Reading(told.value[0], None)
-    assert reading(replace(model, tip=None), loads, answer, tool) == Reading(plain, None)
-    assert reading(model, loads, answer, Blade()) is None and reading(model, loads, answer, None) is None
+    assert reading(model, loads, outside, tool, apart) == Reading(told.value[0], None)
+    assert reading(replace(model, tip=None), loads, answer, tool, apart) == Reading(plain, None)
+    assert reading(model, loads, answer, Blade(), apart) is None and reading(model, loads, answer, None, apart) is None
     assert str(Reading(5.53e-3, 0.62e-3)) == "5.5 +- 0.7 mm" and str(Reading(5.53e-3, None)) == "5.5 mm"
