@@ -1,0 +1,37 @@
+"""What the skull decides, as the bench measures it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from scenes.cli import main
+from sim.accuracy import TRAIN
+from sim.anatomy import TUMOUR_LABEL
+from sim.effects import pushed_effects
+from sim.fem import Fem
+from sim.material import Material
+from sim.meshfile import write_anatomy
+from sim.subject import Plan, make_anatomy
+from sim.template import Tumour, template_subject
+from surrogate.sampling import draw
+
+
+def test_the_less_the_skull_holds_the_farther_the_tumour_moves(tmp_path, capsys):
+    """By the bench, and by finite elements and a mean over the tumour's volume put together here."""
+    anatomy = make_anatomy(template_subject(Tumour()), Plan(2000))
+    write_anatomy(tmp_path / "brain.vtu", anatomy)
+    words = [str(tmp_path / "brain.vtu"), "--loads", "2", "--poisson", "0.49", "--device", "cpu", "--json"]
+    assert main(["bench", "skull", *words]) == 0
+    bonded, slide = json.loads(capsys.readouterr().out)["rows"]
+    assert (bonded["skull"], slide["skull"], bonded["failed"]) == ("bonded", "slide", 0)
+    assert slide["motion"] > 1.02 * bonded["motion"] and bonded["leaked"] == 0.0 < slide["leaked"] < 1e-5
+    assert 0.0 < bonded["bond"] < 3.0 and slide["bond"] is None
+    tissue = Material("neo-hookean", 3000.0, 0.49)
+    answer = Fem(anatomy, pushed_effects(anatomy, tissue), TRAIN, "cpu").deform(draw("palpation", anatomy, 2, 0))
+    mesh = anatomy.mesh
+    inside = mesh.region == TUMOUR_LABEL
+    share = mesh.volumes[inside] / mesh.volumes[inside].sum()
+    moved = np.einsum("t,bti->bi", share, answer.displacement[:, mesh.tets[inside]].mean(axis=2))
+    assert bonded["motion"] == pytest.approx(1e3 * np.linalg.norm(moved, axis=1).mean(), rel=1e-4)
+    assert bonded["bond"] == pytest.approx(answer.bond.max(), rel=1e-3)
