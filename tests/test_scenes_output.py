@@ -93,6 +93,7 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
     np.savez(tmp_path / "arrays.npz", mine=np.zeros(3))
     (tmp_path / "graph.onnx").write_bytes(b"\x08\x08 sulcus onnx 1")
     (tmp_path / "table.csv").write_text("what,default,now,force mean_mm\n")
+    (tmp_path / "factorial.csv").write_text("opening [mm],depth [mm],skull,nu\n")
     (tmp_path / "index.html").write_text("<!doctype html><title>What accuracy costs in time</title>")
     picture = np.zeros((8, 8, 3), np.uint8)
     write_png(tmp_path / "picture.png", picture)
@@ -107,6 +108,7 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         "a model of `sulcus train`": "model.npz",
         "a graph of `sulcus export`": "graph.onnx",
         "a table of `sulcus sensitivity`": "table.csv",
+        "a table of `sulcus sensitivity --factorial`": "factorial.csv",
         "a page of `sulcus report`": "index.html",
         "a picture of sulcus": "picture.png",
         "a film of `sulcus render`": "film.gif",

@@ -13,6 +13,7 @@ from sim.direction import Direction
 from sim.effects import Elasticity, Held, NodalForce
 from sim.linear import BlockJacobi, Preconditioner, conjugate_gradients
 from sim.loads import Loads, Nodal
+from sim.material import Material
 from sim.precondition import rest_solver
 from sim.problem import Problem
 from sim.search import search
@@ -34,7 +35,7 @@ def device() -> Device:
 
 @pytest.fixture
 def problem(device: Device) -> Problem:
-    out = compile_problem([Elasticity(), Held(), NodalForce()], ANATOMY, device)
+    out = compile_problem([Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), NodalForce()], ANATOMY, device)
     out.begin(Cases(Loads((Nodal(FORCE),)), np.zeros(2)))
     return out
 
