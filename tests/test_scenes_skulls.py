@@ -8,13 +8,16 @@ import pytest
 from scenes.cli import main
 from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL
-from sim.effects import pushed_effects
+from sim.effects import Bonded, Slide, pushed_effects
 from sim.fem import Fem
 from sim.material import Material
 from sim.meshfile import write_anatomy
 from sim.subject import Plan, make_anatomy
 from sim.template import Tumour, template_subject
+from surrogate.dataset import read_dataset
+from surrogate.expansion import Expansion
 from surrogate.sampling import draw
+from surrogate.taught import taught_skull
 
 
 def test_the_bench_measures_what_it_says(tmp_path, capsys):
@@ -35,3 +38,15 @@ def test_the_bench_measures_what_it_says(tmp_path, capsys):
     moved = np.einsum("t,bti->bi", share, answer.displacement[:, mesh.tets[inside]].mean(axis=2))
     assert bonded["motion"] == pytest.approx(1e3 * np.linalg.norm(moved, axis=1).mean(), rel=1e-4)
     assert bonded["bond"] == pytest.approx(answer.bond.max(), rel=1e-3)
+
+
+def test_what_is_taught_of_a_skull_is_of_that_skull(tmp_path):
+    """From the command to the finite elements that a learner asks: they slide where the data did."""
+    write_anatomy(tmp_path / "brain.vtu", make_anatomy(template_subject(Tumour()), Plan(2000, craniotomy=0.03)))
+    for skull, effect in (("slide", Slide()), ("bonded", Bonded())):
+        out = tmp_path / f"{skull}.h5"
+        words = ["--count", "2", "--skull", skull, "--element", "p1", "--tolerance", "1e-3", "--device", "cpu"]
+        assert main(["simulate", str(tmp_path / "brain.vtu"), "--out", str(out), *words]) == 0
+        data = read_dataset(out)
+        assert taught_skull(data.provenance) == skull
+        assert effect in Expansion(data, "cpu")._fem().effects
