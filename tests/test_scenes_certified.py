@@ -1,13 +1,19 @@
 """Certificates frame by frame on the command line, and deformers that a budget chose."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from theatres import put, theatre_of
 
+from scenes.certified import certified
 from scenes.cli import main
 from scenes.offers import offers
 from scenes.scene import find_scene
+from sim.deformation import Cost
+from sim.deformation import guess as answered
 from surrogate.certify import SCOPE
 
 
@@ -73,3 +79,24 @@ def test_a_budget_chooses_the_deformer_and_says_which(theatre, anatomy, capsys):
 def test_budgets_that_buy_nothing_are_sentences(anatomy, capsys, words, reason):
     assert check(anatomy, *words) == 2
     assert reason in capsys.readouterr().err
+
+
+def test_searching_is_correcting_and_the_rest_is_estimating(monkeypatch):
+    """By a certificate of known seconds: each figure stands where its name is."""
+    anatomy = SimpleNamespace(tumour_nodes=np.arange(2))
+
+    def answer(x):
+        return answered(np.full((1, 2, 3), x))
+
+    def known(fem, loads, deformation):
+        cost = Cost({"settle": 0.001, "solve": 0.002, "search": 0.5})
+        left = np.array([2e-6]), np.array([1e-5])
+        return SimpleNamespace(estimate=left[1], left=left[0], corrected=answer(3e-6), cost=cost, sound=[True])
+
+    monkeypatch.setattr("scenes.certified.certify", known)
+    drawn = SimpleNamespace(number=7, loads=None, deformation=replace(answer(4e-6), cost=Cost({"predict": 0.004})))
+    (found,) = certified(SimpleNamespace(anatomy=anatomy), [drawn], answer(0.0))  # type: ignore
+    assert (found.predict_ms, found.estimate_ms, found.correct_ms) == pytest.approx((4.0, 3.0, 500.0))
+    assert (found.estimate_mm, found.left_mm) == pytest.approx((1e-2, 2e-3))
+    assert (found.error_mm, found.corrected_mm) == pytest.approx((4e-3 * 3**0.5, 3e-3 * 3**0.5))
+    assert "4.0 ms to predict, 3 to estimate, 500 to correct" in str(found)

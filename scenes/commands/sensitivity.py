@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--factorial", action="store_true",
         help="every combination of skull, Poisson's ratio, opening, depth and stiffness of the template's tumour, in "
-        "place of one change at a time; half an hour on two cores; --out gets the table, and a plot beside it (.png)",
+        "place of one change at a time; an hour on two cores; --out gets the table, and a plot beside it (.png)",
     )  # fmt: skip
     parser.add_argument("--nodes", type=int, default=5300, help="of the meshes of --factorial (default %(default)s)")
     parser.add_argument("--out", type=Path, metavar="TABLE.csv", help="the table, unrounded")
