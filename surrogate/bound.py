@@ -22,6 +22,8 @@ LEVELS = (0.95, 0.99)
 CLASS, CLASSES = 200, 10
 # Of the squared weights, beside the squared misfit of logarithms of unit variance a load.
 RIDGE = 1e-2
+# Of the features, so many say what the load is: force, radius, angle, overhang. The rest say where it is.
+LOAD = 4
 # Standard deviations beyond which a feature counts no further; and the share of the mean below which no error counts.
 FARTHEST, LEAST = 4.0, 1e-3
 # How much a bound grows outside what was taught, for each unit of `Envelope.excess`.
@@ -62,9 +64,18 @@ class Bound:
 
 
 def fitted_bound(
-    seen: tuple[np.ndarray, np.ndarray], features: np.ndarray, force: np.ndarray, error: np.ndarray, each: int = CLASS
+    seen: tuple[np.ndarray, np.ndarray],
+    features: np.ndarray,
+    force: np.ndarray,
+    error: np.ndarray,
+    each: int = CLASS,
+    *,
+    curved: bool = True,
 ) -> Bound:
     """A bound whose scale follows what was `seen`, calibrated on other loads.
+
+    The scale is told the load, not its place: what was seen lies in few discs of the cortex, and a scale that follows
+    the place runs away between them. One that did bounded a distance that was 0.05 mm off by 4.2 mm.
 
     Parameters
     ----------
@@ -74,13 +85,17 @@ def fitted_bound(
         (n, f), (n,) [N] and errors (n, k) [m] at each vertex, of the calibration loads.
     each
         Calibration loads of a class of force, at least: fewer than 99 promise nothing at 0.99.
+    curved
+        Whether the scale's logarithm is quadratic in what says the load, or linear.
     """
     mean, deviation = standardisation(seen[0])
-    design = _monomials(_standard(seen[0], mean, deviation))
+    used = _used(len(mean), LOAD if curved else 0)
+    design = _monomials(_standard(seen[0], mean, deviation))[:, used]
     wanted = np.log(np.maximum(seen[1], max(LEAST * seen[1].mean(), np.finfo(float).tiny)))
     penalty = RIDGE * len(design) * np.eye(design.shape[1])
     penalty[0, 0] = 0.0  # the constant is free
-    weights = np.linalg.solve(design.T @ design + penalty, design.T @ wanted)
+    weights = np.zeros(len(used))
+    weights[used] = np.linalg.solve(design.T @ design + penalty, design.T @ wanted)
     worst = error.max(axis=1)
     ratio = worst / np.exp(_monomials(_standard(features, mean, deviation)) @ weights)
     count = int(np.clip(len(ratio) // each, 1, CLASSES))
@@ -112,6 +127,11 @@ def _monomials(x: np.ndarray) -> np.ndarray:
     """1, x_i and x_i x_j of (B, f): (B, t)."""
     first, second = _pairs(x.shape[1])
     return np.concatenate([np.ones((len(x), 1)), x, x[:, first] * x[:, second]], axis=1)
+
+
+def _used(count: int, curved: int) -> np.ndarray:
+    """Which monomials (t,) bool are fitted: 1, x_i of the load, and x_i x_j of the first `curved` features."""
+    return np.concatenate([[True], np.arange(count) < LOAD, _pairs(count)[1] < curved])
 
 
 def _pairs(count: int) -> tuple[np.ndarray, np.ndarray]:

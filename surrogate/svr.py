@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -44,10 +45,15 @@ class Svr:
         spread = np.subtract(*np.percentile(Y, [75, 25], axis=0))
         dual = np.zeros((len(X), Y.shape[1]))
         intercept = np.zeros(Y.shape[1])
-        for mode in np.flatnonzero(spread > 0.0):
+
+        def taught(mode: int) -> SVR:
             # In units of its quartile range an output meets libsvm's absolute stopping tolerance at any scale.
-            machine = SVR(C=self.penalty, epsilon=self.tube, gamma=1.0 / X.shape[1])
-            machine.fit(scaled, Y[:, mode] / spread[mode])
+            return SVR(C=self.penalty, epsilon=self.tube, gamma=1.0 / X.shape[1]).fit(scaled, Y[:, mode] / spread[mode])
+
+        modes = np.flatnonzero(spread > 0.0)
+        with ThreadPoolExecutor() as pool:
+            machines = list(pool.map(taught, modes))
+        for mode, machine in zip(modes, machines, strict=True):
             dual[machine.support_, mode] = spread[mode] * machine.dual_coef_[0]
             intercept[mode] = spread[mode] * machine.intercept_[0]
         intercept[spread <= 0.0] = np.median(Y[:, spread <= 0.0], axis=0)

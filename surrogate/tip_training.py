@@ -66,6 +66,8 @@ def calibrated_distance(
 ) -> Learned:
     """The model with a bound of its distance, whose scale follows what was `seen`, calibrated on other loads.
 
+    The logarithm of its scale is linear in the load: a tip snaps through with the cortex here and there.
+
     Parameters
     ----------
     seen
@@ -75,5 +77,6 @@ def calibrated_distance(
     """
     assert model.tip is not None
     force = directions(model.asked(known.loads))[0]
-    bound = fitted_bound(seen, features, force, distance_errors(model, known)[:, None], CLASS)
+    error = distance_errors(model, known)[:, None]
+    bound = fitted_bound(seen, features, force, error, CLASS, curved=False)
     return replace(model, tip=replace(model.tip, bound=bound))

