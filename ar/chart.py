@@ -57,7 +57,7 @@ class Dot:
 class Panel:
     """One pair of axes: title, what they show, curves, dots, and `marks`: lines at some x, with words beside.
 
-    size: width and height [pixel].
+    size: width and height [pixel]; y_range: what the axis spans, by default what is shown and a little more.
     """
 
     title: str
@@ -67,6 +67,7 @@ class Panel:
     marks: tuple[tuple[float, str], ...] = ()
     dots: tuple[Dot, ...] = ()
     size: tuple[int, int] = (WIDTH, HEIGHT)
+    y_range: tuple[float, float] | None = None
 
 
 def drawn(panels: Sequence[Panel]) -> np.ndarray:
@@ -89,7 +90,7 @@ def _drawn(panel: Panel) -> np.ndarray:
         raise ValueError(f"{panel.title}: logarithmic axes show positive numbers, and at least one point.")
     width, height = panel.size
     canvas = np.full((FINER * height, FINER * width, 3), PAPER, np.uint8)
-    low, high = _range(points[:, 0]), _range(points[:, 1])
+    low, high = _range(points[:, 0]), panel.y_range or _range(points[:, 1])
 
     def place(x: float, y: float) -> tuple[int, int]:
         across, up = (np.log10(v / a) / np.log10(b / a) for v, (a, b) in ((x, low), (y, high)))

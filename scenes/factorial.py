@@ -105,6 +105,8 @@ def panels(found: Sequence[Cell]) -> list[Panel]:
     """The motion over the tumour's depth, a panel for each opening: skulls, and Poisson's ratios of the default one."""
     chosen = [{**DEFAULT, "nu": nu} for nu in _levels(found, "nu")]
     chosen += [{**DEFAULT, "skull": skull} for skull in _levels(found, "skull") if skull != DEFAULT["skull"]]
+    motions = [cell.force for cell in found if np.isfinite(cell.force)]
+    span = 0.8 * min(motions), 1.5 * max(motions)  # the same for all openings
     out = []
     for opening in _levels(found, "opening [mm]"):
         curves = []
@@ -114,7 +116,9 @@ def panels(found: Sequence[Cell]) -> list[Panel]:
             points = tuple((float(cell.levels["depth [mm]"]), cell.force) for cell in mine)
             curves.append(Curve(f"{body['skull']}, nu {body['nu']:g}", points))
         title = f"Opening of {opening:g} mm: how far {FORCE:g} N move the tumour"
-        out.append(Panel(title, "depth of the tumour under the cortex [mm]", "motion [mm]", tuple(curves)))
+        out.append(
+            Panel(title, "depth of the tumour under the cortex [mm]", "motion [mm]", tuple(curves), y_range=span)
+        )
     return out
 
 

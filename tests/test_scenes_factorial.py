@@ -80,3 +80,4 @@ def test_the_plot_has_a_panel_for_each_opening_and_a_curve_for_each_change():
     drawn = panels(whole)
     assert len(drawn) == 3 and [len(panel.curves) for panel in drawn] == [5, 5, 5]
     assert [len(curve.points) for curve in drawn[0].curves] == [3] * 5
+    assert all(panel.y_range == (0.8, 1.5) for panel in drawn)  # one scale for all openings

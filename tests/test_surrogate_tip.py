@@ -8,13 +8,13 @@ import trimesh
 
 from scenes.reading import Reading, reading
 from scenes.reading import measured as drawn_distance
-from scenes.shipped import template_path
-from scenes.theatre import model_path
+from scenes.scene import find_scene
+from scenes.theatre import open_theatre
 from scenes.tool import Blade, Probe
+from sim.accuracy import LIVE
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, Touching
-from sim.meshfile import read_anatomy
 from sim.open_cortex import open_cortex
 from sim.tip import tip_gauge
 from surrogate.bound import features_of, fitted_bound
@@ -221,15 +221,16 @@ def test_the_store_keeps_it(model, fresh, tmp_path):
     assert models["bare"].tip is None and models["none"].tip == TipModel()
 
 
-def test_models_of_before_answer_without_a_bound():
-    anatomy = read_anatomy(template_path())
-    model = load(model_path(template_path()), anatomy)["series-gp"]
-    at = open_cortex(anatomy).place()
-    loads = Loads((Pushed(at.point[None], 0.1 * at.inward[None], np.array([7e-3])),))
-    told = model.distance(loads)
-    assert 5e-3 < told.value[0] < 12e-3
-    if model.tip is None:
-        assert np.isnan(told.bound).all()
+def test_the_models_that_ship_bound_the_distance_of_a_strong_press_within_a_millimetre_and_a_half():
+    theatre, scene = open_theatre(device="cpu"), find_scene("press")
+    at = open_cortex(theatre.anatomy).place()
+    loads = Loads((Pushed(at.point[None], 0.3 * at.inward[None], np.array([7e-3])),))
+    truth, gauge = theatre.fem(scene, LIVE).deform(loads), tip_gauge(theatre.anatomy)
+    apart = gauge.distances(loads, truth.displacement, truth.nodes)
+    for name, model in theatre.models.items():
+        told = model.distance(loads)
+        assert abs(told.value - apart) <= told.bound[0] < 1.5e-3, name
+    assert np.isnan(replace(model, tip=None).distance(loads).bound).all()  # a model of before promises nothing
 
 
 def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender, gauge, fresh):
