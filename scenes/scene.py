@@ -28,7 +28,7 @@ from sim.effects import (
 )
 from sim.errors import InputError
 from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
-from sim.material import Tissue
+from sim.material import Material, Tissue
 from sim.open_cortex import Place
 from sim.script import run_script, told
 
@@ -247,7 +247,8 @@ def find_scene(name: str) -> Scene:
     Raises
     ------
     InputError
-        No scene of that name; a file that is missing, does not run, has no SCENE, or one whose path gives no Touch.
+        No scene of that name; a file that is missing, does not run, has no SCENE, one whose path gives no Touch, or one
+        of a tissue that fails `sim.conformance.check_tissue`.
     """
     if name.endswith(".py"):
         return _own_scene(name)
@@ -259,6 +260,8 @@ def find_scene(name: str) -> Scene:
 
 
 def _own_scene(path: str) -> Scene:
+    from sim.conformance import check_tissue
+
     found = getattr(run_script(path), "SCENE", None)
     if found is None:
         raise InputError(f"{path}: has no SCENE. Let it say SCENE = Scene(...), as the built-in scenes do.")
@@ -272,4 +275,9 @@ def _own_scene(path: str) -> Scene:
         if not isinstance(touch, Touch):
             what = type(touch).__name__
             raise InputError(f"{path}: at {time:g} s its path gives a {what}. Make it a scenes.paths.Touch.")
+    for effect in found.effects:
+        if isinstance(effect, Elasticity):
+            for tissue in (effect.default, *effect.regions.values()):
+                if tissue is not None and not isinstance(tissue, Material):  # ours are tested
+                    check_tissue(tissue)
     return found

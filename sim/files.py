@@ -6,6 +6,7 @@ import os
 import platform
 import re
 import shutil
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from .errors import InputError
+
+# Seconds after which another machine's unfinished file is a left-over: whoever writes, writes every few minutes.
+STALE = 24 * 3600.0
 
 
 def why(error: OSError) -> str:
@@ -186,12 +190,15 @@ def _partial(path: Path) -> Path:
 
 
 def _sweep(path: Path) -> None:
-    """Remove what dead processes of this machine left of `path`."""
-    form = re.compile(rf"\.sulcus-{_host()}-(\d{{1,9}})-{re.escape(path.name)}")
+    """Remove what dead processes of this machine left of `path`, and what others have not touched for a day."""
+    form = re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-{re.escape(path.name)}")
     try:
         for left in list(path.parent.iterdir()):
             found = form.fullmatch(left.name)
-            if found and not _alive(int(found[1])):
+            if found is None:
+                continue
+            dead = not _alive(int(found[2])) if found[1] == _host() else time.time() - left.stat().st_mtime > STALE
+            if dead:
                 left.unlink(missing_ok=True)
     except OSError:  # a folder that may not be listed, or a left-over that may not be removed, stops no work
         return

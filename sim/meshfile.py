@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -15,9 +15,9 @@ import numpy as np
 from .anatomy import Anatomy
 from .errors import InputError
 from .files import written_whole
-from .limits import LARGEST_MESH
+from .limits import LARGEST_MESH, at_most
 from .mesh import MeshWarning, TetMesh, oriented
-from .reading import read_as
+from .reading import path_of, read_as
 from .vtu import demand_small
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
     """
     import meshio  # an optional reader: machines that only train have none
 
-    path = Path(path)
+    path = path_of(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file. Give a tetrahedral mesh that meshio reads, such as .vtu or .msh.")
     if unit not in UNITS:
@@ -61,9 +61,8 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
     remedy = "Convert it to .vtu or .msh."
     # meshio prints what it stumbles over, and warns of arrays that it skips.
     with read_as(path, "a mesh", remedy), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        if path.suffix == ".vtu":
-            demand_small(path, LARGEST_MESH)
-        with warnings.catch_warnings():
+        counted = path.suffix == ".vtu" and demand_small(path, LARGEST_MESH)
+        with warnings.catch_warnings(), nullcontext() if counted else at_most(LARGEST_MESH):
             warnings.simplefilter("ignore")
             raw = meshio.read(path)
     with read_as(path, "a mesh", remedy):

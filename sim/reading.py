@@ -12,6 +12,19 @@ import numpy as np
 from .errors import InputError
 
 
+def path_of(path: object) -> Path:
+    """What names a file.
+
+    Raises
+    ------
+    InputError
+        Anything but text or a path.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"{path!r} names no file: give its path as text, or as a pathlib.Path.")
+    return Path(path)
+
+
 @contextmanager
 def read_as(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
     """Turn whatever a block raises while it reads `path` into a sentence.

@@ -12,7 +12,7 @@ import numpy as np
 
 from .errors import InputError
 from .limits import MOST_VOXELS
-from .reading import read_as
+from .reading import path_of, read_as
 
 if TYPE_CHECKING:
     from nibabel.nifti1 import Nifti1Image
@@ -47,7 +47,7 @@ def read_volume(path: str | Path) -> Volume:
     """
     import nibabel
 
-    path = Path(path)
+    path = path_of(path)
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {REMEDY}")
     if not path.name.lower().endswith((".nii", ".nii.gz")):

@@ -21,7 +21,7 @@ from sim.errors import InputError
 from sim.limits import INFLATION, LARGEST_ARRAY
 from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Touching
 from sim.mesh import TetMesh, digest_of
-from sim.reading import read_as
+from sim.reading import path_of, read_as
 
 from .patch import open_patch
 from .rows import checksums, numbered, row_type
@@ -177,7 +177,7 @@ def read_dataset(path: str | Path) -> Dataset:
     InputError
         A file that is missing, unfinished, damaged, not HDF5, or not a data set of this project.
     """
-    path = Path(path)
+    path = path_of(path)
     if not path.is_file():
         unfinished = path.with_name(path.name + ".partial")
         remedy = (

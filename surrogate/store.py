@@ -15,7 +15,7 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.files import written_whole
 from sim.mesh import digest_of
-from sim.reading import read_as
+from sim.reading import path_of, read_as
 
 from .ann import Ann
 from .archive import Archive
@@ -89,7 +89,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         A file that is missing or not a model file of this project, that was taught on another anatomy, or that holds
         a model which cannot be.
     """
-    path = Path(path)
+    path = path_of(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
     with read_as(path, "a model", "Make one with `sulcus train`."), path.open("rb") as raw:

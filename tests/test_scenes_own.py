@@ -101,6 +101,41 @@ def test_a_tool_of_ones_own_is_seen_as_its_own_mesh_and_touches_as_its_own_shape
     assert tip.min() > -1e-4  # no vertex is inside of it
 
 
+WRONG = """from dataclasses import replace
+from typing import Any
+
+import warp as wp
+from scenes.press import SCENE as PRESS
+from sim.effects import Elasticity
+from yeoh import Yeoh, stress as own
+
+
+@wp.func
+def half(H: Any, c: Any):
+    return own(H, c) / type(c[0])(2.0)
+
+
+class Mine(Yeoh):
+    law = "mine"
+    functions = replace(Yeoh.functions, stress=half) if HALF else Yeoh.functions
+
+
+SCENE = replace(PRESS, effects=(Elasticity(Mine(500.0, 1500.0, 1e4)), *PRESS.effects[1:]))
+"""
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_a_scene_of_a_law_that_contradicts_itself_does_not_play(tmp_path, half):
+    (tmp_path / "yeoh.py").write_text(SUCKER.with_name("yeoh.py").read_text())
+    path = tmp_path / "mine.py"
+    path.write_text(WRONG.replace("HALF", str(half)))
+    if not half:
+        assert find_scene(str(path)).effects[0].default.law == "mine"
+        return
+    with pytest.raises(InputError, match=r"the law mine does not hold: .*stress is the energy's derivative"):
+        find_scene(str(path))
+
+
 def test_the_same_text_runs_once_and_a_mended_one_anew(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text("class Mine: pass\n")

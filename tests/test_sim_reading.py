@@ -7,13 +7,17 @@ import gzip
 import os
 import platform
 import re
+import resource
 import struct
 import subprocess
 import sys
+import time
 import tracemalloc
 import zlib
 from pathlib import Path
 
+import h5py
+import meshio
 import nibabel
 import numpy as np
 import pytest
@@ -29,6 +33,7 @@ from sim.mesh import TetMesh
 from sim.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
 from sim.reading import read_as
 from sim.volume import read_volume
+from sim.vtu import demand_small
 
 BODY = base_held(box((2, 2, 2), 0.02))
 
@@ -96,7 +101,67 @@ def fattened(path: Path, megabytes: int) -> Path:
     return path
 
 
+def with_raw_bytes(path: Path, packed: bytes) -> Path:
+    """A .vtu whose one array lies behind the XML, packed by zlib, as ParaView writes it."""
+    path.write_bytes(
+        b'<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64" '
+        b'compressor="vtkZLibDataCompressor"><UnstructuredGrid><Piece NumberOfPoints="1" NumberOfCells="0"><Points>'
+        b'<DataArray type="Float64" NumberOfComponents="3" format="appended" offset="0"/></Points><Cells/></Piece>'
+        b'</UnstructuredGrid><AppendedData encoding="raw">\n_' + packed + b"\n</AppendedData></VTKFile>"
+    )
+    return path
+
+
+def bomb(path: Path) -> Path:
+    """A small file of the kind of its ending that asks for gigabytes."""
+    mesh = meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)])
+    if path.suffix == ".msh":
+        mesh.write(path, "gmsh22")
+        head = f"$Nodes\n{len(mesh.points)}\n".encode()
+        path.write_bytes(path.read_bytes().replace(head, b"$Nodes\n900000000\n"))
+    if path.suffix == ".vtk":
+        mesh.write(path)
+        path.write_bytes(re.sub(rb"POINTS \d+", b"POINTS 900000000", path.read_bytes()))
+    if path.suffix == ".xdmf":
+        mesh.write(path)
+        with h5py.File(path.with_suffix(".h5"), "r+") as file:  # whose missing chunks are zeros
+            del file["data0"]
+            file.create_dataset("data0", (400_000_000, 3), "f8", chunks=(100_000, 3))
+        text = path.read_text().replace(f'Dimensions="{len(mesh.points)} 3"', 'Dimensions="400000000 3"')
+        path.write_text(text)
+    return path
+
+
 class TestMeshes:
+    @pytest.mark.parametrize("name", ["a.msh", "a.vtk", "a.xdmf"])
+    def test_no_format_makes_a_library_fill_the_memory(self, tmp_path: Path, name: str) -> None:
+        before = resource.getrlimit(resource.RLIMIT_AS)
+        with pytest.raises(InputError, match=r"take more than 4\.29 GB"):
+            read_mesh(bomb(tmp_path / name))
+        assert resource.getrlimit(resource.RLIMIT_AS) == before
+
+    @pytest.mark.parametrize("name", ["a.msh", "a.vtk", "a.xdmf", "a.inp"])
+    def test_good_meshes_of_those_formats_are_read(self, tmp_path: Path, name: str) -> None:
+        meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(tmp_path / name)
+        assert np.array_equal(read_mesh(tmp_path / name).mesh.tets, BODY.mesh.tets)
+
+    def test_raw_bytes_behind_the_xml_are_counted(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("sim.meshfile.LARGEST_MESH", 2**22)
+        block = zlib.compress(bytes(2**23))
+        path = with_raw_bytes(tmp_path / "a.vtu", struct.pack("<4Q", 1, 2**23, 0, len(block)) + block)
+        tracemalloc.start()
+        try:
+            with pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
+                read_mesh(path)
+            assert tracemalloc.get_traced_memory()[1] < 2**22
+        finally:
+            tracemalloc.stop()
+        few = zlib.compress(np.zeros(3).tobytes())
+        small = with_raw_bytes(tmp_path / "b.vtu", struct.pack("<4Q", 1, 24, 0, len(few)) + few)
+        assert demand_small(small, 24)
+        with pytest.raises(InputError):
+            demand_small(small, 23)
+
     def test_a_small_file_does_not_fill_the_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
         monkeypatch.setattr("sim.meshfile.LARGEST_MESH", 2**22)
@@ -104,12 +169,17 @@ class TestMeshes:
         fattened(tmp_path / "a.vtu", 64)
         tracemalloc.start()
         try:
-            with pytest.raises(InputError, match=r"inflate to more than 0\.00419 GB"):
+            with pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
                 read_mesh(tmp_path / "a.vtu")
             assert tracemalloc.get_traced_memory()[1] < 2**24
         finally:
             tracemalloc.stop()
         assert limits.LARGEST_MESH > 2**31
+
+    @pytest.mark.parametrize("path", [None, 3, b"a.vtu"])
+    def test_what_names_no_file_is_a_sentence(self, path: object) -> None:
+        with pytest.raises(InputError, match="names no file: give its path as text"):
+            read_anatomy(path)  # pyright: ignore[reportArgumentType]
 
     @pytest.mark.parametrize("text", ["no xml", "", "<VTKFile type='ImageData'/>", "<VTKFile", "<a/>"])
     def test_nothing_of_a_library_is_told_or_printed(
@@ -220,6 +290,11 @@ class TestWriting:
             assert not left.exists()
             partial.write_text("whole")
         assert sorted(tmp_path.iterdir()) == sorted([path, living, other, elsewhere])
+        yesterday = time.time() - 25 * 3600.0
+        for file in (living, other, elsewhere):
+            os.utime(file, (yesterday, yesterday))
+        check_output(path, ".txt")  # of another machine nothing is known but that it has written nothing for a day
+        assert sorted(tmp_path.iterdir()) == sorted([path, living, other])
 
     @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no such file system")
     def test_a_folder_that_takes_no_files_is_told_before_the_work(self) -> None:
