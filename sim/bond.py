@@ -31,9 +31,11 @@ def kernel_of(device: Device) -> wp.Kernel:
         tension: wp.float64,
         shear: wp.float64,
         # outputs
-        out: wp.array(dtype=wp.float64),
+        share: wp.array2d(dtype=wp.float64),
+        pulled: wp.array2d(dtype=wp.float64),
+        most: wp.array(dtype=wp.float64),
     ):
-        """s = max over patches of |(max(t.n, 0) / tension, t - (t.n) n / shear)|, t = sum of forces / area."""
+        """s = |(max(t.n, 0) / tension, t - (t.n) n / shear)| and t.n of each patch, t = sum of forces / area; max s."""
         p, c = wp.tid()
         t = wp.vec3d()
         for k in range(first[p], first[p + 1]):
@@ -42,7 +44,9 @@ def kernel_of(device: Device) -> wp.Kernel:
         t /= area[p]
         pull = wp.dot(t, normal[p])
         along = wp.length(t - pull * normal[p]) / shear
-        wp.atomic_max(out, c, wp.sqrt(wp.pow(wp.max(pull, wp.float64(0.0)) / tension, wp.float64(2.0)) + along * along))
+        pulled[p, c] = pull
+        share[p, c] = wp.sqrt(wp.pow(wp.max(pull, wp.float64(0.0)) / tension, wp.float64(2.0)) + along * along)
+        wp.atomic_max(most, c, share[p, c])
 
     return strain
 
@@ -68,7 +72,7 @@ class Bond:
         normal = space.sliding(anatomy.slide_normal, anatomy.held)[nodes]
         kept = np.flatnonzero(normal.any(axis=1) & np.array([area[nodes[patch]].any() for patch in near], bool))
         patches = [nodes[near[patch]] for patch in kept]
-        self._count = len(kept)
+        self.nodes = nodes[kept]
         self._arrays = [
             device.array(np.cumsum([0, *map(len, patches)]), wp.int32),
             device.array(np.concatenate([np.zeros(0, np.int64), *patches]), wp.int32),
@@ -76,14 +80,19 @@ class Bond:
             device.array(np.array([area[patch].sum() for patch in patches]), wp.float64),
         ]
 
-    def share(self, force: wp.array) -> np.ndarray:
-        """Of what the wall exerts on the body, force (3N, B) [N] on the device: (B,); above 1 the bond would tear.
+    def tractions(self, force: wp.array) -> tuple[np.ndarray, np.ndarray]:
+        """Shares and pulls [Pa] (n, B) round `nodes` (n,), of what the wall exerts, force (3N, B) [N] on the device."""
+        share, pulled, _ = self._measured(force)
+        return share.numpy(), pulled.numpy()
 
-        NaN where no skull is.
-        """
-        if not self._count:
-            return np.full(force.shape[1], np.nan)
-        out = wp.zeros(force.shape[1], dtype=wp.float64, device=self._device.name)
+    def share(self, force: wp.array) -> np.ndarray:
+        """The largest share (B,): above 1 the bond would tear. NaN where no skull is."""
+        return self._measured(force)[2].numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
+
+    def _measured(self, force: wp.array) -> list[wp.array]:
+        """Shares and pulls (n, B), and the largest share (B,), on the device."""
+        shape = len(self.nodes), force.shape[1]
+        out = [wp.zeros(size, dtype=wp.float64, device=self._device.name) for size in (shape, shape, shape[1])]
         inputs = [force, *self._arrays, wp.float64(self._effect.tension), wp.float64(self._effect.shear)]
-        self._device.launch(kernel_of(self._device), (self._count, force.shape[1]), inputs, [out])
-        return out.numpy()
+        self._device.launch(kernel_of(self._device), shape, inputs, out)
+        return out

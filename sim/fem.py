@@ -155,11 +155,11 @@ class Fem:
         check_causes(self.effects, loads)
         at = None if at is None else self._vertices(at)
         if start is not None and self._following is not None:
-            answer = self._following.answer(loads, start, lambda: self._guess(loads, start))
+            answer = self._following.answer(loads, start, lambda: self.guess(loads, start))
             if answer is not None:
                 return answer if at is None else answer.at(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
-        last = None if start is None else self._guess(loads, start)
+        last = None if start is None else self.guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads)))
         if start is not None and last is not None:
             cases = Cases(loads, start.time, start.history, last.T.reshape(len(loads), self.space.count, 3))
@@ -224,7 +224,7 @@ class Fem:
         """
         self._check_static(loads)
         self.problem.begin(Cases(loads, answer.time, answer.history))
-        return shortfall(self.problem, self.problem.device.array(self._guess(loads, answer)))
+        return shortfall(self.problem, self.problem.device.array(self.guess(loads, answer)))
 
     @alone
     def corrected(
@@ -243,7 +243,7 @@ class Fem:
         self._check_static(loads)
         at = self._vertices(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
-        guess, cases = self._guess(loads, answer), Cases(loads, answer.time, answer.history)
+        guess, cases = self.guess(loads, answer), Cases(loads, answer.time, answer.history)
         parts = []
         for rows in self._batches(len(loads)):
             step = step_from(self._ladder, cases.rows(rows), guess[:, rows])
@@ -313,8 +313,8 @@ class Fem:
                 found[first : first + groups] = np.concatenate(told, axis=1)
         return found
 
-    def _guess(self, loads: Loads, start: Deformation) -> np.ndarray:
-        """First guesses (3N, B) [m]."""
+    def guess(self, loads: Loads, start: Deformation) -> np.ndarray:
+        """Somebody's answers as columns (3N, B) [m] over the nodes of the element."""
         vertices = len(self._anatomy.mesh.nodes)
         check_start(start, len(loads), vertices)
         full = self.space.interpolated(start.at(np.arange(vertices)).displacement)

@@ -66,7 +66,7 @@ TIERS = (
         "following",
     },
     {"fem"},
-    {"operated", "pressure"},
+    {"operated", "pressure", "tearing"},
 )
 """The solver, from below; every other module of sim lies under it and imports none of it."""
 OWNERS = {

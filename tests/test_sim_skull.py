@@ -41,7 +41,7 @@ def bears(fem: Fem, loads: Loads, found: Deformation) -> np.ndarray:
     """Force (N, 3) [N] of the skull on every node."""
     device = fem.problem.device
     out = device.zeros(fem.problem.rows, 1)
-    fem.problem.barriers[0].add_gradient(device.array(fem._guess(loads, found)), out)
+    fem.problem.barriers[0].add_gradient(device.array(fem.guess(loads, found)), out)
     return -out.numpy().reshape(-1, 3)
 
 
@@ -57,7 +57,7 @@ def test_pressure_and_gap_complement_each_other(element: str, force: float) -> N
     wall = space.nodes[:, 2] > 0.05 - 1e-9
     np.testing.assert_array_equal(skull[~wall], 0.0)
     np.testing.assert_array_equal(skull[:, :2], 0.0)
-    u = fem._guess(lifted(force), found).reshape(-1, 3)
+    u = fem.guess(lifted(force), found).reshape(-1, 3)
     d, pressure = GAP - u[wall, 2], -skull[wall, 2]
     assert d.min() > 0.0
     assert pressure.min() >= 0.0
