@@ -32,10 +32,9 @@ def kernel_of(device: Device) -> wp.Kernel:
         shear: wp.float64,
         # outputs
         share: wp.array2d(dtype=wp.float64),
-        pulled: wp.array2d(dtype=wp.float64),
         most: wp.array(dtype=wp.float64),
     ):
-        """s = |(max(t.n, 0) / tension, t - (t.n) n / shear)| and t.n of each patch, t = sum of forces / area; max s."""
+        """s = |(max(t.n, 0) / tension, t - (t.n) n / shear)| of each patch, t = sum of forces / area; the largest."""
         p, c = wp.tid()
         t = wp.vec3d()
         for k in range(first[p], first[p + 1]):
@@ -44,7 +43,6 @@ def kernel_of(device: Device) -> wp.Kernel:
         t /= area[p]
         pull = wp.dot(t, normal[p])
         along = wp.length(t - pull * normal[p]) / shear
-        pulled[p, c] = pull
         share[p, c] = wp.sqrt(wp.pow(wp.max(pull, wp.float64(0.0)) / tension, wp.float64(2.0)) + along * along)
         wp.atomic_max(most, c, share[p, c])
 
@@ -80,19 +78,18 @@ class Bond:
             device.array(np.array([area[patch].sum() for patch in patches]), wp.float64),
         ]
 
-    def tractions(self, force: wp.array) -> tuple[np.ndarray, np.ndarray]:
-        """Shares and pulls [Pa] (n, B) round `nodes` (n,), of what the wall exerts, force (3N, B) [N] on the device."""
-        share, pulled, _ = self._measured(force)
-        return share.numpy(), pulled.numpy()
+    def shares(self, force: wp.array) -> np.ndarray:
+        """Round `nodes` (n,), of what the wall exerts on the body, force (3N, B) [N] on the device: (n, B)."""
+        return self._measured(force)[0].numpy()
 
     def share(self, force: wp.array) -> np.ndarray:
-        """The largest share (B,): above 1 the bond would tear. NaN where no skull is."""
-        return self._measured(force)[2].numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
+        """The largest of `shares` (B,): above 1 the bond would tear. NaN where no skull is."""
+        return self._measured(force)[1].numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
 
     def _measured(self, force: wp.array) -> list[wp.array]:
-        """Shares and pulls (n, B), and the largest share (B,), on the device."""
+        """Shares (n, B), and the largest (B,), on the device."""
         shape = len(self.nodes), force.shape[1]
-        out = [wp.zeros(size, dtype=wp.float64, device=self._device.name) for size in (shape, shape, shape[1])]
+        out = [wp.zeros(size, dtype=wp.float64, device=self._device.name) for size in (shape, shape[1])]
         inputs = [force, *self._arrays, wp.float64(self._effect.tension), wp.float64(self._effect.shear)]
         self._device.launch(kernel_of(self._device), shape, inputs, out)
         return out

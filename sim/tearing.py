@@ -18,8 +18,9 @@ from .fem import Fem
 from .loads import Loads
 from .term import Cases
 
-# Solves after which a tear is given up that has not come to rest; and how far what let go may pass the skull [m].
-ROUNDS, THROUGH = 60, 1e-7
+# Solves after which a tear is given up that has not come to rest; how far what let go may pass the skull [m]; and how
+# strongly a vertex may be pulled that slides, as a share of what the hardest pressed one bears.
+ROUNDS, THROUGH, PULL = 60, 1e-7, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +88,17 @@ def torn(
         fem = Fem(body, (*others, Slide()), accuracy, device, element=element)
         last = fem.deform(loads, start=last)
         force = _reaction(fem, loads, last)
-        share, pulled = (_round(skull, anatomy, fem, part, force) for part in (bonded, sliding))
-        above = (last.displacement[0] * anatomy.slide_normal).sum(axis=1) > THROUGH
-        holding = bonded & (share[0] <= 1.0)
-        pressed = bonded & ~holding & (share[1] <= 0.0) | sliding & (pulled[1] <= 0.0)
-        pressed |= covered & ~bonded & ~sliding & above
+        share = _shares(skull, anatomy, fem, bonded, force)
+        pull = (_at_vertices(fem, force) * anatomy.slide_normal).sum(axis=1)
+        holding = bonded & (share <= 1.0)
+        pressed = (bonded & ~holding | sliding) & (pull <= PULL * -pull.min())
+        passing = (last.displacement[0] * anatomy.slide_normal).sum(axis=1) > THROUGH
+        pressed |= covered & ~bonded & ~sliding & passing
         rested = bool((holding == bonded).all() and (pressed == sliding).all())
         if rested or rounds == ROUNDS or not last.outcome[0].good:
             break
         bonded, sliding = holding, pressed
-    most = share[0, bonded].max(initial=0.0)
+    most = share[bonded].max(initial=0.0)
     off = covered & ~bonded & ~sliding
     return Torn(replace(last, bond=np.array([most])), np.flatnonzero(sliding), np.flatnonzero(off), rounds, rested)
 
@@ -108,14 +110,23 @@ def _reaction(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
     return problem.gradient(problem.device.array(fem.guess(loads, answer)))
 
 
-def _round(skull: Bonded, anatomy: Anatomy, fem: Fem, part: np.ndarray, force: wp.array) -> np.ndarray:
-    """Round each mesh vertex of a part of the wall (V,) bool: share of the strength, and pull [Pa]: (2, V).
+def _shares(skull: Bonded, anatomy: Anatomy, fem: Fem, bonded: np.ndarray, force: wp.array) -> np.ndarray:
+    """Round each mesh vertex that is bonded, of what the bond bears, as a share of its strength: (V,).
 
-    Means over that part alone: what has let go bears nothing.
+    Means over what holds alone: what has let go bears nothing.
     """
-    body = replace(anatomy, slide_normal=np.where(part[:, None], anatomy.slide_normal, 0.0))
-    bond, count = Bond(skull, body, fem.space, fem.problem.device), len(part)
-    own = bond.nodes < count
-    out = np.zeros((2, count))
-    out[:, bond.nodes[own]] = [values[own, 0] for values in bond.tractions(force)]
+    body = replace(anatomy, slide_normal=np.where(bonded[:, None], anatomy.slide_normal, 0.0))
+    bond = Bond(skull, body, fem.space, fem.problem.device)
+    own = bond.nodes < len(bonded)
+    out = np.zeros(len(bonded))
+    out[bond.nodes[own]] = bond.shares(force)[own, 0]
+    return out
+
+
+def _at_vertices(fem: Fem, force: wp.array) -> np.ndarray:
+    """Nodal forces (V, 3) [N], those at the middle of an edge shared by its ends."""
+    whole = force.numpy().reshape(-1, 3).astype(np.float64)
+    count = len(fem.anatomy.mesh.nodes)
+    out = whole[:count].copy()
+    np.add.at(out, fem.space.edges, 0.5 * whole[count:, None])
     return out

@@ -68,7 +68,7 @@ def test_without_strength_the_skull_only_presses(slab):
     held[found.sliding, 2] = True
     byhand = Fem(hold(slab.mesh, held), (Elasticity(TISSUE), Held(), NodalForce()), REFERENCE, "cpu", element="p1")
     np.testing.assert_allclose(byhand.deform(loads).displacement, found.answer.displacement, atol=1e-9)
-    assert found.answer.displacement[0, found.free, 2].min() > -1e-7
+    assert found.answer.displacement[0, found.free, 2].min() > -1e-7 and found.rounds < 20
 
 
 def test_a_bond_that_holds_is_solved_once(slab):
