@@ -9,12 +9,16 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from .places import PAD, free_place
+
 Corner = Literal["top left", "top right", "bottom left", "bottom right"]
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 WHITE = (244, 244, 240)
-PAD = 8
-# Scale of the lines at the foot of a picture, and from one's baseline to the next [pixel].
-FINE, ROW = 0.45, 18
+# Scale of the lines at the foot of a picture, from one's baseline to the next [pixel], and the share of the picture's
+# width that they may have.
+FINE, ROW, NARROW = 0.45, 18, 0.25
+# Scale of the letters of the patient's sides.
+SIGN = 0.6
 # The patient's sides along the axes of RAS, and against them.
 SIDES = ("RL", "AP", "SI")
 # A direction's second letter is told where it is more than so much of it.
@@ -37,10 +41,69 @@ def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5
     cv2.putText(colour, text, (column, row), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
 
 
-def foot(colour: np.ndarray, text: str, row: int, right: bool = False, ink: Sequence[float] = WHITE) -> None:
-    """Write a line into the picture's lower left corner, or lower right, so many rows over its foot, in place."""
-    width = cv2.getTextSize(text, FONT, FINE, 1)[0][0]
-    write(colour, text, (colour.shape[1] - PAD - width if right else PAD, colour.shape[0] - PAD - row * ROW), FINE, ink)
+def lay(
+    colour: np.ndarray,
+    taken: np.ndarray,
+    lines: Sequence[str],
+    wish: tuple[int, int],
+    scale: float = FINE,
+    ink: Sequence[float] = WHITE,
+    needed: bool = False,
+    sights: np.ndarray | None = None,
+) -> None:
+    """Write lines of ASCII text at the free place nearest to a wish, and take that place; both arrays change in place.
+
+    Lay the most important words first: where there is no room nothing is written, unless it is `needed`.
+
+    Parameters
+    ----------
+    colour, taken
+        The picture (H, W, 3) uint8; (H, W) uint8, above 0 where lines and words are.
+    wish
+        Column and row where the upper left corner of the lines is wanted, as `free_place` takes it.
+    sights
+        (H, W) uint8: above 0 where words hide what should stay in sight, as a tool; they do where there is no other
+        room.
+    """
+    if not lines:
+        return
+    sizes = [cv2.getTextSize(line, FONT, scale, 1) for line in lines]
+    above, below = sizes[0][0][1], sizes[0][1]
+    size = max(width for (width, _), _ in sizes), above + below + ROW * (len(lines) - 1)
+    place = None if sights is None else free_place(taken | sights, size, wish)
+    place = place or free_place(taken, size, wish)
+    if place is None and needed:
+        place = free_place(np.zeros_like(taken), size, wish) or (PAD, PAD)
+    if place is None:
+        return
+    column, row = place
+    for number, line in enumerate(lines):
+        write(colour, line, (column, row + above + number * ROW), scale, ink)
+    taken[row : row + size[1], column : column + size[0]] = 1
+
+
+def folded(text: str, room: float, scale: float = FINE) -> list[str]:
+    """Break a line of text into as few lines as fit into `room` [pixel] where its words allow it, about as wide."""
+    if cv2.getTextSize(text, FONT, scale, 1)[0][0] <= room:
+        return [text] if text else []
+    lines = _broken(text, room, scale)
+    for narrower in range(int(room), 0, -PAD):
+        tried = _broken(text, narrower, scale)
+        if len(tried) > len(lines):
+            break
+        lines = tried
+    return lines
+
+
+def _broken(text: str, room: float, scale: float) -> list[str]:
+    lines: list[str] = []
+    for word in text.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and cv2.getTextSize(longer, FONT, scale, 1)[0][0] <= room:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
 
 
 def millimetres(length: float, error: float | None = None) -> str:
@@ -66,6 +129,7 @@ def panel(colour: np.ndarray, lines: Sequence[str], corner: Corner = "top left",
     out = colour.copy()
     if not lines:
         return out
+    lines = [part for line in lines for part in folded(line, out.shape[1] - 4 * PAD, scale)]
     sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in lines]
     step = max(height for _, height in sizes) + PAD
     height, width = step * len(lines) + PAD, max(width for width, _ in sizes) + 2 * PAD
@@ -94,24 +158,24 @@ def bearings(rotation: np.ndarray) -> dict[str, str]:
     return {"left": towards(-right), "right": towards(right), "top": towards(-down), "bottom": towards(down)}
 
 
-def marked(colour: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def marked(colour: np.ndarray, rotation: np.ndarray, taken: np.ndarray) -> np.ndarray:
     """The picture (H, W, 3) uint8 with the patient's sides at its edges; a copy.
 
-    rotation (3, 3): of the camera, as `bearings` takes it.
+    rotation (3, 3): of the camera, as `bearings` takes it; taken (H, W) uint8: above 0 where lines and words are.
     """
-    out = colour.copy()
-    height, width = out.shape[:2]
-    # Not at the middles of top and foot: tools come in there, and a tumour may reach down to the foot.
-    at = {
-        "left": (8, height // 2),
-        "right": (width, height // 2),
-        "top": (width // 4, 0),
-        "bottom": (3 * width // 4, height),
-    }
+    out, taken = colour.copy(), taken.copy()
+    height, width = taken.shape
     for edge, letters in bearings(rotation).items():
-        (long, tall), _ = cv2.getTextSize(letters, FONT, 0.6, 1)
-        column, row = at[edge]
-        inset = {"left": 0, "right": -long - 8, "top": -long // 2, "bottom": -long // 2}[edge]
-        rise = {"left": tall // 2, "right": tall // 2, "top": tall + 8, "bottom": -10}[edge]
-        write(out, letters, (column + inset, row + rise), 0.6)
+        (long, tall), below = cv2.getTextSize(letters, FONT, SIGN, 1)
+        # Not at the middles of top and foot: tools come in there, and a tumour may reach down to the foot.
+        strip, wish = {
+            "left": (np.s_[:, : long + 2 * PAD], (0, (height - tall) // 2)),
+            "right": (np.s_[:, -long - 2 * PAD :], (width, (height - tall) // 2)),
+            "top": (np.s_[: tall + below + 2 * PAD], (width // 4 - long // 2, 0)),
+            "bottom": (np.s_[-tall - below - 2 * PAD :], (3 * width // 4 - long // 2, height)),
+        }[edge]
+        elsewhere = np.ones_like(taken)
+        elsewhere[strip] = taken[strip]
+        lay(out, elsewhere, [letters], wish, SIGN)
+        taken[strip] = elsewhere[strip]
     return out

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from .camera import Camera
-from .hud import foot, millimetres, write
+from .hud import FINE, NARROW, folded, lay, millimetres
 from .layer import Layer, vertex_normals
 from .raster import Fragments, rasterise
 from .view import Picture
@@ -27,6 +27,8 @@ FAINT = 0.75
 BROKEN, DASHED, DOTTED = (9, 6), (7, 7), (2, 5)
 # Scale of the number beside the line.
 GAUGE = 0.6
+# From the end of the gauge's line to its number [pixel].
+BESIDE = 10
 # A motion of fewer pixels has no arrow.
 LEAST_ARROW = 4.0
 # Light that falls to 1 / e over this depth under the surface [m]: the deeper, the darker.
@@ -88,7 +90,7 @@ def composite(
         Ids of the layers (tool, hand) that cover the overlay wherever the picture shows them.
     style
         "contour": the outline. "window": besides, the ground is dimmed round the outline and the surface shows through,
-        shaded, and darker the deeper it lies. "fill": besides the outline, a flat tint. "none": nothing at all.
+        shaded, and darker the deeper it lies. "fill": besides the outline, a flat tint. "none": nothing but a doubt.
     margin
         One number or (V,) [m]: how uncertain the surface is. Where positive, a dashed second outline runs that far out.
     gauge
@@ -97,9 +99,9 @@ def composite(
         Where the hidden surface was before, as in the scan: a dotted grey outline, with an arrow from there to here and
         the mean motion in millimetres; what that may be off by is the largest margin.
     doubt
-        Why the surface's place may not be relied on. It is written at the picture's foot, see
-        `doubt_lines`, the outline is amber and broken, and nothing is promised: no margin is drawn, and the number
-        beside the line has no error.
+        Why the surface's place may not be relied on. It is written at the picture's foot, see `doubt_lines`, whatever
+        the style; the outline is amber and broken, and nothing is promised: no margin is drawn, and the number beside
+        the line has no error.
 
     Raises
     ------
@@ -110,14 +112,18 @@ def composite(
         raise ValueError(f"there is no overlay style {style!r}: choose one of {', '.join(Style.__args__)}.")
     if picture.colour.shape[:2] != (camera.height, camera.width):
         raise ValueError(f"the picture is {picture.colour.shape[:2]}, the camera {(camera.height, camera.width)}.")
-    out = picture.colour.copy()
+    out, taken = picture.colour.copy(), np.zeros(picture.segmentation.shape, np.uint8)
+    drawn = replace(picture, colour=out, taken=taken)
     if style == "none":
-        return replace(picture, colour=out)
+        write_doubt(drawn, doubt)
+        return drawn
     if doubt:
         hidden, margin = replace(hidden, colour=DOUBTFUL), 0.0
+        gauge = None if gauge is None else replace(gauge, error=None)
     grown = hidden.vertices + np.reshape(margin, (-1, 1)) * vertex_normals(hidden.vertices, hidden.triangles)
     past = hidden.vertices if before is None else before.vertices
     box = box_around(camera, np.concatenate([hidden.vertices, grown, past]))
+    unlined = picture.colour
     if box is not None:
         # Everything but the gauge happens in the box, which is small: a view of `out`, a camera that sees just it.
         here, ground = camera.cropped(*box), out[box]
@@ -127,6 +133,7 @@ def composite(
             ground[fragments.mask] = 0.55 * ground[fragments.mask] + 0.45 * np.array(tint)
         if style == "window":
             draw_window(ground, picture.depth[box], here, hidden, fragments)
+        unlined = out.copy()
         if before is not None:
             draw_before(ground, here, before, hidden, device)
         if np.any(np.asarray(margin) > 0.0):
@@ -141,20 +148,16 @@ def composite(
     if gauge is not None:
         draw_line(out, camera, gauge)
     covered = cv2.LUT(picture.segmentation, np.isin(np.arange(256), occluders).astype(np.uint8))
+    taken[:] = (cv2.inRange(cv2.absdiff(out, unlined), (0, 0, 0), (0, 0, 0)) == 0) & (covered == 0)
     cv2.copyTo(picture.colour, covered, out)
-    if gauge is not None:
-        write_gauge(out, camera, replace(gauge, error=None) if doubt else gauge)
+    # The corner first, so that its words never move; then by importance, for where there is no room some are left out.
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
-        foot(out, f"moved {millimetres(motion, float(np.max(margin)) or None)}", 0)
-    for row, part in enumerate(reversed(doubt_lines(doubt)), start=1):
-        foot(out, part, row, ink=ink_of(WARNING))
-    return replace(picture, colour=out)
-
-
-def doubt_lines(doubt: str) -> list[str]:
-    """A doubt as it is written: its reason, and what follows from it; nothing where there is none."""
-    return [part for part in doubt.split(": ") if part]
+        lay(out, taken, [f"moved {millimetres(motion, float(np.max(margin)) or None)}"], (0, camera.height))
+    write_doubt(drawn, doubt)
+    if gauge is not None:
+        write_gauge(drawn, camera, gauge, covered)
+    return drawn
 
 
 def ink_of(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
@@ -237,9 +240,23 @@ def draw_line(out: np.ndarray, camera: Camera, gauge: Gauge) -> None:
     cv2.circle(out, nearest, 3, (250, 250, 250), -1, cv2.LINE_AA)
 
 
-def write_gauge(out: np.ndarray, camera: Camera, gauge: Gauge) -> None:
-    """Write the gauge's number beside the end of its line, in place; nothing when that lies behind the camera."""
+def write_gauge(drawn: Picture, camera: Camera, gauge: Gauge, covered: np.ndarray) -> None:
+    """Write the gauge's number near the end of its line, in place; nothing when that lies behind the camera.
+
+    covered (H, W) uint8: above 0 where tools are, which the number leaves in sight if it can.
+    """
     (end,), (depth,) = camera.project(np.asarray(gauge.nearest)[None])
     if depth > 0.0:
         column, row = np.clip(end, -1e4, 1e4).round().astype(int).tolist()
-        write(out, str(gauge), (column + 10, row + 16), GAUGE)
+        lay(drawn.colour, drawn.taken, [str(gauge)], (column + BESIDE, row), GAUGE, sights=covered)
+
+
+def write_doubt(drawn: Picture, doubt: str) -> None:
+    """Write why an answer may not be relied on at the left of the foot, in place, room or no room."""
+    height, width = drawn.taken.shape
+    lay(drawn.colour, drawn.taken, doubt_lines(doubt, width), (0, height), FINE, ink_of(WARNING), needed=True)
+
+
+def doubt_lines(doubt: str, width: int) -> list[str]:
+    """A doubt as it is written into a picture of this width [pixel]: its reason, and what follows from it."""
+    return [line for part in doubt.split(": ") for line in folded(part, NARROW * width)]

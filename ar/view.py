@@ -34,12 +34,15 @@ class Picture:
         (H, W, 3) float32, unit, in the world frame, towards the camera; 0 where nothing is seen.
     segmentation
         (H, W) uint8: the id of the layer seen, 0 where nothing is seen.
+    taken
+        (H, W) uint8: above 0 where lines and words are drawn over it.
     """
 
     colour: np.ndarray
     depth: np.ndarray
     normal: np.ndarray
     segmentation: np.ndarray
+    taken: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +122,7 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
         fragments.depth,
         normal.numpy().reshape(height, width, 3),
         segmentation.numpy().reshape(height, width),
+        np.zeros((height, width), np.uint8),
     )
 
 

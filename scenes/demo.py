@@ -354,4 +354,4 @@ class Demo:
 
 def pictured(frame: Frame) -> np.ndarray:
     """A frame's picture (H, W, 3) uint8 with the patient's sides."""
-    return marked(frame.shown, frame.camera.T_camera_world[:3, :3])
+    return marked(frame.shown, frame.camera.T_camera_world[:3, :3], frame.taken)

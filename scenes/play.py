@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 
 from ar.camera import Camera
-from ar.hud import foot, panel
+from ar.hud import NARROW, folded, lay, panel
 from ar.layer import Layer
-from ar.overlay import Gauge, Style, composite, doubt_lines
+from ar.overlay import Gauge, Style, composite
 from ar.view import Picture, render
 from sim.closest import closest
 from sim.deformation import Deformation, Deformer
@@ -57,6 +57,8 @@ class Frame:
         What the camera sees, without overlay.
     shown
         The picture with the predicted tumour in it (H, W, 3) uint8, where the scan had it, and the frame's number.
+    taken
+        (H, W) uint8: above 0 where lines and words stand in it.
     distance
         From the tool's tip to the tumour's predicted surface [m]; None without a tool.
     distance_error
@@ -81,6 +83,7 @@ class Frame:
     tip: np.ndarray | None
     picture: Picture
     shown: np.ndarray
+    taken: np.ndarray
     distance: float | None
     distance_error: float | None
     moved: float
@@ -162,13 +165,13 @@ class Player:
         tumour, rest = (stage.tumour(at) for at in (positions, self.site.anatomy.mesh.nodes))
         doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
-        over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt).colour
+        over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt)
         remark = self.scene.stopped(self.site, touch)
-        annotate(over, number, remark, doubt)
+        annotate(over, number, remark)
         spent = seconds, rendered - begun, clock.perf_counter() - rendered
         return Frame(
             number, float(loads.times[0]), touch, loads, deformation, self.camera,
-            None if held is None else held.pose, None if held is None else held.tip, picture, over,
+            None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
             None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
             float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()),
             doubt, remark, dict(zip(STAGES, spent, strict=True)),
@@ -225,10 +228,11 @@ def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
     return Gauge(tip, closest(tip[None], hidden.vertices[hidden.triangles]).point[0])
 
 
-def annotate(colour: np.ndarray, number: int, remark: str, doubt: str) -> None:
-    """Write a frame's number at the right of the picture's foot, and a remark over the words at its left, in place."""
-    foot(colour, f"frame {number}", 0, right=True)
-    foot(colour, remark, 1 + len(doubt_lines(doubt)))
+def annotate(over: Picture, number: int, remark: str) -> None:
+    """Write a remark at the left of a composite picture's foot, and a frame's number at its right, in place."""
+    height, width = over.taken.shape
+    lay(over.colour, over.taken, folded(remark, NARROW * width), (0, height))
+    lay(over.colour, over.taken, [f"frame {number}"], (width, height))
 
 
 def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:

@@ -1,10 +1,12 @@
-"""The patient's sides at the edges of a picture."""
+"""Words on a picture: the patient's sides at its edges, lines where there is room, lengths as they are read."""
 
+import cv2
 import numpy as np
 import pytest
 
 from ar.camera import look_at
-from ar.hud import bearings, marked, millimetres, towards
+from ar.hud import FINE, FONT, bearings, folded, lay, marked, millimetres, panel, towards
+from ar.places import ASIDE, CLEAR, PAD, STEP, free_place
 
 
 @pytest.mark.parametrize(
@@ -38,7 +40,7 @@ def test_what_lies_at_the_edges_follows_from_the_camera():
 def test_letters_stand_at_the_edges():
     plain = np.full((240, 320, 3), 90, np.uint8)
     turn = np.eye(3)
-    letters = marked(plain, turn)
+    letters = marked(plain, turn, np.zeros(plain.shape[:2], np.uint8))
     changed = (letters != plain).any(axis=2)
     for edge in (changed[100:140, :30], changed[100:140, -30:], changed[:30, 60:100], changed[-30:, 220:260]):
         assert edge.any()
@@ -58,3 +60,83 @@ def test_letters_stand_at_the_edges():
 )
 def test_a_length_is_read_in_millimetres_with_what_it_may_be_off_by(length, error, text):
     assert millimetres(length, error) == text
+
+
+def test_letters_at_an_edge_give_way_along_it():
+    """A line that leaves the picture where the upper letter stands moves that letter aside, and no other."""
+    plain = np.full((240, 320, 3), 90, np.uint8)
+    taken = np.zeros(plain.shape[:2], np.uint8)
+    free = marked(plain, np.eye(3), taken)
+    taken[:120, 70:90] = 1
+    letters = marked(plain, np.eye(3), taken)
+    changed = (letters != plain).any(axis=2)
+    assert not changed[:120, 70:90].any() and changed[:30].any()
+    assert np.array_equal(letters[40:], free[40:]) and taken.sum() == 2400
+    # Where its edge has no room a letter is left out: at another it would be wrong.
+    taken[:40] = 1
+    letters = marked(plain, np.eye(3), taken)
+    assert np.array_equal(letters[:40], plain[:40]) and np.array_equal(letters[60:], free[60:])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_free_place_is_the_nearest(seed):
+    """Held against every place on the same grid, tried one by one."""
+    rng = np.random.default_rng(seed)
+    taken = np.zeros((120, 160), np.uint8)
+    for row, column in rng.integers(0, (120, 160), (14, 2)):
+        taken[row : row + 12, column : column + 12] = 1
+    size, wish = (30, 12), tuple(rng.integers(-20, 180, 2).tolist())
+    there = min(max(wish[0], PAD), 160 - PAD - 30), min(max(wish[1], PAD), 120 - PAD - 12)
+
+    def free(column, row):
+        return not taken[row - CLEAR : row + 12 + CLEAR, column - CLEAR : column + 30 + CLEAR].any()
+
+    def far(column, row):
+        return (ASIDE * (column - there[0])) ** 2 + (row - there[1]) ** 2
+
+    grid = [(c, r) for r in range(PAD, 120 - PAD - 12 + 1, STEP) for c in range(PAD, 160 - PAD - 30 + 1, STEP)]
+    places = [place for place in grid if free(*place)]
+    found = free_place(taken, size, wish)
+    assert places and found is not None and free(*found)
+    assert far(*found) == (0 if free(*there) else min(far(*place) for place in places))
+
+
+def test_without_room_there_is_no_place():
+    taken = np.zeros((100, 200), np.uint8)
+    assert free_place(taken, (184, 84), (0, 0)) == (PAD, PAD)
+    assert free_place(taken, (185, 84), (0, 0)) is None and free_place(taken, (20, 85), (0, 0)) is None
+    taken[::10] = 1
+    assert free_place(taken, (20, 12), (50, 50)) is None
+
+
+def test_words_take_their_place_and_without_room_only_the_needed_are_written():
+    colour, taken = np.zeros((100, 200, 3), np.uint8), np.zeros((100, 200), np.uint8)
+    lay(colour, taken, ["first"], (0, 100))
+    (low,) = np.nonzero(taken.any(axis=1))[0][[-1]]
+    lay(colour, taken, ["second", "and its next line"], (0, 100))
+    assert low == 100 - PAD - 1 and np.nonzero(taken.any(axis=1))[0][0] < low - 40 and colour.any()
+    # What is written is inside what is taken, but for the halo.
+    assert not colour[cv2.dilate(taken, np.ones((9, 9), np.uint8)) == 0].any()
+    full, blank = np.ones((100, 200), np.uint8), np.zeros((100, 200, 3), np.uint8)
+    lay(blank, full, ["dropped"], (0, 100))
+    lay(blank, full, [], (0, 100), needed=True)
+    assert not blank.any()
+    lay(blank, full, ["needed"], (0, 100), needed=True)
+    assert blank[70:, :80].any() and not blank[:60].any()
+
+
+@pytest.mark.parametrize("room", [1.0, 60.0, 130.0, 150.0, 1000.0])
+def test_a_folded_line_keeps_its_words_and_its_room(room):
+    text = "the bone's edge stops the tool 17.5 mm short"
+    lines = folded(text, room)
+    wide = [cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines]
+    assert " ".join(lines) == text
+    assert all(width <= room or " " not in line for width, line in zip(wide, lines, strict=True))
+    assert (len(lines) == 1) is (room == 1000.0) and (room != 150.0 or max(wide) < 1.4 * min(wide))
+
+
+def test_a_panel_folds_lines_that_are_wider_than_the_picture():
+    colour = np.full((150, 200, 3), 90, np.uint8)
+    shown = panel(colour, ["a line that is much wider than so narrow a picture", "short"])
+    changed = (shown != colour).any(axis=2)
+    assert not changed[:, 193:].any() and changed[:, 150:190].any()

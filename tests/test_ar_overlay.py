@@ -9,7 +9,7 @@ import pytest
 from ar.camera import look_at
 from ar.hud import FINE, panel, write
 from ar.layer import Layer, Solid, vertex_normals
-from ar.overlay import BEFORE, DOUBTFUL, GAUGE, WARNING, Gauge, composite, ink_of, iou, silhouette
+from ar.overlay import BEFORE, DOUBTFUL, GAUGE, WARNING, Gauge, composite, doubt_lines, ink_of, iou, silhouette
 from ar.refind import outline_gap, stands
 from ar.view import Lamp, lamp_beside, render
 
@@ -248,7 +248,7 @@ def test_motion_and_doubt_stand_on_lines_of_their_own():
     doubt = "outside what the model learned: do not rely on it"
     shown = composite(picture, here, now, before=before, margin=np.nan, doubt=doubt).colour
     assert stands(shown, "moved 3.0 mm", FINE)
-    assert all(stands(shown, part, FINE, ink_of(WARNING)) for part in doubt.split(": "))
+    assert all(stands(shown, line, FINE, ink_of(WARNING)) for line in doubt_lines(doubt, 400))
     assert stands(composite(picture, here, now, before=before, margin=np.nan).colour, "moved 3.0 mm", FINE)
 
 
@@ -276,6 +276,34 @@ def test_a_tumour_out_of_the_picture_leaves_it_alone():
     picture = render(here, [cortex()], LAMP)
     for centre in ((1.0, 0.0, 0.0), (0.0, -0.1, 0.6)):
         assert np.array_equal(composite(picture, here, tumour(centre)).colour, picture.colour)
+
+
+def test_without_overlay_a_doubt_is_all_that_is_drawn():
+    here = camera(400, 300)
+    picture = render(here, [cortex()], LAMP)
+    gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
+    bare, unsure = (
+        composite(picture, here, tumour(), style="none", gauge=gauge, before=tumour(), doubt=doubt).colour
+        for doubt in ("", "do not rely on it")
+    )
+    assert np.array_equal(bare, picture.colour) and stands(unsure, "do not rely on it", FINE, ink_of(WARNING))
+    rows, columns = np.nonzero((unsure != picture.colour).any(axis=2))
+    assert rows.min() > 270 and columns.max() < 120
+
+
+def test_what_lines_and_words_cover_is_told():
+    """Every pixel of outline, arrow and number, and no other but a margin round letters."""
+    here = camera(400, 300)
+    picture = render(here, [cortex()], LAMP)
+    gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
+    drawn = composite(picture, here, tumour(), style="contour", gauge=gauge, before=tumour((0.01, 0.0, -0.02)))
+    changed = (drawn.colour != picture.colour).any(axis=2)
+    assert not picture.taken.any()
+    taken = drawn.taken > 0
+    halo = cv2.dilate(taken.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    assert (halo | ~changed).all() and changed[taken].mean() > 0.5
+    ring = silhouette(here, tumour().vertices, tumour().triangles).astype(np.uint8)
+    assert taken[(ring - cv2.erode(ring, np.ones((3, 3), np.uint8))) > 0].all()
 
 
 def test_words_stay_inside_the_picture():

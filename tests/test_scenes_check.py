@@ -102,9 +102,9 @@ def drawn(play, frame, positions, camera=None, tip=None):
     gauge = gauged(at, tumour)
     if tip is None:
         gauge = replace(gauge, read=frame.distance, error=frame.distance_error)
-    shown = composite(frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauge, before=rest).colour
-    annotate(shown, frame.number, frame.remark, frame.doubt)
-    return replace(frame, shown=shown)
+    shown = composite(frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauge, before=rest)
+    annotate(shown, frame.number, frame.remark)
+    return replace(frame, shown=shown.colour)
 
 
 def off_by(camera, columns, rows):
