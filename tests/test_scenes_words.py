@@ -113,6 +113,8 @@ def test_no_word_stands_on_a_line_at_the_border_or_on_another(monkeypatch, name,
         assert BORDER <= word.left < word.right <= width - BORDER, word.text
         assert BORDER <= word.top < word.bottom <= height - BORDER, word.text
         assert not [other.text for other in words if other is not word and other.meets(word.grown(WORD))], word.text
+        if word.text[0].isdigit():  # the distance leaves the tool in sight
+            assert not (frame.picture.segmentation[rows, columns] == TOOL).any()
     said = " ".join(word.text for word in words)
     assert f"frame {frame.number}" in said and "moved " in said
     assert frame.distance is not None and f"{1e3 * frame.distance:.1f}" in said and frame.remark in said
