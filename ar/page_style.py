@@ -1,7 +1,8 @@
 """Where things are on the page: the picture pinned and growing with the window, words, controls and 3-D view around it.
 
 viser places panels in pixels; these rules go over its own. Its elements have no names, so they are found by what they
-hold. A browser that knows no `:has()` leaves the rules aside and shows picture and controls in one docked panel.
+hold. In a wide window the controls stand in two columns, so that all are in sight. A browser that knows no `:has()`
+leaves the rules aside and shows picture and controls in one docked panel.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ PAGE, STATUS = "sulcus", "sulcus-status"
 """Names of the elements that hold the words under the picture, and the line over it."""
 PANEL = f"div:has(canvas) ~ div:has(#{PAGE})"
 VIEW = f"div:has(canvas):has(~ div #{PAGE})"
+PARTS = f"div:has(> div > #{SAID})"
 NOTES = ".mantine-Notifications-root"
 
 RULES = """
@@ -43,6 +45,14 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   VIEW { inset: auto 0 0 var(--w) !important; height: var(--low); border-top: 1px solid #444 }
   #PAGE { position: fixed; left: 0; top: calc(var(--w) / var(--aspect)); width: var(--w); bottom: 0; overflow: auto }
 }
+@media (min-width: 75em) and (min-aspect-ratio: 13/10) {
+  PARTS { display: grid; grid-template-columns: 1fr 1fr; align-items: center }
+  PARTS > * { grid-column: 1 / -1 }
+  PARTS > div:has(> button), PARTS > div:has(> .mantine-Flex-root) { grid-column: auto }
+}
+@media (min-width: 75em) and (min-aspect-ratio: 13/10) and (max-height: 50em) {
+  :root { --low: max(22vh, 9rem) }
+}
 @media (min-width: 36.01em) and (max-aspect-ratio: 13/10) {
   PANEL { bottom: 0 !important }
   VIEW { inset: auto calc(100vw - var(--w)) 0 0 !important }
@@ -56,7 +66,7 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   PANEL div[style*="20em"] { width: 100% !important }
   VIEW { position: absolute !important; inset: auto 0 0 0 !important; height: var(--low) !important }
   #PAGE { font-size: 0.78rem }
-  #SAID { max-height: 8.2rem; overflow-y: auto }
+  #SAID { font-size: 0.82rem; max-height: 11.4rem; overflow-y: auto }
   NOTES { left: 0.5rem !important }
 }
 """
@@ -69,6 +79,7 @@ def style(aspect: float) -> str:
         ("#PICTURE", f"#{PICTURE}"),
         ("PANEL", PANEL),
         ("VIEW", VIEW),
+        ("PARTS", PARTS),
         ("NOTES", NOTES),
         ("#PAGE", f"#{PAGE}"),
         ("#STATUS", f"#{STATUS}"),

@@ -230,9 +230,21 @@ def test_on_a_phone_distance_and_playback_come_before_what_explains_the_picture(
     assert page.folder is not None
     assert page.text.order < page.folder.order < page.words.order
     phone = style(4 / 3).split("@media (max-width: 36em)")[1]
-    assert re.search(rf"#{SAID} {{ max-height: [0-9.]+rem; overflow-y: auto }}", phone)
+    said = re.search(rf"#{SAID} {{ font-size: ([0-9.]+)rem; max-height: ([0-9.]+)rem; overflow-y: auto }}", phone)
+    assert said is not None
+    # The distance, and eight lines more: whom to trust, what acts, and the verdict even on an earlier load.
+    size, high = map(float, said.groups())
+    assert high >= 1.25 * 1.4 + 8 * 1.4 * size
     page.fill([], Playback(30, print, print), [Slider("force [N]", 0.0, 1.0, 0.01, 0.2, print)])
     assert page.folder.order < page.words.order
+
+
+def test_a_wide_window_has_its_controls_in_two_columns(page):
+    """All of them in sight in 1280 x 720, and the words over them as wide as both."""
+    wide = style(4 / 3).split("@media (min-width: 75em) and (min-aspect-ratio: 13/10) {")[1].split("@media")[0]
+    holder = f"div:has(> div > #{SAID})"
+    assert 75 * 16 <= 1280 and f"{holder} {{ display: grid; grid-template-columns: 1fr 1fr;" in wide
+    assert wide.index(f"{holder} > * {{ grid-column: 1 / -1 }}") < wide.index(f"{holder} > div:has(> button)")
 
 
 def test_the_line_over_the_picture_comes_and_goes(page):
