@@ -10,6 +10,7 @@ import numpy as np
 from .anatomy import Anatomy
 from .closest import closest
 from .errors import InputError
+from .given import numbers
 from .normals import unit, vertex_normals
 from .triangles import areas
 
@@ -100,8 +101,12 @@ class OpenCortex:
         Raises
         ------
         InputError
-            A place outside the open cortex.
+            What is no number, or not one; a place outside the open cortex.
         """
+        for name, value in (("right_mm", right_mm), ("up_mm", up_mm)):
+            given = numbers(name, value)
+            if given.shape != ():
+                raise InputError(f"{name} has shape {given.shape}: give one number, in millimetres.")
         found = self.nearest(self.origin + 1e-3 * (right_mm * self.right + up_mm * self.up))
         rim = rim_of(self.anatomy.mesh.nodes, self.anatomy.open_surface)
         if not distances_to(rim, found.point[None])[0] > ON_RIM:

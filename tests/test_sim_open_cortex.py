@@ -56,10 +56,24 @@ def test_a_place_is_where_it_was_asked_for(template):
         assert np.isin(place.vertices, template.open_surface).all()
 
 
-@pytest.mark.parametrize("asked", [(60.0, 0.0), (0.0, -200.0), (float("nan"), 0.0)])
+@pytest.mark.parametrize("asked", [(60.0, 0.0), (0.0, -200.0)])
 def test_a_place_under_the_bone_is_refused(template, asked):
     with pytest.raises(InputError, match="outside the open cortex: stay within"):
         open_cortex(template).place(*asked)
+
+
+@pytest.mark.parametrize(
+    ("asked", "reason"),
+    [
+        ({"right_mm": "x"}, "right_mm has the type <U1: give real numbers"),
+        ({"up_mm": None}, "up_mm has the type object: give real numbers"),
+        ({"up_mm": [1.0, 2.0]}, r"up_mm has shape \(2,\): give one number, in millimetres"),
+        ({"right_mm": float("nan")}, "right_mm has a value that is not finite"),
+    ],
+)
+def test_a_place_that_is_no_number_is_refused(template, asked, reason):
+    with pytest.raises(InputError, match=reason):
+        open_cortex(template).place(**asked)
 
 
 def test_without_a_craniotomy_there_is_none(template):
