@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -181,8 +181,6 @@ def _distance(player: Player, frame: Frame, tip: np.ndarray) -> float:
     positions = player.positions(frame.deformation)
     corners = positions[player.stage.at(frame.loads).anatomy.tumour_surface]
     apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", SAMPLES, corners) - tip, axis=2).min())
-    model = player.deformer
-    if not isinstance(model, Learned) or model.tip is None or model.tip.correction is None:
+    if not isinstance(player.deformer, Learned):
         return apart
-    uncorrected = replace(model, tip=None).distance(frame.loads, frame.deformation).value[0]
-    return apart + float(model.distance(frame.loads, frame.deformation).value[0] - uncorrected)
+    return float(player.deformer.distance(frame.loads, frame.deformation, np.array([apart])).value[0])
