@@ -11,14 +11,18 @@ from sim.errors import InputError
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
 
 
-def add_tissue_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare --material and the constants of its laws."""
-    sets = "; ".join(f"{name} (holds for {known.time_scale}; {known.source})" for name, known in MATERIALS.items())
+def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False) -> None:
+    """Declare --material and the constants of its laws; the help tells the `whole` of each tissue, or its name."""
+    sets = ", ".join(MATERIALS) + "; `sulcus solve --help` tells their time scales and sources"
+    if whole:
+        sets = "; ".join(f"{name} (holds for {known.time_scale}; {known.source})" for name, known in MATERIALS.items())
     parser.add_argument(
         "--material",
         default="default",
         choices=(*MATERIALS, *LAWS, Ogden.law),
-        help=f"tissue law, or a named tissue, which is a law with its constants: {sets} (default %(default)s)",
+        metavar="TISSUE",
+        help=f"tissue law ({', '.join((*LAWS, Ogden.law))}), or a named tissue, which is a law with its constants: "
+        f"{sets} (default %(default)s)",
     )
     parser.add_argument(
         "--young", type=float, metavar="PA", help=f"Young's modulus [Pa] (default the material's, or {BRAIN.young:g})"

@@ -140,11 +140,24 @@ def test_contradictions_are_exit_code_two_and_write_nothing(tmp_path: Path, caps
     assert not (tmp_path / "out.vtu").exists()
 
 
-@pytest.mark.parametrize("command", ["solve", "simulate"])
-def test_help_names_every_tissue_with_its_source(command: str, capsys: pytest.CaptureFixture) -> None:
+def told_of_tissue(capsys: pytest.CaptureFixture, *command: str) -> str:
+    """What a command's help says of --material."""
     with pytest.raises(SystemExit):
-        main([command, "--help"])
-    said = "".join(capsys.readouterr().out.split())
+        main([*command, "--help"])
+    options = capsys.readouterr().out.split("\noptions:")[1]
+    return options.split("  --material TISSUE")[1].split("  --young PA")[0]
+
+
+def test_the_help_of_solve_names_every_tissue_with_its_source(capsys: pytest.CaptureFixture) -> None:
+    said = "".join(told_of_tissue(capsys, "solve").split())
     for name, known in MATERIALS.items():
         assert "".join(f"{name} (holds for {known.time_scale}; {known.source})".split()) in said
     assert all(law in said for law in LAWS)
+
+
+@pytest.mark.parametrize("command", ["simulate", "demo", "effects", "bench robust", "bench live"])
+def test_other_helps_name_the_tissues_and_say_where_more_stands(command: str, capsys: pytest.CaptureFixture) -> None:
+    said = told_of_tissue(capsys, *command.split())
+    words = " ".join(said.replace("-\n", "-").split())
+    assert len(said.splitlines()) <= 10 and "`sulcus solve --help`" in words
+    assert all(name in "".join(said.split()) for name in (*MATERIALS, *LAWS))

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(V, 3), a first guess in the file's unit, and cell data `region`. Mid-edge nodes that the file brings are "
         "nodes as any other: held only where `fixed` says so",
     )
-    add_tissue_arguments(parser)
+    add_tissue_arguments(parser, whole=True)
     add_element_argument(parser, "p1, the file's linear tetrahedra as every other program takes them")
     parser.add_argument(
         "--region",
