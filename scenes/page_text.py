@@ -171,10 +171,15 @@ def table(rows: Sequence[Row]) -> str:
         what = "Medians so far, each over loads of its own: not to be compared."
     lines = (
         f"<tr{' class=best' if row.best else ''}><td>{escape(row.name)}</td>"
-        f"<td>{row.milliseconds:.1f} ms</td><td>{row.millimetres:.3f} mm off</td><td>{counted(row.loads)}</td></tr>"
+        f"<td>{row.milliseconds:.1f} ms</td><td>{_off(row.millimetres)} mm off</td><td>{counted(row.loads)}</td></tr>"
         for row in rows
     )
     return f'<p class="dim">{what}</p><table>{"".join(lines)}</table>'
+
+
+def _off(millimetres: float) -> str:
+    """No error is told as none."""
+    return f"{millimetres:.3f}" if millimetres >= 1e-3 else "under 0.001"
 
 
 def counted(loads: int) -> str:
