@@ -186,6 +186,7 @@ class Demo:
         if asked == now.asked and now.frame is not None:
             if style != now.style:
                 self._restyle(now, name)
+            self.wish.go_on(number, len(scene.times))  # after a pause
             return 0
         self.busy.on(self._work(number, name, touch))
         session = self._session(name, off)

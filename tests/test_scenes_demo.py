@@ -130,6 +130,21 @@ def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypat
     assert len(asked) == 1 and seen[:5] == [None] * 5
 
 
+def test_playing_goes_on_after_a_pause(demo, monkeypatch):
+    """In the middle of a run: the frame that it paused at is shown already, and so nothing new is asked for."""
+    demo.wish.set(plays=False, number=20)
+    seen = []
+
+    def played():
+        seen.append(demo.wish.number)
+        if len(seen) == 5:
+            demo.wish.play(True)
+        return seen[-1] > 22 or len(seen) == 100
+
+    run_until(demo, monkeypatch, played)
+    assert seen[:5] == [20] * 5 and seen[-1] == 23
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_finite_elements_that_fail_are_not_waited_for(demo, monkeypatch):
     def overflowing(fem, loads, start=None, at=None):
