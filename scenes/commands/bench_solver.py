@@ -6,12 +6,14 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
 
+from sim.device import find_device
 from sim.errors import InputError
 from sim.meshfile import read_anatomy
 
@@ -20,12 +22,35 @@ from ..shipped import template_path
 if TYPE_CHECKING:
     from ..solver_bench import Row
 
-NAMES = ("torch-fem", "scikit-fem", "felupe")
+NAMES = ("tled", "modified-newton", "torch-fem", "scikit-fem", "felupe")
+COLUMNS = (
+    "engine",
+    "tolerance",
+    "first [s]",
+    "/ ours",
+    "further [s]",
+    "/ ours",
+    "converged",
+    "residual",
+    "off the reference [mm]",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--peers", nargs="*", choices=NAMES, help="these too, or all of them (extra `peers`)")
+    parser.add_argument(
+        "--peers", nargs="*", choices=NAMES, help="these too, or all of them (most want the extra `peers`)"
+    )
+    parser.add_argument(
+        "--tolerance",
+        nargs="+",
+        type=float,
+        default=[1e-6],
+        help="relative residuals that are asked for, each in a run of its own (default 1e-6)",
+    )
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cpu", help="of ours and of tled; others have the CPU"
+    )
     parser.add_argument(
         "--mesh", nargs="+", type=Path, metavar="MESH.vtu", help="made by `sulcus anatomy` (default: the template)"
     )
@@ -40,48 +65,58 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compare; 1 if one of our answers is off."""
     from ..bench import machine
-    from ..solver_bench import LIVE, OWN, PEERS, TOLERANCE, case_of, compare
+    from ..solver_bench import LEAST, LIVE, OWN, PEERS, case_of, compare, judge_of
 
     if args.loads < 2 or args.starts < 1 or args.threads < 1:
         raise InputError(
             f"--loads {args.loads} --starts {args.starts} --threads {args.threads} compares nothing: give "
             "--loads >= 2, --starts >= 1, --threads >= 1."
         )
+    if wrong := [tolerance for tolerance in args.tolerance if not LEAST <= tolerance < 1.0]:
+        raise InputError(f"--tolerance {wrong[0]:g} cannot be judged: give numbers from {LEAST:g} to below 1.")
+    find_device(args.device, "float64")
     asked = () if args.peers is None else args.peers or NAMES
-    engines = (LIVE if args.live else OWN, *(peer for peer in PEERS if peer.name in asked))
+    own = LIVE if args.live else OWN
+    engines = [engine.on(args.device) for engine in (own, *(peer for peer in PEERS if peer.name in asked))]
     cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [template_path()]]
     table = sys.stderr if args.json else sys.stdout
-    where = machine("cpu")
+    where = machine(args.device)
     print(
         f"{where}\n\nLog neo-Hookean, E 3 kPa, nu 0.45, linear tetrahedra, skull nodes held (not sliding: not every "
-        f"peer can); {args.loads} palpation loads as nodal forces, each from rest and alone, to {TOLERANCE:g}, all "
-        f"residuals by one routine; {args.threads} threads; imports not counted, compiled code in its cache.",
+        f"peer can); {args.loads} palpation loads as nodal forces, each from rest and alone; all residuals, and "
+        f"distances from our answers to 1e-11, by one routine; {args.threads} threads; imports not counted, compiled "
+        "code in its cache.",
         file=table,
     )
     found, each = [], args.starts + args.loads
     for case in cases:
         started = sum(not engine.missing for engine in engines)
-        with tqdm(total=started * each, unit="answer", file=sys.stderr) as bar:
-            rows = compare(case, engines, args.starts, args.threads, bar.update)
-        _print(f"{len(case.nodes)} nodes, {len(case.tets)} tetrahedra", rows, table)
-        found.append({"nodes": len(case.nodes), "tets": len(case.tets), "rows": [_plain(row) for row in rows]})
+        size = {"nodes": len(case.nodes), "tets": len(case.tets)}
+        print(f"\n{size['nodes']} nodes, {size['tets']} tetrahedra\n\n| {' | '.join(COLUMNS)} |", file=table)
+        print(f"|{'---|' * len(COLUMNS)}", file=table, flush=True)
+        judge = judge_of(case)
+        with tqdm(total=len(args.tolerance) * started * each, unit="answer", file=sys.stderr) as bar:
+            for tolerance in args.tolerance:
+                to_this = replace(case, tolerance=tolerance)
+                rows = compare(to_this, judge, engines, args.starts, args.threads, bar.update)
+                _print(rows, table)
+                found.append({**size, "tolerance": tolerance, "rows": [_plain(row) for row in rows]})
     if args.json:
-        print(json.dumps({"machine": where, "threads": args.threads, "tolerance": TOLERANCE, "meshes": found}))
+        print(json.dumps({"machine": where, "threads": args.threads, "meshes": found}))
     return 0 if all(answer["good"] for mesh in found for answer in mesh["rows"][0]["answers"]) else 1
 
 
-def _print(title: str, rows: Sequence[Row], table: Any) -> None:
-    names = ("engine", "first [s]", "/ ours", "further [s]", "/ ours", "converged", "residual", "off ours [mm]")
-    print(f"\n{title}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}", file=table)
+def _print(rows: Sequence[Row], table: Any) -> None:
     for row in rows:
         if row.missing:
-            print(f"| {row.engine} | {row.missing} |{' |' * (len(names) - 2)}", file=table)
+            print(f"| {row.engine} | {row.tolerance:g} | {row.missing} |{' |' * (len(COLUMNS) - 3)}", file=table)
             continue
         good = [answer for answer in row.answers if answer.good]
         bad = next((answer for answer in row.answers if not answer.good), None)
         why = f"; not converged: {bad.reason or f'residual {bad.residual:.1e}'}" if bad else ""
         cells = (
             f"{row.engine} ({row.setting})",
+            f"{row.tolerance:g}",
             _figure(row.first, ".2f"),
             _figure(row.first_ratio, ".2f"),
             _figure(row.further, ".3f"),
@@ -104,7 +139,7 @@ def _plain(row: Row) -> dict[str, Any]:
         | {name: _finite(getattr(one, name)) for name in ("seconds", "residual", "apart")}
         for one in row.answers
     ]
-    figures = {name: _finite(getattr(row, name)) for name in ("first", "first_ratio", "further", "ratio")}
+    figures = {name: _finite(getattr(row, name)) for name in ("tolerance", "first", "first_ratio", "further", "ratio")}
     firsts = [_finite(seconds) for seconds in row.firsts]
     named = {"engine": row.engine, "setting": row.setting, "missing": row.missing}
     return named | figures | {"firsts": firsts, "answers": answers}
