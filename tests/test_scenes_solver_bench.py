@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 from conftest import make_box
 
 from scenes.cli import main
 from scenes.commands.bench_solver import NAMES
 from scenes.served import fem_of
-from scenes.solver_bench import HOUSE, OWN, PEERS, TOLERANCE, Engine, case_of, compare, judge_of
+from scenes.solver_bench import HOUSE, LIVE, OWN, PEERS, TOLERANCE, Engine, case_of, compare, judge_of
 from sim.meshfile import write_anatomy
 
 WRONG = """
@@ -114,6 +115,17 @@ def test_the_command_says_it_in_json(box, tmp_path, capsys, more, said_of_it):
     assert "2 of 2" in said.err
 
 
+def test_each_row_names_the_tolerance_that_it_was_asked_for(box, tmp_path, capsys):
+    write_anatomy(tmp_path / "box.vtu", box)
+    words = ["--mesh", str(tmp_path / "box.vtu"), "--loads", "2", "--starts", "1", "--peers", "tled"]
+    assert main(["bench", "solver", *words, "--tolerance", "1e-3", "1e-10"]) == 0
+    lines = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if "2 of 2" in line]
+    assert [cells[1] for cells in lines] == ["0.001", "0.001", "1e-10", "1e-10"]
+    assert [line[0].split()[1] for line in lines] == ["sulcus", "tled"] * 2
+    far = [float(cells[-1].split()[1]) for cells in lines]
+    assert min(far[:2]) > 1e2 * max(far[2:]) and max(far) < 1e-1
+
+
 @pytest.mark.parametrize("name", ["tled", "modified-newton", "scikit-fem"])
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-10])
 def test_a_peer_finds_the_same_field(case, judge, name, tolerance):
@@ -131,6 +143,22 @@ def test_a_peer_finds_the_same_field(case, judge, name, tolerance):
     assert theirs.ratio == pytest.approx(
         np.median([b.seconds / a.seconds for a, b in zip(ours.answers[1:], theirs.answers[1:], strict=True)])
     )
+
+
+def test_ours_and_tled_alone_go_to_the_graphics_card():
+    moved = {engine.name for engine in (OWN, LIVE, *PEERS) if engine.on("cuda").words == (*engine.words, "cuda")}
+    assert moved == {"sulcus", "tled"}
+    assert all(engine.on("cpu") == engine for engine in (OWN, *PEERS))
+    assert all(engine.on("cuda") == engine for engine in PEERS if engine.name not in moved)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
+def test_tled_finds_the_same_field_on_a_graphics_card(case, judge):
+    tled = next(peer for peer in PEERS if peer.name == "tled")
+    for row in compared(case, judge, OWN.on("cuda"), tled.on("cuda")):
+        assert [answer.reason for answer in row.answers] == [""] * len(case.force)
+        assert all(answer.good and answer.apart < 1e-4 for answer in row.answers)
 
 
 def test_tled_of_another_law_is_found_out_and_one_that_ends_too_soon_says_so(case, judge, tmp_path):

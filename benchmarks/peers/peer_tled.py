@@ -180,7 +180,7 @@ def _captured(steps: Callable[[], None], device: str) -> Callable[[], None]:
     """The same as one CUDA graph; on the CPU as it is."""
     if device == "cpu":
         return steps
-    wp.load_module(device=device)
+    steps()  # kernels are loaded before, at rest and without a load
     with wp.ScopedCapture(device=device) as capture:
         steps()
     return lambda: wp.capture_launch(capture.graph)
