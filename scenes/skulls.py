@@ -10,10 +10,15 @@ import numpy as np
 
 from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL, Anatomy
-from sim.effects import pushed_effects
+from sim.deformation import Deformation, joined
+from sim.effects import Bonded, pushed_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
+from sim.tearing import torn
+
+# A bond that lets go where it bears too much, and one that bears nothing: the skull presses only, without a gap.
+TEARING = {"tearing": Bonded(), "pressing": Bonded(1e-6, 1e-6)}
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,8 @@ class Row:
     motion
         Mean motion of the tumour by volume, its mean over the loads [mm].
     leaked, bond
-        The largest over the loads, as in `Deformation`; None where nothing is bonded.
+        The largest over the loads, as in `Deformation`; None where nothing is bonded, and of what passes a skull that
+        the brain may leave.
     seconds
         A load, set-up left out.
     failed
@@ -36,7 +42,7 @@ class Row:
     poisson: float
     vertices: int
     motion: float
-    leaked: float
+    leaked: float | None
     bond: float | None
     seconds: float
     failed: int
@@ -53,19 +59,32 @@ def rows(
 
 
 def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device: str) -> Row:
-    mesh = anatomy.mesh
-    fem = Fem(anatomy, pushed_effects(anatomy, Material("neo-hookean", 3000.0, poisson), skull), TRAIN, device)
-    fem.deform(loads.rows(slice(0, 1)).scaled(1e-3))  # kernels are compiled or loaded at their first launch
-    begun = clock.perf_counter()
-    answer = fem.deform(loads)
-    seconds = (clock.perf_counter() - begun) / len(loads)
-    good = np.array([outcome.good for outcome in answer.outcome])
+    mesh, tissue = anatomy.mesh, Material("neo-hookean", 3000.0, poisson)
+    _answered(anatomy, skull, tissue, loads.rows(slice(0, 1)).scaled(1e-3), device)  # kernels are compiled or loaded
+    answer, good, seconds = _answered(anatomy, skull, tissue, loads, device)
     inside = mesh.region == TUMOUR_LABEL
     moved = np.average(
         answer.displacement[good][:, mesh.tets[inside]].mean(axis=2), axis=1, weights=mesh.volumes[inside]
     )
-    bond = float(answer.bond[good].max())
+    leaked, bond = (float(values[good].max()) for values in (answer.leaked, answer.bond))
     return Row(
         skull, poisson, len(mesh.nodes), 1e3 * float(np.linalg.norm(moved, axis=1).mean()),
-        float(answer.leaked[good].max()), bond if np.isfinite(bond) else None, seconds, int((~good).sum()),
+        None if skull in TEARING else leaked, bond if np.isfinite(bond) else None, seconds, int((~good).sum()),
     )  # fmt: skip
+
+
+def _answered(
+    anatomy: Anatomy, skull: str, tissue: Material, loads: Loads, device: str
+) -> tuple[Deformation, np.ndarray, float]:
+    """Answers, which of them are good (B,), and seconds a load: set-up left out, but for what tears, which needs it."""
+    if skull in TEARING:
+        effects = [TEARING[skull] if isinstance(one, Bonded) else one for one in pushed_effects(anatomy, tissue)]
+        begun = clock.perf_counter()
+        found = [torn(anatomy, effects, loads.rows(np.array([row])), TRAIN, device) for row in range(len(loads))]
+        good = np.array([one.rested and one.answer.outcome[0].good for one in found])
+        return joined([one.answer for one in found]), good, (clock.perf_counter() - begun) / len(loads)
+    fem = Fem(anatomy, pushed_effects(anatomy, tissue, skull), TRAIN, device)
+    begun = clock.perf_counter()
+    answer = fem.deform(loads)
+    seconds = (clock.perf_counter() - begun) / len(loads)
+    return answer, np.array([outcome.good for outcome in answer.outcome]), seconds

@@ -40,6 +40,15 @@ def test_the_bench_measures_what_it_says(tmp_path, capsys):
     assert bonded["bond"] == pytest.approx(answer.bond.max(), rel=1e-3)
 
 
+def test_a_skull_that_only_presses_lets_the_tumour_go_farther_than_one_that_holds(tmp_path, capsys):
+    write_anatomy(tmp_path / "brain.vtu", make_anatomy(template_subject(Tumour()), Plan(2000)))
+    words = [str(tmp_path / "brain.vtu"), "--loads", "1", "--poisson", "0.45", "--device", "cpu", "--json"]
+    assert main(["bench", "skull", *words, "--skulls", "bonded", "tearing", "pressing"]) == 0
+    bonded, tearing, pressing = json.loads(capsys.readouterr().out)["rows"]
+    assert bonded["bond"] < 1.0 and tearing["motion"] == pytest.approx(bonded["motion"], rel=1e-6)
+    assert pressing["motion"] > 1.1 * bonded["motion"] and pressing["leaked"] is None and pressing["bond"] == 0.0
+
+
 def test_what_is_taught_of_a_skull_is_of_that_skull(tmp_path):
     """From the command to the finite elements that a learner asks: they slide where the data did."""
     write_anatomy(tmp_path / "brain.vtu", make_anatomy(template_subject(Tumour()), Plan(2000, craniotomy=0.03)))

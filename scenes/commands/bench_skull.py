@@ -21,7 +21,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "anatomies", nargs="*", type=Path, metavar="ANATOMY.vtu", help="bodies (default: the template of --nodes)"
     )
     parser.add_argument("--nodes", nargs="+", type=int, default=[5300, 17_000, 40_000], help="of the template's meshes")
-    parser.add_argument("--skulls", nargs="+", default=["bonded", "slide"], choices=SKULLS, help="(bonded slide)")
+    parser.add_argument(
+        "--skulls", nargs="+", default=["bonded", "slide"], choices=(*SKULLS, "tearing", "pressing"),
+        help="(bonded slide); tearing lets go where the bond bears too much, pressing bears nothing and has no gap",
+    )  # fmt: skip
     parser.add_argument("--poisson", nargs="+", type=float, default=[0.45, 0.49], help="Poisson's ratios (0.45 0.49)")
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (%(default)s)")
     parser.add_argument("--loads", type=int, default=8, help="how many (%(default)s)")
@@ -48,7 +51,8 @@ def run(args: argparse.Namespace) -> int:
         found.append(row)
         moved = f"{row.motion:.4f}" + (f" ({row.failed} not converged)" if row.failed else "")
         bond = "" if row.bond is None else f"{row.bond:.2f}"
-        cells = (row.skull, f"{row.poisson:g}", row.vertices, moved, f"{row.leaked:.1g}", bond, f"{row.seconds:.2f}")
+        leaked = "" if row.leaked is None else f"{row.leaked:.1g}"
+        cells = (row.skull, f"{row.poisson:g}", row.vertices, moved, leaked, bond, f"{row.seconds:.2f}")
         print(f"| {' | '.join(map(str, cells))} |", file=table, flush=True)
     if args.json:
         print(json.dumps({"machine": where, "rows": [asdict(row) for row in found]}))
