@@ -54,6 +54,7 @@ next: open the table in a spreadsheet""",
     "bench": """examples:
   sulcus bench
   sulcus bench throughput
+  sulcus bench solver --peers tled --tolerance 1e-4 1e-6
 next: sulcus report --quick""",
     "report": """example:
   sulcus report --quick --out report
