@@ -13,6 +13,7 @@ from typing import Any
 
 from ar.screen import write_png
 from sim.files import written_whole
+from surrogate.score import FEWEST_FOR_P999
 
 from .report_plots import against_solves, against_time, front, learners_against_time
 from .report_row import Figures, Row
@@ -41,7 +42,8 @@ NOTES = (
     "reference's own elements, less exactly solved, show their tolerance alone and are not drawn.",
     "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
     "of those vertices. A row in bold, or full colour, is one that no other equals or beats in time and mean error.",
-    "Worst vertex: of each load the vertex with the largest distance; mean, p95 and p99.9 are over the loads.",
+    "Worst vertex: of each load the vertex with the largest distance; mean, p95 and p99.9 are over the loads. "
+    f"No p99.9 is told of fewer than {FEWEST_FOR_P999:,} loads.",
     "Solves: all answers of finite elements that a row was told: loads, linear answers to unit forces at nodes of the "
     "cortex, and terms of the power series. In discs: those that tell of the tumour from inside the discs left out. "
     "The linear answers of the cortex beside the tumour are told everywhere; the cortex is not compared. Minutes: of "
@@ -197,7 +199,7 @@ def _spread(figures: Figures | None) -> tuple[str, ...]:
         return ("",) * len(SPREAD_HEADS)
     worst = figures.worst
     values = (*asdict(figures.mm).values(), worst.mean, worst.p95, worst.p999, *asdict(figures.percent).values())
-    return tuple(map(_text, values))
+    return tuple("\N{EN DASH}" if value is None else _text(value) for value in values)
 
 
 def _text(value: float | None) -> str:

@@ -23,11 +23,11 @@ TENTHS, FEWEST_FOR_P99 = 10, 1000
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean, 95 and 99.9 percentile, and maximum of distances over load x vertex."""
+    """Mean, 95 and 99.9 percentile, and maximum of distances over load x vertex; no 99.9 percentile of few loads."""
 
     mean: float
     p95: float
-    p999: float
+    p999: float | None
     largest: float
 
 

@@ -17,6 +17,8 @@ from .learned import Learned
 from .told import Told
 
 WARM_UP, TIMED = 20, 200
+# Fewer loads do not tell the greatest of a thousand.
+FEWEST_FOR_P999 = 1000
 T = TypeVar("T")
 
 
@@ -29,7 +31,7 @@ class Score:
     name
         Of the deformer.
     mean_mm, p95_mm, p999_mm, max_mm
-        [mm].
+        [mm]; each p999 is None of fewer than `FEWEST_FOR_P999` loads.
     mean_percent, p95_percent, p999_percent, max_percent
         Each distance divided by its load's motion, which is the mean displacement of the vertices in the reference [%].
     worst_mean_mm, worst_p95_mm, worst_p999_mm
@@ -45,15 +47,15 @@ class Score:
     name: str
     mean_mm: float
     p95_mm: float
-    p999_mm: float
+    p999_mm: float | None
     max_mm: float
     mean_percent: float
     p95_percent: float
-    p999_percent: float
+    p999_percent: float | None
     max_percent: float
     worst_mean_mm: float
     worst_p95_mm: float
-    worst_p999_mm: float
+    worst_p999_mm: float | None
     microseconds: float
     bare_microseconds: float | None = None
     told: Told | None = None
@@ -117,7 +119,7 @@ def winner(scores: Sequence[Score]) -> Score:
 
 
 def table(scores: Sequence[Score], motion_mm: float) -> str:
-    """The scores for people, the winner named below, and what the learners were told where that is known."""
+    """The scores for people, below them the winner of several, and what the learners were told where that is known."""
     head = (
         "          mm, all vertices                | mm, worst vertex of a load | % of motion                 "
         "| us, model in NumPy\n"
@@ -125,17 +127,23 @@ def table(scores: Sequence[Score], motion_mm: float) -> str:
         "|      | us, answer with bound"
     )
     rows = [
-        f"{row.name:<10}{row.mean_mm:7.4f} {row.p95_mm:7.4f} {row.p999_mm:7.4f} {row.max_mm:7.4f} | "
-        f"{row.worst_mean_mm:7.4f} {row.worst_p95_mm:7.4f} {row.worst_p999_mm:7.4f}    |"
-        f"{row.mean_percent:7.2f} {row.p95_percent:6.2f} {row.p999_percent:6.2f} {row.max_percent:6.2f} |"
+        f"{row.name:<10}{row.mean_mm:7.4f} {row.p95_mm:7.4f} {_known(row.p999_mm, '7.4f')} {row.max_mm:7.4f} | "
+        f"{row.worst_mean_mm:7.4f} {row.worst_p95_mm:7.4f} {_known(row.worst_p999_mm, '7.4f')}    |"
+        f"{row.mean_percent:7.2f} {row.p95_percent:6.2f} {_known(row.p999_percent, '6.2f')} {row.max_percent:6.2f} |"
         f"{'' if row.bare_microseconds is None else f'{row.bare_microseconds:.0f}':>5} |{row.microseconds:5.0f}"
         for row in scores
     ]
     best = winner(scores)
     fastest = min(scores, key=lambda row: row.microseconds)
-    verdict = f"{best.name} wins: {best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
-    verdict = f"{verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
-    return "\n".join([head, *rows, verdict, *_told(scores)])
+    verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
+    said = f"{best.name} wins: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
+    few = [f"p99.9: not known from fewer than {FEWEST_FOR_P999} loads"] if scores[0].p999_mm is None else []
+    return "\n".join([head, *rows, *few, said if len(scores) > 1 else f"{best.name}: {verdict}", *_told(scores)])
+
+
+def _known(value: float | None, form: str) -> str:
+    """A number, or a dash in its column."""
+    return f"{'-':>{form.split('.')[0]}}" if value is None else f"{value:{form}}"
 
 
 def _told(scores: Sequence[Score]) -> list[str]:
@@ -156,7 +164,12 @@ def _told(scores: Sequence[Score]) -> list[str]:
     ]
 
 
-def spread(values: np.ndarray) -> tuple[float, float, float, float]:
-    """Mean, 95 and 99.9 percentile, and maximum."""
+def spread(values: np.ndarray) -> tuple[float, float, float | None, float]:
+    """Mean, 95 and 99.9 percentile, and maximum of values (B, ...) of B loads; no 99.9 percentile of too few loads."""
     p95, p999 = np.percentile(values, (95.0, 99.9))
-    return float(values.mean()), float(p95), float(p999), float(values.max())
+    return (
+        float(values.mean()),
+        float(p95),
+        float(p999) if len(values) >= FEWEST_FOR_P999 else None,
+        float(values.max()),
+    )

@@ -76,11 +76,7 @@ def page(study, found):
 
 def figures_by_hand(distance, truth):
     share = 100.0 * distance / np.linalg.norm(truth, axis=2).mean(axis=1)[:, None]
-    return [
-        f(v)
-        for v in (1e3 * distance, share)
-        for f in (np.mean, lambda x: np.percentile(x, 95), lambda x: np.percentile(x, 99.9), np.max)
-    ]
+    return [f(v) for v in (1e3 * distance, share) for f in (np.mean, lambda x: np.percentile(x, 95), np.max)]
 
 
 def test_numbers_are_those_recomputed_by_hand(study, page, box):
@@ -94,8 +90,9 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
     truth = Fem(box, effects, REFERENCE, "cpu", element="p2").deform(study.played).at(box.tumour_nodes).displacement
     answer = Fem(box, effects, TRAIN, "cpu", element="p1").deform(study.played).at(box.tumour_nodes).displacement
     wanted = figures_by_hand(np.linalg.norm(answer - truth, axis=2), truth)
-    for kind, values in (("mm", wanted[:4]), ("percent", wanted[4:])):
-        names = ("mean", "p95", "p999", "largest")
+    names = ("mean", "p95", "largest")  # of so few loads no percentile of a thousand is told
+    for kind, values in (("mm", wanted[:3]), ("percent", wanted[3:])):
+        assert stored[0]["reference"][kind]["p999"] is None and lines[0][f"reference.{kind}.p999"] == ""
         assert np.allclose([stored[0]["reference"][kind][name] for name in names], values, rtol=2e-3)
         assert np.allclose([float(lines[0][f"reference.{kind}.{name}"]) for name in names], values, rtol=2e-3)
     data = read_dataset(study.data)
@@ -106,10 +103,10 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
         guess = model.deform(data.loads.rows(np.flatnonzero(test)), at=box.tumour_nodes).displacement
         wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
         held = stored[2]["teacher"][name]
-        assert np.allclose([*held["mm"].values(), *held["percent"].values()], wanted, rtol=1e-5)
+        assert np.allclose([held[kind][each] for kind in ("mm", "percent") for each in names], wanted, rtol=1e-5)
         miss = 1e3 * np.linalg.norm(guess - truth, axis=2).max(axis=1)
-        worst = [miss.mean(), *np.percentile(miss, (95.0, 99.9)), miss.max()]
-        assert np.allclose([*held["worst"].values()], worst, rtol=1e-5)
+        worst = [miss.mean(), np.percentile(miss, 95.0), miss.max()]
+        assert np.allclose([held["worst"][each] for each in names], worst, rtol=1e-5)
         assert held["loads"] == test.sum() and held["values"] == test.sum() * len(box.tumour_nodes)
     assert stored[2]["taught"] == study.discs.taught.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
     # A published learner is told no unit responses.

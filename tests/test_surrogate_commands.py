@@ -56,9 +56,10 @@ def test_training_prints_every_figure_and_writes_every_model(folder, box, capsys
     report = json.loads(capsys.readouterr().out)
     rows = {row["name"]: row for row in report["scores"]}
     assert set(rows) == set(LEARNERS) == set(load(out, box))
-    figures = {f"{figure}_{unit}" for figure in ("mean", "p95", "p999", "max") for unit in ("mm", "percent")}
+    figures = {f"{figure}_{unit}" for figure in ("mean", "p95", "max") for unit in ("mm", "percent")}
     for row in rows.values():
         assert figures | {"microseconds", "bound_mm"} <= set(row) and all(row[name] > 0 for name in figures)
+        assert row["p999_mm"] is row["p999_percent"] is None  # of so few loads
     # A box so coarse has few nodes outside the discs to interpolate from: the linear share is off too.
     assert rows["linear"]["mean_percent"] < 16.0 and rows["series"]["mean_percent"] < rows["linear"]["mean_percent"]
     assert report["winner"] == min(rows.values(), key=lambda row: row["mean_mm"])["name"]
@@ -70,7 +71,7 @@ def test_training_prints_every_figure_and_writes_every_model(folder, box, capsys
     assert solves["series"]["series"] > 0 == solves["svr"]["series"] and solves["series"]["seconds"] > 0.0
     assert main(["train", str(folder / "data.h5"), "--out", str(folder / "table.npz"), "--learners", "linear"]) == 0
     printed = capsys.readouterr().out
-    assert "linear wins" in printed and "10 % of the nominal loads of palpation" in printed
+    assert "wins" not in printed and "linear: " in printed and "10 % of the nominal loads of palpation" in printed
     assert "worst vertex of a load" in printed and "model in NumPy" in printed
 
 

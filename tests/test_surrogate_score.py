@@ -1,10 +1,12 @@
 """How deformers are scored: over all vertices, and by the worst vertex of each load."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from surrogate.sampling import draw
-from surrogate.score import score, table, winner
+from surrogate.score import score, spread, table, winner
 from surrogate.told import Told
 
 
@@ -38,3 +40,27 @@ def test_a_table_says_what_learners_were_told(pretender, box, fresh):
     assert lines[0].split() == ["it", "400", "60", "9000", "9460", "12", "75.5"]
     assert lines[1].split() == ["dumb", "400", "0", "0", "400", "0", "unknown"]
     assert "told" not in table(rows[2:], 1.0)
+
+
+def test_a_single_learner_wins_nothing(pretender, box, fresh):
+    truth = pretender.deform(fresh, at=box.tumour_nodes).displacement + 1e-4
+    one, other = (score(name, pretender, fresh, truth, box.tumour_nodes) for name in ("one", "other"))
+    assert "one wins: 0.17" in table([one, other], 1.0) and " is fastest, " in table([one, other], 1.0)
+    alone = table([one], 1.0)
+    assert "wins" not in alone and "fastest" not in alone
+    assert "one: 0.1732 mm mean error at a mean motion of 1.000 mm" in alone
+
+
+def test_of_few_loads_no_percentile_of_a_thousand_is_told(pretender, box, fresh):
+    """A dash stands in its columns, and a line says why; of 1,000 loads it is the percentile."""
+    distance = np.random.default_rng(0).uniform(size=(1000, 3))
+    few, many = spread(distance[:999]), spread(distance)
+    assert few[2] is None and many[2] == pytest.approx(np.percentile(distance, 99.9)) and few[3] <= 1.0
+    assert few[:2] == pytest.approx((distance[:999].mean(), np.percentile(distance[:999], 95)))
+    truth = pretender.deform(fresh, at=box.tumour_nodes).displacement + 1e-4
+    row = score("few", pretender, fresh, truth, box.tumour_nodes)
+    assert row.p999_mm is row.p999_percent is row.worst_p999_mm is None
+    said = table([row], 1.0).splitlines()
+    assert said[2].split().count("-") == 3 and "not known from fewer than 1000 loads" in said[3]
+    known = table([replace(row, p999_mm=0.25, p999_percent=2.5, worst_p999_mm=0.5)], 1.0).splitlines()
+    assert len(known[2]) == len(said[2]) and "0.2500" in known[2] and "fewer" not in known[3]
