@@ -74,7 +74,7 @@ def fitted_bound(
 ) -> Bound:
     """A bound whose scale follows what was `seen`, calibrated on other loads.
 
-    The scale is told the load, not its place: what was seen lies in few discs of the cortex, and a scale that follows
+    The scale is told the load, not its place: where what was seen lies in few discs of the cortex, a scale that follows
     the place runs away between them. One that did bounded a distance that was 0.05 mm off by 4.2 mm.
 
     Parameters
