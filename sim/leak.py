@@ -79,9 +79,9 @@ class Leak:
         self._covered = device.array(covered[nodes].astype(np.int32), wp.int32)
 
     def share(self, u: wp.array) -> np.ndarray:
-        """Of u (3N, B) [m], on the device: (B,), zero where nothing passes."""
+        """Of u (3N, B) [m], on the device: (B,), zero where nothing passes, NaN where nothing is open and yet something does."""
         out = wp.zeros((2, u.shape[1]), dtype=wp.float64, device=self._device.name)
         inputs = [u, self._nodes, self._vectors, self._covered]
         self._device.launch(kernel_of(self._device), (len(self._nodes), u.shape[1]), inputs, [out])
         passed, swept = out.numpy()
-        return np.where(passed > 0.0, passed / np.maximum(swept, 1e-300), 0.0)
+        return np.divide(passed, swept, out=np.where(passed > 0.0, np.nan, 0.0), where=swept > 0.0)

@@ -101,3 +101,15 @@ def test_a_body_at_rest_lets_nothing_pass(egg):
     device = find_device("cpu", "float64")
     leak = Leak(egg, discretise(egg.mesh, "p1"), device)
     assert leak.share(device.zeros(3 * len(egg.mesh.nodes), 2)).tolist() == [0.0, 0.0]
+
+
+def test_of_a_skull_without_an_opening_there_is_no_share(egg):
+    """The whole surface is covered: what passes it is a share of nothing."""
+    whole = np.unique(egg.mesh.surface)
+    normal = np.zeros_like(egg.slide_normal)
+    normal[whole] = 1.0
+    closed = Anatomy(egg.mesh, egg.held, normal, np.zeros(len(normal), bool))
+    device, space = find_device("cpu", "float64"), discretise(egg.mesh, "p1")
+    grown = device.array((0.01 * egg.mesh.nodes).reshape(-1, 1))
+    leak = Leak(closed, space, device)
+    assert np.isnan(leak.share(grown)).all() and (leak.share(device.zeros(*grown.shape)) == 0.0).all()
