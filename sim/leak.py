@@ -79,7 +79,7 @@ class Leak:
         self._covered = device.array(covered[nodes].astype(np.int32), wp.int32)
 
     def share(self, u: wp.array) -> np.ndarray:
-        """Of u (3N, B) [m], on the device: (B,), zero where nothing passes, NaN where nothing is open and yet something does."""
+        """Of u (3N, B) [m] on the device: (B,), zero where nothing passes, NaN of what passes where nothing is open."""
         out = wp.zeros((2, u.shape[1]), dtype=wp.float64, device=self._device.name)
         inputs = [u, self._nodes, self._vectors, self._covered]
         self._device.launch(kernel_of(self._device), (len(self._nodes), u.shape[1]), inputs, [out])

@@ -107,7 +107,7 @@ def test_of_a_skull_without_an_opening_there_is_no_share(egg):
     """The whole surface is covered: what passes it is a share of nothing."""
     whole = np.unique(egg.mesh.surface)
     normal = np.zeros_like(egg.slide_normal)
-    normal[whole] = 1.0
+    normal[whole, 2] = 1.0
     closed = Anatomy(egg.mesh, egg.held, normal, np.zeros(len(normal), bool))
     device, space = find_device("cpu", "float64"), discretise(egg.mesh, "p1")
     grown = device.array((0.01 * egg.mesh.nodes).reshape(-1, 1))
