@@ -62,6 +62,8 @@ def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device
     mesh, tissue = anatomy.mesh, Material("neo-hookean", 3000.0, poisson)
     _answered(anatomy, skull, tissue, loads.rows(slice(0, 1)).scaled(1e-3), device)  # kernels are compiled or loaded
     answer, good, seconds = _answered(anatomy, skull, tissue, loads, device)
+    if not good.any():
+        return Row(skull, poisson, len(mesh.nodes), float("nan"), None, None, seconds, len(good))
     inside = mesh.region == TUMOUR_LABEL
     moved = np.average(
         answer.displacement[good][:, mesh.tets[inside]].mean(axis=2), axis=1, weights=mesh.volumes[inside]

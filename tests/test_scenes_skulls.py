@@ -20,11 +20,21 @@ from surrogate.sampling import draw
 from surrogate.taught import taught_skull
 
 
-def test_the_bench_measures_what_it_says(tmp_path, capsys):
+@pytest.fixture(scope="module")
+def brain(tmp_path_factory):
+    """A file and its anatomy."""
+    path, anatomy = (
+        tmp_path_factory.mktemp("skulls") / "brain.vtu",
+        make_anatomy(template_subject(Tumour()), Plan(2000)),
+    )
+    write_anatomy(path, anatomy)
+    return str(path), anatomy
+
+
+def test_the_bench_measures_what_it_says(brain, capsys):
     """By the bench, and by finite elements and a mean over the tumour's volume put together here."""
-    anatomy = make_anatomy(template_subject(Tumour()), Plan(2000))
-    write_anatomy(tmp_path / "brain.vtu", anatomy)
-    words = [str(tmp_path / "brain.vtu"), "--loads", "2", "--poisson", "0.49", "--device", "cpu", "--json"]
+    path, anatomy = brain
+    words = [path, "--loads", "2", "--poisson", "0.49", "--device", "cpu", "--json"]
     assert main(["bench", "skull", *words]) == 0
     bonded, slide = json.loads(capsys.readouterr().out)["rows"]
     assert (bonded["skull"], slide["skull"], bonded["failed"]) == ("bonded", "slide", 0)
@@ -40,13 +50,20 @@ def test_the_bench_measures_what_it_says(tmp_path, capsys):
     assert bonded["bond"] == pytest.approx(answer.bond.max(), rel=1e-3)
 
 
-def test_a_skull_that_only_presses_lets_the_tumour_go_farther_than_one_that_holds(tmp_path, capsys):
-    write_anatomy(tmp_path / "brain.vtu", make_anatomy(template_subject(Tumour()), Plan(2000)))
-    words = [str(tmp_path / "brain.vtu"), "--loads", "1", "--poisson", "0.45", "--device", "cpu", "--json"]
+def test_a_skull_that_only_presses_lets_the_tumour_go_farther_than_one_that_holds(brain, capsys):
+    words = [brain[0], "--loads", "1", "--poisson", "0.45", "--device", "cpu", "--json"]
     assert main(["bench", "skull", *words, "--skulls", "bonded", "tearing", "pressing"]) == 0
     bonded, tearing, pressing = json.loads(capsys.readouterr().out)["rows"]
     assert bonded["bond"] < 1.0 and tearing["motion"] == pytest.approx(bonded["motion"], rel=1e-6)
     assert pressing["motion"] > 1.1 * bonded["motion"] and pressing["leaked"] is None and pressing["bond"] == 0.0
+
+
+def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkeypatch):
+    monkeypatch.setattr("sim.tearing.ROUNDS", 1)
+    words = [brain[0], "--loads", "1", "--poisson", "0.45", "--device", "cpu", "--json"]
+    assert main(["bench", "skull", *words, "--skulls", "pressing"]) == 1
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    assert row["failed"] == 1 and row["bond"] is None
 
 
 def test_what_is_taught_of_a_skull_is_of_that_skull(tmp_path):
