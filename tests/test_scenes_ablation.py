@@ -55,16 +55,33 @@ def test_each_effect_has_its_row(theatre):
 def test_bytes_are_the_same_in_every_run(theatre):
     held = [run(replace(theatre, models={}), sinking(), 3).held for _ in range(3)]
     assert held[0] == held[1] == held[2] > 100_000
-    # Counted again, by numbers and their sizes.
-    scene = sinking()
+    assert held[0] == pytest.approx(counted(theatre, sinking(), 3), rel=0.02)
+
+
+def counted(theatre, scene, every):
+    """Bytes that a scene keeps, counted again: numbers of each array, and the size of a number."""
     before = {id(array) for array in device_arrays()}
     fem, last = replace(theatre, models={}).fem(scene, scene.accuracy, live=True), None
-    for time in scene.times[::3].tolist():
+    for time in scene.times[::every].tolist():
         last = fem.deform(scene.loads(theatre.site, scene.path(time), time), start=last)
     new = [array for array in device_arrays() if id(array) not in before]
-    assert held[0] == pytest.approx(
-        sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in new), rel=0.02
-    )
+    return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in new)
+
+
+def test_the_memory_that_is_printed_is_that_of_arrays(theatre, anatomy, capsys):
+    """Of every row, in the table and in JSON, by bytes that are counted without `scenes.ablation.rows`."""
+    assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "60", "--device", "cpu", "--json"]) == 0
+    out, error = capsys.readouterr()
+    table = [[cell.strip() for cell in line.split("|")] for line in error.splitlines() if line.startswith("| ")]
+    scene = find_scene("brain_shift")
+    whole = counted(theatre, scene, 60)
+    expected = {ALL: whole, "Gravity": whole - counted(theatre, without(scene, Gravity()), 60)}
+    cells = {cells[1]: cells[3] for cells in table}
+    told = {row["effect"]: row["held_mb"] for row in json.loads(out)["effects"]}
+    for name, size in expected.items():
+        assert told[name] == pytest.approx(1e-6 * size, rel=0.05) and size > 300_000
+        assert float(cells[name]) == pytest.approx(1e-6 * size, rel=0.05, abs=0.005)
+    assert {cells[name] for name, held in told.items() if held is None} == {""}
 
 
 def test_the_change_is_that_between_the_answers(theatre):
