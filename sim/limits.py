@@ -15,6 +15,8 @@ INFLATION = 1032
 LARGEST_ARRAY = 2 * 1024**3
 # All arrays of a mesh file, inflated [bytes]: nodes, cells, and a few fields beside them.
 LARGEST_MESH = 4 * 1024**3
+# What inflates a hundred times is no mesh: its coordinates hardly repeat. So much is taken of a small file [bytes].
+MESH_INFLATION, SMALL_MESH = 100, 2**28
 # All arrays of a model file, inflated [bytes]: the shipped one, of seven learners, has 0.04 GB.
 LARGEST_MODEL = 2 * 1024**3
 # Text that heads a model file [bytes]: the shipped one has 0.02 MB.
@@ -25,7 +27,23 @@ MOST_VOXELS = 2**29
 
 def too_large(most: int) -> InputError:
     """What is said of a mesh file that asks for more than `most` bytes."""
-    return InputError(f"its arrays take more than {most / 1e9:.3g} GB: it is no mesh of a brain.")
+    return InputError(
+        f"its arrays take more than {most / 1e9:.3g} GB: a file of its size holds no such mesh of a brain. "
+        "Write it anew, or mesh coarser."
+    )
+
+
+def mesh_bytes(size: int, most: int) -> int:
+    """Bytes to which the arrays of a mesh file of `size` bytes may inflate: `most` of a large one.
+
+    Raises
+    ------
+    InputError
+        A file that is larger itself.
+    """
+    if size > most:
+        raise InputError(f"it is of {size / 1e9:,.3g} GB, and {most / 1e9:.3g} GB are the most. Mesh coarser.")
+    return min(most, max(SMALL_MESH, MESH_INFLATION * size))
 
 
 @contextmanager

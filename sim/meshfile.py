@@ -1,4 +1,4 @@
-"""Mesh files: any tetrahedral format that meshio reads in, `.vtu` out, nothing half-written."""
+"""Mesh files: tetrahedra in most formats that meshio reads in, `.vtu` out, nothing half-written."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ import numpy as np
 from .anatomy import Anatomy
 from .errors import InputError
 from .files import written_whole
-from .limits import LARGEST_MESH, at_most
+from .limits import LARGEST_MESH, at_most, mesh_bytes
 from .mesh import MeshWarning, TetMesh, oriented
 from .reading import path_of, read_as
+from .references import demand_own
 from .vtu import demand_small
 
 if TYPE_CHECKING:
@@ -55,15 +56,17 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
 
     path = path_of(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file. Give a tetrahedral mesh that meshio reads, such as .vtu or .msh.")
+        raise InputError(f"{path}: no such file. Give a tetrahedral mesh, such as .vtu or .msh.")
     if unit not in UNITS:
         raise InputError(f"no unit is called {unit!r}: choose one of {', '.join(UNITS)}.")
     remedy = "Convert it to .vtu or .msh."
     # meshio prints what it stumbles over, and warns of arrays that it skips.
     with read_as(path, "a mesh", remedy), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        counted = path.suffix == ".vtu" and demand_small(path, LARGEST_MESH)
+        most = mesh_bytes(path.stat().st_size, LARGEST_MESH)
+        counted = path.suffix.lower() == ".vtu" and demand_small(path, most)
         with warnings.catch_warnings(), nullcontext() if counted else at_most(LARGEST_MESH):
             warnings.simplefilter("ignore")
+            demand_own(path, LARGEST_MESH)
             raw = meshio.read(path)
     with read_as(path, "a mesh", remedy):
         return _taken(path, raw, UNITS[unit])
