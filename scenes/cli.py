@@ -36,7 +36,8 @@ COMMANDS = {
 }
 
 # Commands that make or read models, whose learners may be a user's own.
-PLUGGED = ("train", "judge", "scenes", "demo", "render", "collect", "check")
+MAKING = ("train", "patient")
+READING = ("judge", "export", "scenes", "effects", "demo", "render", "collect", "sensitivity", "check")
 
 # Commands with commands of their own; the first is meant where none is named.
 INNER = {"bench": ("stages", "elements", "skull", "robust", "live", "growth", "throughput", "published", "solver")}
@@ -70,14 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         if name == asked:
             importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
-            if name in PLUGGED:
-                command.add_argument(
-                    "--plugin",
-                    action="append",
-                    default=[],
-                    metavar="FILE.py",
-                    help="run this file: it brings learners",
-                )
+            if name in MAKING + READING:
+                add_plugin(command)
     args = parser.parse_args(arguments)
     warnings.formatwarning = lambda message, *rest: f"sulcus {args.command}: {message}\n"
     try:
@@ -87,6 +82,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"sulcus {args.command}: {error}", file=sys.stderr)
         return 2
+
+
+def add_plugin(parser: argparse.ArgumentParser) -> None:
+    """Declare the files that bring learners."""
+    parser.add_argument(
+        "--plugin", action="append", default=[], metavar="FILE.py", help="run this file: it brings learners"
+    )
 
 
 def _with_points(arguments: Sequence[str]) -> list[str]:

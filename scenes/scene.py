@@ -278,6 +278,9 @@ def _own_scene(path: str) -> Scene:
     for effect in found.effects:
         if isinstance(effect, Elasticity):
             for tissue in (effect.default, *effect.regions.values()):
-                if tissue is not None and not isinstance(tissue, Material):  # ours are tested
-                    check_tissue(tissue)
+                if tissue is not None and type(tissue) is not Material:  # ours are tested
+                    try:
+                        check_tissue(tissue)
+                    except InputError as error:
+                        raise InputError(f"{path}: {error} docs/extend.md says what a law is held to.") from error
     return found

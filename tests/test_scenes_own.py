@@ -132,7 +132,42 @@ def test_a_scene_of_a_law_that_contradicts_itself_does_not_play(tmp_path, half):
     if not half:
         assert find_scene(str(path)).effects[0].default.law == "mine"
         return
-    with pytest.raises(InputError, match=r"the law mine does not hold: .*stress is the energy's derivative"):
+    with pytest.raises(InputError, match=r"mine\.py: the law mine does not hold: .*stress is the energy's derivative"):
+        find_scene(str(path))
+
+
+DERIVED = """from dataclasses import dataclass, replace
+from typing import Any
+
+import warp as wp
+from scenes.press import SCENE as PRESS
+from sim.effects import Elasticity
+from sim.material import Material
+from sim.terms.neo_hookean import LAW, stress as own
+
+
+@wp.func
+def half(H: Any, c: Any):
+    return own(H, c) / type(c[0])(2.0)
+
+
+@dataclass(frozen=True)
+class Mine(Material):
+    @property
+    def functions(self):
+        return replace(LAW, stress=half)
+
+
+MINE = Elasticity(None, {region: Mine("neo-hookean", 3000.0, 0.45) for region in (1, 2)})
+SCENE = replace(PRESS, effects=(MINE, *PRESS.effects[1:]))
+"""
+
+
+def test_a_law_that_is_derived_from_a_built_in_one_is_held_to_the_same(tmp_path):
+    path = tmp_path / "derived.py"
+    path.write_text(DERIVED)
+    words = r"derived\.py: the law neo-hookean does not hold: .*stress is the energy's derivative"
+    with pytest.raises(InputError, match=words):
         find_scene(str(path))
 
 

@@ -88,6 +88,27 @@ def test_a_file_brings_one_that_is_trained_stored_and_plays(folder, box, monkeyp
         assert all(not file[name].dtype.hasobject for name in file.files)
 
 
+READING = "train judge export patient scenes effects demo render collect sensitivity check bench-stages"
+
+
+@pytest.mark.parametrize("command", READING.split())
+def test_whoever_makes_or_reads_models_takes_ones_own(command, capsys):
+    """The sentences of `load` and `check_learners` name the option."""
+    with pytest.raises(SystemExit):
+        main([*command.split("-"), "--help"])
+    assert "--plugin FILE.py" in capsys.readouterr().out
+
+
+def test_a_patients_learner_may_be_ones_own(folder, tmp_path, monkeypatch, capsys, clean):
+    monkeypatch.chdir(folder)
+    words = ["patient", "none.nii.gz", "--brain", "1", "--tumour", "2", "--out", str(tmp_path / "p.vtu")]
+    words += ["--learners", "nearest", "--device", "cpu"]
+    assert main(words) == 2 and "no learner is called nearest" in capsys.readouterr().err
+    assert main([*words, "--plugin", "my_learner.py"]) == 2
+    said = capsys.readouterr().err
+    assert "none.nii.gz: no such file" in said and "no learner" not in said
+
+
 def test_a_package_brings_one_that_is_looked_for_only_when_its_name_is_asked(tmp_path, monkeypatch, clean):
     (tmp_path / "labs_learners.py").write_text(NEAREST.read_text().replace('"nearest"', '"labs"'))
     made = tmp_path / "labs_learners-1.0.dist-info"

@@ -14,8 +14,11 @@ from .demo import add_theatre, deformer_name, scene_asked
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    from ..cli import add_plugin
+
     parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
     add_theatre(parser)
+    add_plugin(parser)
     parser.add_argument("--solves", type=int, default=64, help="loads in the batch (default %(default)s)")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
