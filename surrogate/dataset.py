@@ -337,7 +337,12 @@ def stored(file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...]
         No array has that name, or it is of another kind or shape, or declares more than such a file can hold.
     """
     found = file.get(name)
-    if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+    if (
+        not isinstance(found, h5py.Dataset)
+        or found.file.filename != file.filename  # of a link
+        or found.is_virtual
+        or found.external
+    ):
         raise InputError(f"{file.filename}: has no array `{name}`. {REMEDY}")
     if found.dtype.kind not in kinds:
         raise InputError(f"{file.filename}: `{name}` holds {found.dtype}, which it cannot: it is damaged. {REMEDY}")

@@ -166,6 +166,8 @@ class TestFinished:
             (lambda file: replaced(file, "answers/residual", np.full(20, b"small")), "holds .S5"),
             (lambda file: replaced(file, "answers/outcome", np.zeros(20)), "holds float64"),
             (lambda file: replaced(file, "answers/iterations", np.zeros(19, int)), "measures 19, not 20"),
+            (lambda file: moved_away(file, "answers/residual"), "has no array `answers/residual`"),
+            (lambda file: moved_away(file, "loads"), "has no array `loads/Pushed"),
             (lambda file: swollen(file, "answers/displacement", (10**9, 1352, 3)), "measures 1000000000"),
             (lambda file: swollen(file, "anatomy/nodes", (10**9, 3)), "declares more than such a file holds"),
         ],
@@ -205,6 +207,15 @@ class TestFinished:
 def replaced(file, name, array):
     del file[name]
     file[name] = array
+
+
+def moved_away(file, name):
+    """To another file, to which a link stays."""
+    other = Path(file.filename).with_name("other.h5")
+    with h5py.File(other, "w") as away:
+        file.copy(name, away, "here")
+    del file[name]
+    file[name] = h5py.ExternalLink(str(other), "/here")
 
 
 def swollen(file, name, shape):
