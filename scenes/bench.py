@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from sim.accuracy import LIVE, TRAIN
+from sim.device import find_device
 from surrogate.sampling import draw
 
 from .play import Player
@@ -97,8 +98,14 @@ def rows(theatre: Theatre, player: Player, deformer: str, solves: int, batch: in
 
 
 def machine(device: str) -> str:
-    """Hardware, versions and date, in one line."""
-    names = [wp.get_device(device if device != "auto" else None).name]
+    """Hardware, versions and date, in one line.
+
+    Raises
+    ------
+    InputError
+        A device that this machine does not have.
+    """
+    names = [wp.get_device(find_device(device, "float32").name).name]
     try:
         with open("/proc/cpuinfo") as file:
             names += [line.split(":")[1].strip() for line in file if line.startswith("model name")][:1]

@@ -40,6 +40,8 @@ from .tool import Instrument, Probe
 
 # So far under the cortex a camera looks: between the tool and the tumour [m].
 UNDER = 10e-3
+# Of a scene: an hour at 30 a second.
+MOST_FRAMES = 108_000
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,8 @@ class Scene:
     Raises
     ------
     InputError
-        A tool's force or pose without a tool; a duration or a frame rate that is no number, or not above 0.
+        A tool's force or pose without a tool; a duration or a frame rate that is no number, not above 0, or of more
+        than `MOST_FRAMES` frames.
     """
 
     name: str
@@ -132,6 +135,11 @@ class Scene:
             number = getattr(self, what)
             if not isinstance(number, Real) or not 0.0 < float(number) < np.inf:
                 raise InputError(f"the scene {self.name} has {what} {number!r}: give a number above 0.")
+        if float(self.duration) * float(self.frames_per_second) > MOST_FRAMES:
+            raise InputError(
+                f"the scene {self.name} lasts {self.duration:g} s at {self.frames_per_second:g} frames a second: that is "
+                f"more than {MOST_FRAMES:,} frames. Give a shorter duration, or fewer a second."
+            )
         needs = [type(effect).__name__ for effect in self.effects if isinstance(effect, HANDLED)]
         if self.tool is None and needs:
             raise InputError(

@@ -199,6 +199,10 @@ IMPORT = "from scenes.scene import Scene"
             r"my.py, line 3: Poisson's ratio is 0.5: give a number",
         ),
         (
+            f"{IMPORT}\nSCENE = Scene('a', '', duration=1e12)",
+            r"line 2: the scene a lasts 1e\+12 s at 30 frames a second: that is more than 108,000 frames\.",
+        ),
+        (
             f"{IMPORT}\nSCENE = Scene('a', '', duration='long')",
             "line 2: the scene a has duration 'long': give",
         ),

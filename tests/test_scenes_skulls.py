@@ -66,6 +66,14 @@ def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkey
     assert row["failed"] == 1 and row["bond"] is None
 
 
+@pytest.mark.parametrize(
+    ("words", "reason"), [(["--loads", "0"], "--loads 0: give a whole"), (["--device", "tpu"], "no device")]
+)
+def test_what_cannot_be_measured_is_a_sentence(brain, capsys, words, reason):
+    assert main(["bench", "skull", brain[0], *words]) == 2
+    assert reason in capsys.readouterr().err
+
+
 def test_what_is_taught_of_a_skull_is_of_that_skull(tmp_path):
     """From the command to the finite elements that a learner asks: they slide where the data did."""
     write_anatomy(tmp_path / "brain.vtu", make_anatomy(template_subject(Tumour()), Plan(2000, craniotomy=0.03)))

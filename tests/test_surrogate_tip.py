@@ -174,6 +174,29 @@ def test_how_its_bound_holds_in_the_discs_left_out_is_told_of_a_model_that_knows
     assert found.loads == len(discs) and found.held == pytest.approx(held.mean(axis=1))
 
 
+def test_where_many_loads_calibrate_one_in_three_tells_the_scale(data, monkeypatch):
+    monkeypatch.setattr("surrogate.train.ENOUGH_APART", 200)
+    trained = train(data, ["linear"])
+    model, good = trained.models["linear"], data.loads.rows(np.flatnonzero(data.good))
+    truth = data.displacement(data.anatomy.tumour_nodes)[data.good]
+
+    def told(rows):
+        loads = good.rows(rows)
+        known = measured(open_patch(data.anatomy), only_pushed(loads))
+        within = known._replace(magnitude=np.clip(known.magnitude, *model.envelope.force))
+        answer = model.deform(loads, at=data.anatomy.tumour_nodes).displacement
+        return features_of(only_pushed(loads), within), known.magnitude, np.linalg.norm(answer - truth[rows], axis=2)
+
+    apart = np.arange(len(good))[-trained.calibrated :]
+    features, _, error = told(apart[::3])
+    bounds = fitted_bound((features, error.max(axis=1)), *told(np.delete(apart, np.s_[::3])))
+    assert model.bounds.weights == pytest.approx(bounds.weights) and model.bounds.quantile == pytest.approx(
+        bounds.quantile
+    )
+    monkeypatch.undo()  # of few loads the errors on the discs tell it
+    assert not np.allclose(train(data, ["linear"]).models["linear"].bounds.weights, bounds.weights)
+
+
 def test_the_correction_brings_distances_nearer(model, fresh):
     plain = replace(model, tip=None).distance(fresh[0])
     assert np.isnan(plain.bound).all()

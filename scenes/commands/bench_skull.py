@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from sim.effects import SKULLS
+from sim.errors import InputError
 from sim.meshfile import read_anatomy
 from sim.subject import Plan, make_anatomy
 from sim.template import Tumour, template_subject
@@ -37,6 +38,8 @@ def run(args: argparse.Namespace) -> int:
     from ..bench import machine
     from ..skulls import rows
 
+    if args.loads < 1:
+        raise InputError(f"--loads {args.loads}: give a whole number from 1 up.")
     plans = [Plan(count) for count in args.nodes]
     bodies = [read_anatomy(path) for path in args.anatomies]
     bodies = bodies or [make_anatomy(template_subject(Tumour()), plan) for plan in plans]
