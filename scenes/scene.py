@@ -137,8 +137,8 @@ class Scene:
                 raise InputError(f"the scene {self.name} has {what} {number!r}: give a number above 0.")
         if float(self.duration) * float(self.frames_per_second) > MOST_FRAMES:
             raise InputError(
-                f"the scene {self.name} lasts {self.duration:g} s at {self.frames_per_second:g} frames a second: that is "
-                f"more than {MOST_FRAMES:,} frames. Give a shorter duration, or fewer a second."
+                f"the scene {self.name} lasts {self.duration:g} s at {self.frames_per_second:g} frames a second: "
+                f"that is more than {MOST_FRAMES:,} frames. Give a shorter duration, or fewer a second."
             )
         needs = [type(effect).__name__ for effect in self.effects if isinstance(effect, HANDLED)]
         if self.tool is None and needs:
