@@ -349,6 +349,10 @@ class TestWriting:
             assert not left.exists()
             partial.write_text("whole")
         assert sorted(tmp_path.iterdir()) == sorted([path, living, other, elsewhere])
+        for hours in (0.0, 23.0):
+            os.utime(elsewhere, (time.time() - hours * 3600.0,) * 2)
+            check_output(path, ".txt")
+            assert elsewhere.exists()
         yesterday = time.time() - 25 * 3600.0
         for file in (living, other, elsewhere):
             os.utime(file, (yesterday, yesterday))

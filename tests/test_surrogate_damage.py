@@ -180,6 +180,12 @@ class TestFinished:
             read_dataset(path)
         assert str(caught.value).startswith(str(path))
 
+    def test_no_array_is_larger_than_the_limit(self, whole, monkeypatch):
+        """Not one whose length the file alone decides."""
+        monkeypatch.setattr("surrogate.dataset.LARGEST_ARRAY", 10_000)
+        with pytest.raises(InputError, match=r"`anatomy/nodes` declares more than such a file holds"):
+            read_dataset(whole)
+
     def test_a_ball_has_a_radius(self, whole):
         data = read_dataset(whole)
         for radius in ("abc", "-1", "nan"):

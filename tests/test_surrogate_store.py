@@ -235,3 +235,23 @@ def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path, monkey
         assert len(archive.arrays(["few"])["few"]) == 10
         with pytest.raises(InputError, match="MB are the most"):
             archive.arrays(["few", "many"])
+        monkeypatch.setattr("surrogate.archive.LARGEST_MODEL", 8_200)  # more than each, less than both with their heads
+        assert len(archive.arrays(["many"])["many"]) == 1000
+        with pytest.raises(InputError, match="MB are the most"):
+            archive.arrays(["few", "many"])
+
+
+def test_an_array_of_more_bytes_than_its_member_is_refused_before_memory_is_taken(tmp_path):
+    """As many bytes as the header has numbers, each of eight."""
+    np.savez(tmp_path / "m.npz", many=np.zeros(2**20))
+    with zipfile.ZipFile(tmp_path / "m.npz") as source:
+        raw = source.read("many.npy")
+    with zipfile.ZipFile(tmp_path / "n.npz", "w") as target:
+        target.writestr("many.npy", raw[: 128 + 2**21])
+    tracemalloc.start()
+    try:
+        with (tmp_path / "n.npz").open("rb") as file, pytest.raises(InputError, match="is not what it says"):
+            Archive(file).arrays(["many"])
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()

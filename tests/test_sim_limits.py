@@ -1,0 +1,113 @@
+"""Bounds of files from outside, each at its edge."""
+
+from __future__ import annotations
+
+import base64
+import resource
+import struct
+import zlib
+from pathlib import Path
+from types import SimpleNamespace
+
+import nibabel
+import numpy as np
+import pytest
+from boxes import base_held, box
+
+from sim.errors import InputError
+from sim.files import demand_space
+from sim.limits import at_most
+from sim.mesh import TetMesh
+from sim.meshfile import read_anatomy, write_mesh
+from sim.volume import read_volume
+from sim.vtu import demand_small
+
+BODY = base_held(box((2, 2, 2), 0.02))
+
+
+def packed_vtu(path: Path, order: str, encoding: str) -> Path:
+    """Three numbers behind the XML, packed by zlib."""
+    block = zlib.compress(np.zeros(3).tobytes())
+    header = struct.pack(f"{'>' if order == 'BigEndian' else '<'}4I", 1, 24, 0, len(block))
+    raw = header + block if encoding == "raw" else base64.b64encode(header) + base64.b64encode(block)
+    path.write_bytes(
+        f'<VTKFile type="UnstructuredGrid" byte_order="{order}" compressor="vtkZLibDataCompressor"><UnstructuredGrid>'
+        f'<DataArray format="appended" offset="0"/></UnstructuredGrid><AppendedData encoding="{encoding}">\n_'.encode()
+        + raw
+        + b"\n</AppendedData></VTKFile>"
+    )
+    return path
+
+
+@pytest.mark.parametrize("order", ["LittleEndian", "BigEndian"])
+@pytest.mark.parametrize("encoding", ["raw", "base64"])
+def test_appended_arrays_count_in_either_order_of_bytes(tmp_path: Path, order: str, encoding: str) -> None:
+    path = packed_vtu(tmp_path / "a.vtu", order, encoding)
+    assert demand_small(path, 24) is (encoding == "base64")
+    with pytest.raises(InputError, match="take more than"):
+        demand_small(path, 23)
+
+
+def test_memory_is_bounded_beyond_what_the_process_has() -> None:
+    with at_most(2**28):
+        assert np.ones(2**21).all()
+    with pytest.raises(InputError, match=r"take more than 0\.268 GB"), at_most(2**28):
+        np.ones(2**27)
+
+
+def test_a_limit_that_was_set_before_stays_below() -> None:
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    limit = 2**40
+    try:
+        resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+        with at_most(2**50):
+            assert resource.getrlimit(resource.RLIMIT_AS)[0] == limit
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def test_a_flat_body_is_measured_along_its_longest_side(tmp_path: Path) -> None:
+    mesh = TetMesh(BODY.mesh.nodes * [1.0, 1.0, 0.2], BODY.mesh.tets, BODY.mesh.region)
+    fields = {"held": BODY.held * 1, "slide_normal": np.zeros_like(mesh.nodes), "craniotomy": BODY.craniotomy * 1}
+    write_mesh(tmp_path / "a.vtu", mesh, fields)
+    assert np.ptp(mesh.nodes, axis=0).min() < 5e-3
+    assert read_anatomy(tmp_path / "a.vtu").mesh.digest == mesh.digest
+
+
+def test_the_disk_holds_all_that_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=2_000_000))
+    demand_space(tmp_path / "a.h5", 1_900_000)
+    with pytest.raises(InputError, match=r"needs 2\.1 MB, and the disk has 2\.0 MB left"):
+        demand_space(tmp_path / "a.h5", 2_100_000)
+
+
+def volume(path: Path, edges: tuple[float, ...] = (1.0, 1.0, 1.0), unit: str = "mm", shift: float = 0.0) -> Path:
+    image = nibabel.Nifti1Image(np.ones((6, 6, 6), np.uint8), np.diag([*edges, 1.0]))
+    image.header.set_xyzt_units(unit)
+    image.set_sform(image.affine, 1)
+    moved = image.affine.copy()
+    moved[0, 3] += shift
+    image.set_qform(moved, 1)
+    nibabel.save(image, path)
+    return path
+
+
+def test_a_volume_ends_with_its_last_voxel(tmp_path: Path) -> None:
+    path = volume(tmp_path / "a.nii")
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match=r"ends after 567 of 568 bytes"):
+        read_volume(path)
+
+
+def test_one_coarse_axis_is_too_coarse(tmp_path: Path) -> None:
+    assert read_volume(volume(tmp_path / "a.nii", (1.0, 1.0, 5.9))).values.shape == (6, 6, 6)
+    with pytest.raises(InputError, match=r"1 x 1 x 6\.1"):
+        read_volume(volume(tmp_path / "b.nii", (1.0, 1.0, 6.1)))
+
+
+@pytest.mark.parametrize(("unit", "millimetres"), [("unknown", 1.0), ("mm", 1.0), ("meter", 1e3), ("micron", 1e-3)])
+def test_lengths_are_of_the_unit_that_is_said(tmp_path: Path, unit: str, millimetres: float) -> None:
+    edge = 1.0 / millimetres
+    found = read_volume(volume(tmp_path / "a.nii", (edge, edge, edge), unit, 3.0 / millimetres))
+    np.testing.assert_allclose(np.diag(found.affine)[:3], 1e-3, rtol=1e-6)
+    assert "up to 3 mm apart" in " ".join(found.notes)
