@@ -85,7 +85,7 @@ def volume(path: Path, edges: tuple[float, ...] = (1.0, 1.0, 1.0), unit: str = "
     image = nibabel.Nifti1Image(np.ones((6, 6, 6), np.uint8), np.diag([*edges, 1.0]))
     image.header.set_xyzt_units(unit)
     image.set_sform(image.affine, 1)
-    moved = image.affine.copy()
+    moved = np.array(image.affine)
     moved[0, 3] += shift
     image.set_qform(moved, 1)
     nibabel.save(image, path)
