@@ -24,6 +24,8 @@ CLASS, CLASSES = 200, 10
 RIDGE = 1e-2
 # Of the features, so many say what the load is: force, radius, angle, overhang. The rest say where it is.
 LOAD = 4
+# Fewer errors than ten a term tell no curvature.
+BENDS = 150
 # Standard deviations beyond which a feature counts no further; and the share of the mean below which no error counts.
 FARTHEST, LEAST = 4.0, 1e-3
 # How much a bound grows outside what was taught, for each unit of `Envelope.excess`.
@@ -86,10 +88,10 @@ def fitted_bound(
     each
         Calibration loads of a class of force, at least: fewer than 99 promise nothing at 0.99.
     curved
-        Whether the scale's logarithm is quadratic in what says the load, or linear.
+        Whether the scale's logarithm is quadratic in what says the load, if `BENDS` loads were seen, or linear.
     """
     mean, deviation = standardisation(seen[0])
-    used = _used(len(mean), LOAD if curved else 0)
+    used = _used(len(mean), LOAD if curved and len(seen[1]) >= BENDS else 0)
     design = _monomials(_standard(seen[0], mean, deviation))[:, used]
     wanted = np.log(np.maximum(seen[1], max(LEAST * seen[1].mean(), np.finfo(float).tiny)))
     penalty = RIDGE * len(design) * np.eye(design.shape[1])
