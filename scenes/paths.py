@@ -39,8 +39,8 @@ Path = Callable[[float], Touch]
 AIR = 4e-3
 
 
-# A push weaker than this lifts its tool off [N].
-FAINT = 0.02
+# A push weaker than this lifts its tool off [N]: so little that none is seen to act through the air.
+FAINT = 2e-3
 
 
 def lifted(force: float) -> float:

@@ -9,7 +9,7 @@ from theatres import PUSHING, on_template, small, template_theatre
 
 from ar.camera import project_cv2
 from scenes.lying import Lying
-from scenes.paths import AIR, Touch, draw, lay, palpate, press, slide, smooth
+from scenes.paths import AIR, Touch, draw, lay, lifted, palpate, press, slide, smooth
 from scenes.scene import SCENES, UNDER, Viewpoint, find_scene
 from scenes.site import site_of
 from scenes.stage import CORTEX, DRAPE, TOOL, Stage, clipped
@@ -267,3 +267,7 @@ def test_clipping_keeps_the_positive_part():
 def test_an_unknown_scene_is_named_with_the_known_ones():
     with pytest.raises(InputError, match=r"'dance'.*press, slide, draw"):
         find_scene("dance")
+
+
+def test_no_force_is_seen_to_act_through_the_air():
+    assert lifted(0.0) == AIR and lifted(0.005) == lifted(0.3) == 0.0
