@@ -92,7 +92,8 @@ def folder(box, tmp_path_factory):
     write_anatomy(folder / "other.vtu", replace(box, held=box.held | True))
     write_mesh(folder / "mesh.vtu", box.mesh, {})
     write_anatomy(folder / "closed.vtu", base_held(cube((2, 2, 2))))
-    (folder / "text.npz").write_text("no model")
+    for name in ("text.npz", "text.vtu"):
+        (folder / name).write_text("no model")
     return folder
 
 
@@ -105,7 +106,8 @@ PLAYING = {
 }
 ALL = [
     (["--anatomy", "none.vtu"], "no such file"),
-    (["--anatomy", "text.npz"], "cannot be read"),
+    (["--anatomy", "text.npz"], "no mesh is read from .npz"),
+    (["--anatomy", "text.vtu"], "cannot be read"),
     (["--anatomy", "mesh.vtu"], "not an anatomy"),
     (["--anatomy", "closed.vtu"], "no open cortex"),
     (["--anatomy", "other.vtu"], "was taught on"),
