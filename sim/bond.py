@@ -43,8 +43,10 @@ def kernel_of(device: Device) -> wp.Kernel:
         t /= area[p]
         pull = wp.dot(t, normal[p])
         along = wp.length(t - pull * normal[p]) / shear
-        share[p, c] = wp.sqrt(wp.pow(wp.max(pull, wp.float64(0.0)) / tension, wp.float64(2.0)) + along * along)
-        wp.atomic_max(most, c, share[p, c])
+        s = wp.sqrt(wp.pow(wp.max(pull, wp.float64(0.0)) / tension, wp.float64(2.0)) + along * along)
+        wp.atomic_max(most, c, s)
+        if share:
+            share[p, c] = s
 
     return strain
 
@@ -80,16 +82,17 @@ class Bond:
 
     def shares(self, force: wp.array) -> np.ndarray:
         """Round `nodes` (n,), of what the wall exerts on the body, force (3N, B) [N] on the device: (n, B)."""
-        return self._measured(force)[0].numpy()
+        share = wp.zeros((len(self.nodes), force.shape[1]), dtype=wp.float64, device=self._device.name)
+        self._largest(force, share)
+        return share.numpy()
 
     def share(self, force: wp.array) -> np.ndarray:
         """The largest of `shares` (B,): above 1 the bond would tear. NaN where no skull is."""
-        return self._measured(force)[1].numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
+        return self._largest(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
 
-    def _measured(self, force: wp.array) -> list[wp.array]:
-        """Shares (n, B), and the largest (B,), on the device."""
-        shape = len(self.nodes), force.shape[1]
-        out = [wp.zeros(size, dtype=wp.float64, device=self._device.name) for size in (shape, shape[1])]
+    def _largest(self, force: wp.array, share: wp.array | None = None) -> wp.array:
+        """The largest share of each column (B,), on the device; all of them (n, B) into `share`, where it is given."""
+        most = wp.zeros(force.shape[1], dtype=wp.float64, device=self._device.name)
         inputs = [force, *self._arrays, wp.float64(self._effect.tension), wp.float64(self._effect.shear)]
-        self._device.launch(kernel_of(self._device), shape, inputs, out)
-        return out
+        self._device.launch(kernel_of(self._device), (len(self.nodes), force.shape[1]), inputs, [share, most])
+        return most

@@ -220,20 +220,25 @@ def train(
 
 
 def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> Learned:
-    """With bounds that nothing but these loads tell: one in `SCALE` the scale, the others how much of it."""
-    tells = np.arange(len(loads)) % SCALE == 0
-    scale = loads.rows(np.flatnonzero(tells))
-    error = errors(model, scale, truth[tells], nodes).max(axis=1)
-    seen = _features(patch, model.asked(scale), model.envelope), error
-    return _calibrated(model, patch, seen, loads.rows(np.flatnonzero(~tells)), truth[~tells], nodes)
+    """With bounds that nothing but these loads tell: some tell the scale, the others how much of it."""
+    scale, share = _scale_and_share(len(loads))
+    known = loads.rows(scale)
+    error = errors(model, known, truth[scale], nodes).max(axis=1)
+    seen = _features(patch, model.asked(known), model.envelope), error
+    return _calibrated(model, patch, seen, loads.rows(share), truth[share], nodes)
 
 
 def _distance_bounded(model: Learned, patch: Patch, known: Measured) -> Learned:
     """The same of the distance from tip to tumour."""
-    tells = np.arange(len(known.loads)) % SCALE == 0
-    scale, share = known.rows(np.flatnonzero(tells)), known.rows(np.flatnonzero(~tells))
+    scale, share = (known.rows(rows) for rows in _scale_and_share(len(known.loads)))
     features = [_features(patch, model.asked(some.loads), model.envelope) for some in (scale, share)]
     return calibrated_distance(model, (features[0], distance_errors(model, scale)), features[1], share)
+
+
+def _scale_and_share(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which of `count` loads tell the bounds' scale, one in `SCALE`, and which how much of it."""
+    tells = np.arange(count) % SCALE == 0
+    return np.flatnonzero(tells), np.flatnonzero(~tells)
 
 
 def _calibrated(
