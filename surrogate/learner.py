@@ -15,6 +15,23 @@ from .regressor import Regressor
 
 GROUP = "sulcus.learners"
 """The entry points of packages that bring learners, by the learner's name."""
+RESERVED = frozenset(
+    [
+        "ann",
+        "bayesian",
+        "contact",
+        "contact-gp",
+        "gp",
+        "linear",
+        "pcr",
+        "remainder",
+        "residual",
+        "series",
+        "series-gp",
+        "svr",
+    ]
+)
+"""Names of what comes with sulcus."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +66,7 @@ def learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:
         missing = [what for what in ("fit", "predict", "state", "restored") if not hasattr(kind, what)]
         if missing:
             raise InputError(f"the learner {name} has no {', '.join(missing)}: see surrogate.regressor.Regressor.")
-        if name in _built_in() or (name in OWN and _file(OWN[name].regressor) != _file(kind)):
+        if name in RESERVED or (name in OWN and _file(OWN[name].regressor) != _file(kind)):
             raise InputError(f"a learner is called {name!r} already: choose another name.")
         OWN[name] = Own(encoder, kind)
         return kind
@@ -81,13 +98,6 @@ def find_own(name: str) -> Own | None:
 def name_of(kind: type) -> str | None:
     """The name under which a class was registered."""
     return next((name for name, own in OWN.items() if own.regressor is kind), None)
-
-
-def _built_in() -> set[str]:
-    from .store import FITTED
-    from .train import LEARNERS, OF_POSES
-
-    return {*LEARNERS, *OF_POSES, *FITTED}
 
 
 def _file(kind: type) -> str | None:

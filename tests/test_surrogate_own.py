@@ -18,11 +18,11 @@ from sim.loads import push
 from sim.meshfile import write_anatomy
 from sim.script import run_script
 from surrogate.dataset import read_dataset
-from surrogate.learner import OWN, find_own, learner
+from surrogate.learner import OWN, RESERVED, find_own, learner
 from surrogate.sampling import draw
 from surrogate.simulate import simulate
-from surrogate.store import load, save
-from surrogate.train import train
+from surrogate.store import FITTED, load, save
+from surrogate.train import LEARNERS, OF_POSES, train
 
 NEAREST = Path(__file__).parents[1] / "examples/nearest.py"
 
@@ -128,6 +128,10 @@ def test_ones_own_features(box, clean):
     own = run_script(NEAREST)
     learner("along", lambda patch, pushed: pushed.force)(type("Along", (own.Nearest,), {}))
     assert find_own("along").encoder == "along"
+
+
+def test_all_names_of_what_comes_with_sulcus_are_reserved():
+    assert {*LEARNERS, *OF_POSES, *FITTED} == RESERVED
 
 
 @pytest.mark.parametrize(
