@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .raster import checked_mesh
+from .rasteriser import checked_mesh
 
 
 @dataclass(frozen=True, eq=False)

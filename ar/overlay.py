@@ -12,8 +12,8 @@ import numpy as np
 from .camera import Camera
 from .hud import FINE, NARROW, folded, lay, millimetres
 from .layer import Layer, vertex_normals
-from .raster import Fragments, rasterise
-from .view import Picture
+from .rasteriser import Fragments, rasterise
+from .renderer import Picture
 
 Style = Literal["window", "contour", "fill", "none"]
 # What may not be relied on is drawn in amber, and broken, with words in a paler one, so that pixels of the outline are

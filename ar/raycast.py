@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from .camera import Camera
-from .raster import Fragments, checked_mesh
+from .rasteriser import Fragments, checked_mesh
 
 
 def raycast(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = 1e-3) -> Fragments:

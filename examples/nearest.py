@@ -10,8 +10,8 @@ from typing import Self
 
 import numpy as np
 
-from surrogate.learner import learner
-from surrogate.regressor import standardisation
+from surrogate.model.own_learners import learner
+from surrogate.regressors.protocol import standardisation
 
 NEIGHBOURS = 8
 

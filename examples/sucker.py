@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from scenes.paths import lay
-from scenes.scene import Scene
+from scenes.script.scene import Scene
+from scenes.script.tool_paths import lay
 from sim.effects import Bonded, Elasticity, Held, ToolContact
 from sim.tools import Core
 

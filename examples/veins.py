@@ -12,11 +12,11 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from sim.body import Body
-from sim.columns import gathered
-from sim.device import Device
+from sim.discretisation.body import Body
+from sim.discretisation.term import Cases
 from sim.errors import InputError
-from sim.term import Cases
+from sim.runtime.columns import gathered
+from sim.runtime.device import Device
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def kernels_of(device: Device) -> Kernels:
 
 
 class VeinsTerm:
-    """A Term, as `sim.term.Term` asks for one: it resists, does not depend on the loads, and remembers nothing."""
+    """A `sim.discretisation.term.Term`: it resists, does not depend on the loads, and remembers nothing."""
 
     name = "veins"
     constant, passive, steep = False, True, False

@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
-from sim.law import Law
-from sim.terms.invariants import cofactor_excess, exp_less_one, green_strain, log_one_plus, volume_change
+from sim.terms.laws.invariants import cofactor_excess, exp_less_one, green_strain, log_one_plus, volume_change
+from sim.terms.laws.law import Law
 
 
 @wp.func
@@ -97,7 +97,7 @@ SOFT = Yeoh(c1=500.0, c2=1500.0, bulk=1e4)
 """About as soft as brain."""
 
 if __name__ == "__main__":
-    from sim.conformance import check_tissue
+    from sim.terms.laws.conformance import check_tissue
 
     for finding in check_tissue(SOFT):
         print(finding)

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from sim.errors import InputError
-from sim.script import run_script
+from sim.runtime.user_script import run_script
 
-from .guidance import guidance
+from .commands.guidance import guidance
 
 # A command's module is imported only when it is asked for: `sulcus solve` does not wait for torch.
 COMMANDS = {

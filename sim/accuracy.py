@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Literal
 
+from .arguments import at_least
 from .errors import InputError
-from .given import at_least
 
 Precision = Literal["float32", "float64"]
 FLOOR: dict[str, float] = {"float32": 2e-5, "float64": 1e-11}

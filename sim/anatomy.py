@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from .errors import InputError
-from .mesh import TetMesh, digest_of
+from .geometry.tetmesh import TetMesh, digest_of
 
 BRAIN_LABEL, TUMOUR_LABEL = 1, 2
 """Region labels that the project's own anatomies use."""

@@ -15,10 +15,14 @@ import scipy.sparse as sp
 import warp as wp
 
 from .anatomy import Anatomy
-from .body import Body
-from .constraint import Constraint
-from .device import Device
-from .discretisation import Discretisation, discretise
+from .discretisation.body import Body
+from .discretisation.constraint import Constraint
+from .discretisation.element import Elements
+from .discretisation.footprint import Skin
+from .discretisation.problem import Imposed, Problem
+from .discretisation.rigid_modes import check_held
+from .discretisation.space import Discretisation, discretise
+from .discretisation.term import Barrier, Curved, Term
 from .effects import (
     Bonded,
     BuiltIn,
@@ -38,10 +42,7 @@ from .effects import (
     ToolDisplacement,
     ToolForce,
 )
-from .element import Elements
 from .errors import InputError
-from .footprint import Skin
-from .holding import check_held
 from .loads import (
     Displaced,
     Loads,
@@ -56,8 +57,7 @@ from .loads import (
     check_loads,
 )
 from .material import Tissue, coefficients_of, functions_of, portion
-from .problem import Imposed, Problem
-from .term import Barrier, Curved, Term
+from .runtime.device import Device
 
 CAUSES = {
     ToolForce: Pushed,
@@ -140,11 +140,11 @@ def compile_problem(
 
                 terms.append(InertiaTerm(lumped_mass(effect.density, space), effect.damping, space.marks, device))
             case ToolContact() | Retraction():
-                from .terms.contact import contact_of
+                from .terms.contact.tool_contact import contact_of
 
                 barriers.append(contact_of(effect, anatomy, space, _shear(effects), device))
             case SkullContact():
-                from .terms.skull_contact import skull_of
+                from .terms.contact.skull_contact import skull_of
 
                 barriers.append(skull_of(effect, anatomy, space, _shear(effects), device))
             case ToolDisplacement():
@@ -173,7 +173,9 @@ def _check_names(terms: Iterable[Term], own: Iterable[Term]) -> None:
     taken = {term.name for term in terms}
     for term in own:
         if not isinstance(term, Term):
-            raise InputError(f"an effect of your own made a {type(term).__name__}: let it make a sim.term.Term.")
+            raise InputError(
+                f"an effect of your own made a {type(term).__name__}: let it make a sim.discretisation.term.Term."
+            )
         if term.name in taken:
             raise InputError(f"two terms are called {term.name!r}: give yours another name.")
         taken.add(term.name)
@@ -234,7 +236,7 @@ def compile_part(
 
 def surrounded(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> Part:
     """A part and a stiffness (m, m) [N/m] around it, which its rows (m,) of 3n touch."""
-    from .terms.exterior import Exterior
+    from .terms.schur_stiffness import Exterior
 
     return _loaded(replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, part.device))))
 

@@ -10,8 +10,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .anatomy import Anatomy
+from .arguments import all_finite, as_array, numbers, whole_numbers
 from .errors import InputError
-from .given import all_finite, as_array, numbers, whole_numbers
 from .loads import Loads
 
 # Begins the history's keys of what only shortens the way to the next answer: whoever reads it may forget it.

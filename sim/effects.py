@@ -13,12 +13,12 @@ import numpy as np
 from .anatomy import Anatomy
 from .errors import InputError
 from .material import BRAIN, Tissue, check_described
-from .skull import Bonded, SkullContact, Slide, check_gap
+from .skulls import Bonded, SkullContact, Slide, check_gap
 from .tools import Spatula, Tool, check_tool
 
 if TYPE_CHECKING:
-    from .body import Body
-    from .term import Term
+    from .discretisation.body import Body
+    from .discretisation.term import Term
 
 # Of `Pulsation`: shares of the volume, by which the opened template moves as much as opened brains do.
 CARDIAC, RESPIRATORY = 4.5e-4, 4.5e-4

@@ -14,39 +14,39 @@ import scipy.sparse as sp
 import warp as wp
 
 from .accuracy import TRAIN, Accuracy
-from .alone import alone
 from .anatomy import Anatomy
-from .at_rest import Resting
-from .bond import Bond
-from .columns import unstacked
+from .arguments import at_least, vertex_numbers
 from .compile import check_causes, compile_problem
-from .correction import step_from
 from .deformation import LEARNT_KEY, Cost, Deformation, check_start, joined
-from .device import find_device
-from .discretisation import discretise
+from .diagnostics.bond_traction import Bond
+from .diagnostics.skull_leak import Leak
+from .discretisation.footprint import Skin
+from .discretisation.inverted_elements import Inversion
+from .discretisation.problem import Problem
+from .discretisation.space import discretise
+from .discretisation.term import Cases
 from .effects import Bonded, Effect, Elasticity
-from .elimination import eliminating
 from .errors import InputError
-from .following import Following
-from .footprint import Skin
-from .frame import Frame
-from .given import at_least, vertex_numbers
-from .heading import moved_on, pushes_of, way_of
-from .inversion import Inversion
-from .ladder import FEWEST, Answer, Ladder, shortfall
-from .lbfgs import TAUGHT
-from .leak import Leak
+from .linalg.preconditioner import choose_preconditioner, is_exact, name_of
+from .linalg.rest_solver import Resting
 from .loads import Displaced, Loads, Nodal, Pushed
-from .memory import check_fits, fitting_batch
-from .pace import KEPT, alike
-from .patching import patching
-from .precondition import choose_preconditioner, is_exact, name_of
-from .problem import Problem
-from .series import Reading, factors, taylor, terms_of
-from .still import Still
-from .term import Cases
-from .threads import one_thread
-from .vicinity import vicinity_of
+from .local_solvers.batch_elimination import eliminating
+from .local_solvers.clamped_elimination import vicinity_of
+from .local_solvers.patch_elimination import patching
+from .minimisers.lbfgs import TAUGHT
+from .minimisers.power_series import Reading, factors, taylor, terms_of
+from .runtime.columns import unstacked
+from .runtime.device import find_device
+from .runtime.exclusive import alone
+from .runtime.memory import check_fits, fitting_batch
+from .runtime.threads import one_thread
+from .strategy.captured_frame import Frame
+from .strategy.extrapolation import moved_on, pushes_of, way_of
+from .strategy.frame_sequence import Following
+from .strategy.newton_correction import step_from
+from .strategy.preconditioner_pace import KEPT, alike
+from .strategy.rate_free_steps import Still
+from .strategy.strategy import FEWEST, Answer, Ladder, shortfall
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"

@@ -8,8 +8,8 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
+from .arguments import as_array, numbers
 from .errors import InputError
-from .given import as_array, numbers
 
 
 @dataclass(frozen=True, eq=False)

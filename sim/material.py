@@ -14,7 +14,7 @@ import numpy as np
 from .errors import InputError
 
 if TYPE_CHECKING:
-    from .law import Law
+    from .terms.laws.law import Law
 
 LAWS = ("linear", "corotational", "neo-hookean", "stable-neo-hookean")
 """The laws that E and nu determine; `Ogden` has constants of its own."""
@@ -160,7 +160,7 @@ class Ogden:
 
 
 def _built_in(law: str) -> Law:
-    return importlib.import_module(f".terms.{law.replace('-', '_')}", __package__).LAW
+    return importlib.import_module(f".terms.laws.{law.replace('-', '_')}", __package__).LAW
 
 
 class Tissue(Protocol):

@@ -10,13 +10,13 @@ import warp as wp
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
-from .bond import Bond
 from .deformation import Deformation
+from .diagnostics.bond_traction import Bond
+from .discretisation.term import Cases
 from .effects import Bonded, Effect, Slide
 from .errors import InputError
 from .fem import Fem
 from .loads import Loads
-from .term import Cases
 
 # Solves after which a tear is given up that has not come to rest; how far what let go may pass the skull [m]; and how
 # strongly a vertex may be pulled that slides, as a share of what the hardest pressed one bears.

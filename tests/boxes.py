@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import erf
 
 from sim.anatomy import Anatomy
-from sim.mesh import TetMesh
+from sim.geometry.tetmesh import TetMesh
 
 # Kuhn's six tetrahedra of a cube: paths from corner 0 to corner 7 along the axes; neighbours match.
 CORNER = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]])

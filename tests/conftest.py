@@ -8,9 +8,9 @@ import pytest
 
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Outcome
-from sim.footprint import footprint_weights
+from sim.discretisation.footprint import footprint_weights
+from sim.geometry.tetmesh import TetMesh, oriented
 from sim.loads import Nodal, Pushed
-from sim.mesh import TetMesh, oriented
 
 
 def make_box(cells=(12, 12, 7), spacing=6e-3, tumour=10e-3, depth=22e-3, opening=25e-3):

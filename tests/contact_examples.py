@@ -7,11 +7,11 @@ from scipy.spatial.transform import Rotation
 from term_examples import ANATOMY, MESH, Example
 
 from sim.compile import compile_problem
-from sim.device import Device
-from sim.discretisation import discretise
+from sim.discretisation.space import discretise
+from sim.discretisation.term import Cases, Term
 from sim.effects import Elasticity, Held, Retraction, ToolContact
 from sim.loads import Loads, Retracted, Touching
-from sim.term import Cases, Term
+from sim.runtime.device import Device
 from sim.tools import Ball, Capsule, Spatula, Tool
 
 # On the block's top, tilted into it, and in its side.

@@ -7,9 +7,9 @@ from boxes import base_held, box
 
 from sim.accuracy import Accuracy
 from sim.effects import Effect, Elasticity, Gravity, Held, Resection, ToolForce
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Posture, Resected
 from sim.material import Material
-from sim.mesh import TetMesh
 
 TIGHT = Accuracy(tolerance=1e-11)
 SOFT = Material("neo-hookean", 3000.0, 0.4)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from sim.accuracy import Accuracy
-from sim.direction import Descent
-from sim.newton import Equilibrium, find_equilibrium
-from sim.problem import Problem
+from sim.discretisation.problem import Problem
+from sim.minimisers.newton import Equilibrium, find_equilibrium
+from sim.minimisers.newton_cg import Descent
 
 
 @dataclass(frozen=True, eq=False)

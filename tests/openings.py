@@ -12,16 +12,16 @@ from oracle import tissue
 
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
-from sim.device import find_device
-from sim.discretisation import Discretisation, discretise
+from sim.discretisation.problem import Problem
+from sim.discretisation.space import Discretisation, discretise
+from sim.discretisation.term import Cases
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide
-from sim.lbfgs import Lbfgs
-from sim.linear import Preconditioner
+from sim.linalg.pcg import Preconditioner
+from sim.linalg.preconditioner import rest_solver
 from sim.loads import Loads, Nodal
-from sim.precondition import rest_solver
-from sim.problem import Problem
-from sim.steering import DONE
-from sim.term import Cases
+from sim.minimisers.lbfgs import Lbfgs
+from sim.minimisers.lbfgs_kernels import DONE
+from sim.runtime.device import find_device
 
 MESH = box((8, 8, 5), 0.08, distortion=0.1)
 TOP = MESH.nodes[:, 2] > MESH.nodes[:, 2].max() - 1e-9

@@ -9,8 +9,8 @@ from itertools import combinations
 import numpy as np
 import scipy.sparse as sp
 
+from sim.geometry.tetmesh import TetMesh
 from sim.material import LAWS, Material, Ogden, Tissue
-from sim.mesh import TetMesh
 
 EVERY_LAW = (*LAWS, Ogden.law)
 

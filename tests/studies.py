@@ -1,13 +1,13 @@
 """A small report's study: palpation of a box, of which two loads are played."""
 
-from scenes.report_reference import solve_beyond, solve_reference
-from scenes.report_study import Study
+from scenes.report.reference import solve_beyond, solve_reference
+from scenes.report.study import Study
 from sim.accuracy import TRAIN
 from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
 from sim.material import Material, tissue_to_json
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 

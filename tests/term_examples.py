@@ -12,15 +12,15 @@ from boxes import base_held, box
 from oracle import EVERY_LAW, tissue
 from tiny_terms import Spring, Wall
 
-from sim.bone import Bone
 from sim.compile import compile_problem
-from sim.device import Device
-from sim.discretisation import discretise
+from sim.discretisation.space import discretise
+from sim.discretisation.term import Cases, Term
 from sim.effects import Elasticity, Gravity, Held, Inertia, NodalForce, Pulsation, ToolForce, Wave
 from sim.loads import Loads, Nodal, Posture, Pushed
-from sim.script import run_script
-from sim.term import Cases, Term
-from sim.terms.skull_contact import Skull
+from sim.runtime.device import Device
+from sim.runtime.user_script import run_script
+from sim.terms.contact.skull_contact import Skull
+from sim.terms.contact.skull_surface import Bone
 
 VEINS = run_script(Path(__file__).parents[1] / "examples/veins.py")
 MESH = box((2, 2, 2), 0.1, distortion=0.15)

@@ -11,7 +11,7 @@ from ar.hud import FINE, panel, write
 from ar.layer import Layer, Solid, vertex_normals
 from ar.overlay import BEFORE, DOUBTFUL, GAUGE, WARNING, Gauge, composite, doubt_lines, ink_of, iou, silhouette
 from ar.refind import outline_gap, stands
-from ar.view import Lamp, lamp_beside, render
+from ar.renderer import Lamp, lamp_beside, render
 
 CORTEX, TOOL, TUMOUR = 1, 2, 3
 EYE = np.array([0.0, -0.05, 0.25])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ar.camera import Camera, look_at
-from ar.raster import rasterise, rows_reached
+from ar.rasteriser import rasterise, rows_reached
 from ar.raycast import raycast
 
 NO_TRIANGLES = np.zeros((0, 3), int)

@@ -5,7 +5,7 @@ import pytest
 
 from ar.camera import look_at
 from ar.layer import Layer
-from ar.view import Lamp, as_light, render
+from ar.renderer import Lamp, as_light, render
 
 PLAIN, LID = 1, 2
 

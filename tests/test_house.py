@@ -8,83 +8,64 @@ import tomllib
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
-from statistics import median
 
 import pytest
 
 HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
 """Each room and the rooms that it may import."""
-TIERS = (
-    {
-        "body",
-        "effects",
-        "resection",
-        "device",
-        "lanes",
-        "columns",
-        "rows",
-        "product",
-        "sparse",
-        "sweep",
-        "term",
-        "constraint",
-        "footprint",
-    },
-    {"terms", "problem", "conformance"},
-    {"linear", "factor", "direction", "search", "dense", "memory", "compile", "steering", "narrow", "trial"},
-    {
-        "newton",
-        "series",
-        "balance",
-        "room",
-        "lbfgs",
-        "multigrid",
-        "amg",
-        "inversion",
-        "leak",
-        "bond",
-        "patch",
-        "rim",
-        "compliance",
-        "pairs",
-        "settling",
-        "proximal",
-        "touched",
-    },
-    {
-        "precondition",
-        "at_rest",
-        "condensation",
-        "elimination",
-        "patching",
-        "vicinity",
-        "ladder",
-        "still",
-        "correction",
-        "frame",
-        "following",
-    },
-    {"fem"},
-    {"operated", "pressure", "tearing"},
+ORDER = (
+    {"sim.errors"},
+    {"sim.arguments", "sim.skulls", "sim.tools", "sim.material", "sim.geometry"},
+    {"sim.accuracy", "sim.loads", "sim.anatomy"},
+    {"sim.runtime", "sim.effects", "sim.deformation"},
+    {"sim.discretisation", "sim.terms.laws"},
+    {"sim.terms", "sim.linalg", "sim.bodies", "sim.diagnostics"},
+    {"sim.terms.contact", "sim.minimisers"},
+    {"sim.compile"},
+    {"sim.local_solvers"},
+    {"sim.strategy"},
+    {"sim.fem"},
+    {"sim.resected_fem", "sim.contact_pressure", "sim.tearing"},
+    {"surrogate.data", "surrogate.regressors"},
+    {"surrogate.model"},
+    {"surrogate.evaluation", "surrogate.onnx_export"},
+    {"surrogate.training"},
+    {"scenes.script"},
+    {"scenes.builtin", "scenes.play"},
+    {"scenes.bench"},
+    {"scenes.report"},
+    {"scenes.commands"},
 )
-"""The solver, from below; every other module of sim lies under it and imports none of it."""
+"""Folders from below, and the modules that lie beside them: each imports itself and what lies under it."""
+TOGETHER = {"scenes.cli": "scenes.commands"}
+"""The command line and its commands call each other."""
 OWNERS = {
-    "torch": {"sim/dense.py", "sim/pivots.py", "sim/product.py", "surrogate/ann.py"},
-    "sklearn": {"surrogate/svr.py"},
-    "trimesh": {"scenes/tool.py"},
-    "meshio": {"sim/meshfile.py"},
+    "torch": {
+        "sim/linalg/dense_inverse.py",
+        "sim/linalg/block_inverse.py",
+        "sim/runtime/dense_product.py",
+        "surrogate/regressors/ann.py",
+    },
+    "sklearn": {"surrogate/regressors/svr.py"},
+    "trimesh": {"scenes/script/tool.py"},
+    "meshio": {"sim/bodies/meshfile.py"},
     "viser": {"ar/browser.py", "ar/guard.py", "ar/messages.py"},
-    "nilearn": {"sim/template.py"},
-    "onnx": {"surrogate/exchange.py", "surrogate/wire.py"},
-    "pyamg": {"sim/amg.py"},
-    "nibabel": {"sim/intensity.py", "sim/volume.py"},
+    "nilearn": {"sim/bodies/template.py"},
+    "onnx": {"surrogate/onnx_export/export.py", "surrogate/onnx_export/graph.py"},
+    "pyamg": {"sim/linalg/amg.py"},
+    "nibabel": {"sim/bodies/intensity.py", "sim/bodies/nifti.py"},
 }
 """Libraries that nobody else imports."""
 JOBS = {
-    "warp": {"sim/terms/elasticity.py", "sim/linear.py", "ar/raster.py", "ar/shade.py"},  # finite elements, rasteriser
+    "warp": {
+        "sim/terms/elasticity.py",
+        "sim/linalg/pcg.py",
+        "ar/rasteriser.py",
+        "ar/shade.py",
+    },  # finite elements, rasteriser
     "cv2": {"ar/camera.py", "ar/overlay.py", "ar/screen.py"},  # camera model, compositing, video
-    "numpy": {"sim/loads.py", "sim/deformation.py", "ar/camera.py", "surrogate/dataset.py"},  # the borders
+    "numpy": {"sim/loads.py", "sim/deformation.py", "ar/camera.py", "surrogate/data/dataset.py"},  # the borders
 }
 """Libraries with several jobs: these files, at least, must import them."""
 IMPORT_NAMES = {"opencv-python-headless": "cv2", "scikit-learn": "sklearn", "warp-lang": "warp"}
@@ -100,14 +81,26 @@ def tree_of(path):
     return ast.parse(path.read_text())
 
 
-def imports(path, everywhere=True):
-    """Absolute dotted names that a file imports; only those that run with the module if not `everywhere`."""
+def imports(path, everywhere=True, types=True):
+    """Absolute dotted names that a file imports.
+
+    Only those that run with the module if not `everywhere`; none that only a type checker reads if not `types`.
+    """
     package = name_of(path).removesuffix(".py").split("/")[:-1]
     tree = tree_of(path)
-    inside = {id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)}
+    left_out = (
+        set() if everywhere else {id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)}
+    )
+    if not types:
+        left_out |= {
+            id(n)
+            for f in ast.walk(tree)
+            if isinstance(f, ast.If) and getattr(f.test, "id", "") == "TYPE_CHECKING"
+            for n in ast.walk(f)
+        }
     found = set()
     for node in ast.walk(tree):
-        if not everywhere and id(node) in inside:
+        if id(node) in left_out:
             continue
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
@@ -128,11 +121,11 @@ def importers(library):
 
 def test_the_reader_of_imports_reads():
     """What all other tests here stand on."""
-    assert "sim.errors.InputError" in imports(HOUSE / "sim/mesh.py")
-    assert "surrogate.ann.Ann" in imports(HOUSE / "surrogate/parts.py")
+    assert "sim.errors.InputError" in imports(HOUSE / "sim/geometry/tetmesh.py")
+    assert "surrogate.regressors.ann.Ann" in imports(HOUSE / "surrogate/training/learners.py")
     assert "sim.terms.dead_force.DeadForce" in imports(HOUSE / "sim/compile.py")
     assert "sim.terms.dead_force.DeadForce" not in imports(HOUSE / "sim/compile.py", everywhere=False)
-    assert "scenes.check.measure" in imports(HOUSE / "scenes/commands/check.py") and len(FILES) > 80
+    assert "scenes.play.checks.measure" in imports(HOUSE / "scenes/commands/check.py") and len(FILES) > 80
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -144,13 +137,26 @@ def test_rooms_import_one_way(room):
             assert "tests" not in libraries(path)
 
 
-def test_the_solver_is_built_in_tiers():
-    rank = {name: number for number, tier in enumerate(TIERS, start=1) for name in tier}
-    for path in (HOUSE / "sim").rglob("*.py"):
-        own = rank.get(path.relative_to(HOUSE / "sim").parts[0].removesuffix(".py"), 0)
-        for name in imports(path):
-            if name.startswith("sim."):
-                assert rank.get(name.split(".")[1], 0) <= own, f"{name_of(path)} imports {name} from above"
+def folder_of(module):
+    """The entry of `ORDER` that a module lies in; None of ar, of a package itself, and of what is not ours."""
+    known = {name for tier in ORDER for name in tier} | set(TOGETHER)
+    parts = module.split(".")
+    heads = (".".join(parts[:count]) for count in range(len(parts), 1, -1))
+    found = next((head for head in heads if head in known), None)
+    return TOGETHER.get(found, found)
+
+
+def test_folders_import_one_way():
+    rank = {name: number for number, tier in enumerate(ORDER) for name in tier}
+    for path in FILES:
+        module = name_of(path).removesuffix(".py").replace("/", ".")
+        own = folder_of(module)
+        if path.name == "__init__.py" or module.startswith("ar."):
+            continue
+        assert own, f"{name_of(path)} lies in no folder of ORDER: move it into one"
+        for name in imports(path, types=False):
+            other = folder_of(name)
+            assert other in (None, own) or rank[other] < rank[own], f"{name_of(path)} imports {name} from above"
 
 
 def modules_of(path):
@@ -165,14 +171,16 @@ def test_no_module_imports_itself_by_way_of_others():
 
 
 def test_newton_knows_no_particular_term_and_terms_are_imported_in_their_arm_alone():
+    own = re.compile(r"sim\.terms\.(?!laws\b)")
     for path in FILES:
         name = name_of(path)
         if name.startswith("sim/terms/"):
-            assert not {other for other in imports(path) if re.match(r"sim\.(problem|compile|newton|fem)\b", other)}
+            solver = re.compile(r"sim\.(discretisation\.problem|compile|minimisers|fem)\b")
+            assert not {other for other in imports(path) if solver.match(other)}
             continue
-        assert not [other for other in imports(path, everywhere=False) if other.startswith("sim.terms")], name
+        assert not [other for other in imports(path, everywhere=False, types=False) if own.match(other)], name
         if name != "sim/compile.py":
-            assert not [other for other in imports(path) if other.startswith("sim.terms")], name
+            assert not [other for other in imports(path, types=False) if own.match(other)], name
 
 
 @pytest.mark.parametrize("library", OWNERS)
@@ -186,10 +194,15 @@ def test_each_library_does_its_job(library):
 
 
 def test_rooms_without_pictures_or_networks_import_none():
-    assert all(name.startswith("ar/") or name == "scenes/collect.py" for name in importers("cv2"))
+    outside = {name for name in importers("cv2") if not name.startswith("ar/")}
+    assert outside == {"scenes/play/episode.py", "scenes/bench/loglog_chart.py"}
     # A learnt model is arrays: Warp answers single loads alone, and is loaded with the first of them.
     ours = {name for name in importers("warp") if name.startswith("surrogate/")}
-    assert ours == {"surrogate/swift.py", "surrogate/swift_kernel.py", "surrogate/swift_limits.py"}
+    assert ours == {
+        "surrogate/model/single_load.py",
+        "surrogate/model/single_load_kernel.py",
+        "surrogate/model/single_load_bound.py",
+    }
 
 
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
@@ -212,7 +225,6 @@ def test_files_are_short():
     lengths = {name_of(path): len(path.read_text().splitlines()) for path in FILES}
     tests = {path.name: len(path.read_text().splitlines()) for path in (HOUSE / "tests").glob("*.py")}
     assert not {name: count for name, count in (lengths | tests).items() if count > 400}
-    assert median(lengths.values()) <= 125
 
 
 def test_the_top_level_is_fixed_and_tests_are_flat():
@@ -267,10 +279,10 @@ def test_the_command_line_waits_for_nothing():
     print_heavy = f"import sys; print([name for name in {heavy} if name in sys.modules])"
     assert fresh(f"import scenes.cli; {print_heavy}").strip() == "[]"
     assert "torch" not in fresh(f"import scenes.commands.solve, scenes.commands.anatomy, sim.fem; {print_heavy}")
-    assert "viser" not in fresh(f"import scenes.commands.check, scenes.check, scenes.collect; {print_heavy}")
+    assert "viser" not in fresh(f"import scenes.commands.check, scenes.play.checks, scenes.play.episode; {print_heavy}")
 
 
 def test_a_machine_that_only_trains_needs_no_meshes_and_no_pages():
     block = "import sys; sys.modules |= dict.fromkeys(['meshio', 'nibabel', 'nilearn', 'trimesh', 'viser', 'cv2'])"
-    wanted = "scenes.commands.simulate, scenes.commands.train, surrogate.train, surrogate.store, sim.fem"
+    wanted = "scenes.commands.simulate, scenes.commands.train, surrogate.training.train, surrogate.model.store, sim.fem"
     fresh(f"{block}; import {wanted}")

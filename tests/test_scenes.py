@@ -8,15 +8,15 @@ import trimesh
 from theatres import PUSHING, on_template, small, template_theatre
 
 from ar.camera import project_cv2
-from scenes.lying import Lying
-from scenes.paths import AIR, Touch, draw, lay, lifted, palpate, press, slide, smooth
-from scenes.scene import SCENES, UNDER, Viewpoint, find_scene
-from scenes.site import site_of
-from scenes.stage import CORTEX, DRAPE, TOOL, Stage, clipped
-from scenes.tool import Probe
+from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage, clipped
+from scenes.script.head_posture import Lying
+from scenes.script.scene import SCENES, UNDER, Viewpoint, find_scene
+from scenes.script.site import site_of
+from scenes.script.tool import Probe
+from scenes.script.tool_paths import AIR, Touch, draw, lay, lifted, palpate, press, slide, smooth
 from sim.compile import check_causes
 from sim.errors import InputError
-from surrogate.patch import open_patch
+from surrogate.data.cortex_patch import open_patch
 
 START, END = (-0.01, -0.004), (0.008, 0.006)
 PATHS = {

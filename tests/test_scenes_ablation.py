@@ -12,10 +12,10 @@ import warp as wp
 from theatres import PUSHING, put, short, sinking, theatre_of
 
 from ar.screen import shrunk
-from scenes.ablation import ALL, device_arrays, rows, run, without
 from scenes.cli import main
-from scenes.scene import SCENES, find_scene
-from scenes.sheet import sheet
+from scenes.play.contact_sheet import sheet
+from scenes.play.effect_ablation import ALL, device_arrays, rows, run, without
+from scenes.script.scene import SCENES, find_scene
 from sim.effects import Gravity, Held, ToolForce
 from sim.errors import InputError
 
@@ -69,7 +69,7 @@ def counted(theatre, scene, every):
 
 
 def test_the_memory_that_is_printed_is_that_of_arrays(theatre, anatomy, capsys):
-    """Of every row, in the table and in JSON, by bytes that are counted without `scenes.ablation.rows`."""
+    """Of every row, in the table and in JSON, by bytes that are counted without `scenes.play.effect_ablation.rows`."""
     assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "60", "--device", "cpu", "--json"]) == 0
     out, error = capsys.readouterr()
     table = [[cell.strip() for cell in line.split("|")] for line in error.splitlines() if line.startswith("| ")]
@@ -135,7 +135,7 @@ class TestScenes:
         assert "Resection" in told["resection"]["effects"] and "milliseconds" not in told["press"]
 
     def test_pictures_and_a_sheet(self, anatomy, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr("scenes.scene.SCENES", ("press", "brain_shift"))
+        monkeypatch.setattr("scenes.script.scene.SCENES", ("press", "brain_shift"))
         out = tmp_path / "new" / "sheet"
         assert main(["scenes", "--anatomy", anatomy, "--device", "cpu", "--out", str(out)]) == 0
         assert "ms a frame by linear; the tumour moves" in capsys.readouterr().out

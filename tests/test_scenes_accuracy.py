@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from scenes.scene import find_scene
-from scenes.theatre import open_theatre
+from scenes.play.deformers import open_theatre
+from scenes.script.scene import find_scene
 from sim.accuracy import LIVE, TRAIN, Accuracy
 from sim.fem import Fem
 from sim.loads import stacked

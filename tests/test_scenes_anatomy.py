@@ -7,8 +7,8 @@ import pytest
 from balls import ball
 
 from scenes.cli import main
-from sim.intensity import read_intensity, sidecar
-from sim.meshfile import read_anatomy, write_anatomy
+from sim.bodies.intensity import read_intensity, sidecar
+from sim.bodies.meshfile import read_anatomy, write_anatomy
 
 
 def run(capsys, *words):

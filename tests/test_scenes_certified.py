@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from theatres import put, theatre_of
 
-from scenes.certified import certified
+from scenes.bench.budget import offers
 from scenes.cli import main
-from scenes.offers import offers
-from scenes.scene import find_scene
+from scenes.play.certificates import certified
+from scenes.script.scene import find_scene
 from sim.deformation import Cost
 from sim.deformation import guess as answered
-from surrogate.certify import SCOPE
+from surrogate.evaluation.certificate import SCOPE
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_searching_is_correcting_and_the_rest_is_estimating(monkeypatch):
         left = np.array([2e-6]), np.array([1e-5])
         return SimpleNamespace(estimate=left[1], left=left[0], corrected=answer(3e-6), cost=cost, sound=[True])
 
-    monkeypatch.setattr("scenes.certified.certify", known)
+    monkeypatch.setattr("scenes.play.certificates.certify", known)
     drawn = SimpleNamespace(number=7, loads=None, deformation=replace(answer(4e-6), cost=Cost({"predict": 0.004})))
     (found,) = certified(SimpleNamespace(anatomy=anatomy), [drawn], answer(0.0))  # type: ignore
     assert (found.predict_ms, found.estimate_ms, found.correct_ms) == pytest.approx((4.0, 3.0, 500.0))

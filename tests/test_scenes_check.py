@@ -9,13 +9,13 @@ from theatres import PUSHING, player, put, small, theatre_of
 
 from ar.hud import millimetres
 from ar.overlay import composite
-from scenes.check import Figures, measure
 from scenes.cli import main
-from scenes.paths import press
-from scenes.play import annotate, gauged
-from scenes.scene import SCENES, Bounds, find_scene
-from scenes.stage import TOOL
-from scenes.truth import truth_of
+from scenes.play.checks import Figures, measure
+from scenes.play.player import annotate, gauged
+from scenes.play.reference import truth_of
+from scenes.play.stage import TOOL
+from scenes.script.scene import SCENES, Bounds, find_scene
+from scenes.script.tool_paths import press
 from sim.deformation import Outcome
 
 GOOD = Figures(

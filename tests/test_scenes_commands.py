@@ -10,11 +10,11 @@ from boxes import box as cube
 from theatres import put, theatre_of
 
 from scenes.cli import COMMANDS, main
-from scenes.theatre import model_path
-from sim.intensity import sidecar
-from sim.meshfile import read_anatomy, write_anatomy, write_mesh
-from sim.stages import stage
-from surrogate.store import load
+from scenes.play.deformers import model_path
+from sim.bodies.intensity import sidecar
+from sim.bodies.meshfile import read_anatomy, write_anatomy, write_mesh
+from sim.runtime.timing import stage
+from surrogate.model.store import load
 
 
 def test_a_patient_in_one_go(tmp_path, capsys):

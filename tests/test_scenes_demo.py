@@ -12,12 +12,12 @@ from visitor import Visitor, free_port, wait_for
 from ar.browser import Browser
 from ar.hud import FINE
 from ar.refind import stands
-from scenes.demo import FEM_COLOUR, STALE_COLOUR, Demo, Moment
-from scenes.paths import Touch, press
-from scenes.referee import Referee
-from scenes.wish import HAND, SCRIPT, Wish
+from scenes.play.page import FEM_COLOUR, STALE_COLOUR, Demo, Moment
+from scenes.play.page_referee import Referee
+from scenes.play.page_requests import HAND, SCRIPT, Wish
+from scenes.script.tool_paths import Touch, press
 from sim.fem import Fem
-from surrogate.learned import Learned
+from surrogate.model.learned import Learned
 
 
 @pytest.fixture(scope="module")

@@ -10,26 +10,26 @@ import pytest
 from theatres import player, short, sinking, small, template_theatre, theatre_of
 from visitor import Visitor, free_port, wait_for
 
-from scenes.ablation import without
-from scenes.check import measure
-from scenes.collect import UNITS, collect
-from scenes.demo import Demo
-from scenes.lying import SUPINE, Lying, drained_then_turned, supine
-from scenes.paths import Touch
-from scenes.play import labelled
-from scenes.retract import RELAXING
-from scenes.scene import Bounds, find_scene
-from scenes.site import HOLE
-from scenes.stage import CORTEX, TOOL, Stage
-from scenes.told import told
-from scenes.truth import truth_of
+from scenes.builtin.retract import RELAXING
+from scenes.play.checks import measure
+from scenes.play.effect_ablation import without
+from scenes.play.episode import UNITS, collect
+from scenes.play.load_text import told
+from scenes.play.page import Demo
+from scenes.play.player import labelled
+from scenes.play.reference import truth_of
+from scenes.play.stage import CORTEX, TOOL, Stage
+from scenes.script.head_posture import SUPINE, Lying, drained_then_turned, supine
+from scenes.script.scene import Bounds, find_scene
+from scenes.script.site import HOLE
+from scenes.script.tool_paths import Touch
 from sim.accuracy import LIVE, TRAIN
 from sim.deformation import guess
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, posture, stacked
 from sim.material import Material, tissue_to_json
-from surrogate.taught import refusal, taught_effects
+from surrogate.model.applicability import refusal, taught_effects
 
 EFFECTS = (Elasticity(), Held(), Slide())
 STILL = guess(np.zeros((1, 3, 3)))
@@ -177,7 +177,7 @@ class TestWithoutATool:
             assert not (frame.picture.segmentation == TOOL).any()
             assert (frame.shown != frame.picture.colour).any()
         lines = []
-        monkeypatch.setattr("scenes.play.panel", lambda colour, text: lines.extend(text) or colour)
+        monkeypatch.setattr("scenes.play.player.panel", lambda colour, text: lines.extend(text) or colour)
         labelled(frames[-1], "fem")
         assert any("gravity pulls to the left (0.87) and the back (0.50)" in line for line in lines)
         assert not any("0.00 N" in line for line in lines)

@@ -13,9 +13,9 @@ from boxes import box, quadratic, top_forces
 from oracle import internal_forces
 
 from scenes.cli import main
-from sim.discretisation import ELEMENTS, discretise
+from sim.discretisation.space import ELEMENTS, discretise
+from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, Material
-from sim.mesh import TetMesh
 
 LINEAR = box((2, 2, 3), 0.1, distortion=0.15)
 STRAIGHT, CURVED = quadratic(LINEAR), quadratic(LINEAR, curved=0.05)

@@ -9,16 +9,16 @@ import pytest
 import warp as wp
 from conftest import make_box
 
-from scenes.scene import SCENES, Scene, find_scene
-from scenes.site import site_of
+from scenes.script.scene import SCENES, Scene, find_scene
+from scenes.script.site import site_of
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, guess
+from sim.discretisation.resected_body import bodies
+from sim.discretisation.term import Cases
 from sim.effects import Effect, Elasticity, Held, Inertia, Pulsation, Resection, Wave
 from sim.fem import Fem
 from sim.loads import Loads, Resected
-from sim.resection import bodies
-from sim.term import Cases
 from sim.terms.inertia import lumped_mass
 
 TIGHT = Accuracy(tolerance=1e-10)

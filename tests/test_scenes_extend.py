@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.scene import find_scene
+from scenes.script.scene import find_scene
 
 HOUSE = Path(__file__).parents[1]
 PAGE = (HOUSE / "docs/extend.md").read_text()

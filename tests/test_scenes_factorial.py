@@ -7,9 +7,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from scenes import factorial
+from scenes.bench import factorial
+from scenes.bench.factorial import LEVELS, Cell, cells, panels, shares
 from scenes.cli import main
-from scenes.factorial import LEVELS, Cell, cells, panels, shares
 
 FEW = {
     "opening [mm]": (50.0,), "depth [mm]": (10.0,), "skull": ("bonded", "slide"), "nu": (0.45, 0.49),

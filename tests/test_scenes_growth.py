@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ar.screen import read_png
-from scenes import growth
+from scenes.bench import scaling
+from scenes.bench.scaling import Row, Trial, measured, panels, rows
 from scenes.cli import main
-from scenes.growth import Row, Trial, measured, panels, rows
 from sim.errors import InputError
 
 ROW = Row(2000, 1, 1977, 8987, "sparse factor", 1, 1.0, 0.05, 8.0, 12, 12, 0.3, 0.0)
@@ -24,7 +24,7 @@ def folder(tmp_path_factory):
 
 
 def test_a_row_is_what_was_solved(folder, monkeypatch):
-    monkeypatch.setattr(growth, "LOADS", 4)
+    monkeypatch.setattr(scaling, "LOADS", 4)
     row = measured(Trial("p1", "cpu", folder), 2000, 2)
     assert (row.preconditioner, row.batch, row.loads, row.converged) == ("sparse factor", 2, 4, 4)
     assert 1900 < row.nodes < 2100 and row.tets > 4 * row.nodes
@@ -42,7 +42,7 @@ def test_what_is_measured_is_not_measured_again(folder, tmp_path, monkeypatch, c
         asked.append([row.asked for row in done])
         yield from (replace(ROW, asked=b, batch=b) for b in batches if b not in asked[-1])
 
-    monkeypatch.setattr(growth, "rows", instead)
+    monkeypatch.setattr(scaling, "rows", instead)
     assert main([*words[:-3], "--device", "cpu", "--out", str(out)]) == 0
     assert main([*words, "--out", str(out), "--json"]) == 0
     assert asked == [[], [1]]

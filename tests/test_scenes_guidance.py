@@ -12,15 +12,15 @@ from theatres import put, theatre_of
 
 from ar.screen import read_png, signature
 from scenes.cli import COMMANDS, _with_points, main
+from scenes.commands.guidance import EXAMPLES, NAMES, PLAYING
+from scenes.commands.placement_options import opened
 from scenes.commands.train import _warnings
-from scenes.guidance import EXAMPLES, NAMES, PLAYING
-from scenes.placed import opened
-from scenes.scene import SCENES
-from scenes.truth import truth_of
-from sim.device import find_device
+from scenes.play.reference import truth_of
+from scenes.script.scene import SCENES
+from sim.bodies.label_volume import volume_subject
 from sim.errors import InputError
-from sim.labels import volume_subject
 from sim.loads import push
+from sim.runtime.device import find_device
 
 
 def helped(words, capsys):

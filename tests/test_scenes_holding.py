@@ -6,12 +6,12 @@ import pytest
 from theatres import small, theatre_of
 from visitor import Visitor, free_port, wait_for
 
-from scenes.demo import SCRIPT, Demo
-from scenes.holding import holding
-from scenes.paths import press
-from scenes.play import Player
-from scenes.referee import Referee
-from scenes.theatre import Theatre
+from scenes.play.deformers import Theatre
+from scenes.play.page import SCRIPT, Demo
+from scenes.play.page_referee import Referee
+from scenes.play.player import Player
+from scenes.play.tool_holder import holding
+from scenes.script.tool_paths import press
 from sim.errors import InputError
 
 
@@ -42,7 +42,7 @@ class Silent:
 
 @pytest.fixture
 def demo(theatre, scene, monkeypatch):
-    monkeypatch.setattr("scenes.demo.Referee", Silent)
+    monkeypatch.setattr("scenes.play.page.Referee", Silent)
     demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
     demo.wish.set(plays=False)
     yield demo
@@ -100,7 +100,7 @@ def test_a_load_that_is_refused_is_said_on_the_page_which_goes_on(running, monke
 
 
 def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd):
-    monkeypatch.setattr("scenes.demo.READING", 0.2)
+    monkeypatch.setattr("scenes.play.page.READING", 0.2)
     refuse(monkeypatch, lambda number, touch: number == 5, IndexError("none such"))
     demo.wish.set(plays=True, number=4)
     assert demo.run(2.0) > 1

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.interrupt import until_ended
+from scenes.commands.interrupt import until_ended
 
 COMMAND = """
 import argparse, sys, threading, time
@@ -38,10 +38,10 @@ class Demo:
 
 theatre = Names(models={"linear"}, best=lambda scene: "linear", knowing=lambda scene: True,
                 refusals=lambda scene: {}, described=lambda name, scene: name)
-sys.modules["scenes.demo"] = Names(Demo=Demo)
+sys.modules["scenes.play.page"] = Names(Demo=Demo)
 scene = Names(name="none", made_of=lambda tissue, element: scene)
-sys.modules["scenes.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",))
-sys.modules["scenes.theatre"] = Names(open_theatre=lambda *words: theatre)
+sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",))
+sys.modules["scenes.play.deformers"] = Names(open_theatre=lambda *words: theatre)
 from scenes.commands.demo import add_arguments, run
 parser = argparse.ArgumentParser()
 add_arguments(parser)

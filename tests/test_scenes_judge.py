@@ -11,22 +11,22 @@ from boxes import quadratic
 from conftest import make_box
 from theatres import small, theatre_of
 
+from scenes.builtin.retract import RELAXING
 from scenes.cli import main
-from scenes.retract import RELAXING
-from scenes.scene import Scene
-from scenes.site import site_of
-from scenes.theatre import Theatre, open_theatre
-from scenes.truth import truth_of
+from scenes.play.deformers import Theatre, open_theatre
+from scenes.play.reference import truth_of
+from scenes.script.scene import Scene
+from scenes.script.site import site_of
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
-from sim.discretisation import RECOMMENDED
+from sim.bodies.meshfile import write_anatomy
+from sim.discretisation.space import RECOMMENDED
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN, Material, Tissue
-from sim.meshfile import write_anatomy
-from surrogate.dataset import read_dataset
-from surrogate.store import save
+from surrogate.data.dataset import read_dataset
+from surrogate.model.store import save
 
 STIFF = Material("linear", 9000.0, 0.3)
 

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from conftest import make_box
 
-from scenes import live
+from scenes.bench import live
+from scenes.bench.live import RIDES, WARM_UP, Frame, Ride, errors, frames_of, loads_of, tally
 from scenes.cli import main
-from scenes.live import RIDES, WARM_UP, Frame, Ride, errors, frames_of, loads_of, tally
-from scenes.paths import wander
-from scenes.scene import find_scene
-from scenes.site import site_of
+from scenes.script.scene import find_scene
+from scenes.script.site import site_of
+from scenes.script.tool_paths import wander
+from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
 from sim.effects import Elasticity, Held, ToolForce
 from sim.loads import Pushed
-from sim.meshfile import write_anatomy
 
 SCENE = replace(find_scene("press"), effects=(Elasticity(), Held(), ToolForce()))
 

@@ -11,16 +11,16 @@ import warp as wp
 from conftest import make_box
 from witness import slippery
 
-from scenes.ablation import device_arrays, without
-from scenes.scene import SCENES, Scene, find_scene
-from scenes.site import site_of
+from scenes.play.effect_ablation import device_arrays, without
+from scenes.script.scene import SCENES, Scene, find_scene
+from scenes.script.site import site_of
 from sim.compile import compile_problem
-from sim.device import find_device
-from sim.discretisation import discretise
+from sim.discretisation.footprint import Skin
+from sim.discretisation.space import discretise
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Pulsation, Resection
-from sim.footprint import Skin
 from sim.loads import Resected
-from sim.term import Cases
+from sim.runtime.device import find_device
 
 BODY = slippery(make_box((4, 4, 4), spacing=18e-3, tumour=16e-3, depth=30e-3, opening=26e-3))
 SITE = site_of(BODY)

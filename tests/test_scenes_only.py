@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.scene import SCENES, find_scene
+from scenes.script.scene import SCENES, find_scene
 from sim.effects import BuiltIn, Elasticity
 from sim.material import LAWS
 
@@ -33,9 +33,18 @@ def cost(modules: str = "", kernels: str = "", classes: str = "") -> Cost:
     return Cost(frozenset(modules.split()), frozenset(kernels.split()), frozenset(classes.split()))
 
 
+TOOLS = cost(
+    "contact.barrier contact.reduced contact.tool_contact contact.tool_kernels contact.tool_path",
+    "contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction",
+    "Contact Reduced",
+)
 # A new effect adds one line.
 OF_EFFECT = {
-    "Elasticity": cost("elasticity invariants loops source", "loops:add_gradient", "Elasticity Kernels _Part"),
+    "Elasticity": cost(
+        "elasticity element_kernels laws.invariants laws.law state_source",
+        "element_kernels:add_gradient",
+        "Elasticity Kernels Law _Part",
+    ),
     "Held": cost(),
     "Bonded": cost(),
     "Slide": cost(),
@@ -44,31 +53,39 @@ OF_EFFECT = {
     "NodalForce": cost("dead_force", "", "DeadForce"),
     "Gravity": cost("dead_force gravity", "dead_force:subtract", "DeadForce Forces Kernels"),
     "Inertia": cost("inertia", "inertia:add_force", "Inertia Kernels"),
-    "Pulsation": cost("swelling", "swelling:fill loops:spread", "Swelling"),
+    "Pulsation": cost("swelling", "swelling:fill element_kernels:spread", "Swelling"),
     "Resection": cost(),
-    "ToolContact": cost("barrier contact reduced touch", "touch:add_gradient touch:add_reaction", "Contact Reduced"),
-    "Retraction": cost("barrier contact reduced touch", "touch:add_gradient touch:add_reaction", "Contact Reduced"),
-    "SkullContact": cost("barrier skull_contact", "skull_contact:add_gradient", "Skull"),
+    "ToolContact": TOOLS,
+    "Retraction": TOOLS,
+    "SkullContact": cost(
+        "contact.barrier contact.skull_contact contact.skull_opening contact.skull_surface",
+        "contact.skull_contact:add_gradient",
+        "Bone Skull",
+    ),
 }
 OF_LAW = {
-    "linear": cost("linear"),
-    "corotational": cost("corotational"),
-    "neo-hookean": cost("neo_hookean"),
-    "stable-neo-hookean": cost("stable_neo_hookean"),
-    "ogden": cost("ogden spectral"),
+    "linear": cost("laws.linear"),
+    "corotational": cost("laws.corotational"),
+    "neo-hookean": cost("laws.neo_hookean"),
+    "stable-neo-hookean": cost("laws.stable_neo_hookean"),
+    "ogden": cost("laws.ogden laws.spectral"),
     "prony": cost(
-        "neo_hookean split viscoelastic",
-        "loops:measure loops:spread viscoelastic:advance viscoelastic:fade",
+        "laws.isochoric_split laws.neo_hookean viscoelastic",
+        "element_kernels:measure element_kernels:spread viscoelastic:advance viscoelastic:fade",
         "Prony Kernels Split",
     ),
 }
 # What a solver may do of any energy, as the load needs it.
-ANY = {f"loops:{name}" for name in ("add_energy", "add_curvature", "add_diagonal", "bound_step")} | {
+ANY = {f"element_kernels:{name}" for name in ("add_energy", "add_curvature", "add_diagonal", "bound_step")} | {
     "dead_force:subtract_work",
     "inertia:add_energy",
     "inertia:add_blocks",
-    "touch:add_matrix",
-    *(f"{name}:{kernel}" for name in ("touch", "skull_contact") for kernel in ("add_curvature", "bound_step")),
+    "contact.tool_kernels:add_matrix",
+    *(
+        f"{name}:{kernel}"
+        for name in ("contact.tool_kernels", "contact.skull_contact")
+        for kernel in ("add_curvature", "bound_step")
+    ),
 }
 
 
@@ -154,7 +171,7 @@ def test_a_scene_of_one_law_knows_no_other(law):
 def test_elements_need_no_term_of_their_own(element):
     found = witnessed("press", "", "", element)
     check(found, effects_of("press"), law_of("press"))
-    grids = {"sim.multigrid", "sim.sparse"}
+    grids = {"sim.linalg.multigrid", "sim.linalg.block_sparse"}
     assert (grids <= {name.split(":")[0] for name in found["launched"]}) == (element == "p2")
 
 

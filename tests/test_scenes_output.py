@@ -10,13 +10,13 @@ from boxes import base_held, top_forces
 from boxes import box as cube
 
 from ar.screen import signature, write_film, write_png
-from scenes.beside import demand_no_strangers, remove_data, strangers
 from scenes.cli import main
-from scenes.output import KINDS, claimed, claimed_frames, recognised
+from scenes.commands.companion_files import demand_no_strangers, remove_data, strangers
+from scenes.commands.outputs import KINDS, claimed, claimed_frames, recognised
+from sim.bodies.intensity import Intensity, sidecar, write_intensity
+from sim.bodies.meshfile import read_mesh, write_anatomy, write_mesh
 from sim.errors import InputError
-from sim.files import check_output
-from sim.intensity import Intensity, sidecar, write_intensity
-from sim.meshfile import read_mesh, write_anatomy, write_mesh
+from sim.runtime.atomic_files import check_output
 
 # None of what they read is there: whoever looks at it first says so, and not that nothing can be written.
 WRITING = {

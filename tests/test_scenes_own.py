@@ -10,22 +10,22 @@ import trimesh
 from theatres import put, theatre_of
 
 from scenes.cli import main
-from scenes.scene import find_scene
-from scenes.stage import TOOL
-from scenes.theatre import Theatre
+from scenes.play.deformers import Theatre
+from scenes.play.stage import TOOL
+from scenes.script.scene import find_scene
+from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
-from sim.meshfile import read_anatomy
-from sim.script import run_script
+from sim.runtime.user_script import run_script
 from sim.tools import distances_to
 
 OWN = '''"""The tool nods twice."""
 
 from own_strokes import nod
-from scenes.scene import Scene, Viewpoint
+from scenes.script.scene import Scene, Viewpoint
 
 SCENE = Scene("nod", __doc__, nod(0.2), duration=0.07, viewpoint=Viewpoint(width=400, height=300))
 '''
-STROKES = """from scenes.paths import press
+STROKES = """from scenes.script.tool_paths import press
 
 def nod(force):
     return press(force, rise=0.04, hold=0.0)
@@ -72,7 +72,7 @@ def test_what_its_effects_cost_is_measured(folder, monkeypatch, capsys):
 SUCKER = Path(__file__).parents[1] / "examples/sucker.py"
 HELD_BY = """from dataclasses import replace
 
-from scenes.scene import Viewpoint
+from scenes.script.scene import Viewpoint
 from own_sucker import SCENE as LAID, Sucker
 
 TOOL = Sucker(stl="sucker.stl")
@@ -105,7 +105,7 @@ WRONG = """from dataclasses import replace
 from typing import Any
 
 import warp as wp
-from scenes.press import SCENE as PRESS
+from scenes.builtin.press import SCENE as PRESS
 from sim.effects import Elasticity
 from yeoh import Yeoh, stress as own
 
@@ -140,10 +140,10 @@ DERIVED = """from dataclasses import dataclass, replace
 from typing import Any
 
 import warp as wp
-from scenes.press import SCENE as PRESS
+from scenes.builtin.press import SCENE as PRESS
 from sim.effects import Elasticity
 from sim.material import Material
-from sim.terms.neo_hookean import LAW, stress as own
+from sim.terms.laws.neo_hookean import LAW, stress as own
 
 
 @wp.func
@@ -180,14 +180,14 @@ def test_the_same_text_runs_once_and_a_mended_one_anew(tmp_path):
     assert run_script(path).Mine.number == 2 and not hasattr(first.Mine, "number")
 
 
-IMPORT = "from scenes.scene import Scene"
+IMPORT = "from scenes.script.scene import Scene"
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "my.py: has no SCENE. Let it say SCENE = Scene"),
-        ("SCENE = 'press'", "my.py: its SCENE is a str. Make it a scenes.scene.Scene."),
+        ("SCENE = 'press'", "my.py: its SCENE is a str. Make it a scenes.script.scene.Scene."),
         ("\nSCENE = Scene(", r"my.py, line 2: is no Python \('\(' was never closed\). Mend the file."),
         ("one = 1\nSCENE = one / 0\n", "my.py, line 2: raised ZeroDivisionError: division by zero. Mend the file."),
         ("import no_such_module", "line 1: raised ModuleNotFoundError: No module named 'no_such_module'"),

@@ -8,17 +8,17 @@ import pytest
 from theatres import short, sinking, small, theatre_of
 
 from ar.page_parts import Choice, Fold, Slider
-from scenes.busy import NOTICED, Busy
-from scenes.page_controls import clocked, controls
-from scenes.page_text import RESEARCH, about, fem_words, report, side, trust, words
-from scenes.paths import Touch
-from scenes.play import Player
-from scenes.referee import Truth
-from scenes.scene import find_scene
-from scenes.stage import Stage
-from scenes.stamp import stamp
-from scenes.verdict import Judged, judge, verdict_words
-from scenes.wish import Wish
+from scenes.play.load_stamp import stamp
+from scenes.play.page_controls import clocked, controls
+from scenes.play.page_referee import Truth
+from scenes.play.page_requests import Wish
+from scenes.play.page_text import RESEARCH, about, fem_words, report, side, trust, words
+from scenes.play.page_verdict import Judged, judge, verdict_words
+from scenes.play.player import Player
+from scenes.play.stage import Stage
+from scenes.play.waiting_notice import NOTICED, Busy
+from scenes.script.scene import find_scene
+from scenes.script.tool_paths import Touch
 from sim.accuracy import LIVE
 from sim.deformation import Outcome, guess
 from sim.effects import Elasticity, Held, Slide, ToolForce

@@ -15,17 +15,17 @@ from ar.hud import FINE, NARROW, WHITE, folded
 from ar.overlay import WARNING, ink_of
 from ar.refind import stands
 from scenes.cli import main
-from scenes.paths import Touch
-from scenes.play import CARRIED, IN_BONE, STAGES, labelled
-from scenes.scene import Viewpoint, find_scene
-from scenes.shipped import template_path
-from scenes.stage import CORTEX, TOOL
-from scenes.theatre import Theatre, model_path, open_theatre
+from scenes.play.deformers import Theatre, model_path, open_theatre
+from scenes.play.player import CARRIED, IN_BONE, STAGES, labelled
+from scenes.play.stage import CORTEX, TOOL
+from scenes.script.scene import Viewpoint, find_scene
+from scenes.script.shipped_files import template_path
+from scenes.script.tool_paths import Touch
+from sim.bodies.intensity import sidecar
+from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
 from sim.errors import InputError
-from sim.intensity import sidecar
-from sim.meshfile import write_anatomy
-from surrogate.learned import Learned
+from surrogate.model.learned import Learned
 
 
 @pytest.fixture(scope="module")
@@ -175,10 +175,10 @@ def test_the_overlay_lies_where_the_tumour_is(play):
 def test_a_frame_finds_the_resting_tool_and_the_nearest_point_once(play, monkeypatch):
     found = []
     for place, name in (
-        ("scenes.play", "resting_tip"),
-        ("sim.tip", "resting_tip"),
-        ("scenes.play", "closest"),
-        ("sim.tip", "closest"),
+        ("scenes.play.player", "resting_tip"),
+        ("sim.bodies.tip_distance", "resting_tip"),
+        ("scenes.play.player", "closest"),
+        ("sim.bodies.tip_distance", "closest"),
     ):
         whole = getattr(importlib.import_module(place), name)
 
@@ -226,7 +226,7 @@ def test_the_label_tells_name_force_and_error(play):
 
 def test_the_label_tells_the_error_in_millimetres(play, monkeypatch):
     told = []
-    monkeypatch.setattr("scenes.play.panel", lambda colour, lines: told.extend(lines) or colour)
+    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines: told.extend(lines) or colour)
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     labelled(frame, "linear", 1.2e-4)
     assert "error against FEM: 0.120 mm (frame 51)" in told and told[0] == frame.deformation.source
@@ -235,7 +235,7 @@ def test_the_label_tells_the_error_in_millimetres(play, monkeypatch):
 
 def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
     told = []
-    monkeypatch.setattr("scenes.play.panel", lambda colour, lines: told.append(list(lines)) or colour)
+    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines: told.append(list(lines)) or colour)
     play = player(theatre, short(), "linear")
     for force in (0.2, 0.6):
         labelled(play.draw(0, 0.0, Touch(force=force)), "linear")
@@ -245,7 +245,7 @@ def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch
 
 def test_what_is_drawn_round_the_tumour_is_what_the_model_promises(theatre, monkeypatch):
     drawn = []
-    monkeypatch.setattr("scenes.play.composite", lambda *parts: drawn.append(parts[5]) or _blank())
+    monkeypatch.setattr("scenes.play.player.composite", lambda *parts: drawn.append(parts[5]) or _blank())
     model = theatre.models["linear"]
     surface = np.unique(theatre.anatomy.tumour_surface)
     for force in (0.1, 0.3, 0.6):

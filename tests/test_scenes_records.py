@@ -11,10 +11,10 @@ from theatres import player, put, short, theatre_of
 
 from ar.camera import Camera, project_cv2
 from scenes.cli import main
-from scenes.collect import DEPTH_SCALE, collect
-from scenes.paths import press
-from scenes.play import STAGES
-from scenes.stage import CORTEX, DRAPE, TOOL
+from scenes.play.episode import DEPTH_SCALE, collect
+from scenes.play.player import STAGES
+from scenes.play.stage import CORTEX, DRAPE, TOOL
+from scenes.script.tool_paths import press
 from sim.accuracy import TRAIN
 from sim.effects import Elasticity, Held, ToolForce
 from sim.errors import InputError
@@ -36,7 +36,7 @@ def anatomy(theatre, tmp_path_factory):
 @pytest.fixture
 def brief(monkeypatch):
     """The commands find a scene of seven small frames."""
-    monkeypatch.setattr("scenes.scene.find_scene", lambda name: short())
+    monkeypatch.setattr("scenes.script.scene.find_scene", lambda name: short())
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ class TestEpisode:
     def test_a_full_disk_is_a_sentence(self, theatre, tmp_path, size, most, monkeypatch):
         """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
         resource = pytest.importorskip("resource")
-        monkeypatch.setattr("scenes.collect.PIXEL_BYTES", 0.0)  # as if there had been room at first
+        monkeypatch.setattr("scenes.play.episode.PIXEL_BYTES", 0.0)  # as if there had been room at first
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         drawn = []
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
@@ -250,7 +250,7 @@ class TestRender:
 
     def test_doubtful_answers_are_told_by_the_exit_code(self, anatomy, tmp_path, monkeypatch, capsys):
         strong = replace(short(), path=press(0.8, rise=0.1, hold=0.0))
-        monkeypatch.setattr("scenes.scene.find_scene", lambda name: strong)
+        monkeypatch.setattr("scenes.script.scene.find_scene", lambda name: strong)
         words = ["render", "press", "--anatomy", str(anatomy), "--out", str(tmp_path), "--json"]
         assert main(words) == 1
         assert 2 <= json.loads(capsys.readouterr().out)["not_good"] <= 5

@@ -12,17 +12,17 @@ from conftest import make_box
 from theatres import sinking
 from visitor import free_port
 
-from scenes.ablation import without
-from scenes.demo import Demo
-from scenes.lying import drained
-from scenes.paths import Touch, lay, press
-from scenes.play import Player
-from scenes.reel import Reel, Session
-from scenes.referee import Referee
-from scenes.scene import SCENES, Scene, Viewpoint, find_scene
-from scenes.surgery import Debulking
-from scenes.theatre import Theatre
-from scenes.wish import HAND, SCRIPT
+from scenes.play.deformers import Theatre
+from scenes.play.effect_ablation import without
+from scenes.play.page import Demo
+from scenes.play.page_referee import Referee
+from scenes.play.page_requests import HAND, SCRIPT
+from scenes.play.player import Player
+from scenes.play.replay import Reel, Session
+from scenes.script.debulking import Debulking
+from scenes.script.head_posture import drained
+from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
+from scenes.script.tool_paths import Touch, lay, press
 from sim.deformation import Deformation
 from sim.effects import Elasticity, Gravity, Held, Inertia, remember
 from sim.material import Material
@@ -41,7 +41,7 @@ def theatre() -> Theatre:
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     """Thirteen frames are less than is kept."""
-    monkeypatch.setattr("scenes.reel.KEPT", FEW)
+    monkeypatch.setattr("scenes.play.replay.KEPT", FEW)
 
 
 def hasty(name: str, **values: object) -> Scene:

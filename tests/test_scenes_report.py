@@ -12,43 +12,35 @@ from poison import poisoned
 from studies import TISSUE, nothing, study_of
 
 from ar.screen import read_png
-from scenes import report, report_elements, report_learner, report_reference, report_row
+from scenes.bench.process_memory import peak_memory
 from scenes.cli import main
 from scenes.commands import report as command
-from scenes.peak import peak_memory
-from scenes.report import UNBUILT, every, learners, rows, star
-from scenes.report_adapt import debulked, debulked_study, simulate_debulked, simulating_seconds
-from scenes.report_elements import HALVED, OWN, Elements
-from scenes.report_learner import Learner, counts, measure_learner
-from scenes.report_page import Section, write_report
-from scenes.report_reference import Truth, beyond_of, reference_of, solve_reference
-from scenes.report_row import (
-    DIFFERENCE,
-    ERROR,
-    TOLERANCE_ALONE,
-    Row,
-    against_reference,
-    row_from_json,
-    row_to_json,
-)
-from scenes.report_rows import measured
-from scenes.report_series import series_seconds, tabulate_series
+from scenes.report import finite_elements
+from scenes.report.adaptation import debulked, debulked_study, simulate_debulked, simulating_seconds
+from scenes.report.finite_elements import HALVED, OWN, Elements
+from scenes.report.learner import Learner, counts, measure_learner
+from scenes.report.measure import measured
+from scenes.report.page import Section, write_report
+from scenes.report.reference import Truth, beyond_of, reference_of, solve_reference
+from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, row_from_json, row_to_json
+from scenes.report.rows import UNBUILT, every, learners, rows, star
+from scenes.report.series_time import series_seconds, tabulate_series
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Pushed
-from sim.threads import one_thread
-from surrogate.dataset import read_dataset
-from surrogate.encode import directions, reduce, tool_features
-from surrogate.envelope import envelope_of
-from surrogate.expansion import COARSE, EXPANDED
-from surrogate.parts import SVR
-from surrogate.published import from_angles, published_nodes, sites_of, thirteen, to_angles
-from surrogate.sectors import leave_sectors_out
-from surrogate.svr import Svr
-from surrogate.train import train
-from surrogate.tuned import Tuned
+from sim.runtime.threads import one_thread
+from surrogate.data.dataset import read_dataset
+from surrogate.data.direction_split import leave_sectors_out
+from surrogate.data.encode import directions, reduce, tool_features
+from surrogate.model.training_range import envelope_of
+from surrogate.regressors.svr import Svr
+from surrogate.training.learners import SVR
+from surrogate.training.published_models import from_angles, published_nodes, sites_of, thirteen, to_angles
+from surrogate.training.shared_inputs import COARSE, EXPANDED
+from surrogate.training.train import train
+from surrogate.training.tuning import Tuned
 
 SPECS = (Elements("FEM"), Elements("linear law", law="linear"), Learner("linear"), Learner("published-svr"))
 
@@ -119,8 +111,8 @@ def test_a_learner_is_held_to_loads_that_it_was_not_taught(study, box, tmp_path,
     taught, pushed, nodes = study.discs.taught, study.pushed, Learner(name).vertices(box)
     truth = study.dataset.displacement(nodes)[study.dataset.good]
     path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
-    monkeypatch.setattr(report_learner, "counts", lambda most: [])
-    monkeypatch.setattr(report_learner, "_covered", lambda *known: {})
+    monkeypatch.setattr("scenes.report.learner.counts", lambda most: [])
+    monkeypatch.setattr("scenes.report.learner._covered", lambda *known: {})
     with one_thread():
         row, field = measure_learner(replace(study, data=path), Learner(name))
     lesson = Pushed(pushed.point[taught], pushed.force[taught], pushed.footprint[taught])
@@ -186,7 +178,7 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     told = []
     tabulate_series(study, lambda done, total: told.append((done, total)))
     assert told and told[-1][0] == told[-1][1]
-    monkeypatch.setattr("surrogate.expansion.Expansion._fem", None)
+    monkeypatch.setattr("surrogate.training.shared_inputs.Expansion._fem", None)
     tabulate_series(study, lambda done, total: told.append(None))
     assert None not in told
     row = measured(replace(study), Learner("series"), tmp_path / "series.png")
@@ -199,7 +191,7 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
 
 def test_only_loads_that_both_converged_for_are_compared(study, box, monkeypatch):
     truth = Truth(np.full((2, len(study.drawn), 3), 1e-3), np.array([True, False]), np.ones(2))
-    monkeypatch.setattr(report_row, "reference_of", lambda study: truth)
+    monkeypatch.setattr("scenes.report.row.reference_of", lambda study: truth)
     answer = np.full((2, len(box.tumour_nodes), 3), [[[1e-3, 1e-3, 3e-3]], [[np.nan] * 3]])
     for good, loads in (([True, True], 1), ([True, False], 1)):
         figures = against_reference(study, answer, np.array(good), box.tumour_nodes)
@@ -258,7 +250,7 @@ def test_a_damaged_answer_is_named(study):
 
 def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path, monkeypatch):
     """On a coarse box halving every edge changes the motion by some percent, not by half."""
-    monkeypatch.setattr(report_reference, "REFERENCE", TRAIN)
+    monkeypatch.setattr("scenes.report.reference.REFERENCE", TRAIN)
     one, fine = (replace(study, folder=tmp_path, loads=1, fine=fine) for fine in (False, True))
     for each in (one, fine):
         solve_reference(each, nothing)
@@ -303,13 +295,13 @@ def test_plans(study):
 def test_what_has_the_reference_s_own_elements_is_off_by_its_tolerance_alone(study, fine):
     here = replace(study, fine=fine)
     said = {
-        (element, mesh): report_elements._against(here, Elements("it", element=element, mesh=mesh))
+        (element, mesh): finite_elements._against(here, Elements("it", element=element, mesh=mesh))
         for element in ("p1", "p2")
         for mesh in (OWN, HALVED)
     }
     alone = ("p2", HALVED if fine else OWN)
     assert said.pop(alone) == TOLERANCE_ALONE and set(said.values()) == {ERROR}
-    assert report_elements._against(here, Elements("it", "linear", *alone)) == DIFFERENCE
+    assert finite_elements._against(here, Elements("it", "linear", *alone)) == DIFFERENCE
 
 
 def test_what_cannot_be_had_is_a_row_that_says_why(study, tmp_path):
@@ -321,19 +313,19 @@ def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, found
     """Everything is solved already; the rows are those found."""
     monkeypatch.setattr(command, "QUICK", (100, study.loads, study.beyond))
     words = ["report", "--quick", "--data", str(study.data), "--out", str(study.folder), "--device", "cpu"]
-    monkeypatch.setattr(report, "rows", lambda study, specs: iter(found))
+    monkeypatch.setattr("scenes.report.rows.rows", lambda study, specs: iter(found))
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in said["sections"][0]["rows"]] == [row.name for row in found]
     assert "quadratic tetrahedra (p2) on the same mesh" in (study.folder / "index.html").read_text()
-    monkeypatch.setattr(report, "rows", lambda study, specs: iter([Row("odd", "f", state="no memory")]))
+    monkeypatch.setattr("scenes.report.rows.rows", lambda study, specs: iter([Row("odd", "f", state="no memory")]))
     assert main(words) == 1
     assert "no memory" in capsys.readouterr().out
 
     def stopped(study, specs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "rows", stopped)
+    monkeypatch.setattr("scenes.report.rows.rows", stopped)
     assert main(words) == 130
     assert "the same command goes on" in capsys.readouterr().err
 

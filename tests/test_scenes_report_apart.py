@@ -8,10 +8,9 @@ from conftest import make_box
 from poison import poisoned
 from studies import study_of
 
-from scenes import report_learner
-from scenes.report_learner import Learner, measure_learner
-from sim.threads import one_thread
-from surrogate.expansion import Expansion
+from scenes.report.learner import Learner, measure_learner
+from sim.runtime.threads import one_thread
+from surrogate.training.shared_inputs import Expansion
 
 
 @pytest.fixture(scope="module")
@@ -23,8 +22,8 @@ def study(tmp_path_factory):
 @pytest.mark.parametrize("name", ["linear", "series-gp"])
 def test_no_answer_to_a_load_of_the_discs_reaches_a_row(study, tmp_path, name, monkeypatch):
     """Bit for bit, the table of the series made anew: wild answers to the loads of the discs change figures alone."""
-    monkeypatch.setattr(report_learner, "counts", lambda most: [])
-    monkeypatch.setattr(report_learner, "_covered", lambda *known: {})
+    monkeypatch.setattr("scenes.report.learner.counts", lambda most: [])
+    monkeypatch.setattr("scenes.report.learner._covered", lambda *known: {})
     path, _ = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
     found = []
     for data, folder in ((study.data, "as-it-is"), (path, "wild")):

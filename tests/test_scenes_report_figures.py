@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from conftest import make_box
 
-from scenes import report
 from scenes.cli import main
 from scenes.commands import report as command
-from scenes.report_page import Section, write_report
-from scenes.report_plots import against_time, front
-from scenes.report_row import Row, figures_of, of_times
-from sim.meshfile import write_anatomy
-from surrogate.dataset import read_dataset
+from scenes.report.page import Section, write_report
+from scenes.report.plots import against_time, front
+from scenes.report.row import Row, figures_of, of_times
+from sim.bodies.meshfile import write_anatomy
+from surrogate.data.dataset import read_dataset
 
 
 def test_tenths_of_the_force_and_of_no_load_nothing():
@@ -102,7 +101,7 @@ def test_a_command_without_data_makes_its_own(tmp_path, monkeypatch, capsys):
     """Neo-Hookean, smoothed; what it says goes elsewhere than the line for machines."""
     box = make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
     monkeypatch.setattr(command, "QUICK", (30, 1, 3))
-    monkeypatch.setattr(report, "rows", lambda study, specs: iter([]))
+    monkeypatch.setattr("scenes.report.rows.rows", lambda study, specs: iter([]))
     write_anatomy(tmp_path / "box.vtu", box)
     words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device", "cpu"]
     assert main([*words, "--json"]) == 0

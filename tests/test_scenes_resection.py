@@ -13,12 +13,12 @@ from visitor import free_port, wait_for
 
 from ar.overlay import silhouette
 from scenes.cli import main
-from scenes.collect import collect
-from scenes.demo import Demo
-from scenes.lying import drained
-from scenes.paths import Touch
-from scenes.surgery import Debulking
-from scenes.told import told
+from scenes.play.episode import collect
+from scenes.play.load_text import told
+from scenes.play.page import Demo
+from scenes.script.debulking import Debulking
+from scenes.script.head_posture import drained
+from scenes.script.tool_paths import Touch
 from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import guess
 from sim.effects import Resection

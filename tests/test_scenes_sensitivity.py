@@ -10,26 +10,26 @@ import numpy as np
 import pytest
 from conftest import make_box
 
+from scenes.bench.sensitivity import Study, change, moved_alike, rows
+from scenes.bench.sensitivity_variants import Aim, Body, aimed, variants
 from scenes.cli import main
-from scenes.sensitivity import Study, change, moved_alike, rows
-from scenes.variant import Aim, Body, aimed, variants
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL
+from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome, guess
+from sim.discretisation.footprint import footprint_weights
 from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.footprint import footprint_weights
 from sim.loads import Displaced, Pushed, push
 from sim.material import Material
-from sim.meshfile import write_anatomy
-from surrogate.encode import Basis
-from surrogate.envelope import envelope_of
-from surrogate.learned import Learned, Part
-from surrogate.linear import Linear
-from surrogate.patch import open_patch
-from surrogate.sampling import draw
-from surrogate.store import save
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.encode import Basis
+from surrogate.data.tool_loads import draw
+from surrogate.model.learned import Learned, Part
+from surrogate.model.store import save
+from surrogate.model.training_range import envelope_of
+from surrogate.regressors.compliance_table import Linear
 
 TIGHT = Accuracy(tolerance=1e-9)
 LINEAR = Body(Material("linear", 3000.0, 0.45), element="p1")

@@ -8,16 +8,16 @@ import pytest
 from scenes.cli import main
 from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL
+from sim.bodies.meshfile import write_anatomy
+from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
 from sim.effects import Bonded, Slide, pushed_effects
 from sim.fem import Fem
 from sim.material import Material
-from sim.meshfile import write_anatomy
-from sim.subject import Plan, make_anatomy
-from sim.template import Tumour, template_subject
-from surrogate.dataset import read_dataset
-from surrogate.expansion import Expansion
-from surrogate.sampling import draw
-from surrogate.taught import taught_skull
+from surrogate.data.dataset import read_dataset
+from surrogate.data.tool_loads import draw
+from surrogate.model.applicability import taught_skull
+from surrogate.training.shared_inputs import Expansion
 
 
 @pytest.fixture(scope="module")

@@ -8,15 +8,15 @@ import pytest
 import warp as wp
 from conftest import make_box
 
+from scenes.bench.engine_sulcus import fem_of
+from scenes.bench.peers import HOUSE, LIVE, OWN, PEERS, TOLERANCE, Engine, case_of, compare, judge_of
 from scenes.cli import main
 from scenes.commands.bench_solver import NAMES
-from scenes.served import fem_of
-from scenes.solver_bench import HOUSE, LIVE, OWN, PEERS, TOLERANCE, Engine, case_of, compare, judge_of
-from sim.meshfile import write_anatomy
+from sim.bodies.meshfile import write_anatomy
 
 WRONG = """
-from scenes.served import set_up
-from scenes.serving import serve
+from scenes.bench.engine_sulcus import set_up
+from scenes.bench.engine_process import serve
 
 def spoilt(case):
     solve = set_up(case)
@@ -24,7 +24,7 @@ def spoilt(case):
 
 serve(spoilt)
 """
-FAILING = "from scenes.serving import serve; serve(lambda case: lambda force: 1 / 0)"
+FAILING = "from scenes.bench.engine_process import serve; serve(lambda case: lambda force: 1 / 0)"
 EXPLICIT = f"""
 import sys
 from dataclasses import replace
@@ -32,7 +32,7 @@ sys.path.insert(0, {str(HOUSE / "benchmarks" / "peers")!r})
 import peer_tled
 from peer_tled import serve, set_up
 """
-DYING = "import os; from scenes.serving import serve; serve(lambda case: lambda force: os._exit(3))"
+DYING = "import os; from scenes.bench.engine_process import serve; serve(lambda case: lambda force: os._exit(3))"
 
 
 @pytest.fixture(scope="module")

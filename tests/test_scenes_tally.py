@@ -2,9 +2,9 @@
 
 from collections.abc import Iterable
 
-from scenes.page_text import table
-from scenes.pareto import unbeaten
-from scenes.tally import RECENT, Row, Tally
+from scenes.play.page_tally import RECENT, Row, Tally
+from scenes.play.page_text import table
+from scenes.play.pareto import unbeaten
 
 
 def test_the_front_is_whom_nobody_beats_in_both():

@@ -6,13 +6,13 @@ from dataclasses import replace
 import pytest
 from conftest import make_box
 
-from scenes import throughput
+from scenes.bench import throughput
+from scenes.bench.robustness import Trial
+from scenes.bench.throughput import Row, drawn, rows, together
 from scenes.cli import main
-from scenes.robust import Trial
-from scenes.throughput import Row, drawn, rows, together
 from sim.accuracy import Accuracy
+from sim.bodies.meshfile import write_anatomy
 from sim.material import BRAIN
-from sim.meshfile import write_anatomy
 
 ROW = Row("linear", 0.45, "p1", 99, "sparse factor", 1.0, "bipolar", 60, 60, 4.0, 7.0, (9.0, 2.0, 3.0), 0.1, 4, 9e-5)
 

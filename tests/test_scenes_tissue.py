@@ -14,10 +14,10 @@ from boxes import box, top_forces
 from oracle import internal_forces
 
 from scenes.cli import main
-from scenes.tissue import add_tissue_arguments, regions_of, tissue_of
+from scenes.commands.tissue_options import add_tissue_arguments, regions_of, tissue_of
 from sim.errors import InputError
+from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
-from sim.mesh import TetMesh
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 UPPER = (MESH.nodes[MESH.tets].mean(axis=1)[:, 2] > 0.05).astype(int)

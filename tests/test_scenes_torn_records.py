@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from scenes.growth import read_rows
-from scenes.report_took import note_seconds, noted_seconds
-from scenes.robust import Record, append_records, read_records
+from scenes.bench.robustness import Record, append_records, read_records
+from scenes.bench.scaling import read_rows
+from scenes.report.artefact_time import note_seconds, noted_seconds
 from sim.errors import InputError
 
 RECORDS = [Record("mixed", number, 1.5, 0.006, "CONVERGED", 4, 1e-5, 1e-5, 12.75) for number in range(3)]

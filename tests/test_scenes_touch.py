@@ -9,13 +9,13 @@ import pytest
 import trimesh
 from theatres import player, theatre_of
 
-from scenes.paths import AIR, Touch
-from scenes.play import Player
-from scenes.report_picture import rested
-from scenes.scene import Scene, Viewpoint, find_scene
-from scenes.site import site_of
-from scenes.told import told
-from scenes.truth import truth_of
+from scenes.play.load_text import told
+from scenes.play.player import Player
+from scenes.play.reference import truth_of
+from scenes.report.picture import rested
+from scenes.script.scene import Scene, Viewpoint, find_scene
+from scenes.script.site import site_of
+from scenes.script.tool_paths import AIR, Touch
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.effects import Elasticity, Held, Pulsation, Slide, ToolContact
@@ -24,11 +24,11 @@ from sim.fem import Fem
 from sim.loads import Retracted, Touching
 from sim.material import Material
 from sim.tools import Ball, distances_to
-from surrogate.condense import condensed, side_by_side
-from surrogate.envelope import Envelope
-from surrogate.learned import Learned, Part
-from surrogate.patch import open_patch
-from surrogate.taught import refusal
+from surrogate.data.cortex_patch import open_patch
+from surrogate.model.applicability import refusal
+from surrogate.model.learned import Learned, Part
+from surrogate.model.training_range import Envelope
+from surrogate.training.condense_contact import condensed, side_by_side
 
 SMALL = Viewpoint(width=160, height=120)
 

@@ -9,12 +9,12 @@ import pytest
 
 import ar.hud
 from ar.overlay import Style, outlines, silhouette
-from scenes.demo import pictured
-from scenes.paths import Touch
-from scenes.play import Player, gauged
-from scenes.scene import find_scene
-from scenes.stage import TOOL
-from scenes.theatre import open_theatre
+from scenes.play.deformers import open_theatre
+from scenes.play.page import pictured
+from scenes.play.player import Player, gauged
+from scenes.play.stage import TOOL
+from scenes.script.scene import find_scene
+from scenes.script.tool_paths import Touch
 
 SIZES = (480, 360), (640, 480), (800, 600), (1280, 960)
 # So far words stay from lines, from the border, and lines of text from each other [pixel].

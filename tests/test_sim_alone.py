@@ -15,9 +15,9 @@ from sim.accuracy import LIVE, REFERENCE, Accuracy
 from sim.deformation import LEARNT_KEY, Deformation
 from sim.effects import Elasticity, Held, NodalForce, Resection, ToolForce
 from sim.fem import Fem
-from sim.following import Kept
 from sim.loads import Loads, Resected, push
-from sim.operated import finite_elements
+from sim.resected_fem import finite_elements
+from sim.strategy.frame_sequence import Kept
 
 BODY = base_held(box((4, 4, 4), 0.1))
 EFFECTS = Elasticity(), Held(), ToolForce(), NodalForce()

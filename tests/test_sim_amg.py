@@ -7,22 +7,22 @@ import pytest
 from boxes import base_held, box
 from test_sim_multigrid import built, matrices, spread
 
-from sim import amg, precondition
-from sim.amg import rigid_motions
 from sim.compile import compile_problem
-from sim.device import find_device
-from sim.discretisation import discretise
+from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held
-from sim.linear import BlockJacobi, conjugate_gradients
+from sim.linalg import amg
+from sim.linalg.amg import rigid_motions
+from sim.linalg.pcg import BlockJacobi, conjugate_gradients
+from sim.linalg.preconditioner import name_of
 from sim.material import Material
-from sim.precondition import name_of
+from sim.runtime.device import find_device
 
 
 @pytest.fixture
 def too_large(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every mesh is too large for a factor, and ten nodes are enough for the last level."""
-    monkeypatch.setattr(precondition, "LARGEST_FACTOR", 0)
-    monkeypatch.setattr(precondition, "LARGEST_SMOOTHED_FACTOR", 0)
+    monkeypatch.setattr("sim.linalg.preconditioner.LARGEST_FACTOR", 0)
+    monkeypatch.setattr("sim.linalg.preconditioner.LARGEST_SMOOTHED_FACTOR", 0)
     monkeypatch.setattr(amg, "LARGEST_LAST", 10)
 
 
@@ -72,7 +72,7 @@ def test_the_same_mesh_gives_the_same_cycle() -> None:
 def test_the_choice_goes_by_size_and_element(
     kind: str, largest: int, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(precondition, "LARGEST_FACTOR", largest)
+    monkeypatch.setattr("sim.linalg.preconditioner.LARGEST_FACTOR", largest)
     monkeypatch.setattr(amg, "LARGEST_LAST", 5)
     problem, preconditioner = built(kind, 0.45, (5, 5, 5))
     assert name_of(preconditioner) == name

@@ -8,16 +8,16 @@ from boxes import box, hold
 
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
-from sim.constraint import Constraint
 from sim.deformation import Deformation
-from sim.device import Device, find_device
-from sim.discretisation import ELEMENTS
+from sim.discretisation.constraint import Constraint
+from sim.discretisation.footprint import footprint_weights
+from sim.discretisation.space import ELEMENTS
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.footprint import footprint_weights
 from sim.loads import Cause, Displaced, Loads, Nodal, Prescribed, Pushed
 from sim.material import Material
+from sim.runtime.device import Device, find_device
 
 MESH = box((3, 3, 3), 0.1, distortion=0.1)
 BASE = MESH.nodes[:, 2] < 1e-9

@@ -17,7 +17,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.material import Material
-from sim.script import run_script
+from sim.runtime.user_script import run_script
 from sim.tools import Ball, Capsule, Core, Spatula, Tool, distances_to
 
 SOFT = Material("neo-hookean", 3000.0, 0.45)

@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Outcome, guess
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Retraction, ToolContact
 from sim.fem import Fem
+from sim.geometry.tetmesh import MeshWarning, TetMesh
 from sim.loads import Loads, Retracted, Touching
 from sim.material import Material
-from sim.mesh import MeshWarning, TetMesh
-from sim.term import Cases
 from sim.tools import Ball, Capsule, Spatula, Tool
 
 ROCK = Material("linear", 3000.0, 0.3)

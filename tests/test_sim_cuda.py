@@ -7,9 +7,10 @@ import pytest
 import warp as wp
 from oracle import EVERY_LAW, tissue
 
-from scenes.shipped import template_path
+from scenes.script.shipped_files import template_path
 from sim.accuracy import LIVE, TRAIN, Accuracy
-from sim.discretisation import ELEMENTS
+from sim.bodies.meshfile import read_anatomy
+from sim.discretisation.space import ELEMENTS
 from sim.effects import (
     Elasticity,
     Gravity,
@@ -23,14 +24,13 @@ from sim.effects import (
     ToolForce,
 )
 from sim.fem import Fem
-from sim.following import Kept
-from sim.linear import BlockJacobi
+from sim.linalg.half_symv import add_product, tiles_of
+from sim.linalg.pcg import BlockJacobi
 from sim.loads import Displaced, Loads, Touching, posture, push
 from sim.material import Material
-from sim.meshfile import read_anatomy
-from sim.symmetric import add_product, tiles_of
+from sim.strategy.frame_sequence import Kept
 from sim.tools import Ball, Spatula
-from surrogate.sampling import draw
+from surrogate.data.tool_loads import draw
 
 pytestmark = [
     pytest.mark.gpu,

@@ -10,13 +10,13 @@ from boxes import base_held, box, hold, quadratic
 from cuts import BODY, EFFECTS, MESH, STEPS, TIGHT, lying
 
 from sim.deformation import Deformation, guess
-from sim.discretisation import ELEMENTS
+from sim.discretisation.space import ELEMENTS
 from sim.effects import Elasticity, Gravity, Held, Inertia, Resection
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Prescribed, Resected
 from sim.material import Material
-from sim.operated import finite_elements
+from sim.resected_fem import finite_elements
 
 RELAXING = Material("neo-hookean", 3000.0, 0.4, prony=((0.5, 0.2), (0.2, 5.0)))
 

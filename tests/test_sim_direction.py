@@ -9,15 +9,15 @@ from oracle import tissue
 
 from sim.accuracy import Accuracy
 from sim.compile import compile_problem
-from sim.device import Device, find_device
-from sim.direction import Descent, Direction, NewtonCG
+from sim.discretisation.problem import Problem
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce
+from sim.linalg.preconditioner import rest_solver
 from sim.loads import Loads, Nodal, Prescribed
-from sim.newton import find_equilibrium
-from sim.precondition import rest_solver
-from sim.problem import Problem
-from sim.search import search
-from sim.term import Cases
+from sim.minimisers.line_search import search
+from sim.minimisers.newton import find_equilibrium
+from sim.minimisers.newton_cg import Descent, Direction, NewtonCG
+from sim.runtime.device import Device, find_device
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)

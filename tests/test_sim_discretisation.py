@@ -11,14 +11,14 @@ from boxes import VTK_EDGES, base_held, box, hold, quadratic
 
 from sim.accuracy import Accuracy
 from sim.compile import compile_problem
-from sim.device import find_device
-from sim.discretisation import FACING, Discretisation, discretise
+from sim.diagnostics.skull_leak import surface_vectors
+from sim.discretisation.space import FACING, Discretisation, discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.errors import InputError
 from sim.fem import MIDDLES, Fem
-from sim.leak import surface_vectors
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import push
-from sim.mesh import TetMesh
+from sim.runtime.device import find_device
 
 TIGHT = Accuracy(tolerance=1e-10)
 THIN = box((3, 3, 1), 0.1)

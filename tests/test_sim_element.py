@@ -11,14 +11,14 @@ from oracle import EVERY_LAW, elastic_energy, internal_forces, tissue
 
 from sim.accuracy import REFERENCE, TRAIN, Precision
 from sim.compile import compile_problem
-from sim.device import find_device
-from sim.discretisation import ELEMENTS, discretise
+from sim.discretisation.problem import Problem
+from sim.discretisation.space import ELEMENTS, discretise
 from sim.effects import Elasticity, Held, NodalForce
 from sim.fem import Fem
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal
 from sim.material import Tissue
-from sim.mesh import TetMesh
-from sim.problem import Problem
+from sim.runtime.device import find_device
 
 BLOCK = box((2, 2, 2), 0.1, distortion=0.15)
 UPPER = BLOCK.nodes[BLOCK.tets].mean(axis=1)[:, 2] > 0.05

@@ -11,21 +11,21 @@ from boxes import base_held
 from openings import EFFECTS, FINE, LAWS_AND_ELEMENTS, MESH, TOTAL, begun, body, descent_of, equilibria, loads_of
 from oracle import tissue
 
-from scenes.shipped import template_path
+from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN, Accuracy
+from sim.bodies.meshfile import read_anatomy
 from sim.compile import compile_part, compile_problem
-from sim.condensation import condensed
-from sim.device import find_device
-from sim.discretisation import discretise
+from sim.discretisation.space import discretise
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Slide, ToolForce
-from sim.elimination import PATIENCE, Elimination, eliminating, near_tetrahedra
 from sim.fem import Fem
-from sim.meshfile import read_anatomy
-from sim.precondition import rest_solver
-from sim.steering import BROKEN, DONE, LIVE
-from sim.term import Cases
-from sim.terms.exterior import Exterior
-from surrogate.sampling import draw
+from sim.linalg.preconditioner import rest_solver
+from sim.linalg.schur import condensed
+from sim.local_solvers.batch_elimination import PATIENCE, Elimination, eliminating, near_tetrahedra
+from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
+from sim.runtime.device import find_device
+from sim.terms.schur_stiffness import Exterior
+from surrogate.data.tool_loads import draw
 
 
 @LAWS_AND_ELEMENTS
@@ -161,7 +161,7 @@ def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves(monkeypatc
     near = eliminating(fem.problem, rest_solver(fem.problem), effects, space)
     fem._ladder = replace(fem._ladder, near=lambda: near)
     for cycles in (12, 3):
-        monkeypatch.setattr("sim.elimination.CYCLES", cycles)
+        monkeypatch.setattr("sim.local_solvers.batch_elimination.CYCLES", cycles)
         found = fem.deform(loads_of(many))
         assert all(outcome.good for outcome in found.outcome)
         assert (found.iterations != plain.iterations).any()

@@ -16,16 +16,16 @@ from oracle import internal_forces
 from sim.accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
+from sim.discretisation.footprint import footprint_weights
 from sim.effects import Elasticity, Held, NodalForce, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.footprint import footprint_weights
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Displaced, Loads, Nodal, Prescribed, Pushed, push
 from sim.material import Material
-from sim.mesh import TetMesh
-from surrogate.dataset import read_dataset
-from surrogate.simulate import simulate
-from surrogate.train import train
+from surrogate.data.dataset import read_dataset
+from surrogate.data.simulate import simulate
+from surrogate.training.train import train
 
 BLOCK = box((3, 3, 3), 0.1, distortion=0.1)
 MESH = TetMesh(

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from conftest import make_box
 
-from sim import following
 from sim.accuracy import LIVE, Accuracy
 from sim.deformation import Deformation, Outcome, guess
 from sim.effects import Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.following import Kept
-from sim.frame import MOST
-from sim.lbfgs import LEARNT
 from sim.loads import Loads, push, stacked
+from sim.minimisers.lbfgs import LEARNT
+from sim.strategy import frame_sequence
+from sim.strategy.captured_frame import MOST
+from sim.strategy.frame_sequence import Kept
 
 BODY = make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3)
 EFFECTS = (Elasticity(), Held(), ToolForce())
@@ -84,7 +84,7 @@ def test_an_older_frame_leads_where_it_led_before(fem):
 
 def test_only_what_is_kept_leaves_the_device(fem, monkeypatch):
     read = []
-    monkeypatch.setattr(following, "rows_first", lambda array: read.append(array) or array.numpy().copy())
+    monkeypatch.setattr(frame_sequence, "rows_first", lambda array: read.append(array) or array.numpy().copy())
     last = ride(fem, 3)[-1]
     read.clear()
     for number in range(5):

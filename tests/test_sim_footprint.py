@@ -10,9 +10,9 @@ import warp as wp
 from boxes import box
 from scipy.spatial import Delaunay
 
-from sim.device import find_device
+from sim.discretisation.footprint import CHUNK, Skin, footprint_weights, nearest_on
 from sim.errors import InputError
-from sim.footprint import CHUNK, Skin, footprint_weights, nearest_on
+from sim.runtime.device import find_device
 
 RADIUS, POINT = 0.012, np.array([0.003, -0.002, 0.0])
 

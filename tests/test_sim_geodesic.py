@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from sim.geodesic import distances
-from sim.lattice import graded_lattice
-from sim.mesh import faces_once
-from sim.stuffing import cut, whole
+from sim.bodies.bcc_lattice import graded_lattice
+from sim.bodies.isosurface_stuffing import cut, whole
+from sim.geometry.geodesic import distances
+from sim.geometry.tetmesh import faces_once
 
 
 def test_on_a_sphere_they_are_arcs():

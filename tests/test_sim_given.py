@@ -15,20 +15,8 @@ from sim.deformation import LEARNT_KEY, Deformation, guess
 from sim.effects import Elasticity, Held, Inertia, Resection, ToolForce
 from sim.errors import InputError
 from sim.fem import MIDDLES, Fem
-from sim.loads import (
-    Displaced,
-    Loads,
-    Nodal,
-    Posture,
-    Prescribed,
-    Pushed,
-    Resected,
-    Retracted,
-    Touching,
-    posture,
-    push,
-)
-from sim.operated import finite_elements
+from sim.loads import Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Resected, Retracted, Touching, posture, push
+from sim.resected_fem import finite_elements
 
 BODY = base_held(box((3, 3, 3), 0.1))
 EFFECTS = Elasticity(), Held(), ToolForce()

@@ -12,16 +12,16 @@ from boxes import base_held, box, hold, quadratic
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
-from sim.device import find_device
-from sim.discretisation import ELEMENTS, discretise
+from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Gravity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.immersion import parts_under
+from sim.geometry.submersion import parts_under
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Posture, posture, push
 from sim.material import Material
-from sim.mesh import TetMesh
-from sim.term import Cases
+from sim.runtime.device import find_device
 
 G = 9.80665
 DRY, FLUID = 1040.0 * G, 1007.0 * G  # [N/m^3]

@@ -19,17 +19,17 @@ from sim.accuracy import TRAIN, Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.deformation import Deformation, Outcome, guess
-from sim.device import find_device
-from sim.direction import NewtonCG
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.geometry.tetmesh import MeshWarning, TetMesh, dihedral_angles
+from sim.linalg.preconditioner import rest_solver
 from sim.loads import Loads, Nodal
 from sim.material import Material, Tissue
-from sim.memory import check_fits, host_bytes
-from sim.mesh import MeshWarning, TetMesh, dihedral_angles
-from sim.precondition import rest_solver
-from sim.term import Cases
+from sim.minimisers.newton_cg import NewtonCG
+from sim.runtime.device import find_device
+from sim.runtime.memory import check_fits, host_bytes
 
 TOLERANCE = 1e-7
 ACCURACY = Accuracy(tolerance=TOLERANCE)

@@ -14,8 +14,8 @@ from sim.accuracy import LIVE
 from sim.deformation import guess
 from sim.effects import Elasticity, Held, ToolForce
 from sim.fem import Fem
-from sim.heading import BEFORE, PUSHES, moved_on, pushes_of, shares
 from sim.loads import Loads, push
+from sim.strategy.extrapolation import BEFORE, PUSHES, moved_on, pushes_of, shares
 
 EFFECTS = (Elasticity(), Held(), ToolForce())
 POINT, DOWN = np.array([2e-3, -1e-3, 0.0]), np.array([0.0, 0.0, -0.2])

@@ -13,17 +13,17 @@ from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.deformation import Deformation, guess
-from sim.device import find_device
-from sim.discretisation import ELEMENTS, discretise
+from sim.discretisation.problem import Problem
+from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Inertia, NodalForce, ToolContact
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal, Touching
 from sim.material import Material
-from sim.mesh import TetMesh
-from sim.pace import alike
-from sim.problem import Problem
-from sim.term import Cases
+from sim.runtime.device import find_device
+from sim.strategy.preconditioner_pace import alike
 from sim.terms.inertia import lumped_mass
 from sim.tools import Ball, distances_to
 

@@ -4,8 +4,8 @@ import nibabel
 import numpy as np
 import pytest
 
+from sim.bodies.intensity import Intensity, read_intensity, sidecar, write_intensity
 from sim.errors import InputError
-from sim.intensity import Intensity, read_intensity, sidecar, write_intensity
 
 AFFINE = np.array([[-1e-3, 2e-4, 0, 0.03], [2e-4, 1e-3, 0, -0.02], [0, 0, 2e-3, 0.01], [0, 0, 0, 1.0]])
 

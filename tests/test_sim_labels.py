@@ -7,10 +7,10 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from sim.anatomy import TUMOUR_LABEL
+from sim.bodies.label_volume import volume_subject
+from sim.bodies.subject import Plan, make_anatomy
 from sim.errors import InputError
-from sim.labels import volume_subject
-from sim.mesh import dihedral_angles, faces_once, row_keys
-from sim.subject import Plan, make_anatomy
+from sim.geometry.tetmesh import dihedral_angles, faces_once, row_keys
 
 AXES = np.array([0.045, 0.055, 0.042])  # [m] half axes of the ellipsoid that stands for a brain
 MIDDLE = np.array([0.004, -0.020, 0.012])

@@ -11,12 +11,12 @@ from oracle import internal_forces, tissue
 
 from sim.accuracy import DRAFT, Accuracy
 from sim.deformation import Deformation, Outcome, guess
-from sim.device import find_device
-from sim.discretisation import ELEMENTS, discretise
+from sim.discretisation.inverted_elements import Inversion
+from sim.discretisation.space import ELEMENTS, discretise
 from sim.effects import Elasticity, Held, NodalForce
 from sim.fem import Fem
-from sim.inversion import Inversion
 from sim.loads import Loads, Nodal
+from sim.runtime.device import find_device
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)

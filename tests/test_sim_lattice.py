@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sim.lattice import graded_lattice
-from sim.mesh import FACES, dihedral_angles, faces_once, row_keys, signed_volumes
+from sim.bodies.bcc_lattice import graded_lattice
+from sim.geometry.tetmesh import FACES, dihedral_angles, faces_once, row_keys, signed_volumes
 
 MIDDLE = np.array([0.03, 0.02, 0.01])
 

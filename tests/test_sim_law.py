@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from oracle import EVERY_LAW, energy_density, nearest_rotation, piola, tissue
 
-from sim.conformance import Evaluator, evaluator
 from sim.material import MATERIALS, Ogden, Tissue
+from sim.terms.laws.conformance import Evaluator, evaluator
 
 POSITIVE = ("neo-hookean", "ogden")
 """Laws that are infinite where J <= 0."""

@@ -11,16 +11,16 @@ from tiny_terms import Wall
 
 from sim.accuracy import Accuracy
 from sim.compile import compile_problem
-from sim.device import Device, find_device
-from sim.direction import NewtonCG
+from sim.discretisation.problem import Problem
+from sim.discretisation.term import Cases
 from sim.effects import Effect, Elasticity, Held, NodalForce
-from sim.lbfgs import Descended, Lbfgs
-from sim.linear import BlockJacobi
+from sim.linalg.pcg import BlockJacobi
+from sim.linalg.preconditioner import rest_solver
 from sim.loads import Loads, Nodal
-from sim.precondition import rest_solver
-from sim.problem import Problem
-from sim.steering import BROKEN, DONE, LEFT, LIVE, PAIRS
-from sim.term import Cases
+from sim.minimisers.lbfgs import Descended, Lbfgs
+from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LEFT, LIVE, PAIRS
+from sim.minimisers.newton_cg import NewtonCG
+from sim.runtime.device import Device, find_device
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)

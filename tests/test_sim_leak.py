@@ -8,16 +8,16 @@ from scipy.spatial import Delaunay
 
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
-from sim.device import find_device
-from sim.discretisation import discretise
+from sim.diagnostics.skull_leak import Leak, surface_vectors
+from sim.discretisation.element import quadratic_elements
+from sim.discretisation.space import discretise
 from sim.effects import pushed_effects
-from sim.element import quadratic_elements
 from sim.fem import MIDDLES, Fem
-from sim.leak import Leak, surface_vectors
+from sim.geometry.normals import unit, vertex_normals
+from sim.geometry.tetmesh import TetMesh, oriented
 from sim.loads import push
 from sim.material import BRAIN
-from sim.mesh import TetMesh, oriented
-from sim.normals import unit, vertex_normals
+from sim.runtime.device import find_device
 
 GRADIENT = 1e-3 * np.array([[3.0, 1.0, -2.0], [0.5, -1.0, 4.0], [2.0, -3.0, 5.0]])
 

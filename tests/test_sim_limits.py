@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from boxes import base_held, box
 
+from sim.bodies.meshfile import read_anatomy, write_mesh
+from sim.bodies.nifti import read_volume
+from sim.bodies.vtu_size import demand_small
 from sim.errors import InputError
-from sim.files import demand_space
-from sim.limits import at_most
-from sim.mesh import TetMesh
-from sim.meshfile import read_anatomy, write_mesh
-from sim.volume import read_volume
-from sim.vtu import demand_small
+from sim.geometry.tetmesh import TetMesh
+from sim.runtime.atomic_files import demand_space
+from sim.runtime.file_limits import at_most
 
 BODY = base_held(box((2, 2, 2), 0.02))
 

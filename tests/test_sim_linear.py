@@ -8,16 +8,16 @@ import warp as wp
 from boxes import base_held, box, top_forces
 
 from sim.compile import compile_problem
-from sim.device import Device, find_device
-from sim.direction import Direction
+from sim.discretisation.problem import Problem
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce
-from sim.linear import BlockJacobi, Preconditioner, conjugate_gradients
+from sim.linalg.pcg import BlockJacobi, Preconditioner, conjugate_gradients
+from sim.linalg.preconditioner import rest_solver
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.precondition import rest_solver
-from sim.problem import Problem
-from sim.search import search
-from sim.term import Cases
+from sim.minimisers.line_search import search
+from sim.minimisers.newton_cg import Direction
+from sim.runtime.device import Device, find_device
 
 MESH = box((2, 2, 2), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)

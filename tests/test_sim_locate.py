@@ -3,7 +3,7 @@
 import numpy as np
 from boxes import box
 
-from sim.locate import locate
+from sim.geometry.locate import locate
 
 
 def test_a_linear_field_is_read_exactly_and_a_vertex_at_itself():

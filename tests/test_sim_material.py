@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from sim.material import (
-    LAWS,
-    MATERIALS,
-    Material,
-    Ogden,
-    Tissue,
-    coefficients_of,
-    tissue_from_json,
-    tissue_to_json,
-)
+from sim.material import LAWS, MATERIALS, Material, Ogden, Tissue, coefficients_of, tissue_from_json, tissue_to_json
 
 
 def test_engineering_constants_come_back_from_lames() -> None:

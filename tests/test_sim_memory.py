@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from sim import memory
-from sim.device import find_device
 from sim.errors import InputError
-from sim.memory import check_fits, host_bytes
+from sim.runtime import memory
+from sim.runtime.device import find_device
+from sim.runtime.memory import check_fits, host_bytes
 
 ROWS = 3_000
 

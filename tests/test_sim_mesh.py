@@ -10,7 +10,7 @@ from boxes import base_held, box, hold
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
-from sim.mesh import MeshWarning, TetMesh, dihedral_angles, faces_once, oriented, signed_volumes
+from sim.geometry.tetmesh import MeshWarning, TetMesh, dihedral_angles, faces_once, oriented, signed_volumes
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
 ONE = np.array([[0, 1, 2, 3]])

@@ -12,10 +12,10 @@ import pytest
 from boxes import box, hold, quadratic
 
 from sim.anatomy import Anatomy
+from sim.bodies.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
 from sim.errors import InputError
-from sim.files import check_output
-from sim.mesh import QUADRATIC_EDGES, MeshWarning, TetMesh
-from sim.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
+from sim.geometry.tetmesh import QUADRATIC_EDGES, MeshWarning, TetMesh
+from sim.runtime.atomic_files import check_output
 
 BOX = box((2, 2, 2), 0.1, distortion=0.2)
 MESH = TetMesh(BOX.nodes, BOX.tets, np.arange(len(BOX.tets)) % 3)

@@ -7,17 +7,16 @@ import pytest
 import scipy.sparse as sp
 from boxes import box, hold, quadratic
 
-from sim import precondition
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
-from sim.device import Precision, find_device
-from sim.discretisation import discretise
+from sim.discretisation.problem import Problem
+from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, Slide
-from sim.linear import BlockJacobi, Preconditioner
+from sim.linalg.multigrid import TwoLevel
+from sim.linalg.pcg import BlockJacobi, Preconditioner
+from sim.linalg.preconditioner import choose_preconditioner
 from sim.material import Material
-from sim.multigrid import TwoLevel
-from sim.precondition import choose_preconditioner
-from sim.problem import Problem
+from sim.runtime.device import Precision, find_device
 
 
 def body(kind: str, cells: tuple[int, int, int]) -> Anatomy:
@@ -65,7 +64,7 @@ def spread(K: np.ndarray, M: np.ndarray) -> float:
 @pytest.fixture(autouse=True)
 def smoothed_strains_take_two_levels(monkeypatch: pytest.MonkeyPatch) -> None:
     """Here as on large meshes."""
-    monkeypatch.setattr(precondition, "LARGEST_SMOOTHED_FACTOR", 0)
+    monkeypatch.setattr("sim.linalg.preconditioner.LARGEST_SMOOTHED_FACTOR", 0)
 
 
 @pytest.mark.parametrize("poisson", [0.3, 0.49])

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim import trial
-from sim.columns import add_dots
-from sim.device import find_device
-from sim.narrow import multiply_of
-from sim.steering import PAIRS, PRODUCTS, SOME, SUMS, kernels_of
-from sim.trial import spread_of
+from sim.minimisers import lbfgs_trial_kernels
+from sim.minimisers.lbfgs_column_kernels import multiply_of
+from sim.minimisers.lbfgs_kernels import PAIRS, PRODUCTS, SOME, SUMS, kernels_of
+from sim.minimisers.lbfgs_trial_kernels import spread_of
+from sim.runtime.columns import add_dots
+from sim.runtime.device import find_device
 
 NODES = 1500
 """More than one thread takes."""
@@ -33,7 +33,7 @@ def test_a_step():
     u, d, t, one, many = column(ROWS), column(ROWS), double(1), column(ROWS), column(ROWS)
     t.fill_(0.3)
     for spread, out in ((ONE, one), (MANY, many)):
-        DEVICE.launch(trial.kernels_of(DEVICE, spread).step, (spread.threads(ROWS), 1), [u, t, d], [out])
+        DEVICE.launch(lbfgs_trial_kernels.kernels_of(DEVICE, spread).step, (spread.threads(ROWS), 1), [u, t, d], [out])
     np.testing.assert_array_equal(one.numpy(), many.numpy())
 
 
@@ -45,7 +45,7 @@ def test_a_gradient_is_finished():
     one, many, sums, other = wp.clone(total), wp.clone(total), double(SUMS, 1), double(SUMS, 1)
     inputs = [constant, held, normal, d]
     for spread, out in ((ONE, [one, sums]), (MANY, [many, other])):
-        DEVICE.launch(trial.kernels_of(DEVICE, spread).finish, (spread.threads(NODES), 1), inputs, out)
+        DEVICE.launch(lbfgs_trial_kernels.kernels_of(DEVICE, spread).finish, (spread.threads(NODES), 1), inputs, out)
     np.testing.assert_array_equal(one.numpy(), many.numpy())
     np.testing.assert_allclose(sums.numpy(), other.numpy(), rtol=1e-12)
 

@@ -15,17 +15,17 @@ from tiny_terms import Spring, Wall
 from sim.accuracy import Accuracy, Precision
 from sim.compile import compile_problem
 from sim.deformation import Outcome
-from sim.device import Device, find_device
-from sim.direction import Direction, NewtonCG
+from sim.discretisation.problem import Problem
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.linear import BlockJacobi
+from sim.geometry.tetmesh import TetMesh
+from sim.linalg.pcg import BlockJacobi
+from sim.linalg.preconditioner import rest_solver
 from sim.loads import Loads, Nodal, Prescribed
-from sim.mesh import TetMesh
-from sim.precondition import rest_solver
-from sim.problem import Problem
-from sim.term import Cases
+from sim.minimisers.newton_cg import Direction, NewtonCG
+from sim.runtime.device import Device, find_device
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)

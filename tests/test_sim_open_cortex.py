@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from scenes.shipped import template_path
-from sim.closest import closest
+from scenes.script.shipped_files import template_path
+from sim.bodies.meshfile import read_anatomy
+from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
-from sim.meshfile import read_anatomy
-from sim.open_cortex import open_cortex
+from sim.geometry.closest_point import closest
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,13 @@ from boxes import box, hold
 
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
-from sim.bone import EDGE_FELT, FELT, bone_of
-from sim.discretisation import discretise
+from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, NodalForce, SkullContact
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.opening import edge_of, inside_opening, rim_of
+from sim.terms.contact.skull_opening import edge_of, inside_opening, rim_of
+from sim.terms.contact.skull_surface import EDGE_FELT, FELT, bone_of
 
 MESH = box((10, 6, 3), 0.05)
 HEIGHT = MESH.nodes[:, 2].max()

@@ -12,16 +12,16 @@ from oracle import EVERY_LAW, tissue
 
 from sim.accuracy import REFERENCE, TRAIN
 from sim.compile import compile_problem
-from sim.conformance import check_tissue
-from sim.device import find_device
+from sim.discretisation.footprint import footprint_weights
 from sim.effects import BuiltIn, Elasticity, Held, NodalForce, ToolForce, remember
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.footprint import footprint_weights
-from sim.law import Law
 from sim.loads import Loads, Nodal, Pushed, push
 from sim.material import Material, Ogden
-from sim.script import run_script
+from sim.runtime.device import find_device
+from sim.runtime.user_script import run_script
+from sim.terms.laws.conformance import check_tissue
+from sim.terms.laws.law import Law
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 YEOH, VEINS = (run_script(EXAMPLES / name) for name in ("yeoh.py", "veins.py"))
@@ -203,7 +203,7 @@ class TestEffect:
                 made.name = "tool force"
                 return made
 
-        with pytest.raises(InputError, match=r"made a int: let it make a sim\.term\.Term"):
+        with pytest.raises(InputError, match=r"made a int: let it make a sim\.discretisation\.term\.Term"):
             answer(Elasticity(), Nothing((5,)))
         with pytest.raises(InputError, match=r"two terms are called 'tool force'"):
             answer(Elasticity(), Named((5,)))

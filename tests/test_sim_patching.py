@@ -8,19 +8,19 @@ from boxes import base_held, box
 from openings import EFFECTS, FINE, LAWS_AND_ELEMENTS, TOTAL, begun, descent_of, equilibria, loads_of
 from oracle import tissue
 
-from scenes.shipped import template_path
+from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN, Accuracy
+from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Outcome
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
-from sim.linear import BlockJacobi
-from sim.meshfile import read_anatomy
-from sim.patch import Patch
-from sim.patching import CYCLES, NODES, PATIENCE, patching
-from sim.precondition import rest_solver
-from sim.steering import BROKEN, DONE, LIVE
-from sim.term import Cases
-from surrogate.sampling import draw
+from sim.linalg.pcg import BlockJacobi
+from sim.linalg.preconditioner import rest_solver
+from sim.local_solvers.patch import Patch
+from sim.local_solvers.patch_elimination import CYCLES, NODES, PATIENCE, patching
+from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
+from surrogate.data.tool_loads import draw
 
 
 @LAWS_AND_ELEMENTS
@@ -139,7 +139,7 @@ def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest(monkeypatch: pytest.
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[1:2])
     whole = descent_of(patching, problem, space, law)
-    monkeypatch.setattr("sim.patching.LARGEST_NEAR", 60)
+    monkeypatch.setattr("sim.local_solvers.patch_elimination.LARGEST_NEAR", 60)
     part = descent_of(patching, problem, space, law)
     assert len(part._nodes) < 0.8 * len(whole._nodes) and np.isin(part._nodes, whole._nodes).all()
     found = part.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)

@@ -12,13 +12,13 @@ from oracle import EVERY_LAW, internal_forces, piola, tissue
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
-from sim.device import find_device
-from sim.discretisation import discretise
+from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, NodalForce
 from sim.fem import Fem
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Cause, Loads, Nodal, Prescribed
 from sim.material import MATERIALS, Material, Ogden, Tissue
-from sim.mesh import TetMesh
+from sim.runtime.device import find_device
 
 TIGHT = Accuracy(tolerance=1e-11)
 SMALL = 1e-3 * np.array([[1.0, 2.0, -1.0], [0.5, -1.0, 3.0], [-2.0, 1.0, 0.7]])

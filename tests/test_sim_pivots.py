@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from sim import pivots
+from sim.linalg import block_inverse
 
 COUNT, BORDER = 23, 7
 RANDOM = np.random.default_rng(0)
@@ -17,10 +17,10 @@ ACROSS = RANDOM.normal(size=(COUNT, BORDER))
 
 @pytest.mark.parametrize("block", [1, 5, 23, 100])
 def test_what_is_inverted_in_place_is_the_inverse(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pivots, "BLOCK", block)
-    rows = pivots.halved(sp.csc_array(MATRIX), pivots.cuts_of(COUNT), "cpu")
+    monkeypatch.setattr(block_inverse, "BLOCK", block)
+    rows = block_inverse.halved(sp.csc_array(MATRIX), block_inverse.cuts_of(COUNT), "cpu")
     assert len(rows) == -(-COUNT // block)
-    pivots.invert(rows)
+    block_inverse.invert(rows)
     expected, first = -np.linalg.inv(MATRIX), 0
     for row in rows:
         stop = first + len(row)
@@ -31,8 +31,8 @@ def test_what_is_inverted_in_place_is_the_inverse(block: int, monkeypatch: pytes
 
 @pytest.mark.parametrize("block", [1, 5, 23, 100])
 def test_what_is_eliminated_is_the_solution_and_what_it_takes(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pivots, "BLOCK", block)
-    solution, taken = pivots.eliminated(sp.csc_array(MATRIX), sp.csc_array(ACROSS), "cpu")
+    monkeypatch.setattr(block_inverse, "BLOCK", block)
+    solution, taken = block_inverse.eliminated(sp.csc_array(MATRIX), sp.csc_array(ACROSS), "cpu")
     expected = np.linalg.solve(MATRIX, ACROSS)
     assert solution.dtype == np.float32
     np.testing.assert_allclose(solution, expected, atol=1e-6)
@@ -42,11 +42,11 @@ def test_what_is_eliminated_is_the_solution_and_what_it_takes(block: int, monkey
 def test_what_is_not_positive_definite_is_refused() -> None:
     matrix = sp.csc_array(MATRIX - 1e3 * np.eye(COUNT))
     with pytest.raises(RuntimeError, match="positive"):
-        pivots.eliminated(matrix, sp.csc_array(ACROSS), "cpu")
+        block_inverse.eliminated(matrix, sp.csc_array(ACROSS), "cpu")
 
 
 def test_a_device_is_asked_how_fast_it_multiplies(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pivots, "TRIAL", 8)
-    pivots.rate.cache_clear()
-    assert pivots.rate("cpu") > 0.0
-    pivots.rate.cache_clear()
+    monkeypatch.setattr(block_inverse, "TRIAL", 8)
+    block_inverse.rate.cache_clear()
+    assert block_inverse.rate("cpu") > 0.0
+    block_inverse.rate.cache_clear()

@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 
-import sim.meshing
+import sim.bodies.mesher
+from sim.bodies.placement import BASE, HULL_DEPTH, opening_at, opening_over, side_of, site_over
 from sim.errors import InputError
-from sim.placing import BASE, HULL_DEPTH, opening_at, opening_over, side_of, site_over
 
 LOW, HIGH = np.array([-0.07, -0.09, -0.06]), np.array([0.07, 0.09, 0.08])
 
@@ -75,9 +75,9 @@ def test_too_few_nodes_are_told_how_many_would_do(monkeypatch):
         asked.append(count)
         return "mesh" if count >= 4000 else None
 
-    monkeypatch.setattr(sim.meshing, "_meshed", meshed)
+    monkeypatch.setattr(sim.bodies.mesher, "_meshed", meshed)
     with pytest.raises(InputError, match=re.escape("too intricate for 3000 nodes: ask for 4800, or smooth")):
-        sim.meshing.mesh_solids(None, 3000)
+        sim.bodies.mesher.mesh_solids(None, 3000)
     assert asked == [3000, 3800, 4800]
     with pytest.raises(InputError, match="for 1000 nodes: smooth the labels"):
-        sim.meshing.mesh_solids(None, 1000)
+        sim.bodies.mesher.mesh_solids(None, 1000)

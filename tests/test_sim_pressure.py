@@ -8,12 +8,12 @@ from boxes import base_held, box
 from scipy.spatial.transform import Rotation
 
 from sim.accuracy import Accuracy
+from sim.contact_pressure import pressure
 from sim.effects import Effect, Elasticity, Held, NodalForce, Retraction, ToolContact
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Retracted, Touching
 from sim.material import Material
-from sim.pressure import pressure
 from sim.tools import Ball, Spatula
 
 SIDE, HEIGHT = 0.06, 0.03

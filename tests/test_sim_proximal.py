@@ -10,19 +10,19 @@ import warp as wp
 from boxes import base_held, box
 
 from sim.accuracy import TRAIN, Accuracy
-from sim.compliance import BLOCK, Compliance
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, ToolContact
 from sim.fem import Fem
-from sim.linear import Preconditioner
+from sim.linalg.compliance import BLOCK, Compliance
+from sim.linalg.pcg import Preconditioner
 from sim.loads import Loads, Touching
+from sim.local_solvers.contact_descent import Proximal, proximal
+from sim.local_solvers.contact_preconditioner import Touched
 from sim.material import Material
-from sim.motion import STRIDE, Way
-from sim.pairs import Pairs, pairs_of
-from sim.proximal import Proximal, proximal
-from sim.steering import PAIRS
-from sim.term import Cases
+from sim.minimisers.compact_lbfgs import Pairs, pairs_of
+from sim.minimisers.lbfgs_kernels import PAIRS
+from sim.terms.contact.tool_path import STRIDE, Way
 from sim.tools import Ball
-from sim.touched import Touched
 
 SIDE, HEIGHT, RADIUS = 0.06, 0.03, 6e-3
 BODY = base_held(box((6, 6, 3), SIDE))

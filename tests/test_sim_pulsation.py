@@ -13,20 +13,20 @@ from oracle import EVERY_LAW, tissue
 
 from sim.accuracy import TRAIN, Accuracy
 from sim.anatomy import Anatomy
+from sim.bodies.meshfile import read_anatomy
 from sim.compile import compile_problem
-from sim.device import find_device
-from sim.discretisation import ELEMENTS, discretise
+from sim.discretisation.problem import Problem
+from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Pulsation, Resection, Slide, Wave
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.geometry.normals import unit
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Resected
 from sim.material import Tissue
-from sim.mesh import TetMesh
-from sim.meshfile import read_anatomy
-from sim.normals import unit
-from sim.operated import finite_elements
-from sim.problem import Problem
-from sim.term import Cases
+from sim.resected_fem import finite_elements
+from sim.runtime.device import find_device
 
 MESH = box((2, 2, 2), 0.1, distortion=0.15)
 TIGHT = Accuracy(tolerance=1e-10)

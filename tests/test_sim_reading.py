@@ -23,17 +23,17 @@ import numpy as np
 import pytest
 from boxes import base_held, box
 
-from sim import limits
 from sim.anatomy import Anatomy
+from sim.bodies.intensity import read_intensity
+from sim.bodies.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
+from sim.bodies.nifti import read_volume
+from sim.bodies.vtu_size import demand_small
 from sim.errors import InputError
-from sim.files import check_output, demand_space, written_stream, written_whole
-from sim.intensity import read_intensity
+from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, tissue_from_json, tissue_to_json
-from sim.mesh import TetMesh
-from sim.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
-from sim.reading import read_as
-from sim.volume import read_volume
-from sim.vtu import demand_small
+from sim.runtime import file_limits
+from sim.runtime.atomic_files import check_output, demand_space, written_stream, written_whole
+from sim.runtime.outside_files import read_as
 
 BODY = base_held(box((2, 2, 2), 0.02))
 
@@ -147,7 +147,7 @@ class TestMeshes:
         assert np.array_equal(read_mesh(tmp_path / name).mesh.tets, BODY.mesh.tets)
 
     def test_raw_bytes_behind_the_xml_are_counted(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("sim.meshfile.LARGEST_MESH", 2**22)
+        monkeypatch.setattr("sim.bodies.meshfile.LARGEST_MESH", 2**22)
         block = zlib.compress(bytes(2**23))
         path = with_raw_bytes(tmp_path / "a.vtu", struct.pack("<4Q", 1, 2**23, 0, len(block)) + block)
         tracemalloc.start()
@@ -165,7 +165,7 @@ class TestMeshes:
 
     def test_a_small_file_does_not_fill_the_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
-        monkeypatch.setattr("sim.meshfile.LARGEST_MESH", 2**22)
+        monkeypatch.setattr("sim.bodies.meshfile.LARGEST_MESH", 2**22)
         assert read_mesh(tmp_path / "a.vtu").mesh.digest == BODY.mesh.digest
         fattened(tmp_path / "a.vtu", 64)
         tracemalloc.start()
@@ -175,7 +175,7 @@ class TestMeshes:
             assert tracemalloc.get_traced_memory()[1] < 2**24
         finally:
             tracemalloc.stop()
-        assert limits.LARGEST_MESH > 2**31
+        assert file_limits.LARGEST_MESH > 2**31
 
     def test_a_file_is_no_larger_than_the_limit(self, tmp_path: Path) -> None:
         for name in ("a.vtu", "a.inp"):
@@ -183,7 +183,7 @@ class TestMeshes:
             os.truncate(tmp_path / name, 60 * 10**9)  # of which the disk holds nothing
             with pytest.raises(InputError, match=r"is of 60 GB, and 4\.29 GB are the most\. Mesh coarser"):
                 read_mesh(tmp_path / name)
-        assert limits.mesh_bytes(10, 2**32) == 2**28 and limits.mesh_bytes(2**23, 2**32) == 100 * 2**23
+        assert file_limits.mesh_bytes(10, 2**32) == 2**28 and file_limits.mesh_bytes(2**23, 2**32) == 100 * 2**23
 
     @pytest.mark.parametrize("packing", ["zlib", "lzma"])
     def test_a_bomb_is_refused_before_it_is_inflated(self, tmp_path: Path, packing: str) -> None:
@@ -207,7 +207,7 @@ class TestMeshes:
             demand_small(path, 2**30)
 
     def test_what_looks_raw_in_a_comment_hides_no_array(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("sim.meshfile.LARGEST_MESH", 2**22)
+        monkeypatch.setattr("sim.bodies.meshfile.LARGEST_MESH", 2**22)
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
         text = fattened(tmp_path / "a.vtu", 64).read_text().replace("</VTKFile>", "<!-- </AppendedData> --></VTKFile>")
         (tmp_path / "a.vtu").write_text(text.replace("<Unstr", '<!-- <AppendedData encoding="raw"> --><Unstr', 1))
@@ -331,7 +331,8 @@ def test_an_interruption_stays_one() -> None:
 
 
 class TestWriting:
-    LEAVING = "import os, sys; from sim.files import written_whole\nwith written_whole(sys.argv[1], '.txt') as p:\n"
+    LEAVING = "import os, sys; from sim.runtime.atomic_files import written_whole\n"
+    LEAVING += "with written_whole(sys.argv[1], '.txt') as p:\n"
     LEAVING += " p.write_text('half'); os.kill(os.getpid(), 9)"
 
     def test_what_a_killed_run_left_is_swept_by_the_next(self, tmp_path: Path) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.shipped import template_path
+from scenes.script.shipped_files import template_path
+from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Outcome
-from sim.meshfile import read_anatomy, write_anatomy
 
 HOUSE = Path(__file__).parents[1]
 PAGES = [HOUSE / "README.md", *sorted((HOUSE / "docs").glob("*.md"))]

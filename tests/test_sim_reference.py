@@ -13,9 +13,9 @@ from sim.accuracy import REFERENCE, TRAIN, Accuracy
 from sim.deformation import Deformation
 from sim.effects import Elasticity, Held, NodalForce
 from sim.fem import Fem
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.mesh import TetMesh
 
 DATA = Path(__file__).parent / "data"
 YOUNG, POISSON = 3000.0, 0.45

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from boxes import base_held, box
 
+from sim.bodies.meshfile import read_mesh
 from sim.errors import InputError
-from sim.meshfile import read_mesh
 
 BODY = base_held(box((2, 2, 2), 0.02))
 
@@ -87,8 +87,8 @@ def test_hdf5_of_a_mesh_holds_its_arrays_itself(tmp_path: Path, name: str, way: 
 def test_hdf5_is_as_large_as_its_own_file_allows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.xdmf"
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(path)
-    monkeypatch.setattr("sim.limits.SMALL_MESH", 2**10)
-    monkeypatch.setattr("sim.limits.MESH_INFLATION", 2)
+    monkeypatch.setattr("sim.runtime.file_limits.SMALL_MESH", 2**10)
+    monkeypatch.setattr("sim.runtime.file_limits.MESH_INFLATION", 2)
     with h5py.File(path.with_suffix(".h5"), "r+") as file:
         file["more"] = np.random.default_rng(0).random(400_000)  # 3.2 MB, far more than the XML
     assert read_mesh(path).mesh.digest == BODY.mesh.digest

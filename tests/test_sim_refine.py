@@ -7,9 +7,9 @@ import pytest
 from boxes import box as block
 from boxes import hold
 
+from sim.bodies.refine import refined
 from sim.errors import InputError
-from sim.mesh import TetMesh, row_keys
-from sim.refine import refined
+from sim.geometry.tetmesh import TetMesh, row_keys
 
 
 def test_the_body_stays_and_every_edge_is_halved():

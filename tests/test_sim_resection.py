@@ -13,26 +13,16 @@ from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.deformation import guess
-from sim.device import find_device
-from sim.discretisation import ELEMENTS
-from sim.effects import (
-    Elasticity,
-    Gravity,
-    Held,
-    Inertia,
-    NodalForce,
-    Resection,
-    SkullContact,
-    Slide,
-    ToolContact,
-)
+from sim.discretisation.resected_body import bodies, remains
+from sim.discretisation.space import ELEMENTS
+from sim.effects import Elasticity, Gravity, Held, Inertia, NodalForce, Resection, SkullContact, Slide, ToolContact
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal, Posture, Resected, Touching, posture, push
 from sim.material import Material
-from sim.mesh import TetMesh
-from sim.operated import Operated, finite_elements
-from sim.resection import bodies, remains
+from sim.resected_fem import Operated, finite_elements
+from sim.runtime.device import find_device
 from sim.tools import Ball
 
 

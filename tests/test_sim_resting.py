@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from sim.resting import resting_tip
+from sim.geometry.ball_at_rest import resting_tip
 
 DOWN = np.array([0.0, 0.0, -1.0])
 RADIUS = 7e-3

@@ -5,14 +5,14 @@ import pytest
 import warp as wp
 
 from sim.accuracy import REFERENCE, TRAIN
-from sim.device import find_device
+from sim.discretisation.footprint import footprint_weights
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.footprint import footprint_weights
 from sim.loads import Displaced, Loads, Nodal, Pushed
 from sim.material import LAWS, Material
-from sim.series import mixed, mixing_kernel, products, telling, terms_of
+from sim.minimisers.power_series import mixed, mixing_kernel, products, telling, terms_of
+from sim.runtime.device import find_device
 
 EFFECTS = (Held(), Slide(), ToolForce(), NodalForce())
 POINT, RADIUS = np.array([[2e-3, 1e-3, 0.0], [-8e-3, 4e-3, 0.0]]), np.array([6e-3, 9e-3])
@@ -157,7 +157,7 @@ def test_what_has_no_series_is_refused(box):
 def test_what_does_not_fit_into_memory_is_refused(box, monkeypatch):
     fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1")
     reading = fem.reading(box.tumour_nodes, np.ones((1, len(box.tumour_nodes), 3)))
-    monkeypatch.setattr("sim.memory.host_bytes", lambda: 2_000_000)
+    monkeypatch.setattr("sim.runtime.memory.host_bytes", lambda: 2_000_000)
     with pytest.raises(InputError, match="free"):
         fem.series(pushes(1.0), 3, reading)
     with pytest.raises(InputError, match="free"):

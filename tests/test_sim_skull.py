@@ -10,15 +10,15 @@ from boxes import box, hold, top_forces
 
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
-from sim.bone import FELT, Bone, bend_of
 from sim.deformation import Deformation
-from sim.device import find_device
 from sim.effects import Effect, Elasticity, Held, NodalForce, SkullContact, Slide
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.terms.skull_contact import Skull
+from sim.runtime.device import find_device
+from sim.terms.contact.skull_contact import Skull
+from sim.terms.contact.skull_surface import FELT, Bone, bend_of
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 MESH = box((4, 4, 4), 0.05)

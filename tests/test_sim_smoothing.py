@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from sim.field import onto_level
-from sim.lattice import graded_lattice
-from sim.manifold import clean, ears
-from sim.mesh import dihedral_angles, faces_once, row_keys, signed_volumes
-from sim.smoothing import enclosed_volume, fitted, improved, smallest_sines
-from sim.stuffing import cut, whole
+from sim.bodies.bcc_lattice import graded_lattice
+from sim.bodies.isosurface_stuffing import cut, whole
+from sim.bodies.manifold_repair import clean, ears
+from sim.bodies.mesh_smoothing import enclosed_volume, fitted, improved, smallest_sines
+from sim.bodies.signed_distance import onto_level
+from sim.geometry.tetmesh import dihedral_angles, faces_once, row_keys, signed_volumes
 
 RADIUS = 0.03
 

@@ -13,8 +13,8 @@ from boxes import box, top_forces
 from oracle import internal_forces
 
 from scenes.cli import main
+from sim.geometry.tetmesh import MeshWarning
 from sim.material import LAWS, Material
-from sim.mesh import MeshWarning
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 COUNT = len(MESH.nodes)

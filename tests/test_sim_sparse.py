@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from sim.device import Precision, find_device
-from sim.sparse import Sparse
+from sim.linalg.block_sparse import Sparse
+from sim.runtime.device import Precision, find_device
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-5), ("float64", 1e-13)])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.device import Precision, find_device
-from sim.terms.spectral import principal_axes
+from sim.runtime.device import Precision, find_device
+from sim.terms.laws.spectral import principal_axes
 
 
 def matrices() -> np.ndarray:

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from sim.stages import listened, stage
+from sim.runtime.timing import listened, stage
 
 
 def test_stages_add_up_and_keep_their_order() -> None:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sim.lattice import graded_lattice
-from sim.mesh import dihedral_angles, faces_once, row_keys, signed_volumes
-from sim.stuffing import cut, whole
+from sim.bodies.bcc_lattice import graded_lattice
+from sim.bodies.isosurface_stuffing import cut, whole
+from sim.geometry.tetmesh import dihedral_angles, faces_once, row_keys, signed_volumes
 
 RADIUS, INNER, MIDDLE = 0.06, 0.015, np.array([0.02, 0.01, 0.0])
 

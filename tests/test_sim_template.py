@@ -6,11 +6,11 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from sim.anatomy import TUMOUR_LABEL
+from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.template import VOLUME, Tumour, template_subject
 from sim.errors import InputError
-from sim.geodesic import distances
-from sim.mesh import dihedral_angles
-from sim.subject import Plan, make_anatomy
-from sim.template import VOLUME, Tumour, template_subject
+from sim.geometry.geodesic import distances
+from sim.geometry.tetmesh import dihedral_angles
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ from contact_examples import CONTACTS
 from term_examples import EXAMPLES as OTHERS
 from term_examples import LOGARITHMIC, MESH, ROWS, Example
 
-from sim.device import Device, find_device
-from sim.mesh import signed_volumes
-from sim.term import Term
-from sim.terms.contact import Contact
-from sim.terms.loops import VOLUME_KEPT
+from sim.discretisation.term import Term
+from sim.geometry.tetmesh import signed_volumes
+from sim.runtime.device import Device, find_device
+from sim.terms.contact.tool_contact import Contact
+from sim.terms.element_kernels import VOLUME_KEPT
 
 EXAMPLES = OTHERS | CONTACTS
 

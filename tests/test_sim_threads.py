@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from sim.threads import one_thread
+from sim.runtime.threads import one_thread
 
 
 def threads() -> set[int]:

@@ -8,10 +8,10 @@ from boxes import base_held, box
 from oracle import tissue
 
 from sim.compile import compile_problem
-from sim.device import find_device
 from sim.effects import Elasticity, Held
-from sim.precondition import rest_solver
-from sim.together import LEAST, cores, together
+from sim.linalg.preconditioner import rest_solver
+from sim.runtime.device import find_device
+from sim.runtime.parallel_loops import LEAST, cores, together
 
 
 def test_every_task_is_done_when_it_returns():
@@ -51,7 +51,7 @@ def test_two_cores_find_what_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
     u = device.array(np.random.default_rng(0).normal(size=(mesh.nodes.size, 3)) * 1e-3)
     found = []
     for number in (1, 2):
-        for place in ("sim.terms.elasticity.cores", "sim.factor.cores"):
+        for place in ("sim.terms.elasticity.cores", "sim.linalg.multifrontal.cores"):
             monkeypatch.setattr(place, lambda work, number=number: number)
         problem = compile_problem((Elasticity(tissue("neo-hookean")), Held()), base_held(mesh), device)
         g, _, _ = problem.residual(u)

@@ -10,15 +10,15 @@ from boxes import base_held, box
 from oracle import EVERY_LAW, tissue
 
 from sim.accuracy import Accuracy
-from sim.balance import constants_of
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, push
-from sim.rim import Rimmed
-from sim.steering import DONE, LIVE
-from sim.term import Cases
+from sim.local_solvers.clamped_elimination import Vicinity, vicinity_of
+from sim.local_solvers.clamped_part import Rimmed
+from sim.minimisers.lbfgs_kernels import DONE, LIVE
+from sim.minimisers.residual import constants_of
 from sim.terms.elasticity import Elasticity as ElasticityTerm
-from sim.vicinity import Vicinity, vicinity_of
 
 BODY = base_held(box((4, 4, 4), 0.1))
 EFFECTS = (Elasticity(tissue("stable-neo-hookean")), Held(), ToolForce())

@@ -11,15 +11,15 @@ from oracle import tissue
 
 from sim.accuracy import Accuracy
 from sim.compile import compile_problem
-from sim.device import find_device
-from sim.discretisation import ELEMENTS, discretise
+from sim.discretisation.problem import Problem
+from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.fem import Fem
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal, push
 from sim.material import HYPERELASTIC, Material, Ogden, Tissue
-from sim.mesh import TetMesh
-from sim.problem import Problem
-from sim.term import Cases
+from sim.runtime.device import find_device
 
 SERIES = ((0.45, 0.5), (0.365, 5.0))
 MESH = box((1, 1, 1), 0.1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surrogate.bound import LEVELS, conformal, fitted_bound
+from surrogate.model.conformal import LEVELS, conformal, fitted_bound
 
 
 def drawn(count, seed):

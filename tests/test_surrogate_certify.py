@@ -12,9 +12,9 @@ from sim.effects import Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import push
-from surrogate.certify import SHARE, certify
-from surrogate.choose import Offer, choose
-from surrogate.sampling import draw
+from surrogate.data.tool_loads import draw
+from surrogate.evaluation.certificate import SHARE, certify
+from surrogate.evaluation.choose import Offer, choose
 
 EFFECTS = (Elasticity(), Held(), ToolForce())
 FINE = Accuracy(1e-6)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
-from sim.meshfile import write_anatomy
-from surrogate.dataset import read_dataset
-from surrogate.store import load
-from surrogate.train import LEARNERS
+from sim.bodies.meshfile import write_anatomy
+from surrogate.data.dataset import read_dataset
+from surrogate.model.store import load
+from surrogate.training.train import LEARNERS
 
 
 @pytest.fixture(scope="module")

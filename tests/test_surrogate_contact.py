@@ -16,18 +16,18 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Touching
 from sim.material import Material, tissue_to_json
-from surrogate.condense import condensed, unit_responses
-from surrogate.contact import THICKER, Contact, nearest_shares
-from surrogate.dataset import Dataset, read_dataset
-from surrogate.encode import Basis, tool_features
-from surrogate.expansion import TOUCHED
-from surrogate.indentation import indented
-from surrogate.patch import barycentric_lattice, open_patch
-from surrogate.poses import ball_of, draw_poses
-from surrogate.score import errors
-from surrogate.simulate import simulate
-from surrogate.store import load, save
-from surrogate.train import Trained, learners_for, train
+from surrogate.data.cortex_patch import barycentric_lattice, open_patch
+from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.encode import Basis, tool_features
+from surrogate.data.indentation import indented
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_poses import ball_of, draw_poses
+from surrogate.evaluation.score import errors
+from surrogate.model.store import load, save
+from surrogate.regressors.ball_contact import THICKER, Contact, nearest_shares
+from surrogate.training.condense_contact import condensed, unit_responses
+from surrogate.training.shared_inputs import TOUCHED
+from surrogate.training.train import Trained, learners_for, train
 
 BALL = ball_of("palpation")
 SOFT = Material("linear", 3000.0, 0.45)

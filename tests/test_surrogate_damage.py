@@ -14,19 +14,19 @@ from boxes import box as cube
 
 from scenes.cli import main
 from sim.anatomy import Anatomy
+from sim.bodies.meshfile import write_anatomy
 from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
+from sim.geometry.tetmesh import TetMesh
 from sim.loads import push
 from sim.material import tissue_from_json
-from sim.mesh import TetMesh
-from sim.meshfile import write_anatomy
-from surrogate.dataset import FORMAT, SEAL, UNCHECKED, read_dataset, stored
-from surrogate.journal import DamageWarning
-from surrogate.rows import checksums, row_type
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
-from surrogate.train import train
+from surrogate.data.answer_rows import checksums, row_type
+from surrogate.data.dataset import FORMAT, SEAL, UNCHECKED, read_dataset, stored
+from surrogate.data.journal import DamageWarning
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.training.train import train
 
 SAID = {"preset": "palpation", "seed": "0"}
 
@@ -182,7 +182,7 @@ class TestFinished:
 
     def test_no_array_is_larger_than_the_limit(self, whole, monkeypatch):
         """Not one whose length the file alone decides."""
-        monkeypatch.setattr("surrogate.dataset.LARGEST_ARRAY", 10_000)
+        monkeypatch.setattr("surrogate.data.dataset.LARGEST_ARRAY", 10_000)
         with pytest.raises(InputError, match=r"`anatomy/nodes` declares more than such a file holds"):
             read_dataset(whole)
 
@@ -290,7 +290,7 @@ class TestRoom:
         resource = pytest.importorskip("resource")
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         if not asked:
-            monkeypatch.setattr("surrogate.simulate.demand_space", lambda *sizes: None)
+            monkeypatch.setattr("surrogate.data.simulate.demand_space", lambda *sizes: None)
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
         try:
             with pytest.raises(InputError, match=sentence):

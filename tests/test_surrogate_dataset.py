@@ -13,9 +13,9 @@ from boxes import box as cube
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, posture, push
-from surrogate.dataset import SEAL, read_dataset, read_embedded, read_loads, write_embedded, write_loads
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
+from surrogate.data.dataset import SEAL, read_dataset, read_embedded, read_loads, write_embedded, write_loads
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
 
 SAID = {"preset": "palpation", "seed": "0"}
 
@@ -61,8 +61,8 @@ def test_the_body_travels_with_its_data(tmp_path, mesh):
 
 
 def test_unit_responses_superpose_to_small_loads(tmp_path, box, pretender, loads):
-    from surrogate.encode import nodal_shares
-    from surrogate.patch import open_patch
+    from surrogate.data.cortex_patch import open_patch
+    from surrogate.data.encode import nodal_shares
 
     simulate(tmp_path / "data.h5", pretender, loads, SAID)
     small = loads.scaled(1e-4)
@@ -104,9 +104,9 @@ import os, runpy, signal, sys
 import h5py
 tools = runpy.run_path(sys.argv[1])
 box = tools["make_box"]()
-from surrogate import journal
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
+from surrogate.data import journal
+from surrogate.data.tool_loads import draw
+from surrogate.data.simulate import simulate
 path, kind, last, count = sys.argv[2], sys.argv[3], int(sys.argv[4]), 0
 def dying(*given):
     global count

@@ -12,29 +12,29 @@ import pytest
 from conftest import make_box
 
 from scenes.cli import main
-from scenes.shipped import template_path
+from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN
+from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Outcome
+from sim.discretisation.footprint import footprint_weights
 from sim.effects import NodalForce, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.footprint import footprint_weights
 from sim.loads import Pushed, push, stacked
 from sim.material import Material, tissue_to_json
-from sim.meshfile import read_anatomy, write_anatomy
-from surrogate.ann import Ann
-from surrogate.bayesian import Bayesian
-from surrogate.bound import LEVELS
-from surrogate.dataset import read_dataset
-from surrogate.exchange import onnx_model
-from surrogate.expansion import Expansion
-from surrogate.parts import LEARNT
-from surrogate.patch import open_patch
-from surrogate.sampling import draw
-from surrogate.series import Series
-from surrogate.simulate import simulate
-from surrogate.store import load, save
-from surrogate.train import LEARNERS, train
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.dataset import read_dataset
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.model.conformal import LEVELS
+from surrogate.model.store import load, save
+from surrogate.onnx_export.export import onnx_model
+from surrogate.regressors.ann import Ann
+from surrogate.regressors.bayesian import Bayesian
+from surrogate.regressors.force_series import Series
+from surrogate.training.learners import LEARNT
+from surrogate.training.shared_inputs import Expansion
+from surrogate.training.train import LEARNERS, train
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 # Shares of a load's largest motion and of its bound. Numbers of 24 bits are off by 6e-8, and sums of some hundred terms
@@ -56,7 +56,7 @@ def models(block, tmp_path_factory):
     data = read_dataset(path)
     hasty = {name: ("tool", partial(Ann, steps=30)) for name in ("ann", "residual")}
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("surrogate.parts.LEARNT", LEARNT | hasty)
+        patched.setattr("surrogate.training.learners.LEARNT", LEARNT | hasty)
         return train(data, expansion=Expansion(data, "cpu")).models
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from sim.errors import InputError
-from surrogate.journal import HEAD, DamageWarning, opened
+from surrogate.data.journal import HEAD, DamageWarning, opened
 
 
 def test_records_of_another_run_are_not_taken_up_where_its_beginning_is_damaged(tmp_path):

@@ -14,18 +14,18 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
 from sim.errors import InputError
 from sim.loads import Displaced, Loads, Nodal, Posture, Pushed, push
-from surrogate.bound import features_of, fitted_bound
-from surrogate.coverage import coverage
-from surrogate.dataset import read_dataset
-from surrogate.envelope import envelope_of, measured
-from surrogate.expansion import EXPANDED
-from surrogate.learned import Learned
-from surrogate.patch import open_patch
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
-from surrogate.split import APART
-from surrogate.store import load, save
-from surrogate.train import LEARNERS, train
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.dataset import read_dataset
+from surrogate.data.disc_split import APART
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.evaluation.coverage import coverage
+from surrogate.model.conformal import features_of, fitted_bound
+from surrogate.model.learned import Learned
+from surrogate.model.store import load, save
+from surrogate.model.training_range import envelope_of, measured
+from surrogate.training.shared_inputs import EXPANDED
+from surrogate.training.train import LEARNERS, train
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ import pytest
 from poison import poisoned
 
 from sim.loads import Loads, Pushed
-from surrogate.dataset import read_dataset
-from surrogate.patch import open_patch
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
-from surrogate.train import train
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.dataset import read_dataset
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.training.train import train
 
 
 @pytest.fixture(scope="module")

@@ -11,18 +11,18 @@ import pytest
 
 from scenes.cli import main
 from sim.accuracy import TRAIN
+from sim.bodies.meshfile import write_anatomy
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import push
-from sim.meshfile import write_anatomy
-from sim.script import run_script
-from surrogate.dataset import read_dataset
-from surrogate.learner import OWN, RESERVED, find_own, learner
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
-from surrogate.store import FITTED, load, save
-from surrogate.train import LEARNERS, OF_POSES, train
+from sim.runtime.user_script import run_script
+from surrogate.data.dataset import read_dataset
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.model.own_learners import OWN, RESERVED, find_own, learner
+from surrogate.model.store import FITTED, load, save
+from surrogate.training.train import LEARNERS, OF_POSES, train
 
 NEAREST = Path(__file__).parents[1] / "examples/nearest.py"
 

@@ -10,25 +10,25 @@ import pytest
 
 from scenes.cli import main
 from sim.anatomy import Anatomy
+from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Deformation, Deformer, Outcome
 from sim.effects import Elasticity, Held, NodalForce, ToolContact, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed, Touching
-from sim.meshfile import read_anatomy, write_anatomy
 from sim.tools import Ball, Capsule
-from surrogate.dataset import Dataset, read_dataset
-from surrogate.indentation import indented
-from surrogate.learned import Learned
-from surrogate.parts import POSED
-from surrogate.patch import Patch, open_patch
-from surrogate.poses import DEEP, SHALLOW, ball_of, draw_poses, poses_at
-from surrogate.sampling import TOOLS, draw
-from surrogate.score import errors
-from surrogate.simulate import simulate
-from surrogate.store import load, save
-from surrogate.taught import refusal
-from surrogate.train import Trained, learners_for, train
+from surrogate.data.cortex_patch import Patch, open_patch
+from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.indentation import indented
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import TOOLS, draw
+from surrogate.data.tool_poses import DEEP, SHALLOW, ball_of, draw_poses, poses_at
+from surrogate.evaluation.score import errors
+from surrogate.model.applicability import refusal
+from surrogate.model.learned import Learned
+from surrogate.model.store import load, save
+from surrogate.training.learners import POSED
+from surrogate.training.train import Trained, learners_for, train
 
 BALL = ball_of("palpation")
 EFFECTS = (Elasticity(), Held(), ToolContact((BALL,)))

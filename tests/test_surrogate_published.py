@@ -12,12 +12,28 @@ from scenes.cli import main
 from sim.deformation import Deformer, Outcome
 from sim.errors import InputError
 from sim.loads import Displaced, Loads, Pushed, push
-from surrogate import published
-from surrogate.bayesian import Bayesian, descended, expansion, first_weights, forward, strengths, well_determined
-from surrogate.published import MACHINES, from_angles, published_nodes, sites_of, taught, thirteen, to_angles
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
-from surrogate.turns import positions_of, taught_in_turn
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.regressors.bayesian import (
+    Bayesian,
+    descended,
+    expansion,
+    first_weights,
+    forward,
+    strengths,
+    well_determined,
+)
+from surrogate.training import published_models
+from surrogate.training.published_models import (
+    MACHINES,
+    from_angles,
+    published_nodes,
+    sites_of,
+    taught,
+    thirteen,
+    to_angles,
+)
+from surrogate.training.published_protocol import positions_of, taught_in_turn
 
 RANDOM = np.random.default_rng(11)
 
@@ -153,7 +169,7 @@ class Spy:
 
 
 def test_a_position_left_out_is_never_shown(box, loads, truth, monkeypatch):
-    monkeypatch.setitem(published.MACHINES, "published-svr", Spy)
+    monkeypatch.setitem(published_models.MACHINES, "published-svr", Spy)
     pushed, seen = loads.of(Pushed), []
     with threadpool_limits(2, "blas"):
         model = taught_in_turn("published-svr", box, loads, truth, lambda: seen.append(1))

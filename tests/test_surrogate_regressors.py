@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from surrogate.ann import Ann
-from surrogate.bayesian import Bayesian
-from surrogate.gp import Gp, matern, negative_likelihood
-from surrogate.linear import Linear
-from surrogate.parts import SVR
-from surrogate.pcr import Pcr
-from surrogate.store import REGRESSORS
-from surrogate.svr import Svr
-from surrogate.tuned import Tuned, inner_discs
+from surrogate.model.store import REGRESSORS
+from surrogate.regressors.ann import Ann
+from surrogate.regressors.bayesian import Bayesian
+from surrogate.regressors.compliance_table import Linear
+from surrogate.regressors.gp import Gp, matern, negative_likelihood
+from surrogate.regressors.pcr import Pcr
+from surrogate.regressors.svr import Svr
+from surrogate.training.learners import SVR
+from surrogate.training.tuning import Tuned, inner_discs
 
 MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr, "gp": Gp, "bayesian": Bayesian}
 MAKE["pcr"] = lambda: Pcr(share=1.0)  # its features here have several units
@@ -177,8 +177,8 @@ def test_outputs_that_do_not_vary_are_told_exactly():
 
 def test_predicting_needs_neither_torch_nor_sklearn():
     script = (
-        "import sys, numpy as np, surrogate.store\n"
-        "from surrogate.linear import Linear\n"
+        "import sys, numpy as np, surrogate.model.store\n"
+        "from surrogate.regressors.compliance_table import Linear\n"
         "Linear().fit(np.eye(2), np.eye(2)).predict(np.eye(2))\n"
         "assert not {'torch', 'sklearn', 'warp', 'meshio'} & set(sys.modules), sys.modules.keys()\n"
     )

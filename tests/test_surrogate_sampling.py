@@ -5,8 +5,9 @@ import pytest
 
 from sim.errors import InputError
 from sim.loads import Pushed
-from surrogate.patch import Patch, open_patch
-from surrogate.sampling import (
+from surrogate.data.cortex_patch import Patch, open_patch
+from surrogate.data.disc_split import leave_discs_out
+from surrogate.data.tool_loads import (
     HARDEST,
     PLANE_MODULUS,
     PUBLISHED_FOOTPRINT,
@@ -16,7 +17,6 @@ from surrogate.sampling import (
     refused_words,
     spread,
 )
-from surrogate.split import leave_discs_out
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surrogate.sampling import draw
-from surrogate.score import score, spread, table, winner
-from surrogate.told import Told
+from surrogate.data.tool_loads import draw
+from surrogate.evaluation.score import score, spread, table, winner
+from surrogate.evaluation.solve_counts import Told
 
 
 @pytest.fixture(scope="module")

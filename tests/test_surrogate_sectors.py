@@ -7,12 +7,12 @@ import pytest
 
 from sim.errors import InputError
 from sim.loads import Pushed
-from surrogate.dataset import read_dataset
-from surrogate.patch import open_patch
-from surrogate.sampling import draw
-from surrogate.sectors import leave_sectors_out
-from surrogate.simulate import simulate
-from surrogate.train import train
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.dataset import read_dataset
+from surrogate.data.direction_split import leave_sectors_out
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.training.train import train
 
 
 @pytest.fixture(scope="module")

@@ -13,17 +13,17 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
 from sim.material import Material, tissue_to_json
-from surrogate.dataset import read_dataset
-from surrogate.encode import directions, tool_features
-from surrogate.expansion import COARSE, EXPANDED, FINE, Expansion, Lesson
-from surrogate.left_out import filled
-from surrogate.patch import open_patch
-from surrogate.series import ORDERS, SPANS, Series, forms
-from surrogate.simulate import simulate
-from surrogate.split import Split
-from surrogate.store import load, save
-from surrogate.tabulate import radii_between, tabulated, with_middles
-from surrogate.train import learners_for, train
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.dataset import read_dataset
+from surrogate.data.disc_split import Split
+from surrogate.data.encode import directions, tool_features
+from surrogate.data.simulate import simulate
+from surrogate.model.store import load, save
+from surrogate.regressors.force_series import ORDERS, SPANS, Series, forms
+from surrogate.regressors.left_out_tables import filled
+from surrogate.training.shared_inputs import COARSE, EXPANDED, FINE, Expansion, Lesson
+from surrogate.training.tabulate_series import radii_between, tabulated, with_middles
+from surrogate.training.train import learners_for, train
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from surrogate.archive import Archive
-from surrogate.bound import Bound
-from surrogate.dataset import read_dataset
-from surrogate.encode import Basis
-from surrogate.learned import Part
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
-from surrogate.store import load, save
-from surrogate.train import train
+from surrogate.data.dataset import read_dataset
+from surrogate.data.encode import Basis
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.model.conformal import Bound
+from surrogate.model.learned import Part
+from surrogate.model.npz_archive import Archive
+from surrogate.model.store import load, save
+from surrogate.training.train import train
 
 
 @pytest.fixture(scope="module")
@@ -228,14 +228,16 @@ def test_bad_model_files_are_sentences(box, tmp_path):
 
 
 def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("surrogate.archive.LARGEST_MODEL", 1000)
+    monkeypatch.setattr("surrogate.model.npz_archive.LARGEST_MODEL", 1000)
     np.savez_compressed(tmp_path / "m.npz", few=np.zeros(10), many=np.zeros(1000))
     with (tmp_path / "m.npz").open("rb") as raw:
         archive = Archive(raw)
         assert len(archive.arrays(["few"])["few"]) == 10
         with pytest.raises(InputError, match="MB are the most"):
             archive.arrays(["few", "many"])
-        monkeypatch.setattr("surrogate.archive.LARGEST_MODEL", 8_200)  # more than each, less than both with their heads
+        monkeypatch.setattr(
+            "surrogate.model.npz_archive.LARGEST_MODEL", 8_200
+        )  # more than each, less than both with their heads
         assert len(archive.arrays(["many"])["many"]) == 1000
         with pytest.raises(InputError, match="MB are the most"):
             archive.arrays(["few", "many"])

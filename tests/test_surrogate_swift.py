@@ -9,15 +9,15 @@ import pytest
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, push, stacked
-from surrogate.bound import features_of, fitted_bound
-from surrogate.encode import Basis, tool_features
-from surrogate.envelope import envelope_of, measured
-from surrogate.learned import Learned, Part
-from surrogate.patch import nearest, open_patch
-from surrogate.remainder import Remainder
-from surrogate.sampling import draw
-from surrogate.series import Series
-from surrogate.tabulate import radii_between, with_middles
+from surrogate.data.cortex_patch import nearest, open_patch
+from surrogate.data.encode import Basis, tool_features
+from surrogate.data.tool_loads import draw
+from surrogate.model.conformal import features_of, fitted_bound
+from surrogate.model.learned import Learned, Part
+from surrogate.model.training_range import envelope_of, measured
+from surrogate.regressors.force_series import Series
+from surrogate.regressors.series_residual import Remainder
+from surrogate.training.tabulate_series import radii_between, with_middles
 
 MODES, RADII = 13, radii_between(5e-3, 7.5e-3)
 

@@ -6,30 +6,30 @@ import numpy as np
 import pytest
 import trimesh
 
-from scenes.reading import Reading, reading
-from scenes.reading import measured as drawn_distance
-from scenes.scene import find_scene
-from scenes.theatre import open_theatre
-from scenes.tool import Blade, Probe
+from scenes.play.deformers import open_theatre
+from scenes.play.tip_reading import Reading, reading
+from scenes.play.tip_reading import measured as drawn_distance
+from scenes.script.scene import find_scene
+from scenes.script.tool import Blade, Probe
 from sim.accuracy import LIVE
+from sim.bodies.open_cortex import open_cortex
+from sim.bodies.tip_distance import tip_gauge
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, Touching
-from sim.open_cortex import open_cortex
-from sim.tip import tip_gauge
-from surrogate.bound import features_of, fitted_bound
-from surrogate.coverage import distance_coverage
-from surrogate.dataset import read_dataset
-from surrogate.envelope import measured
-from surrogate.learned import only_pushed
-from surrogate.patch import open_patch
-from surrogate.poses import draw_poses
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
-from surrogate.store import load, save
-from surrogate.tip import TipModel
-from surrogate.tip_training import CLASS, calibrated_distance, distance_errors, measured_distances
-from surrogate.train import train
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.dataset import read_dataset
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.data.tool_poses import draw_poses
+from surrogate.evaluation.coverage import distance_coverage
+from surrogate.model.conformal import features_of, fitted_bound
+from surrogate.model.learned import only_pushed
+from surrogate.model.store import load, save
+from surrogate.model.tip_distance import TipModel
+from surrogate.model.training_range import measured
+from surrogate.training.tip_distance import CLASS, calibrated_distance, distance_errors, measured_distances
+from surrogate.training.train import train
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +175,7 @@ def test_how_its_bound_holds_in_the_discs_left_out_is_told_of_a_model_that_knows
 
 
 def test_where_many_loads_calibrate_one_in_three_tells_the_scale(data, monkeypatch):
-    monkeypatch.setattr("surrogate.train.ENOUGH_APART", 200)
+    monkeypatch.setattr("surrogate.training.train.ENOUGH_APART", 200)
     trained = train(data, ["linear"])
     model, good = trained.models["linear"], data.loads.rows(np.flatnonzero(data.good))
     truth = data.displacement(data.anatomy.tumour_nodes)[data.good]

@@ -9,24 +9,24 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from scenes.lying import drained_then_turned
-from scenes.paths import idle, press
-from scenes.play import Player
-from scenes.scene import SCENES, Scene, Viewpoint, find_scene
-from scenes.shipped import template_path
-from scenes.stage import Stage
-from scenes.theatre import Theatre, model_path
+from scenes.play.deformers import Theatre, model_path
+from scenes.play.player import Player
+from scenes.play.stage import Stage
+from scenes.script.head_posture import drained_then_turned
+from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
+from scenes.script.shipped_files import template_path
+from scenes.script.tool_paths import idle, press
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
+from sim.bodies.intensity import Intensity, read_intensity, sidecar, write_intensity
+from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
-from sim.intensity import Intensity, read_intensity, sidecar, write_intensity
-from sim.meshfile import read_anatomy, write_anatomy
-from surrogate.dataset import read_dataset
-from surrogate.sampling import draw
-from surrogate.simulate import simulate
-from surrogate.store import save
-from surrogate.train import train
+from surrogate.data.dataset import read_dataset
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
+from surrogate.model.store import save
+from surrogate.training.train import train
 
 PUSHING = tuple(name for name in SCENES if ToolForce() in find_scene(name).effects)
 """The built-in scenes in which a tool pushes."""

@@ -6,9 +6,9 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from sim.columns import combined, dots, gathered
-from sim.device import Device
-from sim.term import Cases
+from sim.discretisation.term import Cases
+from sim.runtime.columns import combined, dots, gathered
+from sim.runtime.device import Device
 
 
 class Spring:

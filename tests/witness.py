@@ -15,11 +15,11 @@ import numpy as np
 import warp as wp
 from conftest import make_box
 
-from scenes.paths import Touch
-from scenes.play import Player
-from scenes.scene import Scene, find_scene
-from scenes.stage import Stage
-from scenes.theatre import Theatre
+from scenes.play.deformers import Theatre
+from scenes.play.player import Player
+from scenes.play.stage import Stage
+from scenes.script.scene import Scene, find_scene
+from scenes.script.tool_paths import Touch
 from sim import effects as known
 from sim.anatomy import Anatomy
 from sim.effects import Elasticity
@@ -27,12 +27,13 @@ from sim.material import Material, Ogden
 from sim.tools import Ball, Spatula
 
 LAUNCHED: set[str] = set()
+PACKAGES = ("sim.terms.contact", "sim.terms.laws")
 TISSUES = {
     "ogden": Ogden(((1340.0, -2.0),), 3e4),
     "prony": Material("neo-hookean", 3000.0, 0.45, ((0.4, 0.5),)),
 }
 MADE = {"ToolContact": known.ToolContact((Ball(7e-3),)), "Retraction": known.Retraction(Spatula(12e-3, 20e-3, 1e-3))}
-HEAVY = ("torch", "sim.dense", "pyamg", "sim.amg", "viser", "sklearn", "onnx")
+HEAVY = ("torch", "sim.linalg.dense_inverse", "pyamg", "sim.linalg.amg", "viser", "sklearn", "onnx")
 
 
 def told(kernel: wp.Kernel) -> str:
@@ -82,8 +83,9 @@ def played(scene: Scene) -> dict[str, list[str]]:
     things = gc.get_objects()
     compiled = [thing for thing in things if isinstance(thing, wp.Kernel) and thing.module.execs]
     living = {type(thing).__name__ for thing in things if str(type(thing).__module__).startswith("sim.terms.")}
+    modules = [name for name in sys.modules if name.startswith("sim.terms.") and name not in PACKAGES]
     return {
-        "imported": sorted(name.split(".")[2] for name in sys.modules if name.startswith("sim.terms.")),
+        "imported": sorted(name.removeprefix("sim.terms.") for name in modules),
         "compiled": sorted({told(kernel) for kernel in compiled}),
         "launched": sorted(LAUNCHED),
         "living": sorted(living),

@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 
 from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.bodies.intensity import sidecar, write_intensity
+from sim.bodies.label_volume import volume_subject
+from sim.bodies.mesher import surface_errors
+from sim.bodies.meshfile import write_anatomy
+from sim.bodies.placement import side_of
+from sim.bodies.subject import Plan, Subject, make_anatomy
+from sim.bodies.template import SITES, Tumour, template_subject
 from sim.errors import InputError
-from sim.intensity import sidecar, write_intensity
-from sim.labels import volume_subject
-from sim.mesh import dihedral_angles
-from sim.meshfile import write_anatomy
-from sim.meshing import surface_errors
-from sim.placing import side_of
-from sim.stages import stage
-from sim.subject import Plan, Subject, make_anatomy
-from sim.template import SITES, Tumour, template_subject
+from sim.geometry.tetmesh import dihedral_angles
+from sim.runtime.timing import stage
 
-from ..beside import demand_no_strangers
-from ..output import add_force, claimed
-from ..placed import add_opening_arguments, opened, opened_over, point
+from .companion_files import demand_no_strangers
+from .outputs import add_force, claimed
+from .placement_options import add_opening_arguments, opened, opened_over, point
 
 # Lengths in millimetres, as on the command line.
 DEFAULTS = {

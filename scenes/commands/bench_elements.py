@@ -8,11 +8,11 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from sim.discretisation import ELEMENTS
-from sim.meshfile import read_anatomy
-from sim.refine import refined
+from sim.bodies.meshfile import read_anatomy
+from sim.bodies.refine import refined
+from sim.discretisation.space import ELEMENTS
 
-from ..shipped import template_path
+from ..script.shipped_files import template_path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a solve did not converge."""
-    from ..bench import machine
-    from ..elements import Press, limits, rows
+    from ..bench.elements import Press, limits, rows
+    from ..bench.stages import machine
 
     bodies = [read_anatomy(path) for path in args.anatomies or [template_path()]]
     anatomies = bodies if args.coarse else [mesh for body in bodies for mesh in (body, refined(body))]

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from sim.discretisation import ELEMENTS, RECOMMENDED
+from sim.discretisation.space import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 
-from ..output import add_force, claimed
+from .outputs import add_force, claimed
 
 if TYPE_CHECKING:
-    from ..growth import Row
+    from ..bench.scaling import Row
 
 SIZES = (2000, 5300, 17_000, 50_000, 100_000, 200_000)
 
@@ -39,13 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
-    from ar.chart import drawn
     from ar.screen import write_png
-    from sim.device import find_device
-    from sim.subject import Plan
+    from sim.bodies.subject import Plan
+    from sim.runtime.device import find_device
 
-    from ..bench import machine
-    from ..growth import Trial, append_row, panels, read_rows, rows
+    from ..bench.loglog_chart import drawn
+    from ..bench.scaling import Trial, append_row, panels, read_rows, rows
+    from ..bench.stages import machine
 
     if min(args.batch) < 1:
         raise InputError(f"--batch {min(args.batch)} solves nothing: give whole numbers from 1 up.")

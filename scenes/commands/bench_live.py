@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from sim.discretisation import ELEMENTS, RECOMMENDED
+from sim.bodies.meshfile import read_anatomy
+from sim.discretisation.space import ELEMENTS, RECOMMENDED
 from sim.effects import pushed_effects
 from sim.errors import InputError
-from sim.meshfile import read_anatomy
 
-from ..shipped import template_path
-from ..tissue import add_tissue_arguments, tissue_of
+from ..script.shipped_files import template_path
+from .tissue_options import add_tissue_arguments, tissue_of
 
 if TYPE_CHECKING:
-    from ..live import Tally
+    from ..bench.live import Tally
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,10 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play every tool; 1 if a frame did not converge, or was farther off than promised."""
-    from ..bench import machine
-    from ..live import PROMISED, RIDES, errors, frames_of, live_fem, loads_of, tally
-    from ..scene import find_scene
-    from ..site import site_of
+    from ..bench.live import PROMISED, RIDES, errors, frames_of, live_fem, loads_of, tally
+    from ..bench.stages import machine
+    from ..script.scene import find_scene
+    from ..script.site import site_of
 
     if not 1 <= args.checked <= args.frames:
         raise InputError(

@@ -11,10 +11,10 @@ from dataclasses import asdict
 import numpy as np
 from tqdm import tqdm
 
-from surrogate.dataset import read_dataset
-from surrogate.published import MACHINES, published_nodes
-from surrogate.score import score, table
-from surrogate.turns import positions_of, taught_in_turn
+from surrogate.data.dataset import read_dataset
+from surrogate.evaluation.score import score, table
+from surrogate.training.published_models import MACHINES, published_nodes
+from surrogate.training.published_protocol import positions_of, taught_in_turn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from sim.discretisation import ELEMENTS, RECOMMENDED
+from sim.bodies.meshfile import read_anatomy
+from sim.discretisation.space import ELEMENTS, RECOMMENDED
 from sim.effects import pushed_effects
 from sim.errors import InputError
-from sim.files import check_output
-from sim.meshfile import read_anatomy
+from sim.runtime.atomic_files import check_output
 
-from ..shipped import template_path
-from ..tissue import add_tissue_arguments, tissue_of
+from ..script.shipped_files import template_path
+from .tissue_options import add_tissue_arguments, tissue_of
 
 if TYPE_CHECKING:
-    from ..robust import Tally
+    from ..bench.robustness import Tally
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,8 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
-    from ..bench import machine
-    from ..robust import Trial, append_records, read_records, records, tallies
+    from ..bench.robustness import Trial, append_records, read_records, records, tallies
+    from ..bench.stages import machine
 
     if args.count < 2 or args.batch < 1:
         raise InputError(f"--count {args.count} --batch {args.batch} tries nothing: give --count >= 2, --batch >= 1.")

@@ -8,12 +8,12 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from sim.bodies.meshfile import read_anatomy
+from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
 from sim.effects import SKULLS
 from sim.errors import InputError
-from sim.meshfile import read_anatomy
-from sim.subject import Plan, make_anatomy
-from sim.template import Tumour, template_subject
-from surrogate.sampling import PRESETS, draw
+from surrogate.data.tool_loads import PRESETS, draw
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,8 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a solve did not converge."""
-    from ..bench import machine
-    from ..skulls import rows
+    from ..bench.skull_models import rows
+    from ..bench.stages import machine
 
     if args.loads < 1:
         raise InputError(f"--loads {args.loads}: give a whole number from 1 up.")

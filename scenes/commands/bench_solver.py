@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from sim.device import find_device
+from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
-from sim.meshfile import read_anatomy
+from sim.runtime.device import find_device
 
-from ..shipped import template_path
+from ..script.shipped_files import template_path
 
 if TYPE_CHECKING:
-    from ..solver_bench import Row
+    from ..bench.peers import Row
 
 NAMES = ("tled", "modified-newton", "torch-fem", "scikit-fem", "felupe")
 COLUMNS = (
@@ -64,8 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare; 1 if one of our answers is off."""
-    from ..bench import machine
-    from ..solver_bench import LEAST, LIVE, OWN, PEERS, case_of, compare, judge_of
+    from ..bench.peers import LEAST, LIVE, OWN, PEERS, case_of, compare, judge_of
+    from ..bench.stages import machine
 
     if args.loads < 2 or args.starts < 1 or args.threads < 1:
         raise InputError(

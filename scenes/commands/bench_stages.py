@@ -28,9 +28,9 @@ def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
     from sim.effects import ToolForce
 
-    from ..bench import machine, rows
-    from ..scene import SCENES, find_scene
-    from ..theatre import open_theatre
+    from ..bench.stages import machine, rows
+    from ..play.deformers import open_theatre
+    from ..script.scene import SCENES, find_scene
 
     if args.batch < 1:
         raise InputError(f"--batch {args.batch} solves nothing: give a whole number from 1 up.")

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from sim.accuracy import TRAIN
-from sim.discretisation import ELEMENTS, RECOMMENDED
+from sim.bodies.meshfile import read_anatomy
+from sim.discretisation.space import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 from sim.material import LAWS, Material
-from sim.meshfile import read_anatomy
-from surrogate.sampling import PRESETS
+from surrogate.data.tool_loads import PRESETS
 
-from ..shipped import template_path
+from ..script.shipped_files import template_path
 
 if TYPE_CHECKING:
-    from ..throughput import Row, Together
+    from ..bench.throughput import Row, Together
 
 YOUNG = 3000.0
 # Loads together on the CPU, where more gain nothing; and loads a row there, and on CUDA.
@@ -55,11 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
-    from sim.device import find_device
+    from sim.runtime.device import find_device
 
-    from ..bench import machine
-    from ..robust import Trial
-    from ..throughput import drawn, rows, together
+    from ..bench.robustness import Trial
+    from ..bench.stages import machine
+    from ..bench.throughput import drawn, rows, together
 
     on_cuda = find_device(args.device, TRAIN.precision).on_cuda
     count = args.count if args.count is not None else (CUDA_COUNT if on_cuda else CPU_COUNT)

@@ -18,9 +18,9 @@ from .demo import add_theatre, deformer_name, scene_asked
 if TYPE_CHECKING:
     from sim.deformation import Deformation
 
-    from ..play import Frame
-    from ..scene import Scene
-    from ..theatre import Theatre
+    from ..play.deformers import Theatre
+    from ..play.player import Frame
+    from ..script.scene import Scene
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,10 +38,10 @@ def run(args: argparse.Namespace) -> int:
     """Check scene by scene. 1: a bound was not kept."""
     from tqdm import tqdm
 
-    from ..check import measure
-    from ..scene import SCENES
-    from ..theatre import open_theatre
-    from ..truth import truth_of
+    from ..play.checks import measure
+    from ..play.deformers import open_theatre
+    from ..play.reference import truth_of
+    from ..script.scene import SCENES
 
     if args.every < 1:
         raise InputError(f"--every {args.every}: give a whole number from 1 up.")
@@ -89,9 +89,9 @@ def _certificates(
 ) -> list[dict[str, float | bool]]:
     """Every frame's certificate, printed as it comes."""
     from sim.fem import Fem
-    from surrogate.certify import SCOPE
+    from surrogate.evaluation.certificate import SCOPE
 
-    from ..certified import certified
+    from ..play.certificates import certified
 
     fem, found = theatre.fem(scene, TRAIN, live=True), []
     if not isinstance(fem, Fem):

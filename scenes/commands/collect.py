@@ -8,8 +8,8 @@ import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from ..output import add_force, claimed
 from .demo import add_theatre, deformer_name, scene_asked
+from .outputs import add_force, claimed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,8 +25,8 @@ def run(args: argparse.Namespace) -> int:
     """Play and write."""
     from tqdm import tqdm
 
-    from ..collect import collect
-    from ..theatre import open_theatre
+    from ..play.deformers import open_theatre
+    from ..play.episode import collect
 
     scene = scene_asked(args, args.scene)
     out = claimed(args.out, ".h5", "an episode of `sulcus collect`", args.force, [args.anatomy])

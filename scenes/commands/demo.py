@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
-from ..tissue import add_element_argument, add_tissue_arguments, tissue_asked
+from .tissue_options import add_element_argument, add_tissue_arguments, tissue_asked
 
 if TYPE_CHECKING:
-    from ..scene import Scene
-    from ..theatre import Theatre
+    from ..play.deformers import Theatre
+    from ..script.scene import Scene
 
 
 def add_theatre(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +53,7 @@ def scene_asked(args: argparse.Namespace, name: str) -> Scene:
     InputError
         As `find_scene`, `tissue_of` and `Scene.made_of`.
     """
-    from ..scene import find_scene
+    from ..script.scene import find_scene
 
     return find_scene(name).made_of(tissue_asked(args), args.element)
 
@@ -74,9 +74,9 @@ def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> s
         return args.deformer or theatre.best(scene)
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
-    from surrogate.choose import choose
+    from surrogate.evaluation.choose import choose
 
-    from ..offers import offers
+    from ..bench.budget import offers
 
     choice = choose(offers(theatre, scene), *budget)
     print(f"sulcus {args.command}: {choice.reason}", file=sys.stderr)
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     """Serve until the time is over, Ctrl-C (exit code 0) or SIGTERM (143)."""
     from ar.browser import check_address
 
-    from ..interrupt import until_ended
+    from .interrupt import until_ended
 
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
@@ -115,8 +115,8 @@ def play(args: argparse.Namespace, closing: ExitStack) -> int:
     """Open the page and play; `closing` closes it."""
     from ar.guard import UnguardedError
 
-    from ..demo import Demo
-    from ..theatre import open_theatre
+    from ..play.deformers import open_theatre
+    from ..play.page import Demo
 
     scene = scene_asked(args, args.scene)
     theatre = open_theatre(args.anatomy, args.model, args.device)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from sim.errors import InputError
 
-from ..tissue import add_element_argument, add_tissue_arguments
 from .demo import scene_asked
+from .tissue_options import add_element_argument, add_tissue_arguments
 
 HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")
 
@@ -31,8 +31,8 @@ def run(args: argparse.Namespace) -> int:
     """Solve the scene with and without each."""
     from tqdm import tqdm
 
-    from ..ablation import rows
-    from ..theatre import open_theatre
+    from ..play.deformers import open_theatre
+    from ..play.effect_ablation import rows
 
     if args.every < 1:
         raise InputError(f"--every {args.every}: give a whole number from 1 up.")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
-from sim.meshfile import read_anatomy
-from surrogate.exchange import write_onnx
-from surrogate.store import load
+from surrogate.model.store import load
+from surrogate.onnx_export.export import write_onnx
 
-from ..output import add_force, claimed
+from .outputs import add_force, claimed
 
 ENDING = ".model.npz"
 

@@ -8,13 +8,13 @@ from dataclasses import asdict
 
 import numpy as np
 
+from sim.bodies.tip_distance import tip_gauge
 from sim.errors import InputError
-from sim.tip import tip_gauge
-from surrogate.coverage import coverage, distance_coverage
-from surrogate.dataset import read_dataset
-from surrogate.sampling import refused_share, refused_words
-from surrogate.score import score, table
-from surrogate.store import load
+from surrogate.data.dataset import read_dataset
+from surrogate.data.tool_loads import refused_share, refused_words
+from surrogate.evaluation.coverage import coverage, distance_coverage
+from surrogate.evaluation.score import score, table
+from surrogate.model.store import load
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

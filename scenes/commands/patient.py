@@ -9,17 +9,17 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sim.accuracy import TRAIN
-from sim.device import find_device
-from sim.discretisation import RECOMMENDED
+from sim.discretisation.space import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS
-from sim.stages import listened
-from surrogate.sampling import PRESETS
-from surrogate.split import APART, FEWEST
+from sim.runtime.device import find_device
+from sim.runtime.timing import listened
+from surrogate.data.disc_split import APART, FEWEST
+from surrogate.data.tool_loads import PRESETS
 
-from ..output import add_force, claimed
-from ..placed import add_opening_arguments, opening_words
-from ..tissue import add_element_argument
+from .outputs import add_force, claimed
+from .placement_options import add_opening_arguments, opening_words
+from .tissue_options import add_element_argument
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,10 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; an interrupted run goes on when the same command is given again."""
-    from surrogate.train import check_learners
+    from surrogate.training.train import check_learners
 
     from ..cli import main
-    from ..theatre import model_path
+    from ..play.deformers import model_path
     from .train import asked_learners
 
     # Said now, not after minutes of meshing.

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 
 from ar.screen import Film, read_png, write_film
 from sim.errors import InputError
-from sim.files import REMEDY, why
+from sim.runtime.atomic_files import REMEDY, why
 
-from ..output import add_force, claimed, claimed_folder, claimed_frames
 from .demo import add_theatre, deformer_name, scene_asked
+from .outputs import add_force, claimed, claimed_folder, claimed_frames
 
 if TYPE_CHECKING:
-    from ..scene import Scene
-    from ..theatre import Theatre
+    from ..play.deformers import Theatre
+    from ..script.scene import Scene
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,8 +37,8 @@ def run(args: argparse.Namespace) -> int:
     """Draw, frame by frame. 1: a frame was answered badly."""
     from tqdm import tqdm
 
-    from ..play import labelled
-    from ..theatre import open_theatre
+    from ..play.deformers import open_theatre
+    from ..play.player import labelled
 
     scene = scene_asked(args, args.scene)
     if args.every < 1:

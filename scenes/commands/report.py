@@ -15,11 +15,11 @@ from tqdm import tqdm
 
 from sim.errors import InputError
 
-from ..output import add_force, claimed
+from .outputs import add_force, claimed
 
 if TYPE_CHECKING:
-    from ..report_page import Section
-    from ..report_study import Study
+    from ..report.page import Section
+    from ..report.study import Study
 
 # Loads of the data that is made where none is given; loads held against the reference; loads beyond the taught ones.
 QUICK, WHOLE = (256, 8, 24), (3000, 64, 120)
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a row could not be measured."""
-    from ..report import LATER
+    from ..report.rows import LATER
 
     try:
         sections = _measured(args)
@@ -71,14 +71,14 @@ def run(args: argparse.Namespace) -> int:
 
 def _measured(args: argparse.Namespace) -> list[Section]:
     """The rows of each data set; the page is written anew after each."""
-    from sim.device import find_device
+    from sim.runtime.device import find_device
 
-    from ..bench import machine
-    from ..report import UNBUILT, every, learners, rows, star
-    from ..report_adapt import debulked_study, simulate_debulked
-    from ..report_page import Section, write_report
-    from ..report_reference import solve_beyond, solve_reference
-    from ..report_study import Study
+    from ..bench.stages import machine
+    from ..report.adaptation import debulked_study, simulate_debulked
+    from ..report.page import Section, write_report
+    from ..report.reference import solve_beyond, solve_reference
+    from ..report.rows import UNBUILT, every, learners, rows, star
+    from ..report.study import Study
 
     find_device(args.device, "float32")
     claimed(args.out / "index.html", ".html", "a page of `sulcus report`", args.force)
@@ -116,7 +116,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
 
 
 def _tabulate(study: Study, bar: tqdm) -> None:
-    from ..report_series import tabulate_series
+    from ..report.series_time import tabulate_series
 
     tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"))
     bar.set_postfix_str("")
@@ -136,8 +136,8 @@ def _simulated(path: Path, args: argparse.Namespace, count: int) -> None:
 
 
 def _about(study: Study) -> tuple[str, ...]:
-    from ..report_loads import KINDS
-    from ..report_reference import reference_of
+    from ..report.extrapolated_loads import KINDS
+    from ..report.reference import reference_of
 
     truth, said = reference_of(study), study.dataset.provenance
     mesh = "the same mesh with every edge halved" if study.fine else "the same mesh"

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 from sim.errors import InputError
-from sim.files import REMEDY, why
+from sim.runtime.atomic_files import REMEDY, why
 
-from ..output import add_force, claimed, claimed_folder
+from .outputs import add_force, claimed, claimed_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,9 +28,9 @@ def run(args: argparse.Namespace) -> int:
 
     from ar.screen import write_png
 
-    from ..scene import SCENES, find_scene
-    from ..sheet import sheet, thumbnail
-    from ..theatre import open_theatre
+    from ..play.contact_sheet import sheet, thumbnail
+    from ..play.deformers import open_theatre
+    from ..script.scene import SCENES, find_scene
 
     if args.out is not None:
         claimed_folder(args.out, "pictures")

@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from sim.discretisation import ELEMENTS
+from sim.discretisation.space import ELEMENTS
 from sim.errors import InputError
-from sim.files import written_whole
-from surrogate.sampling import PRESETS, draw
+from sim.runtime.atomic_files import written_whole
+from surrogate.data.tool_loads import PRESETS, draw
 
-from ..output import add_force, claimed
+from .outputs import add_force, claimed
 
 if TYPE_CHECKING:
-    from surrogate.learned import Learned
+    from surrogate.model.learned import Learned
 
-    from ..sensitivity import Change, Row, Study
+    from ..bench.sensitivity import Change, Row, Study
 
 HEAD = ("what", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
 WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
@@ -76,10 +76,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
-    from ..bench import machine
-    from ..sensitivity import Study, rows
-    from ..theatre import open_theatre
-    from ..variant import Body, variants
+    from ..bench.sensitivity import Study, rows
+    from ..bench.sensitivity_variants import Body, variants
+    from ..bench.stages import machine
+    from ..play.deformers import open_theatre
 
     if args.out:
         table = "a table of `sulcus sensitivity --factorial`" if args.factorial else "a table of `sulcus sensitivity`"
@@ -126,10 +126,10 @@ def _factorial(args: argparse.Namespace) -> int:
     """Every combination: which factors decide, alone and together; 1 if a solve did not converge."""
     from math import prod
 
-    from ar.chart import drawn
     from ar.screen import write_png
 
-    from ..factorial import LEVELS, cells, panels, shares
+    from ..bench.factorial import LEVELS, cells, panels, shares
+    from ..bench.loglog_chart import drawn
 
     if args.anatomy:
         raise InputError("--factorial makes its bodies of the template: leave --anatomy out.")

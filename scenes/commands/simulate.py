@@ -13,25 +13,25 @@ from tqdm import tqdm
 
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
+from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Outcome
 from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import tissue_to_json
-from sim.memory import WIDEST, WIDEST_ON_CUDA
-from sim.meshfile import read_anatomy
-from sim.stages import stage
+from sim.runtime.memory import WIDEST, WIDEST_ON_CUDA
+from sim.runtime.timing import stage
 from sim.tools import Ball
-from surrogate.dataset import read_outcomes
-from surrogate.poses import ball_of, draw_poses
-from surrogate.sampling import PRESETS, draw, refused_share, refused_words
-from surrogate.simulate import Solved, simulate
+from surrogate.data.dataset import read_outcomes
+from surrogate.data.simulate import Solved, simulate
+from surrogate.data.tool_loads import PRESETS, draw, refused_share, refused_words
+from surrogate.data.tool_poses import ball_of, draw_poses
 
-from ..beside import remove_data
-from ..output import add_force, claimed
-from ..shipped import template_path
-from ..tissue import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
+from ..script.shipped_files import template_path
+from .companion_files import remove_data
+from .outputs import add_force, claimed
+from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
 
 INTERRUPTED = 130
 DATA = "a data set of `sulcus simulate`"

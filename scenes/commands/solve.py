@@ -11,15 +11,15 @@ import numpy as np
 
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
+from sim.bodies.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 from sim.deformation import Deformation, guess
 from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Cause, Loads, Nodal, Prescribed
-from sim.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 
-from ..output import add_force, claimed
-from ..tissue import add_element_argument, add_skull_argument, add_tissue_arguments, regions_of, tissue_of
+from .outputs import add_force, claimed
+from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, regions_of, tissue_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,16 +12,16 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.errors import InputError
-from sim.stages import stage
-from surrogate.dataset import Dataset, read_dataset
-from surrogate.expansion import EXPANDED, Expansion
-from surrogate.sampling import refused_share, refused_words
-from surrogate.score import table, winner
-from surrogate.split import APART
-from surrogate.store import save
-from surrogate.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, learners_for, train
+from sim.runtime.timing import stage
+from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.disc_split import APART
+from surrogate.data.tool_loads import refused_share, refused_words
+from surrogate.evaluation.score import table, winner
+from surrogate.model.store import save
+from surrogate.training.shared_inputs import EXPANDED, Expansion
+from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, learners_for, train
 
-from ..output import add_force, claimed
+from .outputs import add_force, claimed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -7,11 +7,11 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from ..columns import CHUNK, gathered
-from ..device import Device
-from ..footprint import Skin
+from ..discretisation.footprint import Skin
+from ..discretisation.term import Cases
 from ..loads import Loads, Nodal, Pushed, check_field
-from ..term import Cases
+from ..runtime.columns import CHUNK, gathered
+from ..runtime.device import Device
 
 
 @dataclass(frozen=True)

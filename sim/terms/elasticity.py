@@ -9,14 +9,14 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..columns import Rooms
-from ..device import Device
-from ..element import Elements, hooke_stiffness
-from ..law import Law
-from ..term import Cases
-from ..together import cores, together
-from .loops import kernels_of, spreading_of
-from .source import Source
+from ..discretisation.element import Elements, hooke_stiffness
+from ..discretisation.term import Cases
+from ..runtime.columns import Rooms
+from ..runtime.device import Device
+from ..runtime.parallel_loops import cores, together
+from .element_kernels import kernels_of, spreading_of
+from .laws.law import Law
+from .state_source import Source
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,14 +6,14 @@ from functools import lru_cache
 import numpy as np
 import warp as wp
 
-from ..device import Device
-from ..discretisation import Discretisation
+from ..discretisation.element import EIGHT_POINTS, EIGHT_WEIGHTS, quadratic_shapes, quadratic_slopes
+from ..discretisation.space import Discretisation
 from ..effects import Gravity
-from ..element import EIGHT_POINTS, EIGHT_WEIGHTS, quadratic_shapes, quadratic_slopes
-from ..immersion import parts_under
+from ..geometry.normals import unit
+from ..geometry.submersion import parts_under
+from ..geometry.tetmesh import QUADRATIC_EDGES
 from ..loads import Loads, Posture
-from ..mesh import QUADRATIC_EDGES
-from ..normals import unit
+from ..runtime.device import Device
 from .dead_force import DeadForce, Forces
 
 STANDARD_GRAVITY = 9.80665  # [m/s^2]

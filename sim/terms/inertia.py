@@ -7,11 +7,11 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..columns import CHUNK, Rooms
-from ..device import Device
-from ..discretisation import Discretisation
-from ..element import quadratic_elements
-from ..term import Cases
+from ..discretisation.element import quadratic_elements
+from ..discretisation.space import Discretisation
+from ..discretisation.term import Cases
+from ..runtime.columns import CHUNK, Rooms
+from ..runtime.device import Device
 
 # Shares of a quadratic tetrahedron's mass: its consistent mass matrix' diagonal, scaled to the whole. Row sums would be
 # negative at corners.

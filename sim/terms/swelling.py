@@ -11,9 +11,9 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from ..device import Device
-from ..law import Law
-from ..term import Cases
+from ..discretisation.term import Cases
+from ..runtime.device import Device
+from .laws.law import Law
 
 
 @cache

@@ -24,12 +24,12 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from ..device import Device
-from ..law import Law
+from ..discretisation.term import Cases
 from ..material import Pairs
-from ..term import Cases
-from .invariants import exp_less_one
-from .split import split_of
+from ..runtime.device import Device
+from .laws.invariants import exp_less_one
+from .laws.isochoric_split import split_of
+from .laws.law import Law
 
 # A symmetric tensor's components.
 SIX = 6

@@ -1,0 +1,272 @@
+"""Which triangle does each pixel see: a z-buffer rasteriser in Warp.
+
+Triangles are tested in homogeneous pixel coordinates q = K x_camera = (u w, v w, w), so nothing is ever clipped
+(Olano & Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates"): for p = (u, v, 1) the edge
+functions e_a = p . (q_b x q_c), e_b, e_c have one sign inside, their sum is p . n with n = (q_b - q_a) x (q_c - q_a),
+the depth is n . q_a / p . n, and e / sum e are the weights on the triangle itself, hence perspective-correct.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from .camera import Camera
+from .parallel import in_bands, launch_in_bands, run_length
+
+NOTHING = np.uint64(0xFFFFFFFFFFFFFFFF)
+
+
+@dataclass(frozen=True, eq=False)
+class Fragments:
+    """What each pixel sees.
+
+    face (H, W) int32: index of the triangle, -1 where empty. weights (H, W, 3) float32: barycentric weights of the
+    triangle's corners, 0 where empty. depth (H, W) float32 [m]: z in the camera frame, 0 where empty.
+    """
+
+    face: np.ndarray
+    weights: np.ndarray
+    depth: np.ndarray
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(H, W) bool: where anything is seen."""
+        return self.face >= 0
+
+    def interpolate(self, triangles: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Vertex values (V, C) at every pixel, (H, W, C); 0 where empty. triangles (F, 3) as rasterised."""
+        picture = np.zeros((*self.face.shape, values.shape[1]), values.dtype)
+        seen = self.mask
+        picture[seen] = np.einsum("nk,nkc->nc", self.weights[seen], values[triangles[self.face[seen]]])
+        return picture
+
+
+def rasterise(
+    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = 1e-3, device: str = "cpu"
+) -> Fragments:
+    """The nearest triangle at every pixel centre.
+
+    Both sides of a triangle are seen. A pixel centre on an edge belongs to both neighbours (the z-buffer keeps one,
+    the lower index at equal depth), so shared edges leave no cracks; triangles without area leave no trace.
+
+    Parameters
+    ----------
+    vertices, triangles
+        (V, 3) world points [m]; (F, 3) vertex indices.
+    near
+        Nothing closer than this depth [m] is drawn; triangles may reach through the plane and behind the camera.
+    device
+        A Warp device.
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, indices out of range, vertices that are not finite, or near <= 0.
+    """
+    vertices, triangles = checked_mesh(vertices, triangles)
+    if not near > 0.0:
+        raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
+    shape = camera.height, camera.width
+    homogeneous = camera.in_frame(vertices) @ camera.K.T
+    first, last = rows_reached(homogeneous, near, camera.height)
+    points = wp.array(homogeneous, dtype=wp.vec3d, device=device)
+    corners = wp.array(triangles, dtype=wp.vec3i, device=device, copy=False)
+    nearest = wp.full(shape, value=NOTHING, dtype=wp.uint64, device=device)
+    face = wp.full(shape, value=-1, dtype=wp.int32, device=device)
+    weights = wp.zeros(shape, dtype=wp.vec3f, device=device)
+    depth = wp.zeros(shape, dtype=wp.float32, device=device)
+
+    run, threads = run_length(device), -(-len(triangles) // run_length(device))
+
+    def scan(begin: int, end: int) -> None:
+        inputs = [points, corners, wp.float64(near), first + begin, first + end, run]
+        wp.launch(keep_nearest, threads, inputs, [nearest], device=device)
+
+    wp.load_module(__name__, device=device)
+    in_bands(scan, last - first, device)
+    rows = slice(first, last)
+    found = [nearest[rows], points, corners, first]
+    launch_in_bands(
+        read_nearest, found, [face[rows], weights[rows], depth[rows]], (last - first) * camera.width, device
+    )
+    return Fragments(face.numpy(), weights.numpy(), depth.numpy())
+
+
+def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int, int]:
+    """First and last-but-one row of the picture that points (V, 3) (u w, v w, w) can cover: all, if one is too near."""
+    if not len(homogeneous):
+        return 0, 0
+    if homogeneous[:, 2].min() < near:
+        return 0, height
+    rows = homogeneous[:, 1] / homogeneous[:, 2]
+    first, last = np.clip([np.floor(rows.min()), np.ceil(rows.max()) + 1.0], 0, height).astype(int).tolist()
+    return first, last
+
+
+def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 and triangles (F, 3) int32; ValueError with the reason when they are no mesh."""
+    vertices = np.asarray(vertices, np.float64)
+    triangles = np.asarray(triangles, np.int32)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise ValueError(f"a surface is vertices (V, 3) and triangles (F, 3), not {vertices.shape}, {triangles.shape}.")
+    if not np.isfinite(vertices).all():
+        raise ValueError("a vertex is not finite: every coordinate must be a finite number of metres.")
+    if triangles.size and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
+        raise ValueError(f"a triangle names a vertex outside 0 .. {len(vertices) - 1}.")
+    return vertices, triangles
+
+
+@wp.func
+def edge(q: wp.array(dtype=wp.vec3d), i: wp.int32, j: wp.int32) -> wp.vec3d:
+    """q_i x q_j, rounded alike for both neighbours of the edge: exactly edge(i, j) = -edge(j, i)."""
+    if i < j:
+        return wp.cross(q[i], q[j])
+    return -wp.cross(q[j], q[i])
+
+
+@wp.func
+def around(q: wp.vec3d, box: wp.vec4d) -> wp.vec4d:
+    """The pixel box (u min, v min, u max, v max) grown to hold the pixel of q."""
+    scale = wp.float64(1.0) / q[2]
+    u = q[0] * scale
+    v = q[1] * scale
+    return wp.vec4d(wp.min(box[0], u), wp.min(box[1], v), wp.max(box[2], u), wp.max(box[3], v))
+
+
+@wp.func
+def beyond(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4d:
+    """The pixel box grown to hold the part of the edge a b that lies beyond the near plane."""
+    if a[2] >= near:
+        box = around(a, box)
+    if (a[2] < near) != (b[2] < near):
+        box = around(a + (b - a) * ((near - a[2]) / (b[2] - a[2])), box)
+    return box
+
+
+@wp.func
+def within(slope: wp.float64, offset: wp.float64, span: wp.vec2d) -> wp.vec2d:
+    """The part of a row's span where slope u + offset >= 0, and a little more: each pixel is tested again."""
+    slack = wp.float64(1.0e-3)
+    if slope > wp.float64(0.0):
+        return wp.vec2d(wp.max(span[0], -offset / slope - slack), span[1])
+    if slope < wp.float64(0.0):
+        return wp.vec2d(span[0], wp.min(span[1], -offset / slope + slack))
+    return span
+
+
+@wp.func
+def draw_triangle(
+    face: wp.int32,
+    q: wp.array(dtype=wp.vec3d),
+    triangles: wp.array(dtype=wp.vec3i),
+    near: wp.float64,
+    begin: wp.int32,
+    end: wp.int32,
+    nearest: wp.array2d(dtype=wp.uint64),
+):
+    """Keep, at each pixel centre inside triangle `face` in the rows begin .. end - 1, the minimum of (depth, face).
+
+    Both fit in 64 bits, because the bits of positive floats sort as the floats do.
+    """
+    t = triangles[face]
+    a = q[t[0]]
+    b = q[t[1]]
+    c = q[t[2]]
+    normal = wp.cross(b - a, c - a)
+    volume = wp.dot(normal, a)
+    if volume == wp.float64(0.0):
+        return
+    far = wp.float64(1.0e30)
+    box = wp.vec4d(far, far, -far, -far)
+    box = beyond(a, b, near, box)
+    box = beyond(b, c, near, box)
+    box = beyond(c, a, near, box)
+    # Rounding must not push a pixel out that lies on the box.
+    slack = wp.vec2d(wp.float64(1.0e-6))
+    low = wp.vec2d(box[0], box[1]) - slack
+    high = wp.vec2d(box[2], box[3]) + slack
+    zero = wp.float64(0.0)
+    left = wp.clamp(wp.ceil(low[0]), zero, wp.float64(nearest.shape[1]))
+    right = wp.clamp(wp.floor(high[0]), wp.float64(-1.0), wp.float64(nearest.shape[1] - 1))
+    first = wp.int32(wp.clamp(wp.ceil(low[1]), wp.float64(begin), wp.float64(end)))
+    stop = wp.int32(wp.clamp(wp.floor(high[1]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
+    if left > right or first >= stop:
+        return
+    side = wp.sign(volume)
+    ea = edge(q, t[1], t[2]) * side
+    eb = edge(q, t[2], t[0]) * side
+    ec = edge(q, t[0], t[1]) * side
+    for row in range(first, stop):
+        v = wp.float64(row)
+        ra = ea[1] * v + ea[2]
+        rb = eb[1] * v + eb[2]
+        rc = ec[1] * v + ec[2]
+        span = within(ec[0], rc, within(eb[0], rb, within(ea[0], ra, wp.vec2d(left, right))))
+        first_u = wp.int32(wp.min(wp.ceil(span[0]), right + wp.float64(1.0)))
+        last_u = wp.int32(wp.max(wp.floor(span[1]), left - wp.float64(1.0)))
+        for column in range(first_u, last_u + 1):
+            u = wp.float64(column)
+            if ea[0] * u + ra >= zero and eb[0] * u + rb >= zero and ec[0] * u + rc >= zero:
+                across = normal[0] * u + normal[1] * v + normal[2]
+                if across * side > zero:
+                    z = volume / across
+                    if z >= near:
+                        bits = wp.uint64(wp.cast(wp.float32(z), wp.uint32))
+                        wp.atomic_min(nearest, row, column, (bits << wp.uint64(32)) | wp.uint64(face))
+
+
+@wp.kernel
+def keep_nearest(
+    q: wp.array(dtype=wp.vec3d),
+    triangles: wp.array(dtype=wp.vec3i),
+    near: wp.float64,
+    begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    # outputs
+    nearest: wp.array2d(dtype=wp.uint64),
+):
+    """A run of triangles, each in the rows begin .. end - 1."""
+    start = wp.tid() * run
+    for face in range(start, wp.min(start + run, triangles.shape[0])):
+        draw_triangle(face, q, triangles, near, begin, end, nearest)
+
+
+@wp.kernel
+def read_nearest(
+    begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    nearest: wp.array2d(dtype=wp.uint64),
+    q: wp.array(dtype=wp.vec3d),
+    triangles: wp.array(dtype=wp.vec3i),
+    first: wp.int32,
+    # outputs
+    face: wp.array2d(dtype=wp.int32),
+    weights: wp.array2d(dtype=wp.vec3f),
+    depth: wp.array2d(dtype=wp.float32),
+):
+    """Each pixel: the winning face, its barycentric weights e / sum e, its depth; `first` is the arrays' first row."""
+    start = begin + wp.tid() * run
+    for index in range(start, wp.min(start + run, end)):
+        row = index / nearest.shape[1]
+        column = index - row * nearest.shape[1]
+        key = nearest[row, column]
+        if key != wp.uint64(0xFFFFFFFFFFFFFFFF):
+            winner = wp.int32(key & wp.uint64(0xFFFFFFFF))
+            t = triangles[winner]
+            a = q[t[0]]
+            b = q[t[1]]
+            c = q[t[2]]
+            p = wp.vec3d(wp.float64(column), wp.float64(first + row), wp.float64(1.0))
+            eb = wp.dot(p, wp.cross(c, a - c))
+            ec = wp.dot(p, wp.cross(a, b - a))
+            scale = wp.float64(1.0) / wp.dot(p, wp.cross(b - a, c - a))
+            wb = wp.float32(eb * scale)
+            wc = wp.float32(ec * scale)
+            face[row, column] = winner
+            weights[row, column] = wp.vec3f(1.0 - wb - wc, wb, wc)
+            depth[row, column] = wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)

@@ -1,0 +1,126 @@
+"""How far a tumour moves under every combination of skull, tissue, opening, depth and stiffness."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+
+import numpy as np
+
+from sim.accuracy import TRAIN
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.bodies.open_cortex import open_cortex
+from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
+from sim.effects import Elasticity, ToolDisplacement, pushed_effects
+from sim.fem import Fem
+from sim.loads import Loads, push, stacked
+from sim.material import BRAIN
+
+from .loglog_chart import Curve, Panel
+from .sensitivity import moved_alike
+
+Levels = Mapping[str, Sequence[str | float]]
+LEVELS: Levels = {
+    "opening [mm]": (30.0, 50.0, 110.0),
+    "depth [mm]": (3.0, 10.0, 25.0),
+    "skull": ("bonded", "slide", "contact"),
+    "nu": (0.45, 0.49, 0.499),
+    "tumour's stiffness": (1.0, 3.0),
+}
+"""What is combined; the depth is that of the tumour's cap under the cortex, its stiffness a multiple of the brain's."""
+DEFAULT = {"skull": "bonded", "nu": 0.49, "tumour's stiffness": 1.0}
+FORCE, FOOTPRINT = 0.2, 7e-3  # [N], [m]
+PLACES = ((0.0, 0.0), (6.0, 0.0), (0.0, 6.0))  # [mm] right and up from the middle of the opening
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One combination: its levels, by factor, and the tumour's mean motion [mm] under known force and known motion.
+
+    The known motion is that of the tool under the force in the default body of the same opening and depth. NaN where a
+    load did not converge.
+    """
+
+    levels: Mapping[str, str | float]
+    force: float
+    motion: float
+
+
+def cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[Cell]:
+    """Every combination, on meshes of the template of about so many nodes; the tool presses at three places."""
+    for opening, depth in product(levels["opening [mm]"], levels["depth [mm]"]):
+        subject = template_subject(Tumour(cover=1e-3 * float(depth)))
+        anatomy = make_anatomy(subject, Plan(nodes, 1e-3 * float(opening)))
+        cortex = open_cortex(anatomy)
+        places = [cortex.place(*place) for place in PLACES]
+        forces = stacked([push(place.point, FORCE * place.inward, FOOTPRINT) for place in places])
+        default = _fem(anatomy, DEFAULT, device).deform(forces)
+        motions = moved_alike(anatomy, forces, default)
+        for combination in product(*(levels[name] for name in DEFAULT)):
+            chosen = dict(zip(DEFAULT, combination, strict=True))
+            fem = _fem(anatomy, chosen, device)
+            moved = [_motion(fem, anatomy, loads) for loads in (forces, motions)]
+            yield Cell({"opening [mm]": opening, "depth [mm]": depth, **chosen}, *moved)
+
+
+def _fem(anatomy: Anatomy, chosen: Mapping[str, str | float], device: str) -> Fem:
+    tissue = replace(BRAIN, poisson=float(chosen["nu"]))
+    tumour = replace(tissue, young=float(chosen["tumour's stiffness"]) * tissue.young)
+    _, *others = pushed_effects(anatomy, tissue, str(chosen["skull"]))
+    return Fem(anatomy, (Elasticity(tissue, {TUMOUR_LABEL: tumour}), *others, ToolDisplacement()), TRAIN, device)
+
+
+def _motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
+    answer = fem.deform(loads, at=anatomy.tumour_nodes)
+    if not all(outcome.good for outcome in answer.outcome):
+        return float("nan")
+    return 1e3 * float(np.linalg.norm(answer.displacement, axis=2).mean())
+
+
+def shares(found: Sequence[Cell], what: str = "force") -> dict[str, float]:
+    """Which part of the variance of the motion's logarithm each factor explains, and each pair beyond its two.
+
+    The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. What
+    three and more do together is the rest to 1.
+    """
+    values = np.log([getattr(cell, what) for cell in found])
+    good = np.isfinite(values)
+    values = values[good] - values[good].mean()
+    kept = [cell.levels for cell, one in zip(found, good, strict=True) if one]
+    names = [name for name in kept[0] if len({levels[name] for levels in kept}) > 1]
+
+    def explained(*factors: str) -> float:
+        keys = [tuple(levels[name] for name in factors) for levels in kept]
+        means = {key: np.mean([v for v, k in zip(values, keys, strict=True) if k == key]) for key in set(keys)}
+        return float(sum(means[key] ** 2 for key in keys) / np.square(values).sum())
+
+    own = {name: explained(name) for name in names}
+    pairs = {f"{a} x {b}": explained(a, b) - own[a] - own[b] for a, b in combinations(names, 2)}
+    return dict(sorted({**own, **pairs}.items(), key=lambda item: -item[1]))
+
+
+def panels(found: Sequence[Cell]) -> list[Panel]:
+    """The motion over the tumour's depth, a panel for each opening: skulls, and Poisson's ratios of the default one."""
+    chosen = [{**DEFAULT, "nu": nu} for nu in _levels(found, "nu")]
+    chosen += [{**DEFAULT, "skull": skull} for skull in _levels(found, "skull") if skull != DEFAULT["skull"]]
+    motions = [cell.force for cell in found if np.isfinite(cell.force)]
+    span = 0.8 * min(motions), 1.5 * max(motions)  # the same for all openings
+    out = []
+    for opening in _levels(found, "opening [mm]"):
+        curves = []
+        for body in chosen:
+            here = {**body, "opening [mm]": opening}
+            mine = [cell for cell in found if here.items() <= cell.levels.items() and np.isfinite(cell.force)]
+            points = tuple((float(cell.levels["depth [mm]"]), cell.force) for cell in mine)
+            curves.append(Curve(f"{body['skull']}, nu {body['nu']:g}", points))
+        title = f"Opening of {opening:g} mm: how far {FORCE:g} N move the tumour"
+        out.append(
+            Panel(title, "depth of the tumour under the cortex [mm]", "motion [mm]", tuple(curves), y_range=span)
+        )
+    return out
+
+
+def _levels(found: Sequence[Cell], name: str) -> list[str | float]:
+    return list(dict.fromkeys(cell.levels[name] for cell in found))

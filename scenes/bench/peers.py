@@ -1,0 +1,276 @@
+"""sulcus beside other finite-element packages: one mesh, the same loads from rest, every answer judged by one routine.
+
+Every engine has a process of its own and they take turns, load by load: whatever else the machine does hits all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.deformation import guess
+from sim.discretisation.footprint import footprint_weights
+from sim.fem import Fem
+from sim.loads import Loads, Nodal, Pushed
+from sim.material import Material
+from surrogate.data.tool_loads import draw
+
+from .engine_process import READY, Case, answer_path, write_case
+from .engine_sulcus import fem_of
+
+HOUSE = Path(__file__).parents[2]
+TISSUE = Material("neo-hookean", 3000.0, 0.45)
+TOLERANCE = 1e-6
+FINEST, LEAST = 1e-11, 1e-10
+"""Of the reference, and the least that may be asked of an engine."""
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class Engine:
+    """A package, what of it is used, the modules that it needs, and the words after `python` that start it."""
+
+    name: str
+    setting: str
+    modules: tuple[str, ...]
+    words: tuple[str, ...]
+    cards: bool = False
+    """Whether it also runs on CUDA."""
+
+    def on(self, device: str) -> Engine:
+        """The same on "cpu" or "cuda", if it can."""
+        if device == "cpu" or not self.cards:
+            return self
+        return replace(self, setting=f"{self.setting}; CUDA", words=(*self.words, device))
+
+    @property
+    def missing(self) -> str:
+        """Why it cannot be started here; empty if it can."""
+        script = Path(self.words[0])
+        if script.suffix == ".py" and not script.exists():
+            return f"{script.name} is not here: run it in a checkout of the repository"
+        if any(find_spec(module) is None for module in self.modules):
+            return "not installed: pip install -e '.[peers]'"
+        return ""
+
+    @property
+    def label(self) -> str:
+        """Its name and version."""
+        try:
+            return f"{self.name} {version(self.name)}"
+        except PackageNotFoundError:
+            return self.name
+
+
+def _peer(name: str, setting: str, *modules: str, cards: bool = False) -> Engine:
+    script = HOUSE / "benchmarks" / "peers" / f"peer_{name.replace('-', '_')}.py"
+    return Engine(name, setting, modules, (str(script),), cards)
+
+
+OWN = Engine(
+    "sulcus", "float64; rest stiffness factorised once", (), ("-m", f"{__package__}.engine_sulcus"), cards=True
+)
+LIVE = Engine("sulcus", "the same, live: set up for many single loads", (), (*OWN.words, "live"), cards=True)
+PEERS = (
+    _peer("tled", "explicit, dynamic relaxation; float64, Warp", "warp", cards=True),
+    _peer("modified-newton", "line search; PARDISO's factor at rest kept, renewed where steps are slow", "pypardiso"),
+    _peer("torch-fem", "Newton, cutbacks; direct, PARDISO", "torchfem", "pypardiso"),
+    _peer("scikit-fem", "Newton; basis kept, 2 threads, symmetric PARDISO", "skfem", "pypardiso"),
+    _peer("felupe", "Newton, line search; threads, symmetric PARDISO", "felupe", "pypardiso"),
+)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One load: seconds, residual by our routine (inf: none), largest distance from the reference [mm], why it failed.
+
+    It is good if the residual is at most `tolerance`.
+    """
+
+    seconds: float
+    residual: float
+    apart: float
+    reason: str
+    tolerance: float
+
+    @property
+    def good(self) -> bool:
+        """Whether it counts."""
+        return self.residual <= self.tolerance
+
+
+@dataclass(frozen=True)
+class Row:
+    """One engine on one mesh to one tolerance: seconds of each first answer and each load's answer; or why none.
+
+    `first_ratio` and `ratio` are its seconds over ours, the latter the median over the further loads that both solved.
+    """
+
+    engine: str
+    setting: str
+    tolerance: float
+    firsts: tuple[float, ...] = ()
+    answers: tuple[Answer, ...] = ()
+    missing: str = ""
+    first_ratio: float = np.nan
+    ratio: float = np.nan
+
+    @property
+    def first(self) -> float:
+        """Median seconds from a mesh to its first answer; NaN if none came to the tolerance."""
+        return float(np.median(self.firsts)) if self.answers and self.answers[0].good else np.nan
+
+    @property
+    def further(self) -> float:
+        """Median seconds of a further load, of those that came to the tolerance."""
+        seconds = [answer.seconds for answer in self.answers[1:] if answer.good]
+        return float(np.median(seconds)) if seconds else np.nan
+
+    def beside(self, ours: Row) -> Row:
+        """The same with the ratios."""
+        pairs = zip(self.answers[1:], ours.answers[1:], strict=False)
+        ratios = [mine.seconds / own.seconds for mine, own in pairs if mine.good and own.good]
+        return replace(self, first_ratio=self.first / ours.first, ratio=float(np.median(ratios)) if ratios else np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """What judges every engine: our residual in double precision and our answers (L, V, 3) [m] to `FINEST`."""
+
+    fem: Fem
+    fields: np.ndarray
+
+
+def judge_of(case: Case) -> Judge:
+    """The judge of a case, whatever its tolerance; a load that it cannot solve so well has NaN for an answer."""
+    fem = fem_of(replace(case, tolerance=FINEST))
+    found = fem.deform(Loads((Nodal(case.force),)))
+    return Judge(fem, np.where((found.residual <= FINEST)[:, None, None], found.displacement, np.nan))
+
+
+def case_of(anatomy: Anatomy, loads: int, seed: int, tolerance: float = TOLERANCE) -> Case:
+    """A case that all engines can express: sliding nodes are held, pushes are forces at nodes.
+
+    Raises
+    ------
+    InputError
+        An anatomy without open cortex, or fewer loads than one.
+    """
+    held = np.asarray((anatomy.held | (anatomy.slide_normal != 0.0)).any(axis=1))
+    pushed = draw("palpation", anatomy, loads, seed).of(Pushed)
+    assert pushed is not None
+    mesh = anatomy.mesh
+    weights = footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
+    force = weights[:, :, None] * pushed.force[:, None, :]
+    return Case(mesh.nodes, mesh.tets, held, TISSUE.young, TISSUE.poisson, *TISSUE.lame, force, tolerance)
+
+
+def compare(
+    case: Case, judge: Judge, engines: Sequence[Engine], starts: int, threads: int, done: Callable[[], object]
+) -> list[Row]:
+    """A row for each engine, ours first; `done` is called after every answer.
+
+    Every engine is started once for nothing, which compiles what it compiles and reads its files, and then `starts`
+    times for the first answer; the last of these goes on with the further loads.
+    """
+    rows = [Row(engine.label, engine.setting, case.tolerance, missing=engine.missing) for engine in engines]
+    here = [number for number, row in enumerate(rows) if not row.missing]
+    with TemporaryDirectory() as folder:
+        places = {number: Path(folder) / str(number) for number in here}
+        running: dict[int, _Process] = {}
+        firsts: dict[int, list[float]] = {number: [] for number in here}
+        said: dict[int, list[tuple[float, str]]] = {number: [] for number in here}
+        try:
+            for start in range(starts + 1):
+                for number in here:
+                    if start == 0:
+                        places[number].mkdir()
+                        write_case(places[number], case)
+                    else:
+                        running.pop(number).close()
+                    running[number] = _Process(engines[number], places[number], threads)
+                    last = running[number].solve(0)
+                    firsts[number] += [last[0]] if start else []
+                    said[number] = [last]
+                    done()
+            for load in range(1, len(case.force)):
+                for number in here:
+                    said[number].append(running[number].solve(load))
+                    done()
+        finally:
+            for process in running.values():
+                process.close()
+        for number in here:
+            judged = _judged(judge, case, _fields(places[number], case), said[number])
+            rows[number] = replace(rows[number], firsts=tuple(firsts[number]), answers=judged)
+    return [row.beside(rows[0]) if number else row for number, row in enumerate(rows)]
+
+
+def _fields(folder: Path, case: Case) -> np.ndarray:
+    """The displacements (L, V, 3) [m] that an engine left; NaN where it left none."""
+    paths = [answer_path(folder, load) for load in range(len(case.force))]
+    return np.stack([np.load(path) if path.exists() else np.full(case.nodes.shape, np.nan) for path in paths])
+
+
+def _judged(judge: Judge, case: Case, fields: np.ndarray, said: Sequence[tuple[float, str]]) -> tuple[Answer, ...]:
+    """Every answer with its residual by `Fem.residual` and its distance from the reference."""
+    there = np.isfinite(fields).all(axis=(1, 2))
+    residual, apart = np.full(len(fields), np.inf), np.full(len(fields), np.nan)
+    if there.any():
+        residual[there] = judge.fem.residual(Loads((Nodal(case.force[there]),)), guess(fields[there]))
+        apart[there] = 1e3 * np.linalg.norm(fields[there] - judge.fields[there], axis=2).max(axis=1)
+    return tuple(
+        Answer(seconds, float(left), float(far), reason, case.tolerance)
+        for (seconds, reason), left, far in zip(said, residual, apart, strict=True)
+    )
+
+
+class _Process:
+    """An engine at work."""
+
+    def __init__(self, engine: Engine, folder: Path, threads: int):
+        paths = [str(HOUSE), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, **dict.fromkeys(THREADS, str(threads)), "PYTHONPATH": os.pathsep.join(paths)}
+        self._complaints = folder / "complaints.txt"
+        with open(self._complaints, "w") as complaints:
+            self._child = subprocess.Popen(
+                [sys.executable, *engine.words, str(folder), str(threads)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=complaints,
+                text=True,
+                env=environment,
+            )
+        assert self._child.stdin is not None and self._child.stdout is not None
+        self._ask, self._hear = self._child.stdin, self._child.stdout
+        self._ready = self._hear.readline().strip() == READY
+
+    def solve(self, load: int) -> tuple[float, str]:
+        """Seconds, and why it failed, or an empty string."""
+        answer = ""
+        if self._ready:
+            try:
+                print(load, file=self._ask, flush=True)
+                answer = self._hear.readline()
+            except BrokenPipeError:
+                pass
+        if not answer:
+            last = self._complaints.read_text().strip().rpartition("\n")[2]
+            return np.nan, f"its process ended: {last or self._child.poll()}"
+        read = json.loads(answer)
+        return read["seconds"], read["reason"]
+
+    def close(self) -> None:
+        """Let it end."""
+        self._child.communicate()

@@ -1,0 +1,177 @@
+"""How many random loads converge: from the tools of surgery to what no surgeon does, on record load by load."""
+
+from __future__ import annotations
+
+import csv
+import time as clock
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import REFERENCE, TRAIN, Accuracy
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, Outcome
+from sim.effects import Effect
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Pushed
+from sim.runtime.outside_files import read_as
+from surrogate.data.tool_loads import BRUTAL, TOOLS, draw
+
+SETS = (*TOOLS, "seed", BRUTAL.name)
+# One load in so many has its residual computed again in double precision.
+CHECKED = 100
+
+
+@dataclass(frozen=True)
+class Record:
+    """One load and what became of it; `double` is the residual in double precision, NaN where it was not computed."""
+
+    preset: str
+    number: int
+    force: float
+    footprint: float
+    outcome: str
+    outer: int
+    residual: float
+    double: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What is tried: body, effects and element, on which device, so many loads together."""
+
+    anatomy: Anatomy
+    effects: tuple[Effect, ...]
+    element: str
+    device: str
+    batch: int
+
+    def fem(self, accuracy: Accuracy) -> Fem:
+        """The finite elements of this trial."""
+        return Fem(self.anatomy, self.effects, accuracy, self.device, self.batch, self.element)
+
+
+def shares(count: int) -> dict[str, int]:
+    """How many of `count` loads each set gets: half are brutal, the tools and the published protocol share the rest."""
+    gentle = [name for name in SETS if name != BRUTAL.name]
+    whole, left = divmod(count - count // 2, len(gentle))
+    return {**{name: whole + (place < left) for place, name in enumerate(gentle)}, BRUTAL.name: count // 2}
+
+
+def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iterator[list[Record]]:
+    """Solve what is not `done` yet of `count` loads, to 1e-4 in single precision, in the batches of a whole run."""
+    fem, double = trial.fem(TRAIN), trial.fem(REFERENCE)
+    for preset, wanted in shares(count).items():
+        first = sum(record.preset == preset for record in done)
+        if first >= wanted:
+            continue
+        loads = draw(preset, trial.anatomy, wanted, seed)
+        for start in range(first // trial.batch * trial.batch, len(loads), trial.batch):
+            index = np.arange(start, min(start + trial.batch, len(loads)))
+            some = loads.rows(index)
+            begun = clock.perf_counter()
+            answer = fem.deform(some)
+            seconds = (clock.perf_counter() - begun) / len(index)
+            again = np.full(len(index), np.nan)
+            chosen = np.flatnonzero(index % CHECKED == 0)
+            if len(chosen):
+                again[chosen] = double.residual(some.rows(chosen), answer.rows(chosen))
+            yield _written(preset, index, some, answer, again, seconds)[max(first - start, 0) :]
+
+
+def _written(
+    preset: str, index: np.ndarray, loads: Loads, answer: Deformation, again: np.ndarray, seconds: float
+) -> list[Record]:
+    pushed = loads.of(Pushed)
+    assert pushed is not None
+    force = np.linalg.norm(pushed.force, axis=1)
+    return [
+        Record(
+            preset, int(number), float(force[row]), float(pushed.footprint[row]), answer.outcome[row].name,
+            int(answer.iterations[row]), float(answer.residual[row]), float(again[row]), seconds,
+        )
+        for row, number in enumerate(index)
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Tally:
+    """One set of loads: how many converged, of them after a rescue; outer steps; ms a load; the hardest one.
+
+    `double` is the largest residual in double precision among the `checked` loads.
+    """
+
+    preset: str
+    loads: int
+    converged: int
+    rescued: int
+    outer_median: float
+    outer_p99: float
+    milliseconds: float
+    checked: int
+    double: float
+    hardest: Record
+
+
+def tallies(found: Sequence[Record]) -> list[Tally]:
+    """The sets that were tried, in order. The hardest load failed with the largest residual, or took the most steps."""
+    out = []
+    for preset in SETS:
+        mine = [record for record in found if record.preset == preset]
+        if not mine:
+            continue
+        good = [record for record in mine if Outcome[record.outcome].good]
+        outer = [record.outer for record in mine]
+        double = [record.double for record in mine if np.isfinite(record.double)]
+        hardest = max(mine, key=lambda r: (not Outcome[r.outcome].good, r.residual if r not in good else 0.0, r.outer))
+        rescued = sum(record.outcome != Outcome.CONVERGED.name for record in good)
+        out.append(
+            Tally(
+                preset, len(mine), len(good), rescued, float(np.median(outer)), float(np.percentile(outer, 99)),
+                1e3 * float(np.mean([record.seconds for record in mine])), len(double), max(double, default=np.nan),
+                hardest,
+            )
+        )  # fmt: skip
+    return out
+
+
+def read_records(path: Path, stated: str) -> list[Record]:
+    """The records of an earlier run of the same trial; none if there is no file.
+
+    Raises
+    ------
+    InputError
+        A file of another trial, or that is no record.
+    """
+    if not path.exists():
+        return []
+    types = {item.name: {"str": str, "int": int, "float": float}[str(item.type)] for item in fields(Record)}
+    remedy = "Choose another --out, or remove it."
+    with read_as(path, "the record of a trial", remedy), open(path, newline="") as file:
+        first, *written = file.read().splitlines(keepends=True) or [""]
+        if first.strip() != f"# {stated}":
+            raise InputError(f"{path}: holds another trial, or none: choose another --out, or remove it.")
+        if written and not written[-1].endswith("\n"):  # its last number may be cut short
+            raise InputError(f"{path}: its last line is not whole: remove that line.")
+        records, lines = [], csv.DictReader(written)
+        for row in lines:
+            try:
+                records.append(Record(**{name: types[name](row[name]) for name in types}))
+            except (KeyError, TypeError, ValueError) as error:
+                raise InputError(f"{path}: its line {lines.line_num + 1} is not whole: remove that line.") from error
+        return records
+
+
+def append_records(path: Path, stated: str, found: Sequence[Record]) -> None:
+    """Add records to a file, which begins with what is tried."""
+    begin = not path.exists()
+    with open(path, "a", newline="") as file:
+        writer = csv.DictWriter(file, [item.name for item in fields(Record)])
+        if begin:
+            file.write(f"# {stated}\n")
+            writer.writeheader()
+        writer.writerows(asdict(record) for record in found)

@@ -1,0 +1,205 @@
+"""What a load costs as the mesh grows: seconds and memory, each size and batch in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import resource
+import threading
+import time as clock
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from sim.accuracy import TRAIN
+from sim.bodies.meshfile import read_anatomy, write_anatomy
+from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
+from sim.effects import pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.material import BRAIN
+from sim.runtime.outside_files import read_as
+from surrogate.data.tool_loads import draw
+
+from .loglog_chart import Curve, Panel
+
+# Batches are solved until so many loads, or so many seconds, are spent.
+LOADS, PATIENCE = 12, 60.0
+SEED = 4
+
+
+@dataclass(frozen=True)
+class Row:
+    """One mesh and batch: asked for, then had; seconds; outer steps (median); loads solved, and converged of them.
+
+    memory [GiB]: the process's own at its peak; `card` [GiB] what it took of the graphics card.
+    """
+
+    size: int
+    asked: int
+    nodes: int
+    tets: int
+    preconditioner: str
+    batch: int
+    set_up: float
+    load: float
+    outer: float
+    loads: int
+    converged: int
+    memory: float
+    card: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What is measured: the element, the device, and the folder where meshes are kept."""
+
+    element: str
+    device: str
+    folder: Path
+
+    def mesh(self, size: int) -> Path:
+        """The template's brain of about `size` nodes; made if it is not there."""
+        path = self.folder / f"template_{size}.vtu"
+        if not path.exists():
+            write_anatomy(path, make_anatomy(template_subject(Tumour()), Plan(size)))
+        return path
+
+
+def measured(trial: Trial, size: int, batch: int) -> Row:
+    """Solve palpation loads on one mesh, to 1e-4 in single precision, in this process."""
+    anatomy = read_anatomy(trial.mesh(size))
+    with watched_card(trial.device) as card:
+        begun = clock.perf_counter()
+        fem = Fem(anatomy, pushed_effects(anatomy, BRAIN), TRAIN, trial.device, batch, trial.element)
+        wp.synchronize()
+        made = clock.perf_counter() - begun
+        loads = draw("palpation", anatomy, max(LOADS, batch) + 1, SEED)
+        fem.deform(loads.rows(np.array([-1])).scaled(1e-3))  # kernels are compiled or loaded at their first launch
+        seconds, outer, good, spent = [], [], 0, 0.0
+        while spent < PATIENCE and len(outer) + batch <= max(LOADS, batch):
+            some = loads.rows(np.arange(len(outer), len(outer) + batch))
+            begun = clock.perf_counter()
+            answer = fem.deform(some)
+            seconds.append(clock.perf_counter() - begun)
+            spent += seconds[-1]
+            outer += list(answer.iterations)
+            good += sum(outcome.good for outcome in answer.outcome)
+    return Row(
+        size, batch, len(anatomy.mesh.nodes), len(anatomy.mesh.tets), fem.preconditioner, batch, made,
+        float(np.median(seconds)) / batch, float(np.median(outer)), len(outer), good,
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, max(card) / 2**30,
+    )  # fmt: skip
+
+
+def rows(trial: Trial, sizes: Sequence[int], batches: Sequence[int], done: Sequence[Row]) -> Iterator[Row]:
+    """A row for each size and batch that is not `done`, each measured in a fresh process.
+
+    Raises
+    ------
+    InputError
+        What meshes, devices and memory refuse; a process that was ended, for want of memory most likely.
+    """
+    known = {(row.size, row.asked) for row in done}
+    for size in sizes:
+        for batch in batches:
+            if (size, batch) in known:
+                continue
+            trial.mesh(size)
+            with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+                try:
+                    yield pool.submit(measured, trial, size, batch).result()
+                except BrokenProcessPool:
+                    raise InputError(
+                        f"{size} nodes with --batch {batch}: the process was ended, for want of memory most likely; "
+                        "leave this size out, or give a smaller batch."
+                    ) from None
+
+
+def read_rows(path: Path, stated: str) -> list[Row]:
+    """The rows of an earlier run of the same trial; none if there is no file.
+
+    Raises
+    ------
+    InputError
+        A file of another trial, or that is no record.
+    """
+    if not path.exists():
+        return []
+    with read_as(path, "the record of a trial", "Choose another --out, or remove it."):
+        first, *lines = path.read_text().splitlines() or [""]
+        if first != json.dumps(stated):
+            raise InputError(f"{path}: holds another trial, or none: choose another --out, or remove it.")
+        rows = []
+        for number, line in enumerate(lines, start=2):
+            try:
+                rows.append(Row(**json.loads(line)))
+            except (TypeError, ValueError, RecursionError) as error:
+                raise InputError(f"{path}: its line {number} is not whole: remove that line.") from error
+        return rows
+
+
+def append_row(path: Path, stated: str, row: Row) -> None:
+    """Add a row to a file, which begins with what is measured."""
+    begin = not path.exists()
+    with open(path, "a") as file:
+        if begin:
+            file.write(json.dumps(stated) + "\n")
+        file.write(json.dumps(asdict(row)) + "\n")
+
+
+def panels(found: Sequence[Row]) -> tuple[Panel, ...]:
+    """Seconds and memory over nodes; where another preconditioner is chosen, a mark between the two sizes."""
+    batches = sorted({row.asked for row in found})
+    by_size = sorted({row.nodes: row.preconditioner for row in found}.items())
+    marks = tuple(((a * b) ** 0.5, _kind(two)) for (a, one), (b, two) in pairwise(by_size) if _kind(one) != _kind(two))
+
+    def curve(name: str, value: str, batch: int) -> Curve:
+        return Curve(name, tuple((row.nodes, getattr(row, value)) for row in found if row.asked == batch))
+
+    seconds = [curve("one load" if batch == 1 else f"one of {batch} together", "load", batch) for batch in batches]
+    memory = [curve(f"host, batch of {batch}", "memory", batch) for batch in batches]
+    if any(row.card for row in found):
+        memory += [curve(f"card, batch of {batch}", "card", batch) for batch in batches]
+    first = f"left of the first mark: {by_size[0][1]}" if marks else by_size[0][1]
+    seconds.append(curve("set-up", "set_up", batches[0]))
+    return (
+        Panel("What a load takes", "nodes", f"seconds; {first}", tuple(seconds), marks),
+        Panel("What it needs", "nodes", f"GiB at the peak; {first}", tuple(memory), marks),
+    )
+
+
+def _kind(name: str) -> str:
+    """Without the number of levels."""
+    return name.split(",")[0]
+
+
+@contextmanager
+def watched_card(device: str) -> Iterator[list[int]]:
+    """The bytes of the card that are taken while the block runs, beyond those taken before; zero without a card."""
+    where = wp.get_device(None if device == "auto" else device)
+    taken = [0]
+    if not where.is_cuda:
+        yield taken
+        return
+    before, ended = where.free_memory, threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(0.02):
+            taken.append(before - where.free_memory)
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield taken
+    finally:
+        ended.set()
+        watcher.join()

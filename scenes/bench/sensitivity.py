@@ -1,0 +1,149 @@
+"""What else moves the tumour: tissue, skull, tool and element, each changed by itself around a default."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim.accuracy import TRAIN, Accuracy
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.deformation import Deformation, guess
+from sim.discretisation.footprint import footprint_weights
+from sim.effects import Elasticity, ToolDisplacement, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Displaced, Loads, Pushed
+from surrogate.data.cortex_patch import open_patch
+
+from .sensitivity_variants import Body, Variant, aimed
+
+
+@dataclass(frozen=True)
+class Change:
+    """How the tumour's displacement differs from the default's, over the `solves` that converged; the `failed` not.
+
+    Parameters
+    ----------
+    mean_mm, p95_mm, largest_mm
+        Of the distances between the two, over every load x vertex [mm].
+    worst95_mm
+        In 95 of 100 loads no vertex is farther off [mm], as a surrogate's bound is stated.
+    percent
+        Mean of the distances, each divided by its load's mean motion under the default [%].
+    motion
+        Mean motion over that under the default.
+    """
+
+    solves: int
+    failed: int
+    mean_mm: float
+    p95_mm: float
+    worst95_mm: float
+    largest_mm: float
+    percent: float
+    motion: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """A variant under tools of known force, and under tools of known motion."""
+
+    variant: Variant
+    force: Change
+    motion: Change
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """The same `Pushed` loads on variants of a body."""
+
+    anatomy: Anatomy
+    loads: Loads
+    body: Body
+    accuracy: Accuracy = TRAIN
+    device: str = "auto"
+
+    def fem(self, body: Body) -> Fem:
+        """The finite elements of a body, for tools of either kind."""
+        tissue = body.tissue
+        _, *others = pushed_effects(self.anatomy, tissue, body.skull)
+        elasticity = Elasticity(tissue, {TUMOUR_LABEL: replace(tissue, young=body.tumour * tissue.young)})
+        effects = (elasticity, *others, ToolDisplacement())
+        return Fem(self.anatomy, effects, self.accuracy, self.device, element=body.element)
+
+
+def rows(study: Study, changed: Sequence[Variant]) -> Iterator[Row]:
+    """First the default, whose change is its whole motion; then each variant's change from it.
+
+    Known motions are those of the default under its forces: the mean motion of each footprint. Every solve starts at
+    the default's answer, so that where a load has several equilibria the same one is followed.
+
+    Raises
+    ------
+    InputError
+        An anatomy without tumour or open cortex; loads of another kind than `Pushed`; what `Fem` refuses.
+    """
+    nodes, patch = study.anatomy.tumour_nodes, open_patch(study.anatomy)
+    if not len(nodes):
+        raise InputError("the anatomy has no tumour whose motion could change: make one with `sulcus anatomy`.")
+    body, fem = study.body, study.fem(study.body)
+    pushed = fem.deform(study.loads)
+    known = moved_alike(study.anatomy, study.loads, pushed)
+    defaults = ((study.loads, pushed), (known, fem.deform(known, guess(pushed.displacement))))
+    rest = np.zeros((len(study.loads), len(nodes), 3))
+    whole = [change(default.at(nodes), default.at(nodes), rest) for _, default in defaults]
+    yield Row(Variant("motion itself", "", "", body), *whole)
+    for variant in changed:
+        if variant.body != body:
+            body, fem = variant.body, study.fem(variant.body)
+        found = []
+        for loads, default in defaults:
+            asked = aimed(loads, variant.aim, patch)
+            start = np.tile(default.displacement, (len(asked) // len(loads), 1, 1))
+            of_default = default.at(nodes)
+            found.append(change(fem.deform(asked, guess(start), nodes), of_default, of_default.displacement))
+        yield Row(variant, *found)
+
+
+def change(answer: Deformation, default: Deformation, origin: np.ndarray) -> Change:
+    """How far `answer`, k times the loads of `default` in blocks, lies from `origin` (B, n, 3) [m].
+
+    A load counts where it and its default converged.
+    """
+    ways = len(answer) // len(default)
+    sound, good = (np.array([outcome.good for outcome in one.outcome]) for one in (default, answer))
+    good = good & np.tile(sound, ways)
+    if not good.any():
+        return Change(0, len(good), *[np.nan] * 6)
+    now, then, origin = (
+        1e3 * field[good]
+        for field in (answer.displacement, *(np.tile(one, (ways, 1, 1)) for one in (default.displacement, origin)))
+    )
+    distance = np.linalg.norm(now - origin, axis=2)
+    motion, before = (np.linalg.norm(field, axis=2).mean(axis=1) for field in (now, then))
+    return Change(
+        int(good.sum()),
+        int(len(good) - good.sum()),
+        float(distance.mean()),
+        float(np.percentile(distance, 95.0)),
+        float(np.percentile(distance.max(axis=1), 95.0)),
+        float(distance.max()),
+        100.0 * float((distance.mean(axis=1) / before).mean()),
+        float(motion.mean() / before.mean()),
+    )
+
+
+def moved_alike(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
+    """Tools that move the tissue under them as far as `answer` says that the forces of `loads` do.
+
+    The mean motion of each footprint, from the motion of the mesh's own vertices: on quadratic elements nearly.
+    """
+    cause = loads.only(Pushed)
+    if cause is None:
+        raise InputError("known motions are derived from forces: give `Pushed` loads alone.")
+    mesh = anatomy.mesh
+    weight = footprint_weights(mesh.nodes, mesh.surface, cause.point, cause.footprint).toarray()
+    motion = np.einsum("bv,bvi->bi", weight, answer.displacement)
+    return Loads((Displaced(cause.point, motion, cause.footprint),), loads.time)

@@ -1,0 +1,117 @@
+"""What each stage costs: medians where a stage is short, warm-up excluded, the device waited for at each reading."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time as clock
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import date
+from importlib.metadata import version
+
+import numpy as np
+import warp as wp
+
+from sim.accuracy import LIVE, TRAIN
+from sim.runtime.device import find_device
+from surrogate.data.tool_loads import draw
+
+from ..play.deformers import Theatre
+from ..play.player import Player
+
+WARM_UP = 3
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure in `unit`: median and 95th percentile of `runs` (None: one reading); `note` says what was done."""
+
+    name: str
+    median: float
+    p95: float | None
+    unit: str
+    runs: int
+    note: str
+
+
+def timed(name: str, unit: str, scale: float, runs: int, note: str, work: Callable[[int], object]) -> Row:
+    """Run `work(i)` and report seconds x scale."""
+    seconds = []
+    for run in range(-WARM_UP, runs):
+        wp.synchronize()
+        begun = clock.perf_counter()
+        work(run % runs)
+        wp.synchronize()
+        if run >= 0:
+            seconds.append(clock.perf_counter() - begun)
+    return Row(name, scale * float(np.median(seconds)), scale * float(np.percentile(seconds, 95)), unit, runs, note)
+
+
+def rows(theatre: Theatre, player: Player, deformer: str, solves: int, batch: int) -> Iterator[Row]:
+    """The figures of a theatre, one by one: finite elements, learners, and the pictures of a player of `deformer`."""
+    scene = player.scene
+    nodes = theatre.anatomy.tumour_nodes
+    size = f"{len(theatre.anatomy.mesh.nodes)} nodes, {len(theatre.anatomy.mesh.tets)} tetrahedra"
+    loads = draw("palpation", theatre.anatomy, solves, seed=20)
+    single = [loads.rows(np.array([row])) for row in range(len(loads))]
+
+    begun = clock.perf_counter()
+    fem = theatre.fem(scene, TRAIN, batch)
+    fem.deform(single[0])
+    made = clock.perf_counter() - begun
+    yield Row("FEM set-up", made, None, "s", 1, f"compile or load kernels, factorise; {size}")
+    begun = clock.perf_counter()
+    answers = fem.deform(loads)
+    each = 1e3 * (clock.perf_counter() - begun) / len(loads)
+    good = sum(outcome.good for outcome in answers.outcome)
+    note = f"{good} of {len(loads)} converged to {TRAIN.tolerance:g}; palpation loads, batches of {batch}"
+    yield Row("FEM, a load in a batch", each, None, "ms", len(loads), note)
+    runs = min(20, len(single))
+    yield timed(
+        "FEM, a single load", "ms", 1e3, runs, f"from rest, to {TRAIN.tolerance:g}", lambda i: fem.deform(single[i])
+    )
+
+    live = Player(player.stage, theatre.fem(scene, LIVE, live=True))
+    frames = [frame.seconds["deform"] for frame in live.frames()][WARM_UP:]
+    yield Row(
+        "FEM, live", 1e3 * float(np.median(frames)), 1e3 * float(np.percentile(frames, 95)), "ms", len(frames),
+        f"scene {scene.name}, warm start, to {LIVE.tolerance:g}",
+    )  # fmt: skip
+
+    for name, model in theatre.models.items():
+        row = timed(
+            name,
+            "us",
+            1e6,
+            200,
+            f"one load, all {len(nodes)} tumour nodes",
+            lambda i, model=model: model.deform(single[i % len(single)], at=nodes),
+        )
+        yield row
+    times = scene.times
+    size = f"{scene.viewpoint.width} x {scene.viewpoint.height}"
+    yield timed(
+        "frame", "ms", 1e3, len(times), f"deform ({deformer}), render {size}, composite: {scene.name}",
+        lambda i: player.draw(i, float(times[i]), scene.path(float(times[i]))),
+    )  # fmt: skip
+
+
+def machine(device: str) -> str:
+    """Hardware, versions and date, in one line.
+
+    Raises
+    ------
+    InputError
+        A device that this machine does not have.
+    """
+    names = [wp.get_device(find_device(device, "float32").name).name]
+    try:
+        with open("/proc/cpuinfo") as file:
+            names += [line.split(":")[1].strip() for line in file if line.startswith("model name")][:1]
+    except OSError:
+        names.append(platform.processor())
+    versions = ", ".join(f"{name} {version(name)}" for name in ("sulcus", "warp-lang", "torch", "numpy"))
+    return (
+        f"{' / '.join(names)}, {os.cpu_count()} cores; Python {platform.python_version()}, {versions}; {date.today()}"
+    )

@@ -1,0 +1,1 @@
+"""The scenes that come with sulcus, one file each: copy one to add yours."""

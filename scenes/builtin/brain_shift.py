@@ -1,0 +1,21 @@
+"""The dura is open and half of the fluid drains: the brain sinks, and sinks otherwise when the head is turned."""
+
+import numpy as np
+
+from sim.effects import Elasticity, Gravity, Held, SkullContact
+from sim.material import MATERIALS
+
+from ..script.head_posture import drained_then_turned
+from ..script.scene import Scene
+
+# Minutes go by, and fluid leaves the tissue.
+SLOW = MATERIALS["drained"].tissue
+
+SCENE = Scene(
+    "brain_shift",
+    __doc__ or "",
+    duration=6.0,
+    effects=(Elasticity(SLOW), Held(), SkullContact(), Gravity()),
+    tool=None,
+    lying=drained_then_turned(drain=3.0, pause=0.5, turn=2.0, angle=np.radians(30.0), to=0.5),
+)

@@ -1,0 +1,22 @@
+"""The fluid has partly drained; the tumour is debulked through a corridor, and what is left of it settles."""
+
+from sim.effects import Elasticity, Gravity, Held, SkullContact
+from sim.material import MATERIALS
+
+from ..script.debulking import Debulking
+from ..script.head_posture import drained
+from ..script.scene import Scene
+
+# Minutes go by, and fluid leaves the tissue.
+SLOW = MATERIALS["drained"].tissue
+
+# Without weight nothing would move: the body is taken to be free of stress in the scan.
+SCENE = Scene(
+    "resection",
+    __doc__ or "",
+    duration=5.0,
+    effects=(Elasticity(SLOW), Held(), SkullContact(), Gravity()),
+    tool=None,
+    lying=drained(1.5, to=0.3),
+    surgery=Debulking(times=(2.0, 2.7, 3.4, 4.1)),
+)

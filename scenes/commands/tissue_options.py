@@ -1,0 +1,163 @@
+"""Tissue and elements on the command line: one set of options for every command that solves."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+
+from sim.discretisation.space import ELEMENTS, RECOMMENDED
+from sim.effects import SKULLS
+from sim.errors import InputError
+from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
+
+
+def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False) -> None:
+    """Declare --material and the constants of its laws; the help tells the `whole` of each tissue, or its name."""
+    sets = ", ".join(MATERIALS) + "; `sulcus solve --help` tells their time scales and sources"
+    if whole:
+        sets = "; ".join(f"{name} (holds for {known.time_scale}; {known.source})" for name, known in MATERIALS.items())
+    parser.add_argument(
+        "--material",
+        default="default",
+        choices=(*MATERIALS, *LAWS, Ogden.law),
+        metavar="TISSUE",
+        help=f"tissue law ({', '.join((*LAWS, Ogden.law))}), or a named tissue, which is a law with its constants: "
+        f"{sets} (default %(default)s)",
+    )
+    parser.add_argument(
+        "--young", type=float, metavar="PA", help=f"Young's modulus [Pa] (default the material's, or {BRAIN.young:g})"
+    )
+    parser.add_argument(
+        "--poisson", type=float, metavar="NU", help=f"Poisson's ratio (default the material's, or {BRAIN.poisson:g})"
+    )
+    parser.add_argument(
+        "--ogden",
+        metavar="C1,M1;C2,M2",
+        help="terms of --material ogden: psi = sum of C/M^2 (l1^M + l2^M + l3^M - 3) [Pa] + K/2 (ln J)^2, as FEBio's; "
+        "where mu and alpha are given with 2 mu/alpha^2, C is 2 mu",
+    )
+    parser.add_argument("--bulk", type=float, metavar="K", help="bulk modulus of --material ogden [Pa]")
+
+
+def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] = tuple(SKULLS)) -> None:
+    """Declare --skull, one of `choices`, the first of which is the default."""
+    words = {
+        "bonded": "the meninges hold the brain",
+        "slide": "it slides without friction and never comes off",
+        "contact": "it slides without friction, and comes off",
+    }
+    said = "; ".join(f"{name}, {words[name]}" for name in choices)
+    parser.add_argument(
+        "--skull", choices=choices, default=choices[0], help=f"how the skull holds the brain: {said} (%(default)s)"
+    )
+
+
+def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMENDED) -> None:
+    """Declare --element; None is what is `meant` in words, or p2 where the mesh brings mid-edge nodes of its own."""
+    parser.add_argument(
+        "--element",
+        choices=ELEMENTS,
+        help="; ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
+        + f" (default {meant}; p2 where the mesh brings mid-edge nodes of its own)",
+    )
+
+
+def tissue_of(args: argparse.Namespace) -> Tissue:
+    """The tissue asked for.
+
+    Raises
+    ------
+    InputError
+        Constants that the law lacks or does not have, text of another form, constants that no tissue has.
+    """
+    known = MATERIALS[args.material].tissue if args.material in MATERIALS else None
+    ours = {"--ogden": args.ogden, "--bulk": args.bulk}
+    if args.material == Ogden.law or isinstance(known, Ogden):
+        refuse({"--young": args.young, "--poisson": args.poisson}, args.material, f"the laws {', '.join(LAWS)}")
+    if args.material == Ogden.law:
+        missing = [name for name, value in ours.items() if value is None]
+        if missing:
+            raise InputError(f'--material ogden lacks {missing[0]}: give --ogden "C1,M1;C2,M2" and --bulk K [Pa].')
+        try:
+            terms = parse_terms(args.ogden.split(";"))
+        except ValueError as error:
+            raise InputError(
+                f'--ogden {args.ogden}: write pairs C,M with ; between, as in "1340,-19;200,2".'
+            ) from error
+        return Ogden(terms, args.bulk)
+    refuse(ours, args.material, "--material ogden")
+    if isinstance(known, Ogden):
+        return known
+    base = known or BRAIN
+    return Material(
+        args.material if known is None else base.law,
+        base.young if args.young is None else args.young,
+        base.poisson if args.poisson is None else args.poisson,
+    )
+
+
+def tissue_asked(args: argparse.Namespace) -> Tissue | None:
+    """The tissue asked for, or None where no option of it is given."""
+    constants = (args.young, args.poisson, args.ogden, args.bulk)
+    given = args.material != "default" or any(value is not None for value in constants)
+    return tissue_of(args) if given else None
+
+
+def refuse(given: Mapping[str, object], material: str, owner: str) -> None:
+    """Raise InputError for an option that is given but that only `owner` has."""
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(
+                f"{name} says nothing to --material {material}: it belongs to {owner}. Leave one of them out."
+            )
+
+
+def regions_of(texts: Sequence[str], tissue: Tissue) -> dict[int, Tissue]:
+    """Tissues by region label, of the law of `tissue`.
+
+    Raises
+    ------
+    InputError
+        As `parse_region`; and a label that is given twice.
+    """
+    pairs = [parse_region(text, tissue) for text in texts]
+    labels = [label for label, _ in pairs]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise InputError(f"--region {label} is given twice: give each label once.")
+    return dict(pairs)
+
+
+def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
+    """Read "LABEL:YOUNG,POISSON", or "LABEL:C1,M1;C2,M2;K" where `tissue` obeys Ogden's law.
+
+    Raises
+    ------
+    InputError
+        Text of another form, or constants that no tissue has.
+    """
+    ogden = isinstance(tissue, Ogden)
+    try:
+        label, constants = text.split(":")
+        if ogden:
+            *terms, bulk = constants.split(";")
+            return int(label), Ogden(parse_terms(terms), float(bulk), tissue.prony)
+        young, poisson = constants.split(",")
+        return int(label), Material(tissue.law, float(young), float(poisson), tissue.prony)
+    except InputError as error:
+        raise InputError(f"--region {text}: {error}") from error
+    except ValueError as error:
+        form = "LABEL:C1,M1;C2,M2;K, as in 2:1340,-19;148000" if ogden else "LABEL:YOUNG,POISSON, as in 2:9000,0.45"
+        raise InputError(f"--region {text}: write {form}.") from error
+
+
+def parse_terms(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
+    """Ogden's (c [Pa], m) from texts "C,M".
+
+    Raises
+    ------
+    ValueError
+        Text of another form.
+    """
+    pairs = [text.split(",") for text in texts]
+    return tuple((float(c), float(m)) for c, m in pairs)

@@ -1,0 +1,1 @@
+"""The loop that plays a scene, the page, checks and episodes."""

@@ -1,0 +1,58 @@
+"""A sheet of all scenes: of each its most telling picture, with what a frame costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ar.hud import panel
+from ar.screen import shrunk
+
+from .player import Frame, Player, labelled
+
+# Frames that are drawn of each scene, evenly spaced; the first loads kernels and is not timed.
+DRAWN = 8
+# Width and height of a picture of the sheet [pixel].
+SIZE = (320, 240)
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A picture (H, W, 3) uint8; median milliseconds of a frame by stage; the tumour's largest mean motion [mm]."""
+
+    colour: np.ndarray
+    milliseconds: dict[str, float]
+    moved_mm: float
+
+    @property
+    def total(self) -> float:
+        """Milliseconds of a whole frame."""
+        return sum(self.milliseconds.values())
+
+
+def thumbnail(player: Player, name: str) -> Thumbnail:
+    """The frame of a deformer `name` in which the tumour has moved most, of those after the last cut, small."""
+    every = max(1, (len(player.scene.times) - 1) // (DRAWN - 1))
+    frames = list(player.frames(every))
+    best = max(frames, key=lambda frame: (_cuts(player, frame), frame.moved))
+    picture = panel(labelled(best, name), [player.scene.name], "bottom left", 0.9)
+    return Thumbnail(shrunk(picture, *SIZE), _medians(frames[1:] or frames), 1e3 * max(frame.moved for frame in frames))
+
+
+def _cuts(player: Player, frame: Frame) -> int:
+    left = player.stage.at(frame.loads).left
+    return 0 if left is None else left.done
+
+
+def _medians(frames: list[Frame]) -> dict[str, float]:
+    return {stage: 1e3 * float(np.median([frame.seconds[stage] for frame in frames])) for stage in frames[0].seconds}
+
+
+def sheet(pictures: list[np.ndarray], columns: int = 3) -> np.ndarray:
+    """Pictures (H, W, 3) uint8 of one size side by side in rows, dark where there is none."""
+    blank = np.full_like(pictures[0], 12)
+    whole = [*pictures, *[blank] * (-len(pictures) % columns)]
+    return np.concatenate(
+        [np.concatenate(whole[first : first + columns], axis=1) for first in range(0, len(whole), columns)]
+    )

@@ -1,0 +1,132 @@
+"""Who can play: an anatomy with its scan, and the deformers that know it, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from sim.accuracy import LIVE, Accuracy
+from sim.anatomy import Anatomy
+from sim.bodies.intensity import Intensity, read_intensity, sidecar
+from sim.bodies.meshfile import read_anatomy
+from sim.deformation import Deformer
+from sim.discretisation.space import recommended
+from sim.errors import InputError
+from sim.fem import Fem, solver_named
+from sim.resected_fem import Operated, finite_elements
+from sim.runtime.device import find_device
+from surrogate.model.applicability import refusal
+from surrogate.model.learned import Learned
+from surrogate.model.store import load
+
+from ..script.scene import Scene
+from ..script.shipped_files import template_path
+from ..script.site import Site, site_of
+from .player import Player
+from .stage import Stage
+
+
+@dataclass(frozen=True, eq=False)
+class Theatre:
+    """An anatomy, its T1 scan if there is one, and models by name, learnt from one data set."""
+
+    anatomy: Anatomy
+    intensity: Intensity | None
+    models: Mapping[str, Learned]
+    device: str = "auto"
+
+    @cached_property
+    def site(self) -> Site:
+        """The open cortex."""
+        return site_of(self.anatomy)
+
+    def refusals(self, scene: Scene) -> dict[str, str | None]:
+        """Why each learnt model may not answer a scene, by name; None if it may.
+
+        A model answers the effects, the tissue and the element that it learned from, and no others.
+        """
+        effects, element = scene.effects_on(self.anatomy), self.element_of(scene)
+        return {name: refusal(model, effects, element) for name, model in self.models.items()}
+
+    def knowing(self, scene: Scene) -> dict[str, Learned]:
+        """The learnt models that may answer a scene, by name."""
+        return {name: self.models[name] for name, why in self.refusals(scene).items() if why is None}
+
+    def names(self, scene: Scene) -> tuple[str, ...]:
+        """Every deformer that can be asked for a scene: the learnt ones that know it, then the finite elements."""
+        return (*self.knowing(scene), "fem")
+
+    def best(self, scene: Scene) -> str:
+        """The learnt model of the tightest error bound; the finite elements where none knows the scene."""
+        knowing = self.knowing(scene)
+        return min(knowing, key=lambda name: knowing[name].bound, default="fem")
+
+    def described(self, name: str, scene: Scene) -> str:
+        """A deformer by name, in words: what solves, or what it learned from."""
+        if name != "fem":
+            return self.models[name].source
+        return solver_named(self.element_of(scene), scene.effects)
+
+    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
+        """Finite elements for a scene's effects, tissue and element; `live` as `Fem` has it."""
+        effects, element = scene.effects_on(self.anatomy), self.element_of(scene)
+        return finite_elements(self.anatomy, effects, accuracy, self.device, batch, element, live)
+
+    def element_of(self, scene: Scene) -> str:
+        """The element of a scene, or the one that is recommended for the mesh."""
+        return scene.element or recommended(self.anatomy.mesh)
+
+    def deformer(self, name: str, scene: Scene) -> Deformer:
+        """A deformer by name; "fem" is made for the scene's accuracy.
+
+        Raises
+        ------
+        InputError
+            A name that this theatre does not know; a model that learned from other effects, tissue or element.
+        """
+        if name == "fem":
+            return self.fem(scene, scene.accuracy, live=True)
+        allowed = ", ".join(self.names(scene))
+        if name not in self.models:
+            raise InputError(
+                f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the learnt ones."
+            )
+        why = self.refusals(scene)[name]
+        if why is not None:
+            raise InputError(f"{name} does not know the scene {scene.name}: {why}. Choose one of {allowed}.")
+        return self.models[name]
+
+    def player(self, name: str, scene: Scene) -> Player:
+        """A scene on this anatomy's open cortex with a deformer by name.
+
+        Raises
+        ------
+        InputError
+            As `deformer`; an anatomy without open cortex.
+        """
+        return Player(Stage(scene, self.site, self.intensity), self.deformer(name, scene))
+
+
+def model_path(anatomy: Path) -> Path:
+    """Where the models of an anatomy file are looked for: MESH.model.npz beside MESH.vtu."""
+    return anatomy.with_suffix(".model.npz")
+
+
+def open_theatre(anatomy: Path | None = None, model: Path | None = None, device: str = "auto") -> Theatre:
+    """Read an anatomy (default: the template that ships) with the scan and the models that lie beside it.
+
+    Raises
+    ------
+    InputError
+        Files that are missing, unreadable, or do not belong together; a device that is not there.
+    """
+    # Learnt models alone would not notice, and the finite elements behind them fail too late.
+    find_device(device, LIVE.precision)
+    path = template_path() if anatomy is None else Path(anatomy)
+    body = read_anatomy(path)
+    scan = sidecar(path)
+    learnt = model_path(path) if model is None else Path(model)
+    models = load(learnt, body) if model is not None or learnt.is_file() else {}
+    return Theatre(body, read_intensity(scan) if scan.is_file() else None, models, device)

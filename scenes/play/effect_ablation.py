@@ -1,0 +1,138 @@
+"""What each effect of a scene costs and changes: the scene solved with it and without it, frame after frame."""
+
+from __future__ import annotations
+
+import gc
+import time as clock
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+
+from sim.deformation import Deformer
+from sim.effects import Effect, Elasticity
+from sim.errors import InputError
+
+from ..script.scene import Scene
+from ..script.site import Site
+from .deformers import Theatre
+from .stage import Stage
+
+# Frames that are not timed: kernels are loaded.
+WARM_UP = 2
+ALL = "all"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A scene's frames by finite elements: displacements (F, V, 3) [m], NaN of what was cut out, and what they took.
+
+    milliseconds, median a frame; held, bytes of the device arrays that are kept from frame to frame.
+    """
+
+    displacement: np.ndarray
+    milliseconds: float
+    held: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """One effect: the scene with all of them, less the scene without it; `ALL` is the scene itself, less nothing.
+
+    milliseconds a frame; megabytes that are kept on the device; how far the means over the tumour's and the open
+    cortex's vertices move at most [mm]; `refused` says why the scene cannot be without it: then there are no figures.
+    """
+
+    effect: str
+    milliseconds: float | None = None
+    held_mb: float | None = None
+    tumour_mm: float | None = None
+    cortex_mm: float | None = None
+    refused: str = ""
+
+
+def without(scene: Scene, effect: Effect) -> Scene:
+    """The scene without one of its effects."""
+    if effect not in scene.effects:  # it depends on the body
+        return replace(scene, surgery=None)
+    return replace(scene, effects=tuple(other for other in scene.effects if other != effect))
+
+
+def rows(theatre: Theatre, scene: Scene, every: int) -> Iterator[Row]:
+    """The scene itself, then each of its effects, of the scene's own tissue; every so many frames are solved.
+
+    Raises
+    ------
+    InputError
+        A scene that cannot be solved, or not to the end.
+    """
+    whole = run(theatre, scene, every)
+    nowhere = replace(whole, displacement=np.zeros_like(whole.displacement), milliseconds=0.0, held=0)
+    yield _row(theatre, ALL, whole, nowhere)
+    for effect in scene.effects_on(theatre.anatomy):
+        name = type(effect).__name__
+        if isinstance(effect, Elasticity):
+            yield Row(name, refused="nothing else resists deformation")
+            continue
+        try:
+            less = run(theatre, without(scene, effect), every)
+        except InputError as error:
+            yield Row(name, refused=str(error))
+            continue
+        yield _row(theatre, name, whole, less)
+
+
+def run(theatre: Theatre, scene: Scene, every: int) -> Run:
+    """Solve every so many frames of a scene in turn, each from the last, as it is played.
+
+    Raises
+    ------
+    InputError
+        A body that is not held, a frame of which no good answer is found.
+    """
+    before = device_arrays()  # whoever lets go of them meanwhile, they were not the scene's
+    fem = theatre.fem(scene, scene.accuracy, live=True)
+    times = scene.times[::every].tolist()
+    found, seconds = _solved(fem, scene, theatre.site, times)
+    wp.synchronize()
+    known = {id(array) for array in before}
+    held = sum(array.capacity for array in device_arrays() if id(array) not in known)
+    return Run(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held)
+
+
+def _solved(fem: Deformer, scene: Scene, site: Site, times: list[float]) -> tuple[list[np.ndarray], list[float]]:
+    """Displacements (V, 3) [m], NaN of what was cut out, and seconds of each frame."""
+    last, found, seconds, stage = None, [], [], Stage(scene, site)
+    for time in times:
+        loads = scene.loads(site, scene.path(time), time)
+        wp.synchronize()
+        begun = clock.perf_counter()
+        last = fem.deform(loads, start=last)
+        seconds.append(clock.perf_counter() - begun)
+        found.append(np.where(stage.at(loads).anatomy.orphaned[:, None], np.nan, last.displacement[0]))
+        if not last.outcome[0].good:
+            raise InputError(f"the frame at {time:.2f} s is not answered: {last.outcome[0].value}")
+    return found, seconds
+
+
+def device_arrays() -> list[wp.array]:
+    """All Warp arrays that live and own their memory."""
+    gc.collect()
+    return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]
+
+
+def _row(theatre: Theatre, name: str, whole: Run, less: Run) -> Row:
+    anatomy = theatre.anatomy
+
+    def apart(nodes: np.ndarray) -> float:
+        difference = (whole.displacement - less.displacement)[:, nodes]
+        return 1e3 * float(np.nanmean(np.linalg.norm(difference, axis=2), axis=1).max())
+
+    return Row(
+        name,
+        whole.milliseconds - less.milliseconds,
+        1e-6 * (whole.held - less.held),
+        apart(anatomy.tumour_nodes),
+        apart(np.unique(anatomy.open_surface)),
+    )

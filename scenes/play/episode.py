@@ -1,0 +1,234 @@
+"""A scene as one episode in HDF5: what the camera saw, what the tool did, and where the tumour went.
+
+Patient space is RAS [m]; the camera frame is OpenCV's (x right, y down, z forward). Read a picture with
+`cv2.imdecode(file["pictures/colour"][i], cv2.IMREAD_COLOR)`. Attributes say what each data set is, what solved it, and
+with which tissue, element and tool: `finite_elements` gives them in words, `tissue` and `element` for a program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+
+from ar.overlay import silhouette
+from sim.deformation import Deformation
+from sim.effects import Elasticity
+from sim.errors import InputError
+from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
+from sim.material import tissue_to_json
+from sim.runtime.atomic_files import demand_space, written_stream
+from surrogate.model.learned import Learned
+
+from .deformers import Theatre
+from .player import STAGES, Frame, Player
+from .reference import truth_of
+from .stage import NAMES
+
+FORMAT = "sulcus episode 1"
+DEPTH_SCALE = 1e-5
+"""Metres in one step of the 16-bit depth; 0 where nothing is seen."""
+JPEG_QUALITY = 95
+PIXEL_BYTES = 1.5
+"""Of all pictures of a frame together, packed: 0.9 to 1.0 in the scenes `press` and `draw`."""
+MEANINGS = {
+    "pictures/colour": "JPEG bytes: what the camera sees, BGR when decoded by OpenCV",
+    "pictures/overlay": "JPEG bytes: the same with the predicted tumour drawn into it",
+    "pictures/segmentation": "PNG bytes, 8 bit: the id of what is seen, see the root's `segmentation`",
+    "pictures/tumour_mask": "PNG bytes, 8 bit: 1 where the predicted tumour would be seen were nothing in front of it",
+    "K": "pinhole camera matrix (3, 3) [pixel]",
+    "bound": "(frames, 2): the largest error of a tumour vertex, in 95 and in 99 of 100 loads; NaN: none is stated",
+    "tumour_nodes": "mesh vertices of the rows of tumour_*", "tumour_left": "which of them are not cut out",
+    "outcome_predicted": "how the deformer's answer came about", "outcome_fem": "the same of the finite elements",
+    "tumour_predicted": "positions, by the deformer", "tumour_fem": "positions, by the finite elements",
+    "tumour_rest": "positions in the scan",
+    "reaction_fem": "(frames, tools, 6): force that each tool exerts, and its moment about the tool's lowest point",
+    "time": "since the scene began", "seconds": "what each stage of the picture took",
+    "T_camera_world": "(frames, 4, 4): takes points of the world to the camera's frame: x_camera = T x_world",
+    "T_world_tool": "(frames, 4, 4): takes points of the tool's own frame to the world: x_world = T x_tool",
+    "force": "of the tool on the brain, in the world's frame",
+    "pictures/depth": "PNG bytes, 16 bit: distance along the camera's z axis; 0 where nothing is seen",
+    "contact": "where the tool pushes, on the cortex of the scan",
+    "tip": "the tool's lowest point, against the open cortex's mean outward normal",
+    "distance": "from the tool's tip to the predicted tumour, as the picture says it (a model may correct it)",
+    "distance_error": "what `distance` may be off by, exceeded in 5 of 100 loads; NaN where it is not known",
+}  # fmt: skip
+UNITS = {
+    "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
+    "distance": "m", "distance_error": "m",
+    "direction": "1", "csf_level": "m", "share": "1", "done": "1",
+    "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "bound": "m", "seconds": "s",
+    "reaction_fem": "N, N m", "K": "pixel", "pose": "m", "displacement": "m", "tumour_nodes": "1", "tumour_left": "1",
+    "outcome_predicted": "text", "outcome_fem": "text", "colour": "JPEG", "overlay": "JPEG", "segmentation": "PNG",
+    "tumour_mask": "PNG",
+    "depth": f"{DEPTH_SCALE:g} m (PNG, 16 bit)",
+}  # fmt: skip
+
+
+def collect(
+    path: Path,
+    theatre: Theatre,
+    player: Player,
+    deformer: str,
+    progress: Callable[[Iterable], Iterable],
+    solved: Callable[[int], object] = lambda more: None,
+) -> dict[str, object]:
+    """Play a scene and write its episode; the file appears whole or not at all. Returns what it holds.
+
+    `progress` passes the frames on as they are drawn; `solved` hears how many more the finite elements have answered.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be written, or a disk with less room than it needs.
+    """
+    total = len(player.scene.times)
+    demand_space(path, int(total * PIXEL_BYTES * player.camera.width * player.camera.height))
+    with written_stream(path, ".h5") as stream, h5py.File(stream, "w") as file:
+        pictures = file.create_group("pictures")
+        stores = {
+            name: pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
+            for name in ("colour", "overlay", "depth", "segmentation", "tumour_mask")
+        }
+        rows, loads = [], []  # a frame itself holds seven megabytes
+        for frame in progress(player.frames()):
+            for name, code in encoded(frame, player).items():
+                stores[name][frame.number] = code
+            if stream.failure is not None:  # no frame after it would be kept
+                raise stream.failure
+            rows.append(motion(frame, player))
+            loads.append(frame.loads)
+        outcomes = write_motion(file, player, rows, truth_of(theatre, player.scene, loads, solved))
+        describe(file, theatre, player, deformer)
+    return {"out": str(path), "scene": player.scene.name, "deformer": deformer, "frames": total, "fem": outcomes}
+
+
+def encoded(frame: Frame, player: Player) -> dict[str, np.ndarray]:
+    """The frame's pictures as compressed bytes, by name."""
+    picture = frame.picture
+    tumour = player.stage.at(frame.loads).tumour(player.positions(frame.deformation))
+    mask = silhouette(frame.camera, tumour.vertices, tumour.triangles)
+    depth = np.clip(np.rint(picture.depth / DEPTH_SCALE), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    return {
+        "colour": cv2.imencode(".jpg", picture.colour[..., ::-1], quality)[1].ravel(),
+        "overlay": cv2.imencode(".jpg", frame.shown[..., ::-1], quality)[1].ravel(),
+        "depth": cv2.imencode(".png", depth)[1].ravel(),
+        "segmentation": cv2.imencode(".png", picture.segmentation)[1].ravel(),
+        "tumour_mask": cv2.imencode(".png", mask.astype(np.uint8))[1].ravel(),
+    }
+
+
+def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
+    """What is not a picture, by name."""
+    nodes = player.site.anatomy.tumour_nodes
+    return {
+        "time": frame.time,
+        "T_camera_world": frame.camera.T_camera_world,
+        **({} if frame.pose is None or frame.tip is None else held(frame, frame.pose, frame.tip)),
+        **caused(frame.loads),
+        "tumour_predicted": player.positions(frame.deformation)[nodes],
+        "tumour_left": ~player.stage.at(frame.loads).anatomy.orphaned[nodes],
+        "outcome_predicted": frame.deformation.outcome[0].name,
+        "bound": frame.deformation.bound[:, 0],
+        "seconds": np.array([frame.seconds[stage] for stage in STAGES]),
+    }
+
+
+def held(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, np.ndarray | float]:
+    """Where the tool is, and what the picture says of its distance to the tumour; NaN where it says nothing."""
+    return {
+        "T_world_tool": pose,
+        "tip": tip,
+        "distance": np.nan if frame.distance is None else frame.distance,
+        "distance_error": np.nan if frame.distance_error is None else frame.distance_error,
+    }
+
+
+def caused(loads: Loads) -> dict[str, np.ndarray]:
+    """What each cause of one load case is, by name."""
+    found: dict[str, np.ndarray] = {}
+    for cause in loads.causes:
+        match cause:
+            case Pushed() if "force" in found:
+                raise InputError("episodes hold the force of one tool: collect a scene of one that pushes.")
+            case Pushed():
+                found |= {"force": cause.force[0], "contact": cause.point[0]}
+            case Posture() | Resected() | Retracted():
+                found |= {name: array[0] for name, array in vars(cause).items()}
+            case Touching():
+                pass  # T_world_tool says it
+            case _:
+                raise InputError(f"episodes hold no {type(cause).__name__}: collect a scene without it.")
+    return found
+
+
+def write_motion(file: h5py.File, player: Player, rows: list[dict], truth: Deformation) -> dict[str, int]:
+    """Write what is not a picture, one row per frame, and the finite elements' answers; returns their outcomes."""
+    nodes = player.site.anatomy.tumour_nodes
+    rest = player.site.anatomy.mesh.nodes[nodes]
+    outcomes = [outcome.name for outcome in truth.outcome]
+    columns: dict[str, Sequence | np.ndarray] = {name: [row[name] for row in rows] for name in rows[0]}
+    columns |= {"tumour_fem": rest + truth.at(nodes).displacement, "outcome_fem": outcomes}
+    if truth.reaction.shape[1]:
+        columns["reaction_fem"] = truth.reaction
+    for name, values in columns.items():
+        text = h5py.string_dtype() if isinstance(values[0], str) else None
+        file.create_dataset(name, data=np.asarray(values, text), compression="gzip")
+    file["seconds"].attrs["stages"] = STAGES
+    file.create_dataset("tumour_rest", data=rest)
+    file.create_dataset("tumour_nodes", data=nodes)
+    return {name.lower(): outcomes.count(name) for name in sorted(set(outcomes))}
+
+
+def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str) -> None:
+    """Units, frames and provenance as attributes."""
+    scene, camera, model = player.scene, player.camera, player.deformer
+    file.create_dataset("K", data=camera.K)
+    for name, unit in UNITS.items():
+        for place in (name, f"pictures/{name}"):
+            if place in file:  # what no frame has is not written
+                file[place].attrs["unit"] = unit
+    for name, meaning in MEANINGS.items():
+        if name in file:
+            file[name].attrs["meaning"] = meaning
+    elasticity = next(effect for effect in scene.effects if isinstance(effect, Elasticity))
+    file.attrs.update(
+        {
+            "format": FORMAT,
+            "scene": scene.name,
+            "deformer": deformer,
+            "effects": repr(scene.effects_on(player.site.anatomy)),
+            "finite_elements": theatre.described("fem", scene),
+            "answered_by": theatre.described(deformer, scene),
+            "element": theatre.element_of(scene),
+            "tissue": "none" if elasticity.default is None else tissue_to_json(elasticity.default),
+            "tool": repr(scene.tool),
+            "footprint_m": np.nan if scene.tool is None else scene.tool.radius,
+            "model_digest": digest_of_model(model) if isinstance(model, Learned) else "none",
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "anatomy": player.site.anatomy.digest,
+            "world_frame": "RAS [m]",
+            "camera_frame": "OpenCV: x right, y down, z forward; pixel centres at whole numbers",
+            "width": camera.width,
+            "height": camera.height,
+            "depth_scale_m": DEPTH_SCALE,
+            "segmentation": ", ".join(f"{label} {name}" for label, name in NAMES.items()) + ", 0 nothing",
+            "sulcus_version": version("sulcus"),
+        }
+    )
+
+
+def digest_of_model(model: Learned) -> str:
+    """Sixteen hexadecimal digits of what a model's parts hold and of what it says of its training."""
+    found = sha256(repr(sorted(model.training.items())).encode())
+    for part in model.parts:
+        for array in (part.basis.nodes, part.basis.modes, *part.regressor.state().values()):
+            found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()[:16]

@@ -1,0 +1,187 @@
+"""The words of the page, as HTML: what is seen, what it is of, what was answered, and how far to trust it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from ar import hud
+from sim.deformation import Deformation, Outcome
+from sim.effects import Elasticity
+from sim.material import Material, Tissue
+
+from ..script.scene import Scene
+from ..script.site import Site
+from .deformers import Theatre
+from .load_text import told
+from .page_tally import Row
+from .player import Frame
+from .stage import Stage
+
+SEEN = (
+    "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; "
+    "the green outline shows where it is computed to be now, while the tissue moves."
+)
+RESEARCH = "Research only. Not a medical device."
+MIDLINE = 5e-3
+ELEMENTS = {"p1": "linear tetrahedra", "p2": "quadratic tetrahedra", "smoothed": "smoothed linear tetrahedra"}
+EFFECTS = {
+    "ToolForce": "push of the tool",
+    "ToolContact": "contact of the tool",
+    "Retraction": "the spatula",
+    "Gravity": "gravity and fluid",
+    "Resection": "the resection",
+    "Pulsation": "heartbeat and breath",
+    "SkullContact": "contact with the skull",
+    "Inertia": "inertia",
+}
+"""What a visitor calls the effects of a scene."""
+
+
+def effect_words(name: str) -> str:
+    """What a visitor calls an effect of this class name."""
+    return EFFECTS.get(name, name)
+
+
+def words(theatre: Theatre, scene: Scene, anatomy: str) -> str:
+    """What stands under the picture: what is seen, what the lines mean, and whose brain it is."""
+    title = " ".join(scene.title.split())
+    return (
+        f"<p>{SEEN} <b>{RESEARCH}</b></p><p>Scene: {escape(title)}</p>{legend(scene)}"
+        f'<p class="dim">{escape(about(theatre, scene, anatomy))}</p>'
+    )
+
+
+def legend(scene: Scene) -> str:
+    """What the lines mean, each beside a piece of it."""
+    keys = [
+        ('stroke="#4cf28c" stroke-width="3"', "tumour now (predicted)"),
+        ('stroke="#4cf28c" stroke-width="1.5" stroke-dasharray="4 3"', "bound of its error"),
+        ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan"),
+        ('stroke="#f259bf" stroke-width="1.5"', "finite elements (3-D view)"),
+    ]
+    if scene.tool is not None:
+        keys.append(('stroke="#fff" stroke-width="1.5"', "tip to tumour, in mm"))
+    lines = (
+        f'<span><svg width="26" height="8"><line x1="1" y1="4" x2="25" y2="4" {line}/></svg>{text}</span>'
+        for line, text in keys
+    )
+    return f'<div class="legend">{"".join(lines)}</div>'
+
+
+def about(theatre: Theatre, scene: Scene, anatomy: str) -> str:
+    """Whose brain, which side, and what the finite elements take it to be made of."""
+    mesh = theatre.anatomy.mesh
+    return (
+        f"Brain: {anatomy}, opened {side(theatre.site)}; {len(mesh.nodes)} mesh points. Finite elements: "
+        f"{fem_words(theatre, scene)}."
+    )
+
+
+def side(site: Site) -> str:
+    """Where the opening is, from the middle of the brain's width."""
+    nodes = site.anatomy.mesh.nodes[:, 0]
+    off = float(site.origin[0] - 0.5 * (nodes.min() + nodes.max()))
+    return "near the midline" if abs(off) < MIDLINE else f"on the patient's {'right' if off > 0.0 else 'left'}"
+
+
+def fem_words(theatre: Theatre, scene: Scene) -> str:
+    """Element and tissue that the theatre's finite elements have in a scene."""
+    tissue = next((effect.default for effect in scene.effects if isinstance(effect, Elasticity)), None)
+    element = theatre.element_of(scene)
+    return f"{ELEMENTS.get(element, element)}, {tissue_words(tissue)}"
+
+
+def tissue_words(tissue: Tissue | None) -> str:
+    """A tissue's law and constants."""
+    if tissue is None:
+        return "a tissue for each region"
+    fades = ", which relaxes under a held load" if tissue.prony else ""
+    if not isinstance(tissue, Material):
+        return f"{tissue.law} tissue{fades}"
+    return (
+        f"{tissue.law} tissue of Young's modulus {1e-3 * tissue.young:g} kPa and Poisson's ratio {tissue.poisson:g}"
+        f"{fades}"
+    )
+
+
+def deformer_words(name: str) -> str:
+    """What a deformer is."""
+    return "finite elements" if name == "fem" else f"trained model {name}"
+
+
+def trust(answer: Deformation, name: str) -> str:
+    """How an answer came about, and how far off it may be; in another colour, with the reason, where it is not good."""
+    outcome, who = answer.outcome[0], f"<b>{escape(deformer_words(name))}</b>"
+    if outcome is Outcome.EXTRAPOLATED:
+        return (
+            f'<p>{who}</p><p class="warn">Do not rely on this answer: the load lies outside the range that the model '
+            "was trained on, so nothing is promised about its error.</p>"
+        )
+    if not outcome.good:
+        return f'<p>{who}</p><p class="warn">Do not rely on this answer: {escape(outcome.value)}.</p>'
+    how = "inside the range that it was trained on" if outcome is Outcome.PREDICTED else "solved to its tolerance"
+    if not answer.displacement.any():
+        return f"<p>{who}: {how}. Nothing moves the tumour.</p>"
+    bound = float(answer.bound[0, 0])
+    if not np.isfinite(bound):
+        return f"<p>{who}: {how}.</p>"
+    most = f"{hud.rounded_up(1e3 * bound, 2):.2f} mm"
+    return f"<p>{who}: {how}. In 95 of 100 loads no point of the tumour is off by more than {most}.</p>"
+
+
+def report(
+    frame: Frame, stage: Stage, name: str, verdict: str, rows: Sequence[Row], frames: int, without: Sequence[str] = ()
+) -> str:
+    """What was answered: the distance first, then how far to trust it, what acts, the verdict and the table."""
+    left, nodes = stage.at(frame.loads).left, stage.site.anatomy.mesh.nodes
+    acts = told(frame.loads, frame.deformation, nodes) if frame.loads.causes else ""
+    facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([acts] if acts else [])]
+    facts += [f"tumour moved {1e3 * frame.moved:.2f} mm"]
+    parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {read(frame)}</p>']
+    parts += [trust(frame.deformation, name), f"<p>{escape('; '.join(facts))}</p>"]
+    if without:
+        parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
+    if left is not None and len(left.loose):
+        parts.append(f"<p>{len(left.loose)} tetrahedra that nothing held any more came off with the last steps.</p>")
+    spent = {"deform": "answer", "render": "camera picture", "overlay": "overlay"}
+    took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
+    return "".join([*parts, verdict, table(rows), f'<p class="dim">milliseconds: {took}</p>'])
+
+
+def read(frame: Frame) -> str:
+    """The distance from tip to tumour, with what it may be off by in 5 of 100 loads where that is known."""
+    assert frame.distance is not None
+    return hud.millimetres(frame.distance, frame.distance_error).replace("+-", "\N{PLUS-MINUS SIGN}")
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Time and error of the deformers so far; nothing is ranked that was not shown the same loads."""
+    if not rows:
+        return ""
+    ranked = rows[0].best is not None
+    what = (
+        f"Medians over the same {counted(rows[0].loads)}; bold: no other is both faster and more accurate."
+        if ranked
+        else "Medians so far."
+    )
+    if len(rows) > 1 and not ranked:
+        what = "Medians so far, each over loads of its own: not to be compared."
+    lines = (
+        f"<tr{' class=best' if row.best else ''}><td>{escape(row.name)}</td>"
+        f"<td>{row.milliseconds:.1f} ms</td><td>{_off(row.millimetres)} mm off</td><td>{counted(row.loads)}</td></tr>"
+        for row in rows
+    )
+    return f'<p class="dim">{what}</p><table>{"".join(lines)}</table>'
+
+
+def _off(millimetres: float) -> str:
+    """No error is told as none."""
+    return f"{millimetres:.3f}" if millimetres >= 1e-3 else "under 0.001"
+
+
+def counted(loads: int) -> str:
+    """So many loads, in words."""
+    return f"{loads} load{'' if loads == 1 else 's'}"

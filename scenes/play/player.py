@@ -1,0 +1,248 @@
+"""The loop: a scripted tool, a deformer and a camera make one frame after the other."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ar.camera import Camera
+from ar.hud import NARROW, folded, lay, panel
+from ar.layer import Layer
+from ar.overlay import Gauge, Style, composite
+from ar.renderer import Picture, render
+from sim.deformation import Deformation, Deformer
+from sim.effects import remember
+from sim.geometry.ball_at_rest import resting_tip
+from sim.geometry.closest_point import closest
+from sim.loads import Loads
+from surrogate.model.learned import Learned
+
+from ..script.scene import Scene
+from ..script.site import Site
+from ..script.tool import Instrument, Probe
+from ..script.tool_paths import Touch, lifted
+from .load_text import doubt_of, told
+from .stage import TOOL, Stage
+from .tip_reading import reading
+
+IN_BONE = "the bone is where this push needs the tool: do not rely on it"
+# Tissue may carry a tool into the bone's edge by so much before it is drawn elsewhere, and before its load counts as
+# none that a tool can make [m].
+CARRIED, BLOCKED = 0.5e-3, 2e-3
+STAGES = ("deform", "render", "overlay")
+"""What the time of a frame is spent on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One moment of a scene.
+
+    Parameters
+    ----------
+    number, time
+        From 0; [s].
+    touch, loads
+        What the hand asked for, and what that does to the tissue.
+    deformation
+        The deformer's answer.
+    camera
+        The camera that the picture was drawn with.
+    pose, tip
+        T_world_tool (4, 4), and where the tool touches (3,) [m]; None where the scene has no tool.
+    picture
+        What the camera sees, without overlay.
+    shown
+        The picture with the predicted tumour in it (H, W, 3) uint8, where the scan had it, and the frame's number.
+    taken
+        (H, W) uint8: above 0 where lines and words stand in it.
+    distance
+        From the tool's tip to the tumour's predicted surface [m]; None without a tool.
+    distance_error
+        How far off that may be [m], as printed; None where nobody knows.
+    moved
+        Mean distance of the tumour's predicted surface from where the scan has it [m].
+    doubt
+        Why the answer may not be relied on, in the words that are in the picture; empty where it may.
+    remark
+        What else is said in the picture, as of a tool that the bone stops; mostly empty.
+    seconds
+        Wall time by stage, see `STAGES`.
+    """
+
+    number: int
+    time: float
+    touch: Touch
+    loads: Loads
+    deformation: Deformation
+    camera: Camera
+    pose: np.ndarray | None
+    tip: np.ndarray | None
+    picture: Picture
+    shown: np.ndarray
+    taken: np.ndarray
+    distance: float | None
+    distance_error: float | None
+    moved: float
+    doubt: str
+    remark: str
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldTool:
+    """Where a tool is drawn: tip (3,) [m], and T_world_tool pose (4, 4).
+
+    beyond [m]: how far inside the bone its load needs it.
+    """
+
+    tip: np.ndarray
+    pose: np.ndarray
+    beyond: float
+
+
+@dataclass(frozen=True, eq=False)
+class Player:
+    """A scene on a stage with one deformer. `draw` is a pure function of time, touch and the previous answer."""
+
+    stage: Stage
+    deformer: Deformer
+    style: Style = "window"
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that is played."""
+        return self.stage.scene
+
+    @property
+    def site(self) -> Site:
+        """The open cortex that it is played on."""
+        return self.stage.site
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The scene's camera."""
+        return self.scene.viewpoint.camera(self.site)
+
+    @cached_property
+    def remembers(self) -> bool:
+        """Whether an answer depends on the one before it."""
+        return not isinstance(self.deformer, Learned) and remember(self.scene.effects_on(self.site.anatomy))
+
+    def touch(self, number: int) -> Touch:
+        """What the script's hand asks for in a frame."""
+        return self.scene.path(float(self.scene.times[number]))
+
+    def loads(self, number: int, touch: Touch | None = None) -> Loads:
+        """What acts in a frame; `touch` in place of the script's."""
+        return self.scene.loads(self.site, touch or self.touch(number), float(self.scene.times[number]))
+
+    def answer(self, loads: Loads, last: Deformation | None = None) -> Deformation:
+        """The deformer's answer, from the last one: a learnt model's at the drawn vertices, which are all it knows."""
+        if isinstance(self.deformer, Learned):
+            return self.deformer.deform(loads, at=self.stage.nodes)
+        return self.deformer.deform(loads, start=last)
+
+    def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
+        """The frame of a touch at a time [s]; the deformer starts from the last answer."""
+        begun = clock.perf_counter()
+        loads = self.scene.loads(self.site, touch, time)
+        deformation = self.answer(loads, last)
+        return self.drawn(number, touch, loads, deformation, clock.perf_counter() - begun)
+
+    def drawn(self, number: int, touch: Touch, loads: Loads, deformation: Deformation, seconds: float) -> Frame:
+        """The frame of an answer to loads, which took so many seconds."""
+        begun = clock.perf_counter()
+        margin = self._margin(self.deformer, deformation) if isinstance(self.deformer, Learned) else 0.0
+        positions = self.positions(deformation)
+        held = None if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
+        stage = self.stage.at(loads)
+        picture = render(self.camera, stage.layers(positions, None if held is None else held.pose), stage.lamp)
+        rendered = clock.perf_counter()
+        tumour, rest = (stage.tumour(at) for at in (positions, self.site.anatomy.mesh.nodes))
+        doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
+        gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
+        over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt)
+        remark = self.scene.stopped(self.site, touch)
+        annotate(over, number, remark)
+        spent = seconds, rendered - begun, clock.perf_counter() - rendered
+        return Frame(
+            number, float(loads.times[0]), touch, loads, deformation, self.camera,
+            None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
+            None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
+            float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()),
+            doubt, remark, dict(zip(STAGES, spent, strict=True)),
+        )  # fmt: skip
+
+    def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
+        """From the tip to the tumour, and how far off that may be as far as the deformer knows."""
+        gauge = gauged(held.tip, tumour)
+        told = None if held.beyond > CARRIED else reading(self.deformer, loads, answer, self.scene.tool, gauge.distance)
+        return gauge if told is None else replace(gauge, read=told.distance, error=told.bound)
+
+    def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
+        """How far each vertex of the drawn tumour may be off [m]: what the model promises of this load, if it does."""
+        if model.bounds is None:
+            return model.bound
+        return model.margin(answer)[0][np.searchsorted(model.anatomy.tumour_nodes, self.stage.tumour_vertices)]
+
+    def frames(self, every: int = 1) -> Iterator[Frame]:
+        """The frames of the scene, or every so many of them."""
+        last = None
+        for number in range(0, len(self.scene.times), every):
+            time = float(self.scene.times[number])
+            frame = self.draw(number, time, self.scene.path(time), last)
+            last = frame.deformation
+            yield frame
+
+    def positions(self, deformation: Deformation, row: int = 0) -> np.ndarray:
+        """Where all mesh vertices are (V, 3) [m] in one load case; what the deformer does not know is at rest."""
+        positions = self.site.anatomy.mesh.nodes.copy()
+        positions[deformation.nodes] += deformation.displacement[row]
+        return positions
+
+    def tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> HeldTool:
+        """Where the tool is: of one that pushes, where it comes to rest on the deformed cortex from outside.
+
+        It is lifted off where it is idle. Tissue that is drawn aside may carry it to the bone's edge, which stops it.
+        """
+        if self.scene.posed:
+            return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), 0.0)
+        inward = self.site.axis
+        carried = self.scene.contact(self.site, touch).carried(positions)
+        inside = self.site.within(carried, tool.radius)
+        beyond = float(np.linalg.norm(inside - carried))
+        tip = through = inside if beyond > CARRIED else carried
+        if isinstance(tool, Probe):
+            tip = resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
+        tip = tip - lifted(touch.force) * inward
+        pose = tool.pose(tip, inward, self.site.right)
+        return HeldTool(tip, pose, beyond)
+
+
+def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
+    """From a tip (3,) [m] to the nearest point of a hidden surface."""
+    return Gauge(tip, closest(tip[None], hidden.vertices[hidden.triangles]).point[0])
+
+
+def annotate(over: Picture, number: int, remark: str) -> None:
+    """Write a remark at the left of a composite picture's foot, and a frame's number at its right, in place."""
+    height, width = over.taken.shape
+    lay(over.colour, over.taken, folded(remark, NARROW * width), (0, height))
+    lay(over.colour, over.taken, [f"frame {number}"], (width, height))
+
+
+def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:
+    """The shown picture (H, W, 3) with a panel: deformer, what acts, milliseconds by stage, and error [m] if known."""
+    stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
+    acts = told(frame.loads, frame.deformation)
+    lines = [frame.deformation.source or name, f"t {frame.time:.2f} s   tumour moved {1e3 * frame.moved:.2f} mm"]
+    lines += [*([acts] if acts else []), f"ms: {stages}"]
+    if error is not None:
+        lines.append(f"error against FEM: {1e3 * error:.3f} mm (frame {frame.number})")
+    if not frame.deformation.outcome[0].good:
+        lines.append(frame.deformation.outcome[0].value)
+    return panel(frame.shown, lines)

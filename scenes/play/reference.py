@@ -1,0 +1,38 @@
+"""The finite elements' answer to every frame of a scene: what drawn frames are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from sim.accuracy import TRAIN
+from sim.deformation import Deformation, joined
+from sim.fem import Fem
+from sim.loads import Loads, stacked
+
+from ..script.scene import Scene
+from .deformers import Theatre
+
+# Frames that are solved together: few enough that whoever waits sees them go by.
+TOGETHER = 16
+
+
+def truth_of(
+    theatre: Theatre,
+    scene: Scene,
+    loads: Sequence[Loads],
+    progress: Callable[[int], object] = lambda more: None,
+) -> Deformation:
+    """One row per frame's loads, every vertex, at training accuracy; one after the other where the past matters.
+
+    `progress` hears how many more frames are solved, whenever some are.
+    """
+    fem = theatre.fem(scene, TRAIN, TOGETHER)
+    apart = not isinstance(fem, Fem) or fem.problem.plain
+    size = TOGETHER if apart else 1
+    answers: list[Deformation] = []
+    for first in range(0, len(loads), size):
+        some = stacked(loads[first : first + size])
+        answers.append(fem.deform(some, start=None if apart or not answers else answers[-1]))
+        progress(len(some))
+    return joined([replace(answer, history={}) for answer in answers])

@@ -1,0 +1,213 @@
+"""What the camera sees of an anatomy: open cortex, drape with a hole, tool; and the tumour that lies beneath."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ar.layer import Layer, Solid, vertex_normals
+from ar.renderer import Lamp, lamp_beside
+from sim.anatomy import Anatomy
+from sim.bodies.intensity import Intensity
+from sim.discretisation.resected_body import Remains, bodies
+from sim.effects import SkullContact
+from sim.loads import Loads, Resected
+
+from ..script.scene import Scene
+from ..script.site import HOLE, Site
+
+CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
+"""Segmentation ids."""
+NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool"}
+"""What can be seen of them: the tumour never can."""
+
+CORTEX_COLOUR = (0.86, 0.60, 0.54)
+DRAPE_COLOUR = (0.16, 0.36, 0.42)
+TOOL_COLOUR = (0.78, 0.80, 0.83)
+TUMOUR_COLOUR = (0.30, 0.95, 0.55)
+# Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
+READ_BELOW = 2.0e-3
+# So far under the bone the cortex may come to light [m].
+RIM = 10e-3
+DRAPE_HEIGHT, DRAPE_DEPTH = 3.0e-3, 8.0e-3
+# What is beyond the hole is drawn lower by so many times as far as it is beyond, to the depth of the drape's wall.
+DIP = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Cortex:
+    """Part of the surface: mesh vertices (n,), triangles (m, 3) of them; the scan, and where it is read (n, 3) [m]."""
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    rest: np.ndarray
+    solid: Solid | None
+
+    def at(self, positions: np.ndarray) -> Layer:
+        """As it is seen at `positions` (V, 3) [m]."""
+        rest = None if self.solid is None else self.rest
+        return Layer(
+            "cortex", CORTEX, positions[self.vertices], self.triangles, CORTEX_COLOUR, 0.5, solid=self.solid, rest=rest
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """The drawn parts of a scene; positions are those of all mesh vertices (V, 3) [m]."""
+
+    scene: Scene
+    site: Site
+    intensity: Intensity | None = None
+    left: Remains | None = None
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The body, as far as it is left."""
+        return self.site.anatomy if self.left is None else self.left.anatomy
+
+    def at(self, loads: Loads) -> Stage:
+        """The stage as the first load case has it: after the steps of a resection that are done."""
+        cause = loads.of(Resected)
+        return self if cause is None else self._after[int(cause.done[0])]
+
+    @cached_property
+    def _after(self) -> tuple[Stage, ...]:
+        """The stage after 0, 1, ... steps."""
+        whole = self.site.anatomy
+        return tuple(replace(self, left=left) for left in bodies(whole, self.scene.effects_on(whole)))
+
+    @cached_property
+    def nodes(self) -> np.ndarray:
+        """Sorted mesh vertices (n,) whose motion is drawn: open cortex and tumour."""
+        anatomy = self.anatomy
+        return np.union1d(np.unique(anatomy.open_surface), anatomy.tumour_nodes)
+
+    @cached_property
+    def lamp(self) -> Lamp:
+        """A lamp over the surgeon's shoulder."""
+        camera = self.scene.viewpoint.camera(self.site)
+        return lamp_beside(camera, self.site.origin, radius=1.6 * self.site.radius)
+
+    def cortex(self, positions: np.ndarray) -> Layer:
+        """The open cortex at `positions` (V, 3) [m]."""
+        return self._cortex.at(positions)
+
+    def visible(self, positions: np.ndarray) -> Layer:
+        """The open cortex, and what lies just under the edge of the bone: it comes to light where the brain shifts.
+
+        Where the brain comes off the skull, what is beyond the drape's hole is drawn below it: the drape lies on the
+        scan, and a bump that slides by millimetres would come through where there was none.
+        """
+        layer = self._visible.at(positions)
+        if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):
+            return layer
+        beyond = self.site.across(layer.vertices) - HOLE * self.site.clearance
+        below = np.minimum(DIP * beyond.clip(0.0), DRAPE_DEPTH)
+        return replace(layer, vertices=layer.vertices + below[:, None] * self.site.axis)
+
+    @cached_property
+    def brain(self) -> Layer:
+        """The closed part of the brain's surface, at rest."""
+        mesh, craniotomy = self.anatomy.mesh, self.anatomy.craniotomy
+        vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
+        return Layer("brain", CORTEX, mesh.nodes[vertices], triangles.reshape(-1, 3), CORTEX_COLOUR)
+
+    def layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
+        """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
+        if self.scene.tool is None or pose is None:
+            return [self.visible(positions), self._drape]
+        tool = self.scene.tool.mesh
+        at = np.asarray(tool.vertices) @ pose[:3, :3].T + pose[:3, 3]
+        probe = Layer("tool", TOOL, at, tool.faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
+        return [self.visible(positions), self._drape, probe]
+
+    def tumour(self, positions: np.ndarray) -> Layer:
+        """The tumour's surface at `positions` (V, 3) [m]."""
+        vertices, triangles = self._tumour
+        return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
+
+    @property
+    def tumour_vertices(self) -> np.ndarray:
+        """Mesh vertices (n,) of the tumour's surface, in the order in which they are drawn."""
+        return self._tumour[0]
+
+    @cached_property
+    def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
+        vertices, triangles = np.unique(self.anatomy.tumour_surface, return_inverse=True)
+        return vertices, triangles.reshape(-1, 3)
+
+    @cached_property
+    def _cortex(self) -> Cortex:
+        return self._dressed(self.anatomy.open_surface)
+
+    @cached_property
+    def _visible(self) -> Cortex:
+        mesh = self.anatomy.mesh
+        away = np.linalg.norm(mesh.nodes[mesh.surface] - self.site.origin, axis=2).min(axis=1)
+        return self._dressed(mesh.surface[away < self.site.radius + RIM])
+
+    def _dressed(self, surface: np.ndarray) -> Cortex:
+        """Triangles (S, 3) of the mesh's surface that wear the scan."""
+        vertices, triangles = np.unique(surface, return_inverse=True)
+        triangles = triangles.reshape(-1, 3)
+        at = self.anatomy.mesh.nodes[vertices]
+        return Cortex(vertices, triangles, at - READ_BELOW * vertex_normals(at, triangles), self._solid)
+
+    @cached_property
+    def _solid(self) -> Solid | None:
+        """The scan as a solid texture."""
+        if self.intensity is None:
+            return None
+        values = self.intensity.values.astype(np.float32) / 255.0
+        return Solid(values, np.linalg.inv(self.intensity.affine), dark=(0.34, 0.10, 0.10), relief=1.5e-3)
+
+    @cached_property
+    def _drape(self) -> Layer:
+        """The surface lifted off the brain, with a round hole over the open cortex, and a wall round the hole."""
+        mesh, site = self.site.anatomy.mesh, self.site
+        normals = vertex_normals(mesh.nodes, mesh.surface)
+        lifted = mesh.nodes + DRAPE_HEIGHT * normals
+        # How far a place lies outside the hole: across the axis on the near side, everywhere on the far side.
+        far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
+        outside = np.where(far, site.radius, site.across(mesh.nodes) - HOLE * site.clearance)
+        points, triangles, rim = clipped(lifted, mesh.surface, outside)
+        # The wall has its own vertices: normals shared with the drape would round its edge off.
+        low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis
+        corner = len(points) + np.arange(4 * len(rim)).reshape(-1, 4)  # two upper, two lower, of every edge
+        wall = np.concatenate([corner[:, [0, 1, 3]], corner[:, [0, 3, 2]]])
+        points = np.concatenate([points, np.concatenate([points[rim], low], axis=1).reshape(-1, 3)])
+        return Layer("drape", DRAPE, points, np.concatenate([triangles, wall]), DRAPE_COLOUR, gloss=0.05)
+
+
+def clipped(points: np.ndarray, triangles: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The part of a surface where a linear field is positive: points (n, 3), triangles (m, 3), cut edges (k, 2).
+
+    points (V, 3), triangles (F, 3), value (V,). Triangles that the zero line crosses are cut along it.
+    """
+    positive = value[triangles] > 0.0
+    whole = triangles[positive.all(axis=1)]
+    mixed = triangles[positive.any(axis=1) & ~positive.all(axis=1)]
+    added, pieces, rim = [], [], []
+    for corners in mixed:
+        inside = value[corners] > 0.0
+        # Turn the triangle so that the lone corner comes first.
+        lone = int(np.argmax(inside) if inside.sum() == 1 else np.argmin(inside))
+        a, b, c = np.roll(corners, -lone)
+        cuts = []
+        for other in (b, c):
+            share = value[a] / (value[a] - value[other])
+            cuts.append(len(points) + len(added))
+            added.append((1.0 - share) * points[a] + share * points[other])
+        if value[a] > 0.0:
+            pieces.append([[a, cuts[0], cuts[1]]])
+        else:
+            pieces.append([[cuts[0], b, c], [cuts[0], c, cuts[1]]])
+        rim.append(cuts)
+    parts = [whole, *(np.array(piece) for piece in pieces)]
+    return (
+        np.concatenate([points, *(point[None] for point in added)]),
+        np.concatenate(parts),
+        np.array(rim).reshape(-1, 2),
+    )

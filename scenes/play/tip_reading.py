@@ -1,0 +1,87 @@
+"""The number that is read beside the tool: how far its tip is from the tumour, and how far off that may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ar.hud import millimetres
+from sim.anatomy import Anatomy
+from sim.bodies.tip_distance import tip_gauge
+from sim.deformation import Deformation, Deformer
+from sim.loads import Loads, Pushed, Touching
+from surrogate.model.learned import Learned
+
+from ..script.tool import Instrument, Probe
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The distance from tip to tumour.
+
+    Parameters
+    ----------
+    distance
+        [m].
+    bound
+        With probability 0.95 the finite elements' distance is no farther off [m]; None where nothing is promised.
+    """
+
+    distance: float
+    bound: float | None
+
+    def __str__(self) -> str:
+        return millimetres(self.distance, self.bound)
+
+
+def reading(
+    deformer: Deformer, loads: Loads, answer: Deformation, tool: Instrument | None, apart: float
+) -> Reading | None:
+    """Read the distance in the first load case of a deformer's answer; None where no single ball pushes or is moved.
+
+    Of finite elements it is their own and has no bound. A learnt model promises nothing outside what it was taught.
+
+    Parameters
+    ----------
+    apart
+        How far [m] the tip is from the tumour where both are drawn.
+    """
+    if _ball(loads, tool) is None:
+        return None
+    if not isinstance(deformer, Learned):
+        return Reading(apart, None)
+    found = deformer.distance(loads, answer, np.array([apart]))
+    promised = float(found.bound[0, 0])
+    kept = answer.outcome[0].good and promised < float("inf")
+    return Reading(float(found.value[0]), promised if kept else None)
+
+
+def measured(
+    anatomy: Anatomy, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float
+) -> Reading | None:
+    """Measure the distance in an answer, whoever gave it; nothing is said of its error.
+
+    Parameters
+    ----------
+    answer
+        Of the open cortex and the tumour at least.
+    lift
+        How far [m] an idle tool that pushes is drawn off the tissue.
+
+    Raises
+    ------
+    InputError
+        An answer without open cortex or tumour.
+    """
+    ball = _ball(loads, tool)
+    if ball is None:
+        return None
+    found = tip_gauge(anatomy).distances(loads, answer.displacement, answer.nodes, ball.radius, lift)
+    return Reading(float(found[0]), None)
+
+
+def _ball(loads: Loads, tool: Instrument | None) -> Probe | None:
+    """Return the tool where it is the only thing that pushes or is moved, and a ball; else None."""
+    alone = len(loads.every(Pushed)) + len(loads.every(Touching)) == 1
+    return tool if alone and isinstance(tool, Probe) else None

@@ -1,0 +1,75 @@
+"""How long a row takes to know a body whose tumour was debulked by a fifth: until it answers there as it did before."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import TRAIN
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.effects import NodalForce, pushed_effects
+from sim.fem import Fem
+from sim.geometry.tetmesh import TetMesh
+from surrogate.data.simulate import simulate
+
+from .study import Study
+from .artefact_time import note_seconds, noted_seconds
+
+# Of the tumour's volume.
+SHARE = 0.2
+
+
+def debulked(anatomy: Anatomy) -> Anatomy:
+    """The body without a fifth of its tumour, from the middle outwards; what no tetrahedron is left at is gone too."""
+    mesh = anatomy.mesh
+    tumour = np.flatnonzero(mesh.region == TUMOUR_LABEL)
+    middle, volume = mesh.nodes[mesh.tets[tumour]].mean(axis=1), mesh.volumes[tumour]
+    far = np.linalg.norm(middle - np.average(middle, axis=0, weights=volume), axis=1)
+    inside = np.argsort(far, kind="stable")
+    inside = inside[np.cumsum(volume[inside]) <= SHARE * volume.sum()]
+    left = np.setdiff1d(np.arange(len(mesh.tets)), tumour[inside])
+    used, table = np.unique(mesh.table[left], return_inverse=True)
+    table = table.reshape(len(left), -1)
+    middles = None if mesh.middles is None else table[:, 4:]
+    body = TetMesh(mesh.nodes[used], table[:, :4], mesh.region[left], middles)
+    return Anatomy(body, anatomy.held[used], anatomy.slide_normal[used], anatomy.craniotomy[used])
+
+
+def debulked_study(study: Study) -> Study:
+    """The same study of the debulked body, once `simulate_debulked` has made its data."""
+    return replace(study, data=_path(study))
+
+
+def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
+    """Answer the data's own loads on the debulked body; `progress` is told how many rows more are done."""
+    path = _path(study)
+    if path.exists():
+        progress(len(study.dataset.loads) + len(study.dataset.unit_good))
+        return
+    whole = not path.with_name(path.name + ".partial").exists()
+    body, data = debulked(study.anatomy), study.dataset
+    effects = (*pushed_effects(body, study.tissue), NodalForce())
+    begun = clock.perf_counter()
+    fem = Fem(body, effects, TRAIN, study.device, None, study.element)
+    told = [0]
+
+    def tell(done: int, total: int) -> None:
+        progress(done - told[0])
+        told[0] = done
+
+    simulate(path, fem, data.loads, data.provenance, fem.batch, tell)
+    if whole:
+        note_seconds(path, clock.perf_counter() - begun)
+
+
+def simulating_seconds(study: Study) -> float | None:
+    """What `simulate_debulked` took; None where it was not done, or not in one run."""
+    return noted_seconds(_path(study))
+
+
+def _path(study: Study) -> Path:
+    return study.folder / "answers" / f"debulked-{study.digest}.h5"

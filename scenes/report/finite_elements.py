@@ -1,0 +1,145 @@
+"""A row of finite elements: each played load by itself, from rest, on this mesh or another."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim.accuracy import FLOOR, Accuracy, Precision
+from sim.anatomy import Anatomy
+from sim.effects import pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.discretisation.footprint import nearest_on
+from sim.loads import Loads, Pushed
+from sim.geometry.locate import locate
+from sim.material import Material, Tissue
+from sim.bodies.meshfile import read_anatomy, write_anatomy
+from sim.bodies.refine import refined
+from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
+
+from .adaptation import debulked
+from .row import (DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, of_times)
+from .study import Study
+
+OWN, HALVED = "own", "halved"
+# The tolerance of data sets.
+STANDARD = 1e-4
+
+
+@dataclass(frozen=True)
+class Elements:
+    """Finite elements; what is None is as the data's.
+
+    mesh: `OWN`, `HALVED` (every edge), or the nodes wanted of the template. Without a precision it is single, or double
+    below what that reaches.
+    """
+
+    name: str
+    law: str | None = None
+    element: str | None = None
+    mesh: str = OWN
+    tolerance: float = STANDARD
+    precision: Precision | None = None
+
+    @property
+    def accuracy(self) -> Accuracy:
+        """As the solver takes it."""
+        precision: Precision = "float32" if self.tolerance >= FLOOR["float32"] else "float64"
+        return Accuracy(tolerance=self.tolerance, precision=self.precision or precision)
+
+
+def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
+    """The row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
+
+    Raises
+    ------
+    InputError
+        What `Fem` refuses; a law that the data's tissue has no constants for.
+    """
+    body, own = body_of(study, spec.mesh), study.anatomy
+    begun = clock.perf_counter()
+    fem = _fem(study, spec, body)
+    set_up = clock.perf_counter() - begun
+    loads = study.played if spec.mesh == OWN else onto(body, study.played)
+    located = locate(body.mesh, own.mesh.nodes[own.tumour_nodes])
+    fem.deform(loads.rows(np.array([0])))  # kernels are compiled or loaded at their first launch
+    fields, good, seconds = [], [], []
+    for row in range(len(loads)):
+        begun = clock.perf_counter()
+        answer = fem.deform(loads.rows(np.array([row])))
+        seconds.append(clock.perf_counter() - begun)
+        fields.append(located.read(answer.displacement)[0])
+        good.append(answer.outcome[0].good)
+    field = np.array(fields)
+    row = Row(
+        spec.name,
+        "finite elements",
+        against=_against(study, spec),
+        reference=against_reference(study, field, np.array(good), own.tumour_nodes),
+        failed=good.count(False),
+        set_up=set_up,
+        adapt=_adapt(study, spec, loads.rows(np.array([0]))),
+        **of_times(seconds),
+    )
+    return row, field
+
+
+def _adapt(study: Study, spec: Elements, load: Loads) -> float:
+    """Seconds from the debulked body to its first answer; kernels are there already."""
+    body = debulked(body_of(study, spec.mesh))
+    begun = clock.perf_counter()
+    _fem(study, spec, body).deform(load)
+    return clock.perf_counter() - begun
+
+
+def _fem(study: Study, spec: Elements, body: Anatomy) -> Fem:
+    """Set up for single loads."""
+    effects = pushed_effects(body, tissue_of(study.tissue, spec.law))
+    return Fem(body, effects, spec.accuracy, study.device, None, spec.element or study.element, live=True)
+
+
+def _against(study: Study, spec: Elements) -> str:
+    """What the distance from the reference is."""
+    if tissue_of(study.tissue, spec.law) != study.tissue:
+        return DIFFERENCE
+    same = (spec.element or study.element) == "p2" and spec.mesh == (HALVED if study.fine else OWN)
+    return TOLERANCE_ALONE if same else ERROR
+
+
+def body_of(study: Study, mesh: str) -> Anatomy:
+    """The body on a mesh by name; meshes of the template are made once and kept."""
+    if mesh == OWN:
+        return study.anatomy
+    if mesh == HALVED:
+        return refined(study.anatomy)
+    path = study.folder / "meshes" / f"template_{mesh}.vtu"
+    if not path.exists():
+        write_anatomy(path, make_anatomy(template_subject(Tumour()), Plan(int(mesh))))
+    return read_anatomy(path)
+
+
+def tissue_of(tissue: Tissue, law: str | None) -> Tissue:
+    """The tissue with another law of the same constants.
+
+    Raises
+    ------
+    InputError
+        A tissue whose constants are not E and nu.
+    """
+    if law is None:
+        return tissue
+    if not isinstance(tissue, Material):
+        raise InputError(f"the data's tissue obeys {tissue.law}, whose constants no other law has: nothing to compare.")
+    return replace(tissue, law=law)
+
+
+def onto(body: Anatomy, loads: Loads) -> Loads:
+    """The same pushes at the nearest points of another mesh's open cortex."""
+    pushed = loads.of(Pushed)
+    assert pushed is not None
+    corners = body.mesh.nodes[body.open_surface]
+    return Loads((replace(pushed, point=np.array([nearest_on(corners, point) for point in pushed.point])),), loads.time)

@@ -1,0 +1,151 @@
+"""A row of a learner: taught without the discs, without the sectors, and with ever fewer loads."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.deformation import Deformer, Outcome
+from sim.loads import Loads
+from surrogate.evaluation.coverage import TENTHS, coverage
+from surrogate.training.published_models import MACHINES, published_nodes, taught
+from surrogate.evaluation.score import bare_microseconds, single_seconds
+from surrogate.data.direction_split import leave_sectors_out
+from surrogate.data.disc_split import Split
+from surrogate.evaluation.solve_counts import Told
+from surrogate.training.train import train
+
+from .adaptation import debulked_study, simulating_seconds
+from .reference import beyond_of
+from .row import Figures, Row, against_reference, figures_between, of_times
+from .series_time import series_seconds
+from .study import Study
+
+FEWEST_TAUGHT = 64
+
+
+@dataclass(frozen=True)
+class Learner:
+    """One of `surrogate.training.train.LEARNERS`, or of `surrogate.training.published_models.MACHINES`, which know every tenth vertex."""
+
+    name: str
+
+    def vertices(self, anatomy: Anatomy) -> np.ndarray:
+        """Those of the tumour (k,) that it knows."""
+        return published_nodes(anatomy) if self.name in MACHINES else anatomy.tumour_nodes
+
+
+def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
+    """The row, and displacements (n, k, 3) [m] of the vertices that it knows under the played loads.
+
+    Raises
+    ------
+    InputError
+        What `train` refuses.
+    """
+    nodes = spec.vertices(study.anatomy)
+    known = np.isin(study.anatomy.tumour_nodes, nodes)
+    truth = study.answers[:, known]
+
+    def judged(model: Deformer, split: Split) -> tuple[Figures | None, float]:
+        """Against the data's own answers to the loads that a split leaves out."""
+        rows = np.flatnonzero(split.test)
+        return _held(model, study.converged.rows(rows), truth[rows], nodes)
+
+    discs, sectors = study.discs, leave_sectors_out(study.pushed, study.patch)
+    begun = clock.perf_counter()
+    model, told = _taught(study, spec, discs, truth)
+    learning = clock.perf_counter() - begun
+    order = np.flatnonzero(discs.taught)
+    curve = []
+    for count in counts(len(order)):
+        left_aside = np.isin(np.arange(len(discs.disc)), order[count:])
+        fewer = replace(discs, disc=np.where(left_aside, -2, discs.disc))
+        curve.append((count, judged(_taught(study, spec, fewer, truth)[0], discs)[0]))
+    of_discs, of_sectors = judged(model, discs), judged(_taught(study, spec, sectors, truth)[0], sectors)
+    beyond = beyond_of(study)
+    outside = study.outside.rows(np.flatnonzero(beyond.good))
+    sets = {
+        "discs": of_discs,
+        "sectors": of_sectors,
+        "beyond": _held(model, outside, beyond.displacement[beyond.good][:, known], nodes),
+    }
+    field = model.deform(study.played, at=nodes).displacement
+    covered = _covered(study, spec, outside, beyond.displacement[beyond.good])
+    adapt, adapted = _adapted(study, spec)
+    held_out = study.converged.rows(np.flatnonzero(discs.test))
+    bare = bare_microseconds(model, held_out)
+    row = Row(
+        spec.name,
+        "learnt",
+        reference=against_reference(study, field, np.ones(len(field), bool), nodes),
+        teacher={name: figures for name, (figures, _) in sets.items() if figures is not None},
+        flagged={name: share for name, (_, share) in sets.items()},
+        covered=covered,
+        taught=told.loads,
+        units=told.units,
+        series=told.series,
+        inside=told.inside,
+        bare=None if bare is None else 1e-3 * bare,
+        solving=told.seconds,
+        learning=learning,
+        adapt=adapt,
+        adapted=adapted,
+        curve=tuple((count, each) for count, each in [*curve, (len(order), of_discs[0])] if each is not None),
+        **of_times(single_seconds(model, held_out, nodes, study.timed)),
+    )
+    return row, field
+
+
+def counts(most: int) -> list[int]:
+    """64, 128, 256, ... below `most`."""
+    return [FEWEST_TAUGHT << k for k in range(20) if FEWEST_TAUGHT << k < most]
+
+
+def _covered(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) -> dict[str, float]:
+    """How often bounds at 0.95 hold where nothing is promised; `truth` (B, n, 3) [m] of the loads `outside`."""
+    if spec.name in MACHINES:
+        return {}
+    trained = train(study.dataset, [spec.name], expansion=study.expansion)
+    model, found = trained.models[spec.name], trained.left_out.get(spec.name)
+    covered = {} if found is None else {"discs": found.held[0]}
+    if model.bounds is not None and len(outside) >= TENTHS:
+        covered["beyond"] = coverage(model, outside, truth).held[0]
+    return covered
+
+
+def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]:
+    """Seconds of simulating and learning the debulked body, and figures there; nothing where it was not simulated."""
+    seconds = simulating_seconds(study)
+    if seconds is None:
+        return None, None
+    after = debulked_study(study)
+    nodes = spec.vertices(after.anatomy)
+    truth = after.answers[:, np.isin(after.anatomy.tumour_nodes, nodes)]
+    begun = clock.perf_counter()
+    model, _ = _taught(after, spec, after.discs, truth)
+    seconds += clock.perf_counter() - begun + series_seconds(after, spec.name)
+    rows = np.flatnonzero(after.discs.test)
+    return seconds, _held(model, after.converged.rows(rows), truth[rows], nodes)[0]
+
+
+def _taught(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> tuple[Deformer, Told]:
+    """Fitted to the loads that a split teaches, and what it was told; truth (B, k, 3) [m] of all that converged."""
+    if spec.name not in MACHINES:
+        trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
+        told = trained.scores[0].told
+        assert told is not None
+        return trained.models[spec.name], told
+    rows = np.flatnonzero(split.taught)
+    told = Told(len(rows), 0, 0, 0, study.dataset.seconds("load", len(rows)))
+    return taught(spec.name, study.anatomy, study.converged.rows(rows), truth[rows]), told
+
+
+def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> tuple[Figures | None, float]:
+    """Figures against `truth` (B, k, 3) [m], and the share of the loads that the model calls extrapolated."""
+    answer = model.deform(loads, at=nodes)
+    flagged = [outcome is Outcome.EXTRAPOLATED for outcome in answer.outcome]
+    return figures_between(answer.displacement, truth, loads), float(np.mean(flagged)) if flagged else 0.0

@@ -1,0 +1,47 @@
+"""One row of the report, measured in a process of its own: what it takes of memory is its own too."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sim.errors import InputError
+from sim.runtime.threads import one_thread
+
+from ..bench.scaling import watched_card
+from ..bench.process_memory import peak_memory
+from .finite_elements import Elements, measure_elements
+from .learner import Learner, measure_learner
+from .row import Row
+from .study import Study
+
+Spec = Elements | Learner
+FAMILY = {Elements: "finite elements", Learner: "learnt"}
+
+
+def measured(study: Study, spec: Spec, picture: Path) -> Row:
+    """The row of a deformer, and the picture of its worst case; what cannot be had says why in `Row.state`."""
+    try:
+        with watched_card(study.device) as card:
+            row, field = measure_elements(study, spec) if isinstance(spec, Elements) else _on_one_core(study, spec)
+    except InputError as error:
+        return Row(spec.name, FAMILY[type(spec)], state=str(error))
+    row = replace(row, memory=peak_memory(), card=max(card) / 2**30 or None)
+    if field.shape[1] < len(study.anatomy.tumour_nodes):
+        return row  # what knows some vertices alone has no surface to draw
+    # What pictures take is not the row's.
+    from ar.screen import write_png
+
+    from .picture import worst_picture
+
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    write_png(picture, worst_picture(study, field))
+    return replace(row, picture=picture.name)
+
+
+def _on_one_core(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
+    """Products this small take longer on several, and say less."""
+    with one_thread():
+        return measure_learner(study, spec)

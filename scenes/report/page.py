@@ -1,0 +1,243 @@
+"""The report as files: a page that needs nothing else, plots, a table for spreadsheets, and every number as JSON."""
+
+from __future__ import annotations
+
+import csv
+import json
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from ar.screen import write_png
+from sim.runtime.atomic_files import written_whole
+from surrogate.evaluation.score import FEWEST_FOR_P999
+
+from .plots import against_solves, against_time, front, learners_against_time
+from .row import Figures, Row
+
+PLOTS = {"time": against_time, "learners": learners_against_time, "solves": against_solves}
+SETS = {
+    "discs": "whole discs of cortex left out",
+    "sectors": "whole sectors of direction left out",
+    "beyond": "beyond the taught range",
+}
+SPREAD_HEADS = (
+    "mean mm", "p95", "p99.9", "largest", "worst vertex mm: mean", "p95", "p99.9", "mean %", "p95", "p99.9", "largest",
+)  # fmt: skip
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1200px; margin: 2em auto; padding: 0 1em; }
+table { border-collapse: collapse; font-size: 13px; margin: 1em 0; }
+th, td { padding: 3px 8px; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top; white-space: nowrap; }
+th { background: #f4f4f4; } th:first-child, td:first-child { text-align: left; }
+tr.front td:first-child { font-weight: bold; } tr.pale td { color: #777; } img { max-width: 100%; }
+figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption { font-size: 13px; }
+.wide { overflow-x: auto; }
+"""
+NOTES = (
+    "Two errors, never mixed: from the reference, which says what a row is worth; and from its own teacher, which says "
+    "what learning lost. What obeys another law than the reference has a model difference instead of an error; the "
+    "reference's own elements, less exactly solved, show their tolerance alone and are not drawn.",
+    "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
+    "of those vertices. A row in bold, or full colour, is one that no other equals or beats in time and mean error.",
+    "Worst vertex: of each load the vertex with the largest distance; mean, p95 and p99.9 are over the loads. "
+    f"No p99.9 is told of fewer than {FEWEST_FOR_P999:,} loads.",
+    "Solves: all answers of finite elements that a row was told: loads, linear answers to unit forces at nodes of the "
+    "cortex, and terms of the power series. In discs: those that tell of the tumour from inside the discs left out. "
+    "The linear answers of the cortex beside the tumour are told everywhere; the cortex is not compared. Minutes: of "
+    "these solves, on the machine that made them, and of fitting.",
+    "Time: one load at a time, from rest, learners on one core; median, and p99 where at least 1,000 were timed. It is "
+    "of the whole answer, its bound and limits included, for which series have a kernel of their own. The model alone "
+    "in NumPy compares learners: it is one kind of code for all. "
+    "Set-up, compiling and warm-up are not in it. Memory: the largest resident size of the process that made and "
+    "played the row alone; card: what it took of the graphics card.",
+    "Bounds are promised for loads like those that were taught; how often they hold in discs of cortex and beyond the "
+    "range that were not is shown, but no model promises it. In discs it is that of a model, and loads, apart from the "
+    "figures beside it: some loads calibrate, and others stand in the discs.",
+    "Adapting: wall time until the row answers again after a fifth of the tumour is taken out of its middle: for "
+    "finite elements set-up and the first load, for what is learnt its solves and fitting, all anew; in brackets the "
+    "mean error then [mm], on discs left out, from the debulked body's own teacher.",
+)
+
+
+@dataclass(frozen=True)
+class Section:
+    """The rows of one data set, and sentences about data and reference."""
+
+    name: str
+    about: tuple[str, ...]
+    rows: tuple[Row, ...]
+
+
+def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> None:
+    """Write `index.html`, `report.json`, and for each section `NAME.csv` and its plots, each whole."""
+    bodies = []
+    for section in sections:
+        plots = []
+        for kind, plot in PLOTS.items():
+            picture = plot(section.rows)
+            if picture is not None:
+                write_png(folder / f"{section.name}-{kind}.png", picture)
+                plots.append(folder / f"{section.name}-{kind}.png")
+        _write_csv(folder / f"{section.name}.csv", section.rows)
+        bodies.append(_section(section, folder, plots))
+    with written_whole(folder / "report.json", ".json") as partial:
+        partial.write_text(json.dumps({"machine": machine, "sections": [asdict(section) for section in sections]}))
+    notes = "".join(f"<p>{escape(note)}</p>" for note in NOTES)
+    with written_whole(folder / "index.html", ".html") as partial:
+        partial.write_text(
+            f'<!doctype html><html lang="en"><meta charset="utf-8"><title>What accuracy costs in time</title>'
+            f"<style>{STYLE}</style><h1>What accuracy costs in time</h1>{''.join(bodies)}<h2>How to read this</h2>"
+            f"{notes}<p>{escape(machine)}. Research software, not a medical device.</p></html>\n"
+        )
+
+
+def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
+    measured = [row for row in section.rows if row.reference is not None]
+    learnt = [row for row in section.rows if row.teacher]
+    about = "".join(f"<p>{escape(sentence)}</p>" for sentence in section.about)
+    first, *others = [_picture(plot, plot.stem) for plot in plots] or [""]
+    pictures = [
+        f"<figure>{_picture(folder / 'pictures' / row.picture, row.name)}"
+        f"<figcaption>{escape(row.name)}</figcaption></figure>"
+        for row in measured
+        if row.picture
+    ]
+    return (
+        f"<h2>{escape(section.name)}</h2>{first}{about}"
+        f"<h3>Against the reference</h3>{_against_reference(section)}"
+        + (f"<h3>Against its own teacher</h3>{_against_teacher(learnt)}{''.join(others)}" if learnt else "")
+        + f"<h3>By tenths of the force</h3>{_by_force(measured, learnt)}"
+        "<h3>Worst cases</h3><p>The tumour as the row has it, and dashed in yellow where the reference has it; a pixel "
+        "is about 0.1 mm.</p>"
+        f"{''.join(pictures)}"
+    )
+
+
+def _against_reference(section: Section) -> str:
+    best = front(section.rows)
+    heads = (
+        "row", "distance", "loads", *SPREAD_HEADS, "median ms", "p99", "model in NumPy ms", "set-up s", "memory GiB",
+        "card", "solves", "in discs", "minutes", "adapting s",
+    )  # fmt: skip
+    lines = []
+    for row in section.rows:
+        if row.state != "measured":
+            lines.append(("pale", (row.name, row.state, *[""] * (len(heads) - 2))))
+            continue
+        minutes = None if row.learning is None else (row.learning + (row.solving or 0.0)) / 60.0
+        short = "" if row.solving is not None or row.taught is None else " of fitting"
+        cost = (row.median, row.p99, row.bare, row.set_up, row.memory, row.card)
+        cells = (
+            row.name, row.against, _count(row), *_spread(row.reference), *map(_text, cost), _solves(row),
+            "" if row.inside is None else str(row.inside), _text(minutes) + short, _adapting(row),
+        )  # fmt: skip
+        lines.append(("front" if row.name in best else "", cells))
+    return _table(heads, lines)
+
+
+def _adapting(row: Row) -> str:
+    if row.adapt is None:
+        return "not measured"
+    return _text(row.adapt) if row.adapted is None else f"{_text(row.adapt)} ({_text(row.adapted.mm.mean)})"
+
+
+def _solves(row: Row) -> str:
+    """What a row was told by finite elements, by kind."""
+    kinds = ((row.taught, ""), (row.units, " unit"), (row.series, " series"))
+    return " + ".join(f"{count}{kind}" for count, kind in kinds if count)
+
+
+def _count(row: Row) -> str:
+    loads = 0 if row.reference is None else row.reference.loads
+    return f"{loads}, {row.failed} failed" if row.failed else str(loads)
+
+
+def _against_teacher(rows: Sequence[Row]) -> str:
+    heads = (
+        "row", "loads of", "loads", *SPREAD_HEADS, "called extrapolated", "within 95 % bound",
+    )  # fmt: skip
+    return _table(
+        heads,
+        (
+            (
+                "",
+                (
+                    *(row.name, words, str(figures.loads), *_spread(figures)),
+                    *(_share(shares.get(name)) for shares in (row.flagged, row.covered)),
+                ),
+            )
+            for row in rows
+            for name, words in SETS.items()
+            if (figures := row.teacher.get(name)) is not None
+        ),
+    )
+
+
+def _share(share: float | None) -> str:
+    return "" if share is None else f"{100.0 * share:.0f} %"
+
+
+def _by_force(measured: Sequence[Row], learnt: Sequence[Row]) -> str:
+    """Of learners those against the teacher, of which there are more."""
+    lines = [(row.name, "reference", row.reference) for row in measured]
+    lines += [(row.name, "teacher", row.teacher["discs"]) for row in learnt if "discs" in row.teacher]
+    most = max((len(figures.tenths) for *_, figures in lines if figures), default=0)
+    heads = ("mean mm (largest)", "from", *(f"{k + 1}" for k in range(most)))
+    table = [
+        ("", (name, against, *(f"{_text(t.mean)} ({_text(t.largest)})" for t in figures.tenths)))
+        for name, against, figures in lines
+        if figures
+    ]
+    return _table(heads, table)
+
+
+def _spread(figures: Figures | None) -> tuple[str, ...]:
+    if figures is None:
+        return ("",) * len(SPREAD_HEADS)
+    worst = figures.worst
+    values = (*asdict(figures.mm).values(), worst.mean, worst.p95, worst.p999, *asdict(figures.percent).values())
+    return tuple("\N{EN DASH}" if value is None else _text(value) for value in values)
+
+
+def _text(value: float | None) -> str:
+    """Three digits, as people write them."""
+    if value is None:
+        return ""
+    return "< 0.0001" if 0.0 < value < 1e-4 else f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
+
+
+def _table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
+    """Lines of a class and cells."""
+    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    body = "".join(
+        f'<tr class="{kind}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>' for kind, cells in lines
+    )
+    return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
+
+
+def _picture(path: Path, words: str) -> str:
+    """A picture inside the page."""
+    data = b64encode(path.read_bytes()).decode()
+    return f'<img alt="{escape(words)}" src="data:image/png;base64,{data}">'
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """One line a row; a number inside others is named by the way to it, as in reference.mm.mean."""
+    lines = [dict(_flat(asdict(row))) for row in rows]
+    names = dict.fromkeys(name for line in lines for name in line)
+    with written_whole(path, ".csv") as partial, partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(names))
+        writer.writeheader()
+        writer.writerows(lines)
+
+
+def _flat(value: Any, name: str = "") -> Iterable[tuple[str, Any]]:
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else None
+    if inside is None:
+        yield name, value
+        return
+    for key, each in inside:
+        yield from _flat(each, f"{name}.{key}" if name else str(key))

@@ -1,0 +1,70 @@
+"""The camera's view of a row's worst case: the tumour as predicted, and where the reference has it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ar.camera import look_at
+from ar.hud import panel
+from ar.overlay import DASHED, composite, dash, outlines, silhouette
+from ar.renderer import render
+from sim.bodies.intensity import read_intensity, sidecar
+from sim.loads import Pushed
+from sim.geometry.ball_at_rest import resting_tip
+
+from .reference import reference_of
+from .study import Study
+from ..script.scene import Viewpoint, find_scene
+from ..script.shipped_files import template_path
+from ..script.site import Site, site_of
+from ..play.stage import TOOL, Stage
+from ..script.tool import Probe
+
+# So narrow that a pixel is a tenth of a millimetre.
+VIEW = Viewpoint(fov=np.radians(9.0), width=400, height=300)
+YELLOW = (255, 215, 50)
+
+
+def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 3) uint8 of the played load of the largest distance.
+
+    answer (n, k, 3) [m]: a row's displacements of the tumour's vertices.
+    """
+    truth, anatomy = reference_of(study), study.anatomy
+    tumour = np.isin(study.drawn, anatomy.tumour_nodes)
+    distance = np.linalg.norm(answer - truth.displacement[:, tumour], axis=2).max(axis=1) * truth.good
+    worst = int(distance.argmax())
+    there = anatomy.mesh.nodes.copy()
+    there[study.drawn] += truth.displacement[worst]
+    predicted = there.copy()
+    predicted[anatomy.tumour_nodes] = anatomy.mesh.nodes[anatomy.tumour_nodes] + answer[worst]
+    pushed = study.played.of(Pushed)
+    assert pushed is not None
+    site = site_of(anatomy)
+    scan = read_intensity(sidecar(template_path())) if study.of_template else None
+    middle = there[anatomy.tumour_nodes].mean(axis=0)
+    camera = look_at(VIEW.camera(site).centre, middle, site.up, VIEW.fov, VIEW.width, VIEW.height)
+    radius = float(pushed.footprint[worst])
+    tip = rested(site, pushed.point[worst], there, radius)
+    tool = Probe(radius)
+    stage = Stage(replace(find_scene("press"), viewpoint=VIEW, tool=tool), site, scan)
+    picture = render(camera, stage.layers(there, tool.pose(tip, site.axis, site.right)), stage.lamp)
+    shown = composite(picture, camera, stage.tumour(predicted), (TOOL,), "window").colour
+    reference = stage.tumour(there)
+    for outline in outlines(silhouette(camera, reference.vertices, reference.triangles)):
+        dash(shown, outline, YELLOW, DASHED)
+    force = float(np.linalg.norm(pushed.force[worst]))
+    lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"off by up to {1e3 * distance[worst]:.3f} mm"]
+    return panel(shown, lines)
+
+
+def rested(site: Site, point: np.ndarray, positions: np.ndarray, radius: float) -> np.ndarray:
+    """Return the tip (3,) [m] of a ball that pushes at a point: it touches the deformed cortex, and pierces it nowhere.
+
+    point (3,): at rest [m]; positions (V, 3): of all mesh vertices now [m]; radius of the ball [m].
+    """
+    place = point - site.origin
+    carried = site.contact(float(place @ site.right), float(place @ site.up), radius).carried(positions)
+    return resting_tip(positions, site.anatomy.open_surface, carried, site.axis, radius)

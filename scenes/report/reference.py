@@ -1,0 +1,100 @@
+"""What rows are held against: the reference's answers, kept load by load, and the teacher's beyond its own data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import REFERENCE, TRAIN
+from sim.effects import pushed_effects
+from sim.fem import Fem
+from sim.runtime.atomic_files import written_whole
+from sim.loads import Loads
+from sim.geometry.locate import Located, locate
+from sim.runtime.outside_files import read_as
+from sim.bodies.refine import refined
+
+from .study import Study
+
+# Loads that are solved together where a batch is worth it: a stop loses no more than these.
+TOGETHER = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Answers to n loads: displacement (n, k, 3) [m]; good (n,) bool, which converged; seconds (n,) that each took."""
+
+    displacement: np.ndarray
+    good: np.ndarray
+    seconds: np.ndarray
+
+
+def solve_reference(study: Study, progress: Callable[[int], object]) -> None:
+    """Solve the played loads with quadratic tetrahedra to 1e-8 in double precision, and keep each at `study.drawn`.
+
+    `progress` is told how many more are done. What is kept already is not solved again.
+    """
+
+    def made() -> tuple[Fem, Located]:
+        body = refined(study.anatomy) if study.fine else study.anatomy
+        fem = Fem(body, pushed_effects(body, study.tissue), REFERENCE, study.device, None, "p2")
+        return fem, locate(body.mesh, study.anatomy.mesh.nodes[study.drawn])
+
+    _solve(study, "reference", study.played, made, progress)
+
+
+def solve_beyond(study: Study, progress: Callable[[int], object]) -> None:
+    """Answer the loads beyond the taught ones as the data's own loads were answered, and keep each at the tumour."""
+
+    def made() -> tuple[Fem, Located]:
+        body = study.anatomy
+        fem = Fem(body, pushed_effects(body, study.tissue), TRAIN, study.device, None, study.element)
+        return fem, locate(body.mesh, body.mesh.nodes[body.tumour_nodes])
+
+    _solve(study, "beyond", study.outside, made, progress)
+
+
+def reference_of(study: Study) -> Truth:
+    """What `solve_reference` kept."""
+    return _read(study, "reference", len(study.played))
+
+
+def beyond_of(study: Study) -> Truth:
+    """What `solve_beyond` kept."""
+    return _read(study, "beyond", len(study.outside))
+
+
+def _solve(
+    study: Study, kind: str, loads: Loads, made: Callable[[], tuple[Fem, Located]], progress: Callable[[int], object]
+) -> None:
+    missing = np.array([row for row in range(len(loads)) if not _path(study, kind, row).exists()], int)
+    progress(len(loads) - len(missing))
+    if not len(missing):
+        return
+    fem, located = made()
+    for rows in np.array_split(missing, -(-len(missing) // min(fem.batch, TOGETHER))):
+        answer = fem.deform(loads.rows(rows))
+        for row, field, outcome in zip(rows, located.read(answer.displacement), answer.outcome, strict=True):
+            with written_whole(_path(study, kind, row), ".npz") as partial:
+                np.savez(partial, displacement=field, good=outcome.good, seconds=answer.cost.total / len(rows))
+        progress(len(rows))
+
+
+def _read(study: Study, kind: str, count: int) -> Truth:
+    kept = []
+    for row in range(count):
+        path = _path(study, kind, row)
+        with (
+            read_as(path, "an answer of the reference", "Delete it: it is made anew."),
+            path.open("rb") as raw,
+            np.load(raw) as file,
+        ):
+            kept.append([file[name] for name in ("displacement", "good", "seconds")])
+    return Truth(*(np.stack(part) for part in zip(*kept, strict=True)))
+
+
+def _path(study: Study, kind: str, row: int) -> Path:
+    return study.folder / "answers" / f"{kind}-{study.digest}-{row:04d}.npz"

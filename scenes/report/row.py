@@ -1,0 +1,205 @@
+"""What a row of the report holds: distances, milliseconds, memory, and what its making took."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from sim.loads import Loads, Pushed
+from surrogate.data.encode import directions
+from surrogate.evaluation.score import spread
+
+from .reference import reference_of
+from .study import Study
+
+# What a distance from the reference is: of the same law, of another, or of the reference's own elements.
+ERROR, DIFFERENCE, TOLERANCE_ALONE = "error", "model difference", "its tolerance alone"
+TENTHS, FEWEST_FOR_P99 = 10, 1000
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean, 95 and 99.9 percentile, and maximum of distances over load x vertex; no 99.9 percentile of few loads."""
+
+    mean: float
+    p95: float
+    p999: float | None
+    largest: float
+
+
+@dataclass(frozen=True)
+class Tenth:
+    """A tenth of the loads by force [N]: mean and largest distance [mm], and the mean in % of the motion."""
+
+    least: float
+    greatest: float
+    mean: float
+    largest: float
+    percent: float
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Distances between answers: how many loads and values, in mm and in % of each load's motion, by force.
+
+    `worst` is of each load's worst vertex, over the loads [mm].
+    """
+
+    loads: int
+    values: int
+    motion: float
+    mm: Spread
+    worst: Spread
+    percent: Spread
+    tenths: tuple[Tenth, ...]
+
+
+def figures_of(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> Figures | None:
+    """Figures of distances (B, n) [m] from `truth` (B, n, 3) [m] under forces (B,) [N]; None of no load.
+
+    A load's motion is the mean displacement of its n vertices in `truth`.
+    """
+    if not len(distance):
+        return None
+    motion = np.linalg.norm(truth, axis=2).mean(axis=1)
+    mm, percent = 1e3 * distance, 100.0 * distance / motion[:, None]
+    parts = [rows for rows in np.array_split(np.argsort(force, kind="stable"), TENTHS) if len(rows)]
+    tenths = (
+        Tenth(*(float(v) for v in (force[r].min(), force[r].max(), mm[r].mean(), mm[r].max(), percent[r].mean())))
+        for r in parts
+    )
+    return Figures(
+        len(distance),
+        distance.size,
+        1e3 * float(motion.mean()),
+        Spread(*spread(mm)),
+        Spread(*spread(mm.max(axis=1))),
+        Spread(*spread(percent)),
+        tuple(tenths),
+    )
+
+
+def figures_between(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> Figures | None:
+    """Figures of `answer` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
+    pushed = loads.of(Pushed)
+    assert pushed is not None
+    return figures_of(np.linalg.norm(answer - truth, axis=2), truth, directions(pushed)[0])
+
+
+def against_reference(study: Study, answer: np.ndarray, good: np.ndarray, nodes: np.ndarray) -> Figures | None:
+    """Figures of answers (n, k, 3) [m] at vertices (k,) to the played loads, if both are good: `good` (n,)."""
+    truth = reference_of(study)
+    rows = np.flatnonzero(good & truth.good)
+    known = np.isin(study.drawn, nodes)
+    return figures_between(answer[rows], truth.displacement[rows][:, known], study.played.rows(rows))
+
+
+def of_times(seconds: Sequence[float]) -> dict[str, Any]:
+    """What a row says of the wall times of single loads [s]."""
+    ms = 1e3 * np.array(seconds)
+    p99 = float(np.percentile(ms, 99.0)) if len(ms) >= FEWEST_FOR_P99 else None
+    return {"median": float(np.median(ms)), "p99": p99, "timed": len(ms)}
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured; None where nothing was.
+
+    Parameters
+    ----------
+    name, family
+        Of the deformer.
+    state
+        "measured", or a sentence that says why not.
+    against
+        `ERROR`; `DIFFERENCE` where its law is another; `TOLERANCE_ALONE` where its elements are the reference's own.
+    reference
+        Distances from the reference on the played loads.
+    teacher
+        Distances from its own teacher, by set of loads: "discs", "sectors", "beyond".
+    flagged
+        Share of each set that it calls extrapolated by itself.
+    covered
+        Share of the loads of "discs" and "beyond" whose largest error is within the bound at 0.95.
+    failed
+        Played loads that it found no answer to; they are in none of the figures.
+    median, p99
+        Milliseconds a load, one at a time; p99 of at least 1,000.
+    bare
+        Milliseconds a load of a learned model alone in NumPy: no bound, no limits, one kind of code for all learners.
+    timed
+        How many loads were timed.
+    set_up
+        Seconds before the first load.
+    memory, card
+        Of its process, and of the graphics card, at the peak [GiB].
+    taught, units, series
+        Solves of finite elements that it was told: loads, unit responses of the open cortex, terms of the series.
+    inside
+        Those of them inside the discs left out that tell of the tumour.
+    solving
+        Seconds of all these solves, if the data say.
+    learning
+        Seconds of fitting; the solves' are not among them.
+    adapt
+        Seconds until it answers again when the tumour is debulked by a fifth: set-up, or solves and fitting, anew.
+    adapted
+        Distances from the teacher of the debulked body then, on discs left out; None of finite elements.
+    curve
+        Distances from the teacher on the discs, by number of loads taught.
+    picture
+        PNG in the report's folder: the played load of the largest distance from the reference.
+    """
+
+    name: str
+    family: str
+    state: str = "measured"
+    against: str = ERROR
+    reference: Figures | None = None
+    teacher: Mapping[str, Figures] = field(default_factory=dict)
+    flagged: Mapping[str, float] = field(default_factory=dict)
+    covered: Mapping[str, float] = field(default_factory=dict)
+    failed: int = 0
+    median: float | None = None
+    p99: float | None = None
+    bare: float | None = None
+    timed: int = 0
+    set_up: float | None = None
+    memory: float | None = None
+    card: float | None = None
+    taught: int | None = None
+    units: int | None = None
+    series: int | None = None
+    inside: int | None = None
+    solving: float | None = None
+    learning: float | None = None
+    adapt: float | None = None
+    adapted: Figures | None = None
+    curve: tuple[tuple[int, Figures], ...] = ()
+    picture: str | None = None
+
+
+def row_to_json(row: Row) -> str:
+    """Text that `row_from_json` reads."""
+    return json.dumps(asdict(row))
+
+
+def row_from_json(text: str) -> Row:
+    """The row that `row_to_json` wrote."""
+    stored: dict[str, Any] = json.loads(text)
+    for name in ("reference", "adapted"):
+        stored[name] = _figures(stored[name])
+    stored["teacher"] = {name: _figures(each) for name, each in stored["teacher"].items()}
+    stored["curve"] = tuple((taught, _figures(each)) for taught, each in stored["curve"])
+    return Row(**stored)
+
+
+def _figures(stored: dict[str, Any] | None) -> Figures | None:
+    if stored is None:
+        return None
+    spreads = {name: Spread(**stored[name]) for name in ("mm", "worst", "percent")}
+    return Figures(**{**stored, **spreads, "tenths": tuple(Tenth(**each) for each in stored["tenths"])})

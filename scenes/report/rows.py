@@ -1,0 +1,114 @@
+"""The rows of the report: which there are, and a run that goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, replace
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import FLOOR, Precision
+from sim.runtime.atomic_files import written_whole
+from sim.material import LAWS
+from sim.geometry.tetmesh import digest_of
+from surrogate.training.published_models import MACHINES
+from surrogate.training.train import LEARNERS
+
+from .finite_elements import HALVED, OWN, STANDARD, Elements
+from .learner import Learner
+from .row import Row, row_from_json, row_to_json
+from .measure import FAMILY, Spec, measured
+from .study import Study
+
+# The state of rows that nothing is wrong with.
+LATER = "not built yet"
+UNBUILT = ("mass-spring", "meshless", "boundary element", "geometry-based")
+ELEMENTS = ("p1", "smoothed", "p2")
+MESHES = {"2.5k": "2500", "17k": "17000"}
+TOLERANCES = (1e-2, 1e-3, STANDARD, 1e-5, 1e-6)
+Run = Callable[[Study, Spec, Path], Row]
+
+
+def star(study: Study, remesh: bool = True) -> tuple[Elements, ...]:
+    """The data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`."""
+    meshes = {} if not remesh else MESHES if study.of_template else {"halved edges": HALVED}
+    return (
+        Elements("FEM"),
+        *(Elements(f"FEM {name}", element=name) for name in ELEMENTS if name != study.element),
+        *(Elements(f"FEM {name}", mesh=mesh) for name, mesh in meshes.items()),
+        *(Elements(f"FEM {_power(size)}", tolerance=size) for size in TOLERANCES if size != STANDARD),
+        Elements("FEM float64", precision="float64"),
+        *(Elements(f"FEM {law} law", law=law) for law in LAWS if law != study.tissue.law),
+    )
+
+
+def every(study: Study) -> tuple[Elements, ...]:
+    """All of the star's laws, elements, meshes, tolerances and precisions with each other."""
+    meshes = {OWN: OWN, **(MESHES if study.of_template else {"halved edges": HALVED})}
+    precisions: tuple[Precision, ...] = ("float32", "float64")
+    return tuple(
+        Elements(f"FEM {law} {element} {name} {_power(size)} {precision}", law, element, mesh, size, precision)
+        for law, element, (name, mesh), size, precision in product(
+            LAWS, ELEMENTS, meshes.items(), TOLERANCES, precisions
+        )
+        if size >= FLOOR[precision]
+    )
+
+
+def learners() -> tuple[Learner, ...]:
+    """Whatever `surrogate` knows, the published ones last."""
+    return tuple(Learner(name) for name in (*LEARNERS, *MACHINES))
+
+
+def apart(study: Study, spec: Spec, picture: Path) -> Row:
+    """Measured in a process of its own."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        try:
+            # What the study has read already stays here.
+            return pool.submit(measured, replace(study), spec, picture).result()
+        except BrokenProcessPool:
+            return Row(spec.name, FAMILY[type(spec)], state="its process was ended, for want of memory most likely")
+
+
+def rows(study: Study, specs: Sequence[Spec], run: Run = apart) -> Iterator[Row]:
+    """A row for each of the `specs`, then the empty ones; those whose inputs are the same as before are read.
+
+    A row is kept as soon as it is measured, unless it could not be.
+    """
+    for spec in specs:
+        stem = f"{study.data.stem} {spec.name}".replace(" ", "-")
+        path = study.folder / "rows" / f"{stem}.json"
+        digest = _digest(study, spec)
+        kept = _kept(path, digest)
+        if kept is None:
+            kept = run(study, spec, study.folder / "pictures" / f"{stem}.png")
+            if kept.state == "measured":
+                with written_whole(path, ".json") as partial:
+                    partial.write_text(json.dumps({"digest": digest, "row": json.loads(row_to_json(kept))}))
+        yield kept
+    yield from (Row(name, name, state=LATER) for name in UNBUILT)
+
+
+def _power(tolerance: float) -> str:
+    """0.01 as 1e-2."""
+    return f"{tolerance:.0e}".replace("e-0", "e-")
+
+
+def _digest(study: Study, spec: Spec) -> str:
+    stated = f"{study.digest} {study.timed} {study.device} {type(spec).__name__} {sorted(asdict(spec).items())}"
+    return digest_of(np.frombuffer(stated.encode(), np.uint8))
+
+
+def _kept(path: Path, digest: str) -> Row | None:
+    """The row in a file, if it is there, whole, and of the same inputs."""
+    try:
+        stored = json.loads(path.read_text())
+        return row_from_json(json.dumps(stored["row"])) if stored["digest"] == digest else None
+    except (OSError, ValueError, LookupError, TypeError):
+        return None

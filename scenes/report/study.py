@@ -1,0 +1,145 @@
+"""What a report plays: loads of the discs of cortex that no learner saw, and loads beyond all that were taught."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.loads import Loads, Pushed
+from sim.material import BRAIN, Tissue, tissue_from_json
+from sim.geometry.tetmesh import digest_of
+from sim.bodies.meshfile import read_anatomy
+from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.encode import directions
+from surrogate.training.shared_inputs import Expansion
+from surrogate.data.cortex_patch import Patch, open_patch
+from surrogate.data.disc_split import Split, leave_discs_out
+
+from .extrapolated_loads import loads_beyond
+from ..script.shipped_files import template_path
+
+
+@dataclass(frozen=True)
+class Study:
+    """One data set, and how much of it is played.
+
+    Parameters
+    ----------
+    data
+        A data set of `sulcus simulate`: its anatomy, tissue, element and loads are the report's.
+    folder
+        Where meshes and answers are kept.
+    device
+        "auto", "cpu" or "cuda".
+    loads, beyond, timed
+        Held-out loads that are held against the reference; loads beyond the taught ones; single loads that are timed.
+    fine
+        Whether the reference's mesh has every edge halved.
+    """
+
+    data: Path
+    folder: Path
+    device: str = "auto"
+    loads: int = 64
+    beyond: int = 120
+    timed: int = 1000
+    fine: bool = False
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The data."""
+        return read_dataset(self.data)
+
+    @cached_property
+    def expansion(self) -> Expansion:
+        """The series of its finite elements, which every training on the data shares."""
+        return Expansion(self.dataset, self.device, kept=self.folder / "answers" / f"series-{self.digest}.npz")
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The body."""
+        return self.dataset.anatomy
+
+    @cached_property
+    def of_template(self) -> bool:
+        """Whether the body is the one that ships, of which other meshes can be made."""
+        return self.anatomy.digest == read_anatomy(template_path()).digest
+
+    @cached_property
+    def tissue(self) -> Tissue:
+        """The tissue that the data was made with."""
+        stated = self.dataset.provenance.get("tissue")
+        return BRAIN if stated is None else tissue_from_json(stated)
+
+    @property
+    def element(self) -> str:
+        """The element that the data was made with."""
+        return self.dataset.provenance.get("element", "p1")
+
+    @cached_property
+    def patch(self) -> Patch:
+        """The open cortex."""
+        return open_patch(self.anatomy)
+
+    @cached_property
+    def drawn(self) -> np.ndarray:
+        """Sorted vertices (m,) of tumour and open cortex: where the reference is read."""
+        return np.union1d(self.patch.nodes, self.anatomy.tumour_nodes)
+
+    @cached_property
+    def converged(self) -> Loads:
+        """The loads of the data that converged; a split has a row for each."""
+        return self.dataset.loads.rows(np.flatnonzero(self.dataset.good))
+
+    @property
+    def pushed(self) -> Pushed:
+        """Of `converged`.
+
+        Raises
+        ------
+        InputError
+            Loads of another kind.
+        """
+        pushed = self.converged.only(Pushed)
+        if pushed is None:
+            raise InputError(f"{self.data}: holds other loads than pushes: simulate pushes.")
+        return pushed
+
+    @cached_property
+    def answers(self) -> np.ndarray:
+        """The data's own answers (B, k, 3) [m] to `converged`, at the tumour's vertices."""
+        return self.dataset.displacement(self.anatomy.tumour_nodes)[self.dataset.good]
+
+    @cached_property
+    def discs(self) -> Split:
+        """Discs of cortex left out."""
+        return leave_discs_out(self.pushed.point, self.patch)
+
+    @cached_property
+    def played(self) -> Loads:
+        """Loads of the left-out discs, spread evenly over their forces."""
+        rows = np.flatnonzero(self.discs.test)
+        rows = rows[np.argsort(directions(self.pushed)[0][rows], kind="stable")]
+        chosen = np.unique(np.linspace(0, len(rows) - 1, min(self.loads, len(rows))).round().astype(int))
+        return self.converged.rows(rows[chosen])
+
+    @cached_property
+    def outside(self) -> Loads:
+        """Loads beyond those taught: stronger, more oblique, nearer to the rim, in equal parts."""
+        pushed = self.converged.rows(np.flatnonzero(self.discs.test)).of(Pushed)
+        taught = self.converged.rows(np.flatnonzero(self.discs.taught)).of(Pushed)
+        assert pushed is not None and taught is not None
+        return loads_beyond(self.patch, taught, pushed, self.beyond)
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of what every answer here depends on."""
+        data = self.dataset
+        stated = repr((sorted(data.provenance.items()), self.loads, self.beyond, self.fine, version("sulcus")))
+        return digest_of(np.frombuffer(stated.encode(), np.uint8), data.good, *vars(self.pushed).values())

@@ -1,0 +1,1 @@
+"""What a scene is: tool paths, site, tool, posture, debulking."""

@@ -1,0 +1,296 @@
+"""What a scene is: effects, a scripted tool, a camera, an accuracy and the bounds that its figures must keep."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from numbers import Real
+from pathlib import Path as FilePath
+from typing import Any, cast
+
+import numpy as np
+
+from ar.camera import Camera, look_at
+from sim.accuracy import LIVE, Accuracy
+from sim.anatomy import Anatomy
+from sim.bodies.open_cortex import Place
+from sim.effects import (
+    Bonded,
+    Effect,
+    Elasticity,
+    Gravity,
+    Held,
+    Resection,
+    Retraction,
+    SkullContact,
+    ToolContact,
+    ToolForce,
+)
+from sim.errors import InputError
+from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
+from sim.material import Material, Tissue
+from sim.runtime.user_script import run_script, told
+
+from .debulking import Debulking
+from .head_posture import Lie, supine
+from .site import Site
+from .tool import Instrument, Probe
+from .tool_paths import AIR, Path, Touch, idle
+
+# So far under the cortex a camera looks: between the tool and the tumour [m].
+UNDER = 10e-3
+# Of a scene: an hour at 30 a second.
+MOST_FRAMES = 108_000
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera by its place relative to the open cortex: from the side, for a tool moves a tumour mostly downwards.
+
+    distance [m] from the site; tilt [rad] of the way to the camera, from the outward normal towards the site's `up`;
+    vertical field of view [rad]; size of the picture [pixel].
+    """
+
+    distance: float = 0.20
+    tilt: float = -0.8
+    fov: float = np.radians(16.0)
+    width: int = 640
+    height: int = 480
+
+    def camera(self, site: Site) -> Camera:
+        """The camera that looks at a site."""
+        outward = -np.cos(self.tilt) * site.axis + np.sin(self.tilt) * site.up
+        target = site.origin + UNDER * site.axis
+        return look_at(target + self.distance * outward, target, site.up, self.fov, self.width, self.height)
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the figures of a scene must keep for it to pass.
+
+    Parameters
+    ----------
+    overlap
+        Least intersection over union of the drawn tumour's silhouette and the finite elements'.
+    error
+        Largest mean distance between the predicted tumour and the finite elements' [m].
+    pixels
+        Largest difference between our projection and OpenCV's [pixel].
+    drawn
+        How far the outline in the picture may be from where the finite elements have it [pixel].
+    """
+
+    overlap: float = 0.95
+    error: float = 0.3e-3
+    pixels: float = 1e-3
+    drawn: float = 2.0
+
+
+PALPATION = Probe()
+# A tool that is stopped by less is where it was asked for [m].
+SHORT = 0.1e-3
+HANDLED = (ToolForce, ToolContact, Retraction)
+"""Effects that need a tool in somebody's hand."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One scripted scene. Times in seconds; what acts at a time follows from its effects.
+
+    Parameters
+    ----------
+    path, tool
+        What the hand does, and with what; without a tool none is in view.
+    lying
+        How the head lies, where `Gravity` is asked for.
+    surgery
+        What is cut, if anything.
+    element
+        One of `sim.discretisation.space.ELEMENTS`; None: the one that is recommended for the mesh.
+
+    Raises
+    ------
+    InputError
+        A tool's force or pose without a tool; a duration or a frame rate that is no number, not above 0, or of more
+        than `MOST_FRAMES` frames.
+    """
+
+    name: str
+    title: str
+    path: Path = idle
+    duration: float = 4.0
+    effects: tuple[Effect, ...] = (Elasticity(), Held(), Bonded(), ToolForce())
+    tool: Instrument | None = PALPATION
+    lying: Lie = supine
+    surgery: Debulking | None = None
+    viewpoint: Viewpoint = Viewpoint()
+    element: str | None = None
+    accuracy: Accuracy = LIVE
+    bounds: Bounds = Bounds()
+    frames_per_second: float = 30.0
+
+    def __post_init__(self) -> None:
+        for what in ("duration", "frames_per_second"):
+            number = getattr(self, what)
+            if not isinstance(number, Real) or not 0.0 < float(number) < np.inf:
+                raise InputError(f"the scene {self.name} has {what} {number!r}: give a number above 0.")
+        if float(self.duration) * float(self.frames_per_second) > MOST_FRAMES:
+            raise InputError(
+                f"the scene {self.name} lasts {self.duration:g} s at {self.frames_per_second:g} frames a second: "
+                f"that is more than {MOST_FRAMES:,} frames. Give a shorter duration, or fewer a second."
+            )
+        needs = [type(effect).__name__ for effect in self.effects if isinstance(effect, HANDLED)]
+        if self.tool is None and needs:
+            raise InputError(
+                f"the scene {self.name} asks for {needs[0]}, but has no tool: give it one, or leave it out."
+            )
+
+    def made_of(self, tissue: Tissue | None, element: str | None) -> Scene:
+        """The scene with another tissue, element, or both; tissue that relaxes goes on relaxing by the same series.
+
+        Raises
+        ------
+        InputError
+            A law that cannot relax, in a scene whose tissue does.
+        """
+        if tissue is None:
+            return self if element is None else replace(self, element=element)
+
+        def made(effect: Effect) -> Effect:
+            if not isinstance(effect, Elasticity):
+                return effect
+            relaxes = () if effect.default is None else effect.default.prony
+            series = {"prony": relaxes} if relaxes and not tissue.prony else {}
+            return replace(effect, default=replace(cast(Any, tissue), **series))
+
+        return replace(self, effects=tuple(made(effect) for effect in self.effects), element=element or self.element)
+
+    @property
+    def times(self) -> np.ndarray:
+        """Time of every frame (n,) [s]."""
+        return np.arange(round(self.duration * self.frames_per_second) + 1) / self.frames_per_second
+
+    def effects_on(self, anatomy: Anatomy) -> tuple[Effect, ...]:
+        """Its effects, with those that depend on the body: from a skull that is held no brain comes off."""
+        gone = () if anatomy.slide_normal.any() else (SkullContact,)
+        kept = tuple(effect for effect in self.effects if not isinstance(effect, gone))
+        return kept if self.surgery is None else (*kept, _resection(self.surgery, anatomy))
+
+    def contact(self, site: Site, touch: Touch) -> Place:
+        """The material point that the tool touches."""
+        assert self.tool is not None
+        return site.contact(touch.x, touch.y, self.tool.radius)
+
+    @property
+    def posed(self) -> bool:
+        """Whether the hand moves its tool, instead of pushing with it."""
+        return any(isinstance(effect, ToolContact | Retraction) for effect in self.effects)
+
+    def tip(self, site: Site, touch: Touch) -> np.ndarray:
+        """Where a tool that is moved would touch first (3,) [m]; the bone's edge stops it."""
+        assert self.tool is not None
+        asked = self.contact(site, touch).point + touch.depth * site.direction(touch)
+        return site.within(asked, self.tool.radius)
+
+    def stopped(self, site: Site, touch: Touch) -> str:
+        """Say that the bone's edge stops the tool short of where a touch asks for it; empty where it does not."""
+        if self.tool is None:
+            return ""
+        asked = site.origin + touch.x * site.right + touch.y * site.up
+        if self.posed:
+            asked = asked + touch.depth * site.direction(touch)
+        beyond = float(site.across(asked[None])[0]) - site.reach(self.tool.radius)
+        return f"the bone's edge stops the tool {1e3 * beyond:.1f} mm short" if beyond > SHORT else ""
+
+    def pose(self, site: Site, touch: Touch) -> np.ndarray:
+        """T_world_tool (4, 4) of a tool that is moved; it faces the tissue whichever way it is moved."""
+        assert self.tool is not None
+        return self.tool.pose(self.tip(site, touch), site.axis, site.right)
+
+    def loads(self, site: Site, touch: Touch, time: float) -> Loads:
+        """One load case: the cause of every effect that has one; where none has, time alone goes on."""
+        causes = (self._cause(effect, site, touch, time) for effect in self.effects_on(site.anatomy))
+        return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
+
+    def _cause(self, effect: Effect, site: Site, touch: Touch, time: float) -> Cause | None:
+        """What an effect of the scene is told at a moment."""
+        match effect:
+            case ToolForce():
+                return self._pushed(site, touch)
+            case Resection():
+                assert self.surgery is not None
+                return Resected(np.array([self.surgery.done(time)]))
+            case ToolContact():
+                return Touching(self.pose(site, touch)[None, None])
+            case Retraction():
+                laid = self.pose(site, replace(touch, depth=-AIR))
+                return Retracted(laid[None], (self.pose(site, touch) - laid)[None, :3, 3])
+            case Gravity():
+                return self.lying(time).posture(site.anatomy.mesh.nodes)
+            case _:
+                return None
+
+    def _pushed(self, site: Site, touch: Touch) -> Pushed:
+        assert self.tool is not None
+        force = touch.force * site.direction(touch)
+        return Pushed(self.contact(site, touch).point[None], force[None], np.array([self.tool.radius]))
+
+
+@lru_cache(8)
+def _resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
+    """Each frame asks for it."""
+    return surgery.resection(anatomy)
+
+
+SCENES = ("press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation")
+"""The built-in scenes, each a module of this room that exports SCENE."""
+
+
+def find_scene(name: str) -> Scene:
+    """A built-in scene by name, or the SCENE of a user's own file by its path, which ends in .py.
+
+    The file is run as any Python file is: with all the rights of who runs it.
+
+    Raises
+    ------
+    InputError
+        No scene of that name; a file that is missing, does not run, has no SCENE, one whose path gives no Touch, or one
+        of a tissue that fails `sim.terms.laws.conformance.check_tissue`.
+    """
+    if name.endswith(".py"):
+        return _own_scene(name)
+    if name not in SCENES:
+        raise InputError(
+            f"no scene is called {name!r}: choose one of {', '.join(SCENES)}, or name a file of your own, MY_SCENE.py."
+        )
+    return importlib.import_module(f"scenes.builtin.{name}").SCENE
+
+
+def _own_scene(path: str) -> Scene:
+    from sim.terms.laws.conformance import check_tissue
+
+    found = getattr(run_script(path), "SCENE", None)
+    if found is None:
+        raise InputError(f"{path}: has no SCENE. Let it say SCENE = Scene(...), as the built-in scenes do.")
+    if not isinstance(found, Scene):
+        raise InputError(f"{path}: its SCENE is a {type(found).__name__}. Make it a scenes.script.scene.Scene.")
+    for time in found.times.tolist():
+        try:
+            touch = found.path(time)
+        except Exception as error:
+            raise InputError(told(FilePath(path).absolute(), error)) from error
+        if not isinstance(touch, Touch):
+            what = type(touch).__name__
+            raise InputError(
+                f"{path}: at {time:g} s its path gives a {what}. Make it a scenes.script.tool_paths.Touch."
+            )
+    for effect in found.effects:
+        if isinstance(effect, Elasticity):
+            for tissue in (effect.default, *effect.regions.values()):
+                if tissue is not None and type(tissue) is not Material:  # ours are tested
+                    try:
+                        check_tissue(tissue)
+                    except InputError as error:
+                        raise InputError(f"{path}: {error} docs/extend.md says what a law is held to.") from error
+    return found

@@ -1,0 +1,55 @@
+"""The open cortex as a place to work at: where a hand touches it, and which way it goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.bodies.open_cortex import OpenCortex, Place, open_cortex
+
+from .tool_paths import Touch
+
+# Radius of the drape's hole over that of the largest circle of open cortex: its rim hides the mesh's ragged border.
+HOLE = 0.98
+
+
+@dataclass(frozen=True, eq=False)
+class Site(OpenCortex):
+    """The open cortex, and what a hand asks of it."""
+
+    def reach(self, radius: float) -> float:
+        """How far from the line through the origin along the axis the bone lets a tool of this `radius` go [m]."""
+        return max(0.0, HOLE * self.clearance - radius)
+
+    def within(self, point: np.ndarray, radius: float) -> np.ndarray:
+        """The point (3,) [m], brought back across the axis to where the bone stops a tool of this `radius` [m]."""
+        arm = point - self.origin
+        aside = arm - (arm @ self.axis) * self.axis
+        length = float(np.linalg.norm(aside))
+        return point - max(0.0, 1.0 - self.reach(radius) / max(length, np.finfo(float).tiny)) * aside
+
+    def contact(self, x: float, y: float, radius: float) -> Place:
+        """The material point of the open cortex nearest to the place (x, y) [m] of its tangent plane.
+
+        A tool of this `radius` [m] stays inside the opening: the place is brought back to where the bone stops it.
+        """
+        return self.nearest(self.within(self.origin + x * self.right + y * self.up, radius))
+
+    def direction(self, touch: Touch) -> np.ndarray:
+        """Unit direction (3,) of a touch's force: inwards, tilted."""
+        along = self.axis + np.tan(touch.tilt[0]) * self.right + np.tan(touch.tilt[1]) * self.up
+        return along / np.linalg.norm(along)
+
+
+def site_of(anatomy: Anatomy) -> Site:
+    """The frame of an anatomy's open cortex.
+
+    Raises
+    ------
+    InputError
+        An anatomy without open cortex.
+    """
+    frame = open_cortex(anatomy)
+    return Site(anatomy, frame.origin, frame.axis, frame.right, frame.up)

@@ -1,6 +1,0 @@
-"""A palpation ball slides across the cortex over the tumour with steady force."""
-
-from .paths import slide
-from .scene import Scene
-
-SCENE = Scene("slide", __doc__ or "", slide(0.2, start=(-0.012, -0.006), end=(0.012, 0.006), seconds=3.0), duration=4.0)

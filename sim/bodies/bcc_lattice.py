@@ -1,0 +1,145 @@
+"""A graded body-centred cubic lattice of tetrahedra: what `isosurface_stuffing` carves bodies from.
+
+A 2:1 balanced octree, filled with tetrahedra as in Labelle & Shewchuk 2007, "Isosurface Stuffing: Fast Tetrahedral
+Meshes with Good Dihedral Angles", section 3: between cells of one size the BCC tetrahedra (dihedral angles 60 and 90
+degrees), between cells of two sizes pyramids split along the diagonal through the larger face's middle (at least 45).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+NEIGHBOURS = np.ones((3, 3, 3), bool)
+# Corners of a square face in the two tangential axes, in turn; each edge k joins corners k and k + 1.
+SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+
+Sizing = Callable[[np.ndarray], np.ndarray]
+"""Wanted cell size (n,) [m] at points (n, 3) [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Tetrahedra that fill a box.
+
+    nodes (V, 3) [m]; tets (T, 4), positively oriented; centre (V,) bool: the node is the middle of a cell, not a
+    corner (an edge that joins the two kinds is a short one, any other a long one).
+    """
+
+    nodes: np.ndarray
+    tets: np.ndarray
+    centre: np.ndarray
+
+
+def graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, levels: int, size: Sizing) -> Lattice:
+    """The lattice over the box from `low` (3,) to `high` (3,) [m].
+
+    Cells of edge `coarsest` [m] are halved up to `levels` times where they are larger than `size` asks for.
+    Neighbours, diagonal ones too, differ by one halving at most.
+    """
+    count = np.ceil((high - low) / coarsest).astype(int)
+    origin = 0.5 * (low + high) - 0.5 * coarsest * count
+    exists, split = _octree(origin, count, coarsest, levels, size)
+    unit = coarsest / 2 ** (levels + 1)  # half the finest cell: every node has whole coordinates
+    span = count * 2 ** (levels + 1) + 1
+
+    leaves = [there & ~halved for there, halved in zip(exists, split, strict=True)]
+    corners = [np.argwhere(leaf) * 2 ** (levels + 1 - level) for level, leaf in enumerate(leaves)]
+    known = np.unique(
+        np.concatenate(
+            [
+                _key((at[:, None] + 2 ** (levels + 1 - level) * np.indices((2, 2, 2)).reshape(3, 8).T), span).ravel()
+                for level, at in enumerate(corners)
+            ]
+        )
+    )
+    cells: list[np.ndarray] = []
+    for level in range(levels + 1):
+        edge = 2 ** (levels + 1 - level)
+        for axis in range(3):
+            cells += _between_equals(leaves[level], axis, edge, known, span)
+            cells += _between_unequals(leaves[level], exists[level], axis, edge)
+    corners_of_tets = np.concatenate(cells)
+    keys, tets = np.unique(_key(corners_of_tets, span), return_inverse=True)
+    whole = np.stack(np.unravel_index(keys, span), axis=1)
+    return Lattice(origin + unit * whole, tets.reshape(-1, 4), ~np.isin(keys, known))
+
+
+def _octree(
+    origin: np.ndarray, count: np.ndarray, coarsest: float, levels: int, size: Sizing
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Per level, which cells exist and which of them are halved (dense boolean arrays)."""
+    split = []
+    there = np.ones(count, bool)
+    for level in range(levels):
+        edge = coarsest / 2**level
+        index = np.argwhere(there)
+        halved = np.zeros(there.shape, bool)
+        halved[tuple(index.T)] = size(origin + edge * (index + 0.5)) < edge
+        split.append(halved)
+        there = _children(halved)
+    split.append(np.zeros(count * 2**levels, bool))
+    for level in range(levels - 1, 0, -1):  # balance: a halved cell's neighbours exist, so their parents are halved
+        grown = ndimage.binary_dilation(split[level], NEIGHBOURS)
+        split[level - 1] |= grown.reshape(*np.stack([count * 2 ** (level - 1), [2, 2, 2]], 1).ravel()).any((1, 3, 5))
+    return [np.ones(count, bool), *[_children(halved) for halved in split[:-1]]], split
+
+
+def _children(halved: np.ndarray) -> np.ndarray:
+    return halved.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+
+
+def _key(whole: np.ndarray, span: np.ndarray) -> np.ndarray:
+    """One number for whole coordinates (..., 3)."""
+    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(whole, -1, 0)), tuple(span)))
+
+
+def _face(corner: np.ndarray, axis: int, edge: int, upper: bool) -> np.ndarray:
+    """Corners (n, 4, 3), in turn, of the lower or upper face across `axis` of cells at `corner` (n, 3)."""
+    offset = np.zeros((4, 3), int)
+    offset[:, [(axis + 1) % 3, (axis + 2) % 3]] = SQUARE * edge
+    offset[:, axis] = edge * upper
+    return corner[:, None] + offset
+
+
+def _between_equals(leaf: np.ndarray, axis: int, edge: int, known: np.ndarray, span: np.ndarray) -> list[np.ndarray]:
+    """BCC tetrahedra round each face between two leaves of one size, halved where an edge has a middle node."""
+    ahead = np.delete(leaf, 0, axis)
+    corner = np.argwhere(np.delete(leaf, -1, axis) & ahead) * edge
+    below = corner + edge // 2
+    above = below + edge * np.eye(3, dtype=int)[axis]
+    square = _face(corner, axis, edge, upper=True)
+    tets = []
+    for k in range(4):
+        start, end = square[:, k], square[:, (k + 1) % 4]
+        middle = (start + end) // 2
+        halved = np.isin(_key(middle, span), known)
+        tets.append(np.stack([below, above, start, end], 1)[~halved])
+        tets.append(np.stack([below, above, start, middle], 1)[halved])
+        tets.append(np.stack([below, above, middle, end], 1)[halved])
+    return tets
+
+
+def _between_unequals(leaf: np.ndarray, exists: np.ndarray, axis: int, edge: int) -> list[np.ndarray]:
+    """Split pyramids on both sides of each face between a leaf and a leaf of twice its size."""
+    tets = []
+    for step in (-1, 1):
+        neighbour = np.roll(exists, -step, axis)
+        rim = [slice(None)] * 3
+        rim[axis] = slice(-1, None) if step > 0 else slice(0, 1)
+        neighbour[tuple(rim)] = True  # nothing lies beyond the box
+        index = np.argwhere(leaf & ~neighbour)
+        small = index * edge + edge // 2
+        large = (index + step * np.eye(3, dtype=int)[axis]) // 2 * 2 * edge + edge
+        square = _face(index * edge, axis, edge, upper=step > 0)
+        # The larger face's middle is the corner at which both tangential indices turn from even to odd.
+        tangential = np.stack([index[:, (axis + 1) % 3], index[:, (axis + 2) % 3]], 1)
+        first = np.argmax((SQUARE[None] == 1 - tangential[:, None] % 2).all(2), axis=1)
+        a, b, c, d = (square[np.arange(len(square)), (first + k) % 4] for k in range(4))
+        lower, upper = (small, large) if step > 0 else (large, small)
+        for p, q, r in ((a, b, c), (a, c, d)):
+            tets += [np.stack([p, q, r, upper], 1), np.stack([p, r, q, lower], 1)]
+    return tets

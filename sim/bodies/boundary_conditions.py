@@ -1,0 +1,49 @@
+"""Where a brain is held: at the brainstem; where a skull stands over it; and where it is open."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..anatomy import Anatomy
+from ..errors import InputError
+from ..geometry.geodesic import distances
+from ..geometry.normals import vertex_normals
+from ..geometry.tetmesh import TetMesh
+from .placement import STEM
+
+FEWEST_OPEN = 6  # nodes; fewer do not carry a tool
+
+
+def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float) -> Anatomy:
+    """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
+
+    Stem: surface nodes within 0.15 of the brain's height from the lowest one (least superior); held. Craniotomy:
+    surface nodes within half of the diameter `craniotomy` [m] along the surface from the point nearest to `site`;
+    free. Skull: the rest of the surface, each node with its unit normal n_i, along the integral of grad N_i: a body of
+    linear tetrahedra whose nodes do not move along theirs passes no volume through the skull (Engelman, Sani, Gresho
+    1982, Int. J. Numer. Methods Fluids 2:225-238). Effects say what the skull does.
+
+    Raises
+    ------
+    InputError
+        An opening with fewer than 6 nodes, or one that leaves no skull.
+    """
+    surface = mesh.surface
+    outer = np.unique(surface)
+    lowest = outer[mesh.nodes[outer, 2].argmin()]
+    height = np.ptp(mesh.nodes[outer, 2])
+    stem = np.zeros(len(mesh.nodes), bool)
+    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= STEM * height
+    opened = (distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy) & ~stem
+    if opened.sum() < FEWEST_OPEN:
+        raise InputError(
+            f"a craniotomy of {craniotomy * 1e3:g} mm holds {opened.sum()} mesh nodes, and {FEWEST_OPEN} are needed: "
+            "ask for a larger one, or for more nodes."
+        )
+    rest = np.zeros(len(mesh.nodes), bool)
+    rest[outer] = True
+    rest &= ~stem & ~opened
+    if not rest.any():
+        raise InputError(f"a craniotomy of {craniotomy * 1e3:g} mm leaves no skull: ask for a smaller one.")
+    normals = np.where(rest[:, None], vertex_normals(mesh.nodes, surface), 0.0)
+    return Anatomy(mesh, np.repeat(stem[:, None], 3, axis=1), normals, opened)

@@ -1,0 +1,157 @@
+"""A user's label volume as a subject: which voxels are brain, which tumour, and where the skull is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from scipy import ndimage
+
+from ..errors import InputError
+from .intensity import Intensity
+from .nifti import read_volume
+from .placement import Piece, site_over
+from .signed_distance import mask_field
+from .subject import Subject, rim
+
+SMALLEST_BRAIN, LARGEST_BRAIN = 20e-6, 5000e-6  # [m^3]
+FEWEST_VOXELS = 27  # of a tumour; fewer have no shape
+SPECK = 1e-3  # of the tumour's volume; smaller components are noise
+EXTENSION = 8  # voxels
+
+
+def volume_subject(
+    path: str | Path, brain: Sequence[int], tumour: Sequence[int], t1: str | Path | None = None
+) -> Subject:
+    """The subject in a NIfTI file of whole-number labels, of which some are `brain` and some `tumour`.
+
+    The solid is brain or tumour, its largest component, with holes filled; tumour components outside it are left out,
+    and each such change is noted. The skull is opened over the largest of them. `t1` is a volume of intensities in the
+    same space.
+
+    Raises
+    ------
+    InputError
+        What `read_volume` refuses; labels that are not whole, not there, or named twice; a brain of less than 20 ml or
+        more than 5,000 ml; a tumour outside the brain or of fewer than 27 voxels.
+    """
+    volume = read_volume(path)
+    _check_labels(path, volume.values, brain, tumour)
+    voxel = abs(float(np.linalg.det(volume.affine[:3, :3])))
+    notes = list(volume.notes)
+    marked = np.isin(volume.values, tumour)
+    solid = _whole(np.isin(volume.values, brain), marked, voxel, notes)
+    if not SMALLEST_BRAIN <= solid.sum() * voxel <= LARGEST_BRAIN:
+        raise InputError(
+            f"{path}: the labels {_listed(brain)} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
+            f"{SMALLEST_BRAIN * 1e6:g} to {LARGEST_BRAIN * 1e6:g} ml. Check the labels and the voxel size."
+        )
+    edge = int(solid.sum() - solid[1:-1, 1:-1, 1:-1].sum())
+    if edge:
+        notes.append(
+            f"{edge} voxels of the brain lie on the volume's border: where it is cut there is no cortex, so see that "
+            "the craniotomy lies elsewhere"
+        )
+    inside = _inside(path, solid, marked, voxel, notes)
+    cortex, interface = rim(solid, volume.affine), rim(inside, volume.affine)
+    pieces = _pieces(inside, volume.affine)
+    intensity = None
+    if t1 is not None:
+        grey = read_volume(t1)
+        intensity = Intensity(grey.values, grey.affine)
+    return Subject(
+        brain=mask_field(solid, volume.affine),
+        tumour=mask_field(_extended(inside, solid), volume.affine),
+        cortex=cortex,
+        interface=interface,
+        tumour_volume=float(inside.sum() * voxel),
+        site=site_over(cortex, pieces[0].centre),
+        intensity=intensity,
+        notes=tuple(notes),
+        pieces=pieces,
+    )
+
+
+def _check_labels(path: str | Path, values: np.ndarray, brain: Sequence[int], tumour: Sequence[int]) -> None:
+    if not brain or not tumour:
+        raise InputError("name at least one label of the brain and one of the tumour.")
+    both = sorted(set(brain) & set(tumour))
+    if both:
+        raise InputError(f"labels {_listed(both)} are named as brain and as tumour: give each to one of them.")
+    if values.dtype.kind == "f" and not np.array_equal(values, np.rint(values)):
+        raise InputError(f"{path}: holds fractions, so it is no label volume. Give whole-number labels.")
+    present = np.unique(values).astype(int).tolist()
+    if present == [0]:
+        raise InputError(f"{path}: is empty, every voxel is 0. Export the labels again.")
+    missing = sorted((set(brain) | set(tumour)) - set(present))
+    if missing or 0 in (*brain, *tumour):
+        wrong = f"has no label {_listed(missing)}" if missing else "has label 0 as background"
+        raise InputError(f"{path}: {wrong}. Choose from {_listed([label for label in present if label])}.")
+
+
+def _listed(labels: Sequence[int]) -> str:
+    shown = ", ".join(map(str, labels[:20]))
+    return f"{shown}, ... ({len(labels)} in all)" if len(labels) > 20 else shown
+
+
+def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
+    """The component of brain or tumour that holds most of the brain, its holes filled."""
+    component, _ = cast(tuple[np.ndarray, int], ndimage.label(brain | tumour))
+    solid = component == np.bincount(component[brain]).argmax()
+    lost = int((brain & ~solid).sum())
+    if lost:
+        notes.append(f"left out {lost * voxel * 1e6:.2g} ml of brain that is not connected to the rest")
+    filled = cast(np.ndarray, ndimage.binary_fill_holes(solid))
+    holes = int((filled & ~solid).sum())
+    if holes:
+        notes.append(f"filled {holes * voxel * 1e6:.2g} ml of holes in the brain")
+    return filled
+
+
+def _inside(path: str | Path, solid: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
+    """The tumour's components that lie in the solid, but for specks."""
+    inside = tumour & solid
+    if not inside.any():
+        raise InputError(f"{path}: the tumour lies outside the brain. Check the labels given as brain and as tumour.")
+    component, count = cast(tuple[np.ndarray, int], ndimage.label(inside, np.ones((3, 3, 3))))
+    size = np.bincount(component.ravel(), minlength=count + 1)
+    kept = size >= max(SPECK * inside.sum(), FEWEST_VOXELS)
+    kept[0] = False
+    if not kept.any():
+        raise InputError(
+            f"{path}: the tumour's largest component has {size[1:].max()} voxels, and {FEWEST_VOXELS} are needed to "
+            "show its shape. Resample the volume more finely, or check the labels."
+        )
+    result = kept[component]
+    for lost, where in ((tumour & ~solid, "outside the brain"), (inside & ~result, "in specks")):
+        if lost.any():
+            notes.append(f"left out {lost.sum() * voxel * 1e6:.2g} ml of tumour {where}")
+    return result
+
+
+def _extended(tumour: np.ndarray, solid: np.ndarray) -> np.ndarray:
+    """The tumour, and beside the brain all voxels whose nearest one in the solid is tumour.
+
+    A tumour that reaches the cortex then goes on beyond it, and its field crosses the cortex instead of touching it.
+    """
+    (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(tumour.astype(np.uint8)))
+    wide = tuple(slice(max(part.start - EXTENSION, 0), part.stop + EXTENSION) for part in box)
+    if solid[wide].all():
+        return tumour
+    nearest = ndimage.distance_transform_edt(~solid[wide], return_distances=False, return_indices=True)
+    extended = tumour.copy()
+    extended[wide] = tumour[wide][tuple(cast(np.ndarray, nearest))]
+    return extended
+
+
+def _pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[Piece, ...]:
+    """The tumour's connected pieces, the largest first; of a piece's surface voxels the mean is its centre."""
+    component, count = cast(tuple[np.ndarray, int], ndimage.label(tumour, np.ones((3, 3, 3))))
+    voxel = abs(float(np.linalg.det(affine[:3, :3])))
+    pieces = []
+    for number in range(1, count + 1):
+        one = component == number
+        pieces.append(Piece(float(one.sum() * voxel), rim(one, affine).mean(axis=0)))
+    return tuple(sorted(pieces, key=lambda piece: -piece.volume))

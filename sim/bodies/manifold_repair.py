@@ -1,0 +1,83 @@
+"""Take away the tetrahedra that keep a carved body from being one piece with a clean surface."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array, csgraph
+
+from ..geometry.tetmesh import FACES, row_keys
+
+
+def largest_piece(tets: np.ndarray) -> np.ndarray:
+    """Which tetrahedra (T,) belong to the largest piece whose tetrahedra hang together by faces."""
+    _, number, count = np.unique(row_keys(tets[:, FACES].reshape(-1, 3)), return_inverse=True, return_counts=True)
+    owner = np.repeat(np.arange(len(tets)), 4)
+    order = np.argsort(number, kind="stable")
+    pairs = owner[order[np.flatnonzero(count[number[order]] == 2)]].reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(tets), len(tets)))
+    _, label = csgraph.connected_components(graph, directed=False)
+    return label == np.bincount(label).argmax()
+
+
+def clean(tets: np.ndarray) -> np.ndarray:
+    """Which tetrahedra (T,) to keep so that they are one piece whose surface is a 2-manifold.
+
+    Where the surface touches itself, at an edge with more than two triangles or a node with more than one fan of
+    them, the tetrahedra behind the triangles are taken away, but for those behind the node's largest fan.
+    """
+    keep = np.ones(len(tets), bool)
+    while True:
+        keep[keep] = largest_piece(tets[keep])
+        offending = _pinching(tets[keep])
+        if len(offending) == 0:
+            return keep
+        keep[np.flatnonzero(keep)[offending]] = False
+
+
+def _pinching(tets: np.ndarray) -> np.ndarray:
+    """Numbers of the tetrahedra behind every surface fan but the largest at its node."""
+    faces = tets[:, FACES].reshape(-1, 3)
+    _, first, count = np.unique(row_keys(faces), return_index=True, return_counts=True)
+    outer = np.sort(first[count == 1])
+    surface, behind = faces[outer], outer // 4
+    # One graph node for each corner of a triangle; corners at one mesh node join across a surface edge, if just two do.
+    corner = np.arange(3 * len(surface)).reshape(-1, 3)
+    sides = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]])
+    ends = surface.ravel()[sides]
+    turned = ends[:, 0] > ends[:, 1]
+    sides[turned] = sides[turned][:, ::-1]
+    _, edge, shared = np.unique(row_keys(ends), return_inverse=True, return_counts=True)
+    order = np.argsort(edge, kind="stable")
+    pairs = sides[order[shared[edge[order]] == 2]].reshape(-1, 2, 2)
+    joined = np.concatenate([pairs[:, :, 0], pairs[:, :, 1]])
+    graph = coo_array((np.ones(len(joined), bool), (joined[:, 0], joined[:, 1])), shape=(corner.size, corner.size))
+    _, fan = csgraph.connected_components(graph, directed=False)
+    size, node = np.bincount(fan), np.zeros(fan.max() + 1, int)
+    node[fan] = surface.ravel()
+    order = np.lexsort((np.arange(len(size)), -size, node))
+    lesser = np.ones(len(size), bool)
+    lesser[order[np.unique(node[order], return_index=True)[1]]] = False
+    return np.unique(behind[lesser[fan.reshape(-1, 3)].any(axis=1)])
+
+
+def ears(tets: np.ndarray, unwanted: np.ndarray) -> np.ndarray:
+    """Which of the tetrahedra marked `unwanted` (T,) can go and leave the surface a 2-manifold.
+
+    A tetrahedron with three faces on the surface can, and one with two if the edge between the other two faces lies
+    within; of neighbours only one goes.
+    """
+    faces = tets[:, FACES].reshape(-1, 3)
+    _, number, count = np.unique(row_keys(faces), return_inverse=True, return_counts=True)
+    outer = (count[number] == 1).reshape(-1, 4)
+    width = int(tets.max()) + 1
+    edges = np.sort(faces[outer.ravel()][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    surface_edges = np.unique(edges @ [width, 1])
+    gone = np.zeros(len(tets), bool)
+    taken = np.zeros(width, bool)
+    for tet in np.flatnonzero(unwanted & (outer.sum(axis=1) >= 2)):
+        hidden = tets[tet][outer[tet]]  # corners opposite to outer faces: with two, the ends of the inner edge
+        inner = len(hidden) == 3 or not np.isin(np.sort(hidden) @ [width, 1], surface_edges)
+        if len(hidden) < 4 and inner and not taken[tets[tet]].any():
+            gone[tet] = True
+            taken[tets[tet]] = True
+    return gone

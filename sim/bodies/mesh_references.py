@@ -1,0 +1,105 @@
+"""Mesh files that refer to other files, or declare what they do not hold: refused before a library follows them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+from ..errors import InputError
+from ..runtime.file_limits import INFLATION, mesh_bytes, too_large
+
+# Of meshio's formats those whose readers end where a file is cut short (of .mdpa, .tec and .node they never do), and
+# whose files say how much they hold (of .gz they do not).
+ENDINGS = (
+    *(".vtu", ".vtk", ".msh", ".inp", ".xdmf", ".xmf", ".mesh", ".meshb", ".bdf", ".nas", ".fem", ".med", ".cgns"),
+    *(".h5m", ".hmf", ".avs", ".vol", ".su2", ".ugrid", ".f3grid", ".post", ".dato"),
+)
+
+
+def demand_own(path: Path, most: int) -> None:
+    """Refuse other formats than `ENDINGS`, numbers that lie outside the file or its folder, HDF5 of over `most` bytes.
+
+    Raises
+    ------
+    InputError
+        Naming what it refers to, or the limit.
+    """
+    import h5py  # as optional as meshio
+
+    suffix = path.suffix.lower()
+    if suffix not in ENDINGS:
+        given = suffix or "a name without ending"
+        raise InputError(f"no mesh is read from {given}: give a tetrahedral mesh as {', '.join(ENDINGS)}.")
+    if suffix == ".inp":
+        _demand_no_include(path)
+    elif suffix in (".xdmf", ".xmf"):
+        for other in _named(path):
+            demand_stored(other, most)
+    elif h5py.is_hdf5(path):
+        demand_stored(path, most)
+
+
+def demand_stored(path: Path, most: int) -> None:
+    """Refuse HDF5 that refers to other files, whose arrays take over `most` bytes, or more than was stored of them.
+
+    Raises
+    ------
+    InputError
+        Naming the array or the link.
+    """
+    import h5py
+
+    most = mesh_bytes(path.stat().st_size, most)
+    left, seen = most, set()
+
+    def look(group: h5py.Group, within: str) -> None:
+        nonlocal left
+        for name in group:
+            here = f"{within}/{name}"
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise InputError(f"`{here}` is a link of {path.name} to another place. Store the array itself there.")
+            found = group[name]
+            if found in seen:  # by another name
+                continue
+            seen.add(found)
+            if isinstance(found, h5py.Group):
+                look(found, here)
+            elif isinstance(found, h5py.Dataset) and found.shape is not None:
+                if found.is_virtual or found.external:
+                    raise InputError(f"`{here}` of {path.name} lies in another file. Store the array itself there.")
+                if found.nbytes > INFLATION * found.id.get_storage_size():
+                    raise InputError(f"`{here}` of {path.name} declares more than it holds. Write the file anew.")
+                left -= found.nbytes
+                if left < 0:
+                    raise too_large(most)
+
+    with h5py.File(path, "r") as file:
+        look(file, "")
+
+
+def _named(path: Path) -> set[Path]:
+    """The HDF5 files in its folder that an XDMF file names."""
+    folder = path.resolve().parent
+    named = set()
+    for item in ElementTree.parse(path).iter():
+        kind = item.get("Format")
+        if kind == "HDF":
+            name = (item.text or "").strip().split(":")[0]
+            other = (folder / name).resolve()
+            if not other.is_relative_to(folder):
+                raise InputError(
+                    f"it refers to {name}, outside of its folder. Put that file beside it, under its name."
+                )
+            if not other.is_file():
+                raise InputError(f"it refers to {name}, which is not there. Put that file beside it.")
+            named.add(other)
+        elif kind not in (None, "XML"):
+            raise InputError(f"its numbers are of the format {kind}. Write them as HDF, or as XML.")
+    return named
+
+
+def _demand_no_include(path: Path) -> None:
+    with path.open(errors="replace") as lines:
+        for line in lines:
+            if line.partition(",")[0].strip().replace("*", "").upper() == "INCLUDE":
+                raise InputError("it includes another file. Join the two to one.")

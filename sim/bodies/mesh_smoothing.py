@@ -1,0 +1,142 @@
+"""Move nodes of a stuffed mesh: onto the best fit of its surfaces, and out of the way of bad dihedral angles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..geometry.tetmesh import EDGES, FACES
+from .signed_distance import Field, onto_level
+
+Projection = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Points (n, 3) [m] wished for and their nodes (n,) -> the nearest points (n, 3) where those nodes may lie."""
+
+GOOD_SINE = np.sin(np.radians(18.0))
+ROUNDS = 60
+LARGEST_SHIFT = 5e-4  # [m] off a surface to fit it better: half a voxel
+# The faces that meet at each edge of a tetrahedron (a face carries the number of the corner opposite to it).
+MEETING = np.array([[2, 3], [1, 3], [1, 2], [0, 3], [0, 2], [0, 1]])
+TRIALS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
+TRIALS /= np.linalg.norm(TRIALS, axis=1, keepdims=True)
+LARGEST_STEP, SMALLEST_STEP = 0.3, 0.02  # of the shortest edge at the node
+
+
+def smallest_sines(corners: np.ndarray) -> np.ndarray:
+    """The smallest sine (...,) of a dihedral angle in each tetrahedron of `corners` (..., 4, 3); negative if inverted.
+
+    Small for angles near 0 and near 180 degrees alike (Klingner & Shewchuk 2007).
+    """
+    faces = corners[..., FACES, :]
+    normals = np.cross(faces[..., 1, :] - faces[..., 0, :], faces[..., 2, :] - faces[..., 0, :])
+    areas = np.linalg.norm(normals, axis=-1)
+    lengths = np.linalg.norm(corners[..., EDGES[:, 1], :] - corners[..., EDGES[:, 0], :], axis=-1)
+    six_volumes = -np.einsum("...i,...i->...", normals[..., 3, :], corners[..., 3, :] - corners[..., 0, :])
+    product = np.maximum(areas[..., MEETING[:, 0]] * areas[..., MEETING[:, 1]], 1e-300)
+    return (six_volumes[..., None] * lengths / product).min(axis=-1)
+
+
+def fitted(
+    nodes: np.ndarray, triangles: np.ndarray, field: Field, movable: np.ndarray, volume: float | None = None
+) -> np.ndarray:
+    """Nodes (V, 3) [m], of which those `movable` (V,) moved so that the closed surface of triangles (S, 3) fits best.
+
+    With its nodes on a curved surface a triangle lies on the hollow side. Each node moves by the mean deviation of
+    its triangles: a deviation that vanishes at the corners of a triangle and is quadratic between them has 3/4 of
+    its middle's value as mean. A `volume` [m^3] to be enclosed shifts all of them alike by what is then missing.
+    """
+    on = np.unique(triangles)
+    on = on[movable[on]]
+    if len(on) == 0:
+        return nodes
+    middle, area = _middles_and_areas(nodes, triangles)
+    weight, total = np.zeros(len(nodes)), np.zeros(len(nodes))
+    for corner in triangles.T:
+        np.add.at(weight, corner, area)
+        np.add.at(total, corner, -0.75 * area * field(middle))
+    level = np.clip(total[on] / weight[on], -LARGEST_SHIFT, LARGEST_SHIFT)
+    nodes = nodes.copy()
+    nodes[on] = onto_level(field, nodes[on], level)
+    if volume is not None:
+        moving = movable[triangles].mean(axis=1)  # a triangle sweeps in proportion to its corners that move
+        for _ in range(2):
+            _, area = _middles_and_areas(nodes, triangles)
+            missing = (volume - enclosed_volume(nodes, triangles)) / (area @ moving)
+            level = np.clip(level + missing, -LARGEST_SHIFT, LARGEST_SHIFT)
+            nodes[on] = onto_level(field, nodes[on], level)
+    return nodes
+
+
+def enclosed_volume(nodes: np.ndarray, triangles: np.ndarray) -> float:
+    """Volume [m^3] inside a closed surface of triangles (S, 3), outwards."""
+    a, b, c = (nodes[triangles[:, k]] for k in range(3))
+    return float(np.einsum("ti,ti->", a, np.cross(b, c))) / 6.0
+
+
+def _middles_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    corners = nodes[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return corners.mean(axis=1), 0.5 * np.linalg.norm(normal, axis=1)
+
+
+def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection) -> np.ndarray:
+    """Nodes (V, 3) [m] moved until no dihedral angle is below 18 degrees, or none of them can be raised further.
+
+    Each round a set of nodes of bad tetrahedra, no two in one tetrahedron, tries 26 steps each and takes the one that
+    makes the angles round it fall least short of that.
+    """
+    nodes = nodes.copy()
+    order = np.argsort(tets, axis=None, kind="stable")
+    incident, begin = order // 4, np.searchsorted(tets.ravel()[order], np.arange(len(nodes) + 1))
+    step = np.full(len(nodes), LARGEST_STEP)
+    sines = smallest_sines(nodes[tets])
+    for _ in range(ROUNDS):
+        movers = _independent(tets, sines, step)
+        if len(movers) == 0:
+            break
+        counts = begin[movers + 1] - begin[movers]
+        row = np.repeat(np.arange(len(movers)), counts)
+        first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        near = incident[np.arange(len(row)) - first[row] + begin[movers][row]]
+        own = tets[near] == movers[row, None]
+
+        corners = nodes[tets[near]]
+        edges = np.linalg.norm(corners - nodes[movers][row, None], axis=2)
+        length = np.minimum.reduceat(np.where(own, np.inf, edges).min(axis=1), first)
+        trials = nodes[movers, None] + (step[movers] * length)[:, None, None] * TRIALS
+        placed = project(trials.reshape(-1, 3), np.repeat(movers, len(TRIALS))).reshape(trials.shape)
+        astray = np.linalg.norm(placed - trials, axis=2) > (step[movers] * length)[:, None]
+        trials = np.where(astray[..., None], nodes[movers, None], placed)
+        tried = np.where(own[:, None, :, None], trials[row][:, :, None], corners[:, None])
+        badness = np.add.reduceat(_badness(smallest_sines(tried)), first)
+        best = badness.argmin(axis=1)
+        better = badness.min(axis=1) < 0.99 * np.add.reduceat(_badness(sines[near]), first)
+
+        step[movers[~better]] *= 0.4
+        moved = movers[better]
+        nodes[moved] = trials[better, best[better]]
+        touched = near[better[row]]
+        sines[touched] = smallest_sines(nodes[tets[touched]])
+        around = np.unique(tets[touched])
+        step[around] = np.maximum(step[around], 3.0 * SMALLEST_STEP)
+    return nodes
+
+
+def _independent(tets: np.ndarray, sines: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Nodes of bad tetrahedra that may still move, the worst first, such that no two share a tetrahedron."""
+    bad = np.flatnonzero(sines < GOOD_SINE)
+    worst = np.full(len(step), np.inf)
+    np.minimum.at(worst, tets[bad].ravel(), np.repeat(sines[bad], 4))
+    worst[step < SMALLEST_STEP] = np.inf
+    movers = np.flatnonzero(np.isfinite(worst))
+    rank = np.full(len(step), len(step))
+    rank[movers[np.argsort(worst[movers], kind="stable")]] = np.arange(len(movers))
+    lowest = rank[tets].min(axis=1)
+    beaten = np.zeros(len(step), bool)
+    beaten[tets[rank[tets] > lowest[:, None]]] = True
+    return movers[~beaten[movers]]
+
+
+def _badness(sines: np.ndarray) -> np.ndarray:
+    """What a node's steps make smaller: how far angles fall short, squared so that the worst count most."""
+    return np.maximum(GOOD_SINE - sines, 0.0) ** 2

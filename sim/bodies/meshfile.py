@@ -1,0 +1,172 @@
+"""Mesh files: tetrahedra in most formats that meshio reads in, `.vtu` out, nothing half-written."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..anatomy import Anatomy
+from ..errors import InputError
+from ..geometry.tetmesh import MeshWarning, TetMesh, oriented
+from ..runtime.atomic_files import written_whole
+from ..runtime.file_limits import LARGEST_MESH, at_most, mesh_bytes
+from ..runtime.outside_files import path_of, read_as
+from .mesh_references import demand_own
+from .vtu_size import demand_small
+
+if TYPE_CHECKING:
+    import meshio
+
+UNITS = {"m": 1.0, "mm": 1e-3}
+# meshio's names of tetrahedra by their nodes; it brings every format's order of mid-edge nodes to VTK's.
+CELLS = {4: "tetra", 10: "tetra10"}
+
+# An anatomy's longest side [m]: a mouse's brain has 15 mm, a whole head 0.3 m.
+SMALLEST, LARGEST = 5e-3, 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """What a file held: the mesh in metres, its point data as stored, and what was changed in reading."""
+
+    mesh: TetMesh
+    point_data: Mapping[str, np.ndarray]
+    notes: tuple[str, ...]
+
+
+def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
+    """Read tetrahedra with cell data `region` (absent: one region 0).
+
+    Quadratic ones (`tetra10`) are taken as they are, curved edges too. Cells that are not tetrahedra are dropped and
+    tetrahedra of negative orientation are turned, each with a note.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or unreadable, without tetrahedra or with both kinds, or with data that does not fit.
+    """
+    import meshio  # an optional reader: machines that only train have none
+
+    path = path_of(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file. Give a tetrahedral mesh, such as .vtu or .msh.")
+    if unit not in UNITS:
+        raise InputError(f"no unit is called {unit!r}: choose one of {', '.join(UNITS)}.")
+    remedy = "Convert it to .vtu or .msh."
+    # meshio prints what it stumbles over, and warns of arrays that it skips.
+    with read_as(path, "a mesh", remedy), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        most = mesh_bytes(path.stat().st_size, LARGEST_MESH)
+        counted = path.suffix.lower() == ".vtu" and demand_small(path, most)
+        with warnings.catch_warnings(), nullcontext() if counted else at_most(LARGEST_MESH):
+            warnings.simplefilter("ignore")
+            demand_own(path, LARGEST_MESH)
+            raw = meshio.read(path)
+    with read_as(path, "a mesh", remedy):
+        return _taken(path, raw, UNITS[unit])
+
+
+def _taken(path: Path, raw: meshio.Mesh, metre: float) -> MeshFile:
+    """What meshio read, with lengths in units of `metre` [m]."""
+    kinds = {block.type for block in raw.cells}
+    found = kinds.intersection(CELLS.values())
+    if not found:
+        held = ", ".join(sorted(kinds)) or "no cells"
+        raise InputError(f"{path}: holds {held}, but no tetrahedra (`tetra` or `tetra10`). Mesh its volume first.")
+    if len(found) > 1:
+        raise InputError(
+            f"{path}: holds {' and '.join(sorted(found))}, which do not conform: mesh it with one of them."
+        )
+    blocks = [number for number, block in enumerate(raw.cells) if block.type in found]
+    notes = []
+    dropped = sorted({f"{len(block.data)} {block.type}" for block in raw.cells if block.type not in found})
+    if dropped:
+        notes.append(f"dropped cells that are not tetrahedra: {', '.join(dropped)}")
+    table = np.concatenate([raw.cells[number].data for number in blocks])
+    region = np.zeros(len(table), np.int32)
+    if "region" in raw.cell_data:
+        stored = np.concatenate([raw.cell_data["region"][number] for number in blocks])
+        with np.errstate(invalid="ignore"):  # what is no number, or too large for one, does not come back
+            region = stored.astype(np.int32)
+        if stored.ndim != 1 or not np.array_equal(stored, region):
+            raise InputError(f"{path}: cell data `region` must be one whole number for each tetrahedron.")
+    table, turned = oriented(raw.points, table)
+    tets, middles = np.split(table, [4], axis=1)
+    nodes = np.asarray(raw.points, np.float64) * metre
+    mesh = TetMesh(nodes, tets, region, middles if middles.size else None)
+    if turned:
+        notes.append(f"turned {turned} tetrahedra of negative orientation")
+    return MeshFile(mesh, {name: np.asarray(field) for name, field in raw.point_data.items()}, tuple(notes))
+
+
+def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray]) -> None:
+    """Write `.vtu` in metres, with cell data `region`, `tetra10` cells where the mesh has mid-edge nodes.
+
+    The file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        A name that does not end in .vtu, or a folder that cannot be written to.
+    """
+    import meshio
+
+    with written_whole(path, ".vtu") as partial:
+        meshio.Mesh(
+            mesh.nodes,
+            [(CELLS[mesh.table.shape[1]], mesh.table)],
+            point_data=dict(point_data),
+            cell_data={"region": [mesh.region]},
+        ).write(partial)
+
+
+def read_anatomy(path: str | Path) -> Anatomy:
+    """Read an anatomy written by `write_anatomy`.
+
+    Raises
+    ------
+    InputError
+        As `read_mesh`; a mesh that lacks `held`, `slide_normal` or `craniotomy`, or has numbers there that are none;
+        a body that is too small or too large for one in metres.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the body measures", MeshWarning)  # it is refused instead
+        file = read_mesh(path)
+    missing = [name for name in ("held", "slide_normal", "craniotomy") if name not in file.point_data]
+    if missing:
+        raise InputError(
+            f"{path}: has no point data {', '.join(f'`{name}`' for name in missing)}, so it is a mesh but not an "
+            "anatomy. Make one with `sulcus anatomy`, or add them."
+        )
+    data = file.point_data
+    with read_as(path, "an anatomy", "Make one with `sulcus anatomy`."):
+        for name in ("held", "slide_normal", "craniotomy"):
+            if data[name].dtype.kind not in "fiub" or not np.isfinite(data[name]).all():
+                raise InputError(f"`{name}` has values that are no finite numbers: give 0 or 1, or unit normals.")
+        anatomy = Anatomy(file.mesh, data["held"] != 0, data["slide_normal"], data["craniotomy"] != 0)
+        size = float(np.ptp(anatomy.mesh.nodes, axis=0).max())
+        if not SMALLEST <= size <= LARGEST:
+            raise InputError(
+                f"the body measures {1e3 * size:,.3g} mm, and an anatomy {1e3 * SMALLEST:g} to {1e3 * LARGEST:g} mm: "
+                "its coordinates must be metres."
+            )
+        return anatomy
+
+
+def write_anatomy(path: str | Path, anatomy: Anatomy) -> None:
+    """Write an anatomy as `.vtu` in metres (RAS): `region`, `held`, `slide_normal`, `craniotomy`."""
+    write_mesh(
+        path,
+        anatomy.mesh,
+        {
+            "held": anatomy.held.astype(np.uint8),
+            "slide_normal": anatomy.slide_normal,
+            "craniotomy": anatomy.craniotomy.astype(np.uint8),
+        },
+    )

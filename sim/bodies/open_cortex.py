@@ -1,0 +1,158 @@
+"""The open cortex of an anatomy: its frame, its rim, and places on it where a tool can press."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..anatomy import Anatomy
+from ..arguments import numbers
+from ..errors import InputError
+from ..geometry.closest_point import closest
+from ..geometry.normals import unit, vertex_normals
+from ..geometry.triangles import areas
+
+# A place so near to the rim [m] lies on it.
+ON_RIM = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A material point of the open cortex.
+
+    Parameters
+    ----------
+    point
+        (3,) [m], at rest.
+    inward
+        (3,) unit normal of the surface there, into the brain.
+    vertices, weights
+        Mesh vertices (3,) of its triangle, and barycentric weights (3,).
+    """
+
+    point: np.ndarray
+    inward: np.ndarray
+    vertices: np.ndarray
+    weights: np.ndarray
+
+    def carried(self, positions: np.ndarray) -> np.ndarray:
+        """Where it is (3,) when the mesh's vertices are at positions (V, 3) [m]."""
+        return self.weights @ positions[self.vertices]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenCortex:
+    """The open cortex and its frame.
+
+    Parameters
+    ----------
+    anatomy
+        The body.
+    origin
+        (3,) [m] its middle, on the surface.
+    axis
+        (3,) the mean inward normal.
+    right, up
+        (3,) span the tangent plane; `up` is as superior as the surface allows.
+    """
+
+    anatomy: Anatomy
+    origin: np.ndarray
+    axis: np.ndarray
+    right: np.ndarray
+    up: np.ndarray
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """Of its triangles (S, 3, 3) [m]."""
+        return self.anatomy.mesh.nodes[self.anatomy.open_surface]
+
+    @cached_property
+    def radius(self) -> float:
+        """Radius of the circle of its area [m]."""
+        return float(np.sqrt(areas(self.corners).sum() / np.pi))
+
+    @cached_property
+    def clearance(self) -> float:
+        """Radius of the largest circle round the origin, across the axis, that it fills [m]."""
+        rim = rim_of(self.anatomy.mesh.nodes, self.anatomy.open_surface) - self.origin
+        return float(distances_to(rim - (rim @ self.axis)[..., None] * self.axis, np.zeros((1, 3)))[0])
+
+    @cached_property
+    def _inward(self) -> np.ndarray:
+        return -vertex_normals(self.anatomy.mesh.nodes, self.anatomy.open_surface)
+
+    def across(self, points: np.ndarray) -> np.ndarray:
+        """Distance (n,) [m] of points (n, 3) from the line through the origin along the axis."""
+        arm = points - self.origin
+        return np.linalg.norm(arm - np.outer(arm @ self.axis, self.axis), axis=1)
+
+    def nearest(self, point: np.ndarray) -> Place:
+        """The place that is nearest to a point (3,) [m]."""
+        at, triangle, weights = (found[0] for found in closest(point[None], self.corners))
+        vertices = self.anatomy.open_surface[triangle]
+        return Place(at, unit((weights @ self._inward[vertices])[None])[0], vertices, weights)
+
+    def place(self, right_mm: float = 0.0, up_mm: float = 0.0) -> Place:
+        """The place so many millimetres to the right of the middle, and up, in the tangent plane.
+
+        Raises
+        ------
+        InputError
+            What is no number, or not one; a place outside the open cortex.
+        """
+        for name, value in (("right_mm", right_mm), ("up_mm", up_mm)):
+            given = numbers(name, value)
+            if given.shape != ():
+                raise InputError(f"{name} has shape {given.shape}: give one number, in millimetres.")
+        found = self.nearest(self.origin + 1e-3 * (right_mm * self.right + up_mm * self.up))
+        rim = rim_of(self.anatomy.mesh.nodes, self.anatomy.open_surface)
+        if not distances_to(rim, found.point[None])[0] > ON_RIM:
+            raise InputError(
+                f"the place {right_mm:g} mm right, {up_mm:g} mm up lies outside the open cortex: stay within "
+                f"{1e3 * self.clearance:.3g} mm of its middle, or open the skull wider with --craniotomy."
+            )
+        return found
+
+
+def open_cortex(anatomy: Anatomy) -> OpenCortex:
+    """Find the frame of an anatomy's open cortex.
+
+    Raises
+    ------
+    InputError
+        An anatomy without open cortex.
+    """
+    triangles = anatomy.open_surface
+    if len(triangles) == 0:
+        raise InputError("this anatomy has no open cortex: make one with `sulcus anatomy --craniotomy 50`.")
+    corners = anatomy.mesh.nodes[triangles]
+    a, b, c = np.moveaxis(corners, 1, 0)
+    area = 0.5 * np.cross(b - a, c - a)
+    axis = -area.sum(axis=0) / np.linalg.norm(area.sum(axis=0))
+    size = np.linalg.norm(area, axis=1)
+    middle = (size @ (a + b + c)) / (3.0 * size.sum())
+    # Superior, or anterior where the craniotomy looks straight up.
+    reference = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(axis, reference)
+    right /= np.linalg.norm(right)
+    return OpenCortex(anatomy, closest(middle[None], corners).point[0], axis, right, np.cross(right, axis))
+
+
+def rim_of(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Edges (E, 2, 3) [m] that belong to one only of triangles (S, 3) of points (V, 3) [m]."""
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, count = np.unique(edges, axis=0, return_counts=True)
+    return points[edges[count == 1]]
+
+
+def distances_to(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distances (B,) [m] from `points` (B, 3) to the nearest of `edges` (E, 2, 3)."""
+    start, along = edges[:, 0], edges[:, 1] - edges[:, 0]
+    offset = points[:, None] - start
+    square = np.einsum("ei,ei->e", along, along)
+    share = np.einsum("bei,ei->be", offset, along) / np.where(square > 0.0, square, 1.0)
+    offset -= np.clip(share, 0.0, 1.0)[:, :, None] * along
+    return np.sqrt(np.einsum("bei,bei->be", offset, offset).min(axis=1))

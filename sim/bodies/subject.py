@@ -1,0 +1,97 @@
+"""A head before it is meshed: what the template and a user's labels have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from scipy import ndimage
+
+from ..anatomy import Anatomy
+from ..errors import InputError
+from .boundary_conditions import bounded
+from .intensity import Intensity
+from .mesher import Solids, mesh_solids
+from .placement import Piece
+from .signed_distance import Field
+
+FEWEST_NODES, MOST_NODES = 2_000, 250_000
+SMALLEST_CRANIOTOMY, LARGEST_CRANIOTOMY = 0.015, 0.120  # [m]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a subject becomes an anatomy: nodes wanted, diameter of the opening along the cortex [m].
+
+    Raises
+    ------
+    InputError
+        Nodes outside 2,000 to 250,000, or a craniotomy outside 15 to 120 mm.
+    """
+
+    nodes: int = 5300
+    craniotomy: float = 0.050
+
+    def __post_init__(self) -> None:
+        if not FEWEST_NODES <= self.nodes <= MOST_NODES:
+            raise InputError(f"{self.nodes} nodes are outside {FEWEST_NODES} to {MOST_NODES}: choose a number between.")
+        if not SMALLEST_CRANIOTOMY <= self.craniotomy <= LARGEST_CRANIOTOMY:
+            raise InputError(
+                f"a craniotomy of {self.craniotomy * 1e3:g} mm is outside {SMALLEST_CRANIOTOMY * 1e3:g} to "
+                f"{LARGEST_CRANIOTOMY * 1e3:g} mm: choose a diameter between."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A brain with a tumour, in the volume's RAS frame [m].
+
+    Parameters
+    ----------
+    brain, tumour
+        Fields of the whole solid (brain and tumour together) and of the tumour.
+    cortex, interface
+        Points (n, 3) [m] at the solid's surface and at the tumour's.
+    tumour_volume
+        [m^3].
+    site
+        (3,) [m]: the point of the cortex over which the skull is opened.
+    intensity
+        T1 intensities, where they are known.
+    notes
+        Sentences about what was changed in reading.
+    pieces
+        Of the tumour, the largest first.
+    """
+
+    brain: Field
+    tumour: Field
+    cortex: np.ndarray
+    interface: np.ndarray
+    tumour_volume: float
+    site: np.ndarray
+    intensity: Intensity | None = None
+    notes: tuple[str, ...] = ()
+    pieces: tuple[Piece, ...] = ()
+
+
+def make_anatomy(subject: Subject, plan: Plan) -> Anatomy:
+    """Mesh a subject and bound it. The same subject and plan give the same anatomy, bit by bit.
+
+    Raises
+    ------
+    InputError
+        What `mesh_solids` and `bounded` refuse.
+    """
+    opening = subject.cortex[np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * plan.craniotomy]
+    low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
+    solids = Solids(subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening)
+    return bounded(mesh_solids(solids, plan.nodes), subject.site, plan.craniotomy)
+
+
+def rim(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
+    """Centres (n, 3) [m] of the voxels of `mask` (I, J, K) that touch its outside."""
+    padded = np.pad(mask, 1)
+    index = np.argwhere(padded & ~cast(np.ndarray, ndimage.binary_erosion(padded))) - 1
+    return index @ affine[:3, :3].T + affine[:3, 3]

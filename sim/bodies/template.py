@@ -1,0 +1,186 @@
+"""The built-in subject: the MNI152 brain of the nilearn wheel, scaled to a person's, with a tumour placed in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, cast
+
+import numpy as np
+from scipy import ndimage
+
+from ..errors import InputError
+from .intensity import Intensity
+from .placement import Piece, site_over
+from .signed_distance import Field, mask_field
+from .subject import Subject, rim
+
+VOLUME = 1470e-6  # [m^3]; the mask itself has 1,883 ml, more than a person
+THRESHOLD = 0.2  # of the template's brightest voxel: nilearn's own mask
+SITES = {
+    "frontal": (32.0, 42.0, 36.0),
+    "central": (40.0, -14.0, 58.0),
+    "parietal": (36.0, -58.0, 52.0),
+    "temporal": (66.0, -22.0, 2.0),
+    "occipital": (28.0, -92.0, 14.0),
+}
+"""Directions, from the brain's middle, of points on the right hemisphere's convexity: MNI152 coordinates [mm]."""
+
+Shape = Literal["sphere", "lobed"]
+LOBES, LOBE_HEIGHT, LOBE_SHARPNESS = 6, 0.5, 5.0
+SMOOTH = 5e-3  # [m] over which the cortex is levelled to find which way is in
+SMALLEST_RADIUS, LARGEST_RADIUS = 3e-3, 35e-3
+SMALLEST_COVER, LARGEST_COVER = 1e-3, 60e-3
+CLEARANCE = 5e-4  # [m] of brain that must lie round the tumour
+
+
+@dataclass(frozen=True)
+class Tumour:
+    """A tumour to be placed: radius (of the ball of the same volume) and cover, its cap's depth under the cortex [m].
+
+    `middle` (x, y, z) [m], RAS, places it in the head; without it, it lies `cover` under the cortex of a `site`.
+
+    Raises
+    ------
+    InputError
+        A radius outside 3 to 35 mm, a cover outside 1 to 60 mm, a shape or site that is not known, or a middle that
+        is not finite.
+    """
+
+    radius: float = 0.012
+    cover: float = 0.010
+    shape: Shape = "sphere"
+    site: str = "central"
+    seed: int = 0
+    middle: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("radius", self.radius, SMALLEST_RADIUS, LARGEST_RADIUS),
+            ("cover", self.cover, SMALLEST_COVER, LARGEST_COVER),
+        ):
+            if not low <= value <= high:
+                raise InputError(
+                    f"a tumour {name} of {value * 1e3:g} mm is outside {low * 1e3:g} to {high * 1e3:g} mm: choose one "
+                    "between."
+                )
+        if self.shape not in ("sphere", "lobed"):
+            raise InputError(f"no tumour shape is called {self.shape!r}: choose sphere or lobed.")
+        if self.site not in SITES:
+            raise InputError(f"no site is called {self.site!r}: choose one of {', '.join(SITES)}.")
+        if self.seed < 0:
+            raise InputError(f"a seed of {self.seed} is negative: give 0 or more.")
+        if self.middle is not None and not np.isfinite(self.middle).all():
+            raise InputError("a tumour's middle needs three finite coordinates.")
+
+    @property
+    def place(self) -> str:
+        """Where it is to lie, in words."""
+        if self.middle is not None:
+            return f"at {', '.join(f'{1e3 * value:g}' for value in self.middle)} mm"
+        return f"with {self.cover * 1e3:g} mm of cover at the {self.site} site"
+
+
+@dataclass(frozen=True, eq=False)
+class Lobed:
+    """A star-shaped solid: its radius in the unit direction n is scale * (1 + sum_k height_k exp(s (n . d_k - 1))).
+
+    middle (3,) [m]; directions (L, 3) of unit length; heights (L,); scale [m]. A ball has no lobes.
+    """
+
+    middle: np.ndarray
+    directions: np.ndarray
+    heights: np.ndarray
+    scale: float
+
+    def radius(self, directions: np.ndarray) -> np.ndarray:
+        """Distance (n,) [m] from the middle to the surface in unit directions (n, 3)."""
+        lobes = np.exp(LOBE_SHARPNESS * (directions @ self.directions.T - 1.0))
+        return self.scale * (1.0 + lobes @ self.heights)
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Distance (n,) [m] beyond the surface along the ray from the middle, at points (n, 3) [m]."""
+        arm = points - self.middle
+        length = np.linalg.norm(arm, axis=1)
+        return length - self.radius(arm / np.maximum(length, 1e-12)[:, None])
+
+
+def template_subject(tumour: Tumour) -> Subject:
+    """The template with a tumour, in the template's own RAS frame, scaled to 1,470 ml about the brain's centroid.
+
+    Raises
+    ------
+    InputError
+        A tumour that would reach out of the brain.
+    """
+    grey, mask, affine = _scaled_template()
+    brain, cortex = mask_field(mask, affine), rim(mask, affine)
+    if tumour.middle is None:
+        site, inward = _site(brain, cortex, tumour.site)
+        shape = _placed(tumour, site, inward)
+    else:
+        shape = _round(tumour, lambda unit, scale: np.array(tumour.middle))
+        site = site_over(cortex, shape.middle)
+    interface = shape.middle + _sphere(400) * shape.radius(_sphere(400))[:, None]
+    if (brain(interface) > -CLEARANCE).any():
+        raise InputError(
+            f"a {tumour.shape} tumour of {tumour.radius * 1e3:g} mm radius {tumour.place} reaches out of the brain: "
+            "choose a smaller radius, or another place."
+        )
+    volume = 4.0 / 3.0 * np.pi * tumour.radius**3
+    return Subject(
+        brain, shape, cortex, interface, volume, site, Intensity(grey, affine), pieces=(Piece(volume, shape.middle),)
+    )
+
+
+def _scaled_template() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Grey values (I, J, K), the brain's mask, and their affine (4, 4) to metres."""
+    from nilearn.datasets import load_mni152_template  # takes seconds; only where an anatomy is made
+
+    image = load_mni152_template(resolution=1)
+    grey = np.asarray(image.dataobj)
+    component, _ = cast(tuple[np.ndarray, int], ndimage.label(grey > THRESHOLD * grey.max()))
+    mask = cast(np.ndarray, ndimage.binary_fill_holes(component == np.bincount(component.ravel())[1:].argmax() + 1))
+    affine = np.array(image.affine, np.float64)
+    centre = affine[:3, :3] @ np.argwhere(mask).mean(axis=0) + affine[:3, 3]
+    scale = (VOLUME / (mask.sum() * abs(np.linalg.det(affine[:3, :3])))) ** (1.0 / 3.0)
+    affine[:3, 3] -= centre
+    affine[:3] *= scale
+    affine[:3, 3] += 1e-3 * centre
+    return grey, mask, affine
+
+
+def _site(brain: Field, cortex: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Where (3,) [m] the ray from the brain's middle leaves it at a named site, and the inward normal (3,) there."""
+    middle = 0.5 * (cortex.min(axis=0) + cortex.max(axis=0))
+    outward = 1e-3 * np.array(SITES[name]) - middle
+    outward /= np.linalg.norm(outward)
+    along = np.arange(0.02, 0.15, 1e-5)
+    site = middle + along[np.flatnonzero(brain(middle + along[:, None] * outward) < 0.0)[-1]] * outward
+    near = cortex[np.linalg.norm(cortex - site, axis=1) <= 3.0 * SMOOTH]
+    normal = np.linalg.eigh(np.cov(near.T))[1][:, 0]
+    return site, -normal * np.sign(normal @ outward)
+
+
+def _placed(tumour: Tumour, site: np.ndarray, inward: np.ndarray) -> Lobed:
+    """The tumour with its cap `cover` under `site` (3,), seen along `inward` (3,)."""
+    return _round(tumour, lambda unit, scale: site + (tumour.cover + scale * unit.radius(-inward[None])[0]) * inward)
+
+
+def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:
+    """The tumour round a `middle` (3,) [m], told its shape at unit scale and its scale [m]."""
+    rng = np.random.default_rng(tumour.seed)
+    directions = rng.normal(size=(LOBES if tumour.shape == "lobed" else 0, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    heights = rng.uniform(0.3, 1.0, len(directions)) * LOBE_HEIGHT
+    unit = Lobed(np.zeros(3), directions, heights, 1.0)
+    scale = tumour.radius / (unit.radius(_sphere(20_000)) ** 3).mean() ** (1.0 / 3.0)
+    return Lobed(middle(unit, scale), directions, heights, scale)
+
+
+def _sphere(count: int) -> np.ndarray:
+    """Unit directions (count, 3), spread evenly (a Fibonacci lattice): a mean over them is one over the sphere."""
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)

@@ -1,0 +1,134 @@
+"""How far the tip of a tool is from the tumour, both where they are in the deformed brain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from ..anatomy import Anatomy
+from ..errors import InputError
+from ..geometry.ball_at_rest import resting_tip
+from ..geometry.closest_point import closest
+from ..loads import Loads, Pushed, Touching
+from .open_cortex import OpenCortex, open_cortex
+
+# Cases whose tumours are looked at together.
+TOGETHER = 64
+
+
+@dataclass(frozen=True, eq=False)
+class TipGauge:
+    """Measures from the tip of a round tool to the closest point of the tumour's surface.
+
+    A tool that pushes is a ball of its footprint's radius. It comes down along the open cortex's inward axis until it
+    rests on the deformed open cortex, on the line through the point that it pushes, where the tissue has carried that.
+    Its tip is its lowest point along that axis. Where poses are told, the tip is where they have it.
+
+    Parameters
+    ----------
+    anatomy
+        The body.
+
+    Raises
+    ------
+    InputError
+        An anatomy without open cortex.
+    """
+
+    anatomy: Anatomy
+
+    @cached_property
+    def cortex(self) -> OpenCortex:
+        """The open cortex and its frame."""
+        return open_cortex(self.anatomy)
+
+    @cached_property
+    def nodes(self) -> np.ndarray:
+        """Sorted mesh vertices (n,) whose motion it needs: open cortex, and the tumour's surface."""
+        return np.union1d(self._open[0], self._tumour[0])
+
+    @cached_property
+    def _open(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mesh vertices (m,) of the open cortex, and its triangles (S, 3) of them."""
+        nodes, triangles = np.unique(self.anatomy.open_surface, return_inverse=True)
+        return nodes, triangles.reshape(-1, 3)
+
+    @cached_property
+    def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
+        nodes, triangles = np.unique(self.anatomy.tumour_surface, return_inverse=True)
+        return nodes, triangles.reshape(-1, 3)
+
+    def distances(
+        self,
+        loads: Loads,
+        displacement: np.ndarray,
+        nodes: np.ndarray,
+        ball: float | None = None,
+        lift: float = 0.0,
+    ) -> np.ndarray:
+        """Distances (B,) [m] from tip to tumour.
+
+        Parameters
+        ----------
+        loads
+            B pushes, or poses of one ball.
+        displacement, nodes
+            (B, n, 3) [m] of mesh vertices (n,), among them all of `self.nodes`.
+        ball
+            Radius [m] of the ball whose poses the loads are.
+        lift
+            How far [m] a tool that pushes has been lifted off, against the axis.
+
+        Raises
+        ------
+        InputError
+            Loads of another kind, poses of a ball of unknown radius, vertices that are missing, an anatomy without
+            tumour, or a ball that passes the open cortex by.
+        """
+        if not len(self.anatomy.tumour_nodes):
+            raise InputError("the anatomy has no tumour, from which a tip had a distance: make one that has.")
+        row = np.full(len(self.anatomy.mesh.nodes), -1)
+        row[nodes] = np.arange(len(nodes))
+        if (row[self.nodes] < 0).any():
+            raise InputError(
+                f"the distance from tip to tumour needs vertex {self.nodes[row[self.nodes] < 0][0]}, which this answer "
+                "does not know: ask for the open cortex and the tumour."
+            )
+        tips = self._tips(loads, displacement, row[self._open[0]], ball, lift)
+        found, at = np.empty(len(loads)), row[self._tumour[0]]
+        for first in range(0, len(loads), TOGETHER):
+            some = slice(first, first + TOGETHER)
+            tumour = self.anatomy.mesh.nodes[self._tumour[0]] + displacement[some][:, at]
+            near = closest(tips[some], tumour[:, self._tumour[1]]).point
+            found[some] = np.linalg.norm(near - tips[some], axis=1)
+        return found
+
+    def _tips(
+        self, loads: Loads, displacement: np.ndarray, row: np.ndarray, ball: float | None, lift: float
+    ) -> np.ndarray:
+        """Of the tool (B, 3) [m]; `row` (m,) of the open cortex's vertices in `displacement`."""
+        axis, touching = self.cortex.axis, loads.of(Touching)
+        if touching is not None and ball is not None:
+            pose = touching.pose[:, 0]
+            return pose[:, :3, 3] + ball * (pose[:, :3, 2] + axis)
+        pushed = loads.of(Pushed)
+        if pushed is None:
+            raise InputError("there is no tip where no tool pushes, and no ball of known radius is moved.")
+        nodes, triangles = self._open
+        rest, tips = self.anatomy.mesh.nodes[nodes], np.empty((len(loads), 3))
+        for first in range(0, len(loads), TOGETHER):
+            some = slice(first, first + TOGETHER)
+            _, triangle, weights = closest(pushed.point[some], rest[triangles])
+            for case, at, share in zip(range(first, len(loads)), triangle, weights, strict=False):
+                surface = rest + displacement[case, row]
+                through = share @ surface[triangles[at]]
+                tips[case] = resting_tip(surface, triangles, through, axis, float(pushed.footprint[case]))
+        return tips - lift * axis
+
+
+@lru_cache(8)
+def tip_gauge(anatomy: Anatomy) -> TipGauge:
+    """The gauge of an anatomy; every frame asks for it."""
+    return TipGauge(anatomy)

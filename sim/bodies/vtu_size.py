@@ -1,0 +1,114 @@
+"""How much a `.vtu` file inflates to, found without inflating it whole: a few bytes may stand for gigabytes."""
+
+from __future__ import annotations
+
+import base64
+import lzma
+import re
+import zlib
+from collections.abc import Callable, Iterator
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..errors import InputError
+from ..runtime.file_limits import too_large
+
+# What meshio takes for the start of raw bytes.
+RAW = re.compile(rb'<AppendedData[^>]+">')
+# Bytes inflated at once.
+PIECE = 2**20
+OPENERS = {"vtkZLibDataCompressor": zlib.decompressobj, "vtkLZMADataCompressor": lzma.LZMADecompressor}
+WORDS = {"UInt32": "u4", "UInt64": "u8"}
+
+
+def demand_small(path: Path, most: int) -> bool:
+    """Refuse a file whose packed arrays inflate to more than `most` bytes in all, or to more than they declare.
+
+    False of a file whose arrays it cannot count, or not as surely as meshio reads them: no XML, raw, or not packed.
+
+    Raises
+    ------
+    InputError
+        Naming the limit.
+    """
+    text, behind = path.read_bytes(), None
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:  # raw bytes, which no XML may hold
+        raw = RAW.search(text)
+        if raw is None:
+            return False
+        end = text.find(b"</AppendedData>")
+        behind = text[raw.end() : end].lstrip()[1:]
+        try:
+            root = ElementTree.fromstring(text[: raw.end()] + text[end:])
+        except ElementTree.ParseError:
+            return False
+    headed = root.get("header_type", "UInt32")
+    if headed not in WORDS:
+        raise InputError(f"its header_type is {headed!r}. Write it anew with {' or '.join(WORDS)}.")
+    opener = OPENERS.get(root.get("compressor", ""))
+    if opener is None:
+        return False
+    word = np.dtype(WORDS[headed]).newbyteorder(">" if root.get("byte_order") == "BigEndian" else "<")
+    raw = behind is not None
+    if behind is None:
+        behind = (root.findtext("AppendedData") or "").strip()[1:]
+    left = most
+    for array in root.iter("DataArray"):
+        kind = array.get("format")
+        if kind in ("binary", "appended"):
+            inside = behind[int(array.get("offset", 0)) :] if kind == "appended" else (array.text or "").strip()
+            declared, blocks = _packed(inside, word)
+            left -= declared
+            if left < 0:
+                raise too_large(most)
+            for block in blocks:
+                declared -= _inflated(opener, block, declared)
+                if declared < 0:
+                    raise InputError("an array inflates to more than its header says. Write the file anew.")
+    return not raw
+
+
+def _packed(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[bytes]]:
+    """Bytes that an array declares, and its packed blocks.
+
+    They lie behind a header of their number, the size of a block and of the last one, and the packed size of each.
+    `inside` is raw, or the header and the blocks are in base64.
+    """
+
+    def part(place: int, size: int) -> bytes:
+        if isinstance(inside, bytes):
+            return inside[place : place + size]
+        return base64.b64decode(inside[place : place + _letters(size)])
+
+    count = int(np.frombuffer(part(0, word.itemsize), word, 1)[0])
+    header = word.itemsize * (3 + count)
+    size, _, *sizes = map(int, np.frombuffer(part(0, header), word)[1 : 3 + count])
+    packed = part(header if isinstance(inside, bytes) else _letters(header), sum(sizes))
+    ends = [0, *accumulate(sizes)]
+    return count * size, (packed[start:end] for start, end in pairwise(ends))
+
+
+def _letters(size: int) -> int:
+    """Letters of base64 for so many bytes."""
+    return -(-size // 3) * 4
+
+
+def _inflated(opener: Callable[[], Any], block: bytes, most: int) -> int:
+    """Bytes that a block inflates to, all its streams together, or some number above `most`."""
+    total, rest = 0, block
+    while rest and total <= most:
+        opened = opener()
+        while total <= most and not opened.eof:
+            piece = opened.decompress(rest, PIECE)
+            rest = getattr(opened, "unconsumed_tail", b"")
+            total += len(piece)
+            if not piece and not rest:
+                return total
+        rest = opened.unused_data
+    return total

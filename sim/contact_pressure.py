@@ -1,0 +1,48 @@
+"""How hard what touches a body presses on it, from place to place."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .deformation import Deformation
+from .discretisation.term import Cases
+from .errors import InputError
+from .fem import Fem
+from .loads import Loads
+
+
+def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
+    """Mean pressure (B, V) [Pa] of tools, and of a skull that lets go, round each vertex: its force by its area.
+
+    A vertex has a third of the area of each surface triangle at it, as it is deformed; inside the body it has neither.
+    Tools are where the answer has them.
+
+    Raises
+    ------
+    InputError
+        Nothing that touches; quadratic elements, whose nodal forces are no pressures; an answer to other loads, or not
+        of all vertices.
+    """
+    if not fem.problem.barriers:
+        raise InputError("nothing touches this body: add ToolContact, Retraction or SkullContact to read a pressure.")
+    if fem.space.table.shape[1] > 4:
+        raise InputError("a pressure is read from linear tetrahedra: make the solver with p1 or smoothed elements.")
+    count = fem.space.count
+    if answer.displacement.shape != (len(loads), count, 3):
+        raise InputError(
+            f"the answer has {len(answer)} load cases at {len(answer.nodes)} vertices, the loads have {len(loads)} and "
+            f"the body {count}: give the whole answer to these loads."
+        )
+    device, surface = fem.problem.device, fem.space.surface
+    with fem.lock:
+        fem.problem.begin(Cases(loads, answer.time, answer.history, share=np.zeros(len(answer))))
+        u = device.array(answer.displacement.reshape(-1, 3 * count).T)
+        gradient = device.zeros(*u.shape)
+        for term in fem.problem.barriers:
+            term.add_gradient(u, gradient)
+    force = np.linalg.norm(gradient.numpy().T.reshape(answer.displacement.shape), axis=2)
+    corners = (fem.space.nodes + answer.displacement)[:, surface]
+    sides = corners[:, :, 1:] - corners[:, :, :1]
+    third = np.linalg.norm(np.cross(sides[:, :, 0], sides[:, :, 1]), axis=2) / 6.0
+    area = np.array([np.bincount(surface.ravel(), np.repeat(row, 3), count) for row in third]).reshape(force.shape)
+    return np.divide(force, area, out=np.zeros_like(area), where=area > 0.0)

@@ -1,0 +1,98 @@
+"""How near the bond between brain and skull comes to tearing."""
+
+from functools import cache
+
+import numpy as np
+import warp as wp
+from scipy.spatial import KDTree
+
+from ..anatomy import Anatomy
+from ..discretisation.space import Discretisation
+from ..effects import Bonded
+from ..geometry.triangles import areas
+from ..runtime.device import Device
+
+# Tractions are means over so far [m] round a node: at the rim of an opening they have no limit, but a mean.
+ROUND = 5e-3
+
+
+@cache
+def kernel_of(device: Device) -> wp.Kernel:
+    """The kernel of a device's scalar type, over (patch, column)."""
+    scalar = device.scalar
+
+    @wp.kernel(module="unique")
+    def strain(
+        force: wp.array2d(dtype=scalar),
+        first: wp.array(dtype=wp.int32),
+        nodes: wp.array(dtype=wp.int32),
+        normal: wp.array(dtype=wp.vec3d),
+        area: wp.array(dtype=wp.float64),
+        tension: wp.float64,
+        shear: wp.float64,
+        # outputs
+        share: wp.array2d(dtype=wp.float64),
+        most: wp.array(dtype=wp.float64),
+    ):
+        """s = |(max(t.n, 0) / tension, t - (t.n) n / shear)| of each patch, t = sum of forces / area; the largest."""
+        p, c = wp.tid()
+        t = wp.vec3d()
+        for k in range(first[p], first[p + 1]):
+            for i in range(3):
+                t[i] += wp.float64(force[3 * nodes[k] + i, c])
+        t /= area[p]
+        pull = wp.dot(t, normal[p])
+        along = wp.length(t - pull * normal[p]) / shear
+        s = wp.sqrt(wp.pow(wp.max(pull, wp.float64(0.0)) / tension, wp.float64(2.0)) + along * along)
+        wp.atomic_max(most, c, s)
+        if share:
+            share[p, c] = s
+
+    return strain
+
+
+class Bond:
+    """The largest traction between brain and skull, as a share of what `Bonded` bears.
+
+    Tension and shear count together, as sqrt((t_n / tension)^2 + (t_s / shear)^2): the quadratic nominal stress
+    criterion of cohesive layers (Camanho, Davila 2002, NASA/TM-2002-211737, eq. 16). Pressure breaks nothing.
+    """
+
+    def __init__(self, effect: Bonded, anatomy: Anatomy, space: Discretisation, device: Device):
+        self._effect, self._device = effect, device
+        covered = (anatomy.slide_normal != 0.0).any(axis=1)
+        corners = space.mesh.surface
+        wall = (covered | anatomy.held.all(axis=1))[corners].all(axis=1) & covered[corners].any(axis=1)
+        triangles = space.surface[wall]
+        share = np.repeat(areas(space.nodes[triangles[:, :3]])[:, None] / 3.0, 3, axis=1)
+        # Of a quadratic triangle's area the corners' shape functions have none.
+        area = np.bincount(triangles[:, -3:].ravel(), share.ravel(), space.count)
+        nodes = np.unique(triangles)
+        near = KDTree(space.nodes[nodes]).query_ball_point(space.nodes[nodes], ROUND)
+        normal = space.sliding(anatomy.slide_normal, anatomy.held)[nodes]
+        kept = np.flatnonzero(normal.any(axis=1) & np.array([area[nodes[patch]].any() for patch in near], bool))
+        patches = [nodes[near[patch]] for patch in kept]
+        self.nodes = nodes[kept]
+        self._arrays = [
+            device.array(np.cumsum([0, *map(len, patches)]), wp.int32),
+            device.array(np.concatenate([np.zeros(0, np.int64), *patches]), wp.int32),
+            device.array(normal[kept], wp.vec3d),
+            device.array(np.array([area[patch].sum() for patch in patches]), wp.float64),
+        ]
+
+    def shares(self, force: wp.array) -> np.ndarray:
+        """Round `nodes` (n,), of what the wall exerts on the body, force (3N, B) [N] on the device: (n, B)."""
+        share = wp.zeros((len(self.nodes), force.shape[1]), dtype=wp.float64, device=self._device.name)
+        self._largest(force, share)
+        return share.numpy()
+
+    def share(self, force: wp.array) -> np.ndarray:
+        """The largest of `shares` (B,): above 1 the bond would tear. NaN where no skull is."""
+        return self._largest(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
+
+    def _largest(self, force: wp.array, share: wp.array | None = None) -> wp.array:
+        """The largest share of each column (B,), on the device; all of them (n, B) into `share`, where it is given."""
+        most = wp.zeros(force.shape[1], dtype=wp.float64, device=self._device.name)
+        inputs = [force, *self._arrays, wp.float64(self._effect.tension), wp.float64(self._effect.shear)]
+        self._device.launch(kernel_of(self._device), (len(self.nodes), force.shape[1]), inputs, [share, most])
+        return most

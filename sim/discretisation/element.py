@@ -1,0 +1,129 @@
+"""Finite elements as tables: node numbers, shape gradients and quadrature weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import InputError
+from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh
+
+# Eight points of degree 3, the corners and the middles of the faces. With the four points that quadratic shapes need at
+# rest, elements under a tool fold at their corners, where no point looks.
+EIGHT_POINTS = np.vstack([np.eye(4), (np.ones((4, 4)) - np.eye(4)) / 3.0])
+EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)
+# Element matrices are summed in parts of so many entries, which bounds the memory that it takes.
+ENTRIES = 20_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Elements:
+    """T elements of at most n nodes with q quadrature points.
+
+    table (T, n) node numbers; gradient (T, q, n, 3) of the shape functions in the rest configuration [1/m];
+    weight (T, q) rest volume of each quadrature point [m^3]; nodes, how many nodes the discretisation has;
+    owner (T,) the mesh's tetrahedron whose tissue each element has; marks (T, k) vertices and labels that tell each
+    from all others, whatever is cut from the mesh; size (T,) how many of the n places a row uses, the first ones;
+    None: all.
+    """
+
+    table: np.ndarray
+    gradient: np.ndarray
+    weight: np.ndarray
+    nodes: int
+    owner: np.ndarray
+    marks: np.ndarray
+    size: np.ndarray | None = None
+
+    def on(self, nodes: np.ndarray) -> Elements:
+        """The same elements, of a body that has these nodes (n,) alone, ascending: theirs among them."""
+        return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), nodes=len(nodes))
+
+
+def linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
+    """Linear tetrahedra: one quadrature point, gradients constant. `chosen` (T,) bool picks elements."""
+    tets = mesh.tets[chosen]
+    corners = mesh.nodes[tets]
+    jacobian = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    inverse = np.linalg.inv(jacobian)  # rows: gradients of barycentric coordinates 1, 2, 3
+    gradient = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+    weight = mesh.volumes[chosen][:, None]
+    return Elements(tets, gradient[:, None], weight, len(mesh.nodes), np.flatnonzero(chosen), tets)
+
+
+def quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> Elements:
+    """Ten-node tetrahedra, straight or curved, eight quadrature points of degree 3.
+
+    Zienkiewicz, Taylor 2005, "The Finite Element Method", section 4.7. nodes (N, 3) [m]; table (T, 10): corners, then
+    the middles of `QUADRATIC_EDGES`; `chosen` (T,) bool picks elements.
+
+    Raises
+    ------
+    InputError
+        An element that its mid-edge nodes fold over.
+    """
+    table = table[chosen]
+    slope = quadratic_slopes(EIGHT_POINTS)
+    jacobian = np.einsum("tai,qaj->tqij", nodes[table], slope)
+    volume = np.linalg.det(jacobian)
+    folded = np.flatnonzero((volume <= 0.0).any(axis=1))
+    if len(folded):
+        raise InputError(
+            f"quadratic tetrahedron {np.flatnonzero(chosen)[folded[0]]} (and {len(folded) - 1} more) is folded over "
+            "by its mid-edge nodes: move them towards the middles of their edges."
+        )
+    gradient = np.einsum("qaj,tqji->tqai", slope, np.linalg.inv(jacobian))
+    weight = volume * EIGHT_WEIGHTS / 6.0
+    return Elements(table, gradient, weight, len(nodes), np.flatnonzero(chosen), table[:, :4])
+
+
+def quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Shape functions (..., n) of a quadratic simplex at corner coordinates (..., d): L (2 L - 1), and 4 L_i L_j."""
+    middle = 4.0 * corner[..., edges[:, 0]] * corner[..., edges[:, 1]]
+    return np.concatenate([corner * (2.0 * corner - 1.0), middle], axis=-1)
+
+
+def quadratic_slopes(corner: np.ndarray) -> np.ndarray:
+    """Derivatives (q, 10, 3) of the ten shape functions by corner coordinates 1, 2, 3 at points (q, 4)."""
+    slope = np.zeros((len(corner), 10, 4))
+    slope[:, np.arange(4), np.arange(4)] = 4.0 * corner - 1.0
+    for place, (i, j) in enumerate(QUADRATIC_EDGES, start=4):
+        slope[:, place, i], slope[:, place, j] = 4.0 * corner[:, j], 4.0 * corner[:, i]
+    return slope[:, :, 1:] - slope[:, :, :1]
+
+
+def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray) -> sp.csc_array:
+    """Stiffness at rest (3N, 3N) [N/m] of isotropic elements with Lamé's mu, lam (T,) [Pa].
+
+    K_ab = integral of mu (g_a . g_b I + g_b (x) g_a) + lambda g_a (x) g_b.
+    """
+    rows = 3 * elements.nodes
+    total = sp.csc_array((rows, rows))
+    count, most = elements.table.shape
+    size = np.full(count, most) if elements.size is None else elements.size
+    for places in np.unique(size):
+        alike = np.flatnonzero(size == places)
+        for part in np.array_split(alike, -(-len(alike) * 9 * places**2 // ENTRIES)):
+            total += _assembled(elements, part, int(places), mu[part], lam[part])
+    return total
+
+
+def _assembled(elements: Elements, part: np.ndarray, size: int, mu: np.ndarray, lam: np.ndarray) -> sp.csc_array:
+    g, w = elements.gradient[part, :, :size], elements.weight[part]
+    slopes = g.reshape(len(part), -1, 3 * size)
+    outer = (np.swapaxes(slopes * w[:, :, None], 1, 2) @ slopes).reshape(len(part), size, 3, size, 3)
+    outer = outer.transpose(0, 1, 3, 2, 4)  # g_a (x) g_b as blocks (T, a, b, 3, 3)
+    blocks = lam[:, None, None, None, None] * outer + mu[:, None, None, None, None] * np.swapaxes(outer, 3, 4)
+    dots = mu[:, None, None] * np.trace(outer, axis1=3, axis2=4)
+    for i in range(3):
+        blocks[..., i, i] += dots
+    table = elements.table[part, :size].astype(np.int64)
+    pair = (table[:, :, None] * elements.nodes + table[:, None, :]).ravel()
+    order = np.argsort(pair, kind="stable")
+    first = np.flatnonzero(np.diff(pair[order], prepend=-1))
+    row, column = np.divmod(pair[order[first]], elements.nodes)
+    summed = np.add.reduceat(blocks.reshape(-1, 9)[order], first, axis=0).reshape(-1, 3, 3)
+    start = np.searchsorted(row, np.arange(elements.nodes + 1))
+    return sp.csc_array(sp.bsr_array((summed, column, start), shape=(3 * elements.nodes,) * 2).tocsr().T)  # symmetric

@@ -1,0 +1,345 @@
+"""A round tool on a triangulated surface: how its weight falls on the mesh's vertices.
+
+The traction w(s) = sqrt(1 - s^2), s = |x - c| / r, is that of a flat punch's smooth counterpart (Hertz), integrated
+over triangles subdivided until they are small against the footprint: force and moment do not depend on the mesh.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..errors import InputError
+from ..runtime.device import Device, find_device
+
+# Triangles are divided until their longest edge is below this share of the footprint's radius.
+FINENESS = 0.12
+# Each edge in so many pieces at least, and then in twice as many until that is fine enough.
+PIECES = 8
+# No edge is cut into more: a footprint of 0.1 mm needs them on a triangle of 50 m.
+MOST_PIECES = 2**22
+# Triangles that one thread searches, and findings of which it takes the nearest.
+CHUNK = wp.constant(16)
+
+vec6d = wp.types.vector(length=6, dtype=wp.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """How B tools press M nodes: a force F puts weight / total x F on every node.
+
+    nodes (M,) numbers; weight (M, B) float64 and sums (B,) of 4-vectors on the device: the total, and the sum of
+    weight x position [m].
+    """
+
+    nodes: np.ndarray
+    weight: wp.array
+    sums: wp.array
+
+    def rows(self, count: int) -> sp.csr_array:
+        """Shares (B, `count`) of all nodes of a mesh, each row summing to one, on the host."""
+        weight, total = self.weight.numpy().T, self.sums.numpy().reshape(-1, 4)[:, 0]
+        tool, place = np.nonzero(weight)
+        share = weight[tool, place] / total[tool]
+        return sp.csr_array((share, (tool, self.nodes[place])), shape=(len(weight), count))
+
+    def centres(self) -> np.ndarray:
+        """Where each force acts (B, 3) [m], on the host."""
+        sums = self.sums.numpy().reshape(-1, 4)
+        return sums[:, 1:] / sums[:, :1]
+
+
+@dataclass(frozen=True, eq=False)
+class Imprint:
+    """Arrays on the device in which B tools press: (B,) of point and radius [m], and of where each touches first.
+
+    `found` (n, B) on the way there, fewer each time; weight (M, B) and sums (B,) as `Footprints`.
+    """
+
+    tools: wp.array
+    touched: wp.array
+    found: tuple[wp.array, ...]
+    weight: wp.array
+    sums: wp.array
+
+
+class Skin:
+    """A surface that tools touch, on a device.
+
+    Parameters
+    ----------
+    nodes
+        (N, 3) [m].
+    triangles
+        (S, 3), or (S, 6) with the middles of `TRIANGLE_EDGES` if quadratic. The corners say where they lie.
+    device
+        Where its arrays live.
+    name
+        What a sentence calls it.
+    """
+
+    def __init__(self, nodes: np.ndarray, triangles: np.ndarray, device: Device, name: str = "surface"):
+        self.device, self._name = device, name
+        self.nodes, table = np.unique(triangles, return_inverse=True)
+        self.numbers = device.array(self.nodes, wp.int32)
+        corners = nodes[triangles[:, :3]]
+        centre = corners.mean(axis=1)
+        reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+        edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0)
+        self._least = edge / (FINENESS * MOST_PIECES)
+        self._corners = device.array(corners, wp.vec3d)
+        self._ball = device.array(np.column_stack([centre, reach]), wp.vec4d)
+        self._table = device.array(table.reshape(triangles.shape), wp.int32)
+        self._position = device.array(nodes[self.nodes], wp.vec3d)
+        self._last: tuple[bytes, Footprints] | None = None
+
+    def nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest points (B, 3) [m] to `points` (B, 3) and how far they are; inf if not `within` (B,) [m]."""
+        imprint = self.imprint(self._tools(points, within))
+        self._touch(imprint)
+        touched = imprint.touched.numpy().reshape(-1, 4)
+        return touched[:, :3], touched[:, 3]
+
+    def press(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
+        """Footprints of tools at `points` (B, 3) with `radii` (B,) [m].
+
+        A point off the surface is moved to its nearest point on it, by at most its radius. The last answer is kept: a
+        solve asks for its tools more than once.
+
+        Raises
+        ------
+        InputError
+            A footprint that does not touch the surface, or is too small to be integrated over its triangles.
+        """
+        key, last = np.column_stack([points, radii]).tobytes(), self._last
+        if last is None or last[0] != key:
+            last = self._last = key, self._pressed(points, radii)
+        return last[1]  # another thread may have pressed elsewhere since
+
+    def imprint(self, tools: wp.array) -> Imprint:
+        """Where tools (B,) are about to press."""
+        count, device = len(tools), self.device.name
+        found, left = [], len(self._ball)
+        while left > 1 or not found:
+            left = -(-left // CHUNK)
+            found.append(wp.empty((left, count), dtype=wp.vec4d, device=device))
+        sums = wp.empty(count, dtype=wp.vec4d, device=device)
+        weight = wp.empty((len(self.nodes), count), dtype=wp.float64, device=device)
+        return Imprint(tools, found[-1].flatten(), tuple(found), weight, sums)
+
+    def put(self, imprint: Imprint) -> None:
+        """Let the tools press, on the device alone; infinitely far away, and no weight, where one does not touch."""
+        self._touch(imprint)
+        imprint.weight.zero_()
+        imprint.sums.zero_()
+        inputs = [self._corners, self._ball, self._table, self._position, imprint.tools, imprint.touched]
+        self.device.launch(_press, (len(self._ball), len(imprint.tools)), inputs, [imprint.weight, imprint.sums])
+
+    def demand_touch(self, points: np.ndarray, radii: np.ndarray) -> None:
+        """Refuse tools, as `press` has them, of which one does not touch the surface.
+
+        Raises
+        ------
+        InputError
+            Naming the first of them.
+        """
+        self._demand(points, radii, self.nearest(points, radii)[1])
+
+    def _pressed(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
+        small = radii.min(initial=np.inf)
+        if small < self._least:
+            raise InputError(
+                f"a footprint of {1e3 * small:.3g} mm is too small for the triangles of this surface: give a radius of "
+                f"at least {1e3 * self._least:.3g} mm."
+            )
+        imprint = self.imprint(self._tools(points, radii))
+        self.put(imprint)
+        self._demand(points, radii, imprint.touched.numpy().reshape(-1, 4)[:, 3])
+        return Footprints(self.nodes, imprint.weight, imprint.sums)
+
+    def _demand(self, points: np.ndarray, radii: np.ndarray, away: np.ndarray) -> None:
+        """Refuse tools that are infinitely far `away` (B,) from the surface."""
+        missed = np.flatnonzero(np.isinf(away))
+        if len(missed):
+            number = missed[0]
+            raise InputError(
+                f"load {number} presses at {np.round(1e3 * points[number], 1)} mm with a footprint of "
+                f"{1e3 * radii[number]:.3g} mm, which does not touch the {self._name}: choose a point on it."
+            )
+
+    def _tools(self, points: np.ndarray, radii: np.ndarray) -> wp.array:
+        return self.device.array(np.column_stack([points, radii]), wp.vec4d)
+
+    def _touch(self, imprint: Imprint) -> None:
+        """Where each tool touches first, and how far that is from its point; inf if beyond its radius."""
+        inputs = [self._corners, self._ball, imprint.tools]
+        self.device.launch(_search, imprint.found[0].shape, inputs, [imprint.found[0]])
+        for some, fewer in pairwise(imprint.found):
+            self.device.launch(_settle, fewer.shape, [some], [fewer])
+
+
+def footprint_weights(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray) -> sp.csr_array:
+    """Weights (B, N), each row summing to one; parameters and errors as `Skin` and `Skin.press`, on the host."""
+    return Skin(nodes, triangles, find_device("cpu", "float64")).press(points, radii).rows(len(nodes))
+
+
+def nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m]."""
+    apart = np.arange(3 * len(corners)).reshape(-1, 3)
+    skin = Skin(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))
+    return skin.nearest(point[None], np.array([np.inf]))[0][0]
+
+
+@wp.func
+def _on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+    """The point nearest to `point` between a and b."""
+    edge = b - a
+    square = wp.dot(edge, edge)
+    along = wp.float64(0.0)
+    if square > wp.float64(0.0):
+        along = wp.clamp(wp.dot(point - a, edge) / square, wp.float64(0.0), wp.float64(1.0))
+    return a + along * edge
+
+
+@wp.func
+def _nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+    """Whichever is nearer to `point`."""
+    return wp.where(wp.length_sq(one - point) <= wp.length_sq(other - point), one, other)
+
+
+@wp.func
+def _on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+    """The point nearest to `point` on a triangle.
+
+    Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the plane's foot where it lies inside, else the
+    nearest of the three edges. A needle has no foot to round-off: its edges serve.
+    """
+    nearest = _nearer(_nearer(_on_edge(a, b, point), _on_edge(b, c, point), point), _on_edge(c, a, point), point)
+    first, second, offset = b - a, c - a, point - a
+    # Corner coordinates of the foot from the Gram matrix of two edges.
+    aa, ab, bb = wp.dot(first, first), wp.dot(first, second), wp.dot(second, second)
+    pa, pb = wp.dot(offset, first), wp.dot(offset, second)
+    area = aa * bb - ab * ab
+    v, w = bb * pa - ab * pb, aa * pb - ab * pa
+    if area > wp.float64(0.0) and v >= wp.float64(0.0) and w >= wp.float64(0.0) and v + w <= area:
+        nearest = _nearer(a + (v / area) * first + (w / area) * second, nearest, point)
+    return nearest
+
+
+@wp.func
+def _place(of: wp.vec4d) -> wp.vec3d:
+    """Centre of a ball, point of a tool; the fourth component is its radius."""
+    return wp.vec3d(of[0], of[1], of[2])
+
+
+@wp.func
+def _joined(place: wp.vec3d, length: wp.float64) -> wp.vec4d:
+    return wp.vec4d(place[0], place[1], place[2], length)
+
+
+@wp.kernel
+def _search(
+    corners: wp.array2d(dtype=wp.vec3d),
+    ball: wp.array(dtype=wp.vec4d),
+    tools: wp.array(dtype=wp.vec4d),
+    # outputs
+    found: wp.array2d(dtype=wp.vec4d),
+):
+    """The nearest point of a chunk of triangles, and how far it is; inf where none is near enough."""
+    chunk, c = wp.tid()
+    point = _place(tools[c])
+    best = tools[c][3]
+    found[chunk, c] = _joined(point, wp.float64(wp.inf))
+    for s in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, ball.shape[0])):
+        near = ball[s][3] + best
+        if wp.length_sq(_place(ball[s]) - point) <= near * near:
+            nearest = _on_triangle(corners[s, 0], corners[s, 1], corners[s, 2], point)
+            far = wp.length(nearest - point)
+            if far <= best:
+                best = far
+                found[chunk, c] = _joined(nearest, far)
+
+
+@wp.kernel
+def _settle(
+    found: wp.array2d(dtype=wp.vec4d),
+    # outputs
+    nearest: wp.array2d(dtype=wp.vec4d),
+):
+    """The nearest of some."""
+    group, c = wp.tid()
+    best = found[group * CHUNK, c]
+    for k in range(1, CHUNK):
+        other = found[wp.min(group * CHUNK + k, found.shape[0] - 1), c]
+        if other[3] < best[3]:
+            best = other
+    nearest[group, c] = best
+
+
+@wp.kernel
+def _press(
+    corners: wp.array2d(dtype=wp.vec3d),
+    ball: wp.array(dtype=wp.vec4d),
+    table: wp.array2d(dtype=wp.int32),
+    position: wp.array(dtype=wp.vec3d),
+    tools: wp.array(dtype=wp.vec4d),
+    touched: wp.array(dtype=wp.vec4d),
+    # outputs
+    weight: wp.array2d(dtype=wp.float64),
+    sums: wp.array(dtype=wp.vec4d),
+):
+    """Add the integral of w N_a over a triangle, up to a factor, by the centres of n^2 equal pieces.
+
+    A row of pieces, y constant, meets the footprint in an interval: where A j^2 + 2 B j + C < 0 at its j-th piece.
+    """
+    s, c = wp.tid()
+    point, radius = _place(touched[c]), tools[c][3]
+    near = ball[s][3] + radius
+    if wp.length_sq(_place(ball[s]) - point) > near * near:
+        return
+    zero, one, two = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0)
+    start, first, second = corners[s, 0] - point, corners[s, 1] - corners[s, 0], corners[s, 2] - corners[s, 0]
+    longest = wp.max(wp.max(wp.length(first), wp.length(second)), wp.length(first - second))
+    n = int(PIECES)
+    while longest > wp.float64(FINENESS) * radius * wp.float64(n) and n < MOST_PIECES:
+        n *= 2
+    h = one / wp.float64(n)
+    step = h * second
+    A = wp.length_sq(step)
+    # Moments of w over the triangle for corner coordinates (1 - y - z, y, z): of 1, y, z, and of y^2, y z, z^2.
+    m, mm = wp.vec3d(), wp.vec3d()
+    # Upright pieces have their centres a third of the way, those turned round two thirds.
+    for turned in range(2):
+        third = wp.float64(turned + 1) / wp.float64(3.0)
+        for i in range(n - turned):
+            b = (wp.float64(i) + third) * h
+            at = start + b * first + third * step
+            B = wp.dot(at, step)
+            C = wp.length_sq(at) - radius * radius
+            if B * B > A * C:
+                root = wp.sqrt(B * B - A * C)
+                low = int(wp.max((-B - root) / A, zero))
+                high = int(wp.clamp((root - B) / A, -one, wp.float64(n - i - turned - 1)))
+                row = wp.vec3d()
+                for j in range(low, high + 1):
+                    k = wp.float64(j)
+                    a = (k + third) * h
+                    row += wp.sqrt(wp.max(-((A * k + two * B) * k + C), zero)) * wp.vec3d(one, a, a * a)
+                m += wp.vec3d(row[0], b * row[0], row[1])
+                mm += wp.vec3d(b * b * row[0], b * row[1], row[2])
+    if m[0] == zero:
+        return
+    scale = wp.length(wp.cross(first, second)) * h * h / radius
+    x, y, z = m[0] - m[1] - m[2], m[1], m[2]
+    share = vec6d(x, y, z, zero, zero, zero)
+    if table.shape[1] == 6:  # L (2 L - 1) at corners, 4 L_i L_j between them
+        xy, yz, zx = y - mm[0] - mm[1], mm[1], z - mm[1] - mm[2]
+        halves = vec6d(xy + zx, xy + yz, yz + zx, -two * xy, -two * yz, -two * zx)
+        share -= two * halves
+    moment = wp.vec3d()
+    for a in range(table.shape[1]):
+        wp.atomic_add(weight, table[s, a], c, scale * share[a])
+        moment += share[a] * position[table[s, a]]
+    wp.atomic_add(sums, c, scale * wp.vec4d(m[0], moment[0], moment[1], moment[2]))

@@ -1,0 +1,73 @@
+"""Which tetrahedra lie inside out: a body may be in equilibrium there, but no tissue is."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from ..runtime.device import Device
+from .element import linear_elements, quadratic_elements
+from .space import Discretisation
+
+# A volume below this share of its rest value is collapsed: round-off decides on which side of zero it lies.
+COLLAPSED = 1e-6
+
+
+@cache
+def kernel_of(device: Device, size: int, points: int) -> wp.Kernel:
+    """The kernel for tetrahedra of `size` nodes and `points` quadrature points, over (tetrahedron, column)."""
+    scalar, vec = device.scalar, device.vector
+    least = COLLAPSED
+
+    @wp.kernel(module="unique")
+    def count_inverted(
+        u: wp.array2d(dtype=scalar),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        # outputs
+        out: wp.array(dtype=wp.int32),
+    ):
+        """n += 1 where det F <= 1e-6 at some point, F = I + sum over nodes of u_a (x) grad N_a."""
+        e, c = wp.tid()
+        for q in range(points):
+            F = wp.identity(n=3, dtype=scalar)
+            for a in range(size):
+                i = 3 * table[e, a]
+                F += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]), gradient[e, q, a])
+            if wp.determinant(F) <= scalar(least):
+                wp.atomic_add(out, c, 1)
+                return
+
+    return count_inverted
+
+
+class Inversion:
+    """Counts tetrahedra that lie inside out, or collapsed, at some quadrature point.
+
+    Linear tetrahedra have one point, quadratic ones eight. Smoothed strains are averages: there too every tetrahedron
+    is looked at by itself.
+    """
+
+    def __init__(self, space: Discretisation, device: Device):
+        every = np.ones(len(space.mesh.tets), bool)
+        quadratic = space.element == "p2"
+        elements = (
+            quadratic_elements(space.nodes, space.table, every) if quadratic else linear_elements(space.mesh, every)
+        )
+        self._device = device
+        self._table = device.array(elements.table, wp.int32)
+        self._gradient = device.array(elements.gradient, device.vector)
+
+    def count(self, u: wp.array) -> np.ndarray:
+        """How many (B,) in u (3N, B) [m], on the device."""
+        out = wp.zeros(u.shape[1], dtype=wp.int32, device=self._device.name)
+        self.add_count(u, out)
+        return out.numpy()
+
+    def add_count(self, u: wp.array, out: wp.array) -> None:
+        """Add how many in u (3N, B) [m] to out (B,) int32, on the device alone."""
+        _, points, size = self._gradient.shape
+        inputs = [u, self._table, self._gradient]
+        self._device.launch(kernel_of(self._device, size, points), (len(self._table), u.shape[1]), inputs, [out])

@@ -1,0 +1,83 @@
+"""What is left of a body after each step of a resection, and what came loose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..anatomy import Anatomy
+from ..effects import Bonded, Effect, Held, Resection, Slide
+from ..errors import InputError
+from .rigid_modes import check_held, loosened
+
+
+@dataclass(frozen=True, eq=False)
+class Remains:
+    """A body after so many steps.
+
+    Parameters
+    ----------
+    done
+        Steps.
+    anatomy
+        What is left, under the whole body's vertex numbers.
+    loose
+        (n,) the whole body's tetrahedra that no step took: nothing held them any more, and they went too.
+    """
+
+    done: int
+    anatomy: Anatomy
+    loose: np.ndarray
+
+    def __str__(self) -> str:
+        """The sentence that a user reads."""
+        said = f"{self.done} step{'' if self.done == 1 else 's'} done"
+        if not len(self.loose):
+            return said
+        return f"{said}; {len(self.loose)} tetrahedra that nothing held any more went too"
+
+
+def bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[Remains, ...]:
+    """`remains` under effects, `Resection` one of them: what none of them holds, or keeps on the skull, comes loose.
+
+    Raises
+    ------
+    InputError
+        As `remains`.
+    """
+    effects = tuple(effects)
+    cut = next(effect for effect in effects if isinstance(effect, Resection))
+    kinds = {type(effect) for effect in effects}
+    held = Held in kinds or not anatomy.held.any()
+    whole = anatomy if held else replace(anatomy, held=np.zeros_like(anatomy.held))
+    return remains(whole, cut, bool(kinds & {Bonded, Slide}))
+
+
+def remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[Remains, ...]:
+    """What is left after 0, 1, ... all steps; `slides`: slide normals keep tissue on the skull.
+
+    Raises
+    ------
+    InputError
+        A body that is not held; a step that takes a tetrahedron that the mesh does not have, or the last of the body.
+    """
+    return tuple(_remains(anatomy, effect, slides))
+
+
+def _remains(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[Remains]:
+    normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
+    check_held(anatomy.mesh, anatomy.held, normal)  # else all of it would count as loose
+    yield Remains(0, anatomy, np.zeros(0, np.int64))
+    taken: set[int] = set()
+    for done, step in enumerate(effect.steps, start=1):
+        taken.update(step)
+        gone = np.array(sorted(taken))
+        try:
+            left = anatomy.without(gone)
+            kept = np.setdiff1d(np.arange(len(anatomy.mesh.tets)), gone)
+            loose = kept[loosened(left, slides)]
+            yield Remains(done, anatomy.without(np.concatenate([gone, loose])) if len(loose) else left, loose)
+        except InputError as error:
+            raise InputError(f"step {done} of Resection cannot be done: {error}") from error

@@ -1,0 +1,112 @@
+"""Whether the constraints hold a body: no part of it may move rigidly without resistance."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..anatomy import Anatomy
+from ..errors import InputError
+from ..geometry.tetmesh import FACES, TetMesh, row_keys
+
+# A rigid motion is felt when the constraints move by more than this share of it, in the mean.
+FELT = 1e-6
+
+
+def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray) -> None:
+    """Refuse a body, or a part of one, that can translate or rotate freely.
+
+    held (V, 3) bool and normal (V, 3) are the constraints. A node of no element must be held: nothing else stops it.
+    Elements joined by faces make a rigid cluster; clusters that share a corner or an edge only are hinged there.
+
+    Raises
+    ------
+    InputError
+        Naming the part and what is missing.
+    """
+    count = len(mesh.nodes)
+    used = np.zeros(count, bool)
+    used[mesh.table] = True
+    loose = np.flatnonzero(~used & ~held.all(axis=1))
+    if len(loose):
+        raise InputError(f"node {loose[0]} (and {len(loose) - 1} more) belongs to no tetrahedron: remove or hold it.")
+    key = np.unique(np.repeat(_clusters(mesh.tets), mesh.table.shape[1]) * count + mesh.table.ravel())
+    cluster, node = divmod(key, count)
+    piece = _components(cluster, cluster.max() + 1 + node, cluster.max() + 1 + count)[cluster]
+    for number in np.unique(piece):
+        mine = piece == number
+        free, at = _free_motions(mesh.nodes, held, normal, cluster[mine], node[mine])
+        if free == 0:
+            continue
+        hinged = len(np.unique(cluster[mine])) > 1
+        part = node[mine & (cluster == at)]
+        where = f"{len(part)} nodes round {np.round(1e3 * mesh.nodes[part].mean(axis=0), 1)} mm"
+        if hinged:
+            raise InputError(
+                f"a part of {where} can move rigidly in {free} ways: it shares corners or an edge with the rest, but "
+                "no face. Join it by faces, hold it, or remove it."
+            )
+        what = "the body" if len(part) == used.sum() else f"a loose piece of {where}"
+        raise InputError(
+            f"{what} can move rigidly in {free} of 6 ways: hold at least three nodes of it that are not in line."
+        )
+
+
+def loosened(anatomy: Anatomy, slides: bool = True) -> np.ndarray:
+    """Tetrahedra (n,) that can move rigidly: joined by faces to nothing held, nor borne by what slides, if it does."""
+    normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
+    cluster, nodes = _clusters(anatomy.mesh.tets), anatomy.mesh.nodes
+    loose = []
+    for number in np.unique(cluster):
+        mine = np.flatnonzero(cluster == number)
+        node = np.unique(anatomy.mesh.table[mine])
+        if not anatomy.held[node].any():
+            one = np.zeros(len(node), np.int64)
+            if _free_motions(nodes, anatomy.held, normal, one, node)[0]:
+                loose.append(mine)
+    return np.concatenate(loose) if loose else np.zeros(0, np.int64)
+
+
+def _components(first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:
+    """Component numbers (count,) of a graph with edges (first, second)."""
+    graph = sp.coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    return sp.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def _clusters(tets: np.ndarray) -> np.ndarray:
+    """Numbers (T,) of the clusters of elements that are joined by faces."""
+    keys = row_keys(tets[:, FACES].reshape(-1, 3))
+    order = np.argsort(keys)
+    same = keys[order[1:]] == keys[order[:-1]]
+    return _components(order[:-1][same] // 4, order[1:][same] // 4, len(tets))
+
+
+def _free_motions(
+    nodes: np.ndarray, held: np.ndarray, normal: np.ndarray, cluster: np.ndarray, node: np.ndarray
+) -> tuple[int, int]:
+    """How many rigid motions of clusters nothing resists, and the cluster that moves most in one of them.
+
+    `cluster` (m,) and `node` (m,) pair the clusters with their nodes. Six unknowns a cluster, and as equations: held
+    components and normals do not move, nodes that clusters share move alike.
+    """
+    names, local = np.unique(cluster, return_inverse=True)
+    size = np.bincount(local)
+    centre = np.column_stack([np.bincount(local, x) / size for x in nodes[node].T])
+    arm = nodes[node] - centre[local]
+    arm /= np.maximum.reduceat(np.linalg.norm(arm, axis=1), np.flatnonzero(np.diff(local, prepend=-1)))[local, None]
+    # (m, 3, 6): displacement of each node under its cluster's unit translations and rotations.
+    turn = np.cross(np.eye(3)[None], arm[:, None]).swapaxes(1, 2)
+    motion = np.concatenate([np.broadcast_to(np.eye(3), turn.shape), turn], axis=2)
+    column = np.broadcast_to(6 * local[:, None, None] + np.arange(6), motion.shape)
+    row = np.broadcast_to(np.arange(3 * len(node)).reshape(-1, 3, 1), motion.shape)
+    moves = sp.csr_array((motion.ravel(), (row.ravel(), column.ravel())), shape=(3 * len(node), 6 * len(names)))
+    along = normal[node].ravel(), np.arange(3 * len(node)), np.arange(0, 3 * len(node) + 1, 3)
+    across = sp.csr_array(along, shape=(len(node), 3 * len(node))) @ moves
+    order, x = np.argsort(node, kind="stable"), np.arange(3)
+    joint = np.flatnonzero(node[order[1:]] == node[order[:-1]])
+    one, other = ((3 * order[joint + k][:, None] + x).ravel() for k in (0, 1))
+    felt = sp.vstack([moves[held[node].ravel()], across, moves[one] - moves[other]])
+    equations = int(held[node].sum() + (normal[node] != 0.0).any(axis=1).sum() + len(one))
+    values, vectors = np.linalg.eigh((felt.T @ felt).toarray())
+    amount = np.abs(vectors[:, 0]).reshape(-1, 6).max(axis=1)
+    return int((values <= FELT**2 * max(equations, 1)).sum()), int(names[np.argmax(amount)])

@@ -1,0 +1,174 @@
+"""The nodes of an element type over a mesh. The mesh's own come first; nothing outside this room knows the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import InputError
+from ..geometry.normals import unit
+from ..geometry.tetmesh import QUADRATIC_EDGES, TRIANGLE_EDGES, TetMesh, row_keys
+from .element import Elements, linear_elements, quadratic_elements
+from .smoothed import edge_elements, node_elements
+
+ELEMENTS = {
+    "p1": "linear tetrahedra: the fastest, and too stiff, the more so the less tissue can be compressed",
+    "p2": "quadratic tetrahedra: the most accurate, seven times as many nodes",
+    "smoothed": "linear tetrahedra with strains averaged over edges and nodes: nearly as accurate as p2 on p1's nodes",
+}
+RECOMMENDED = "smoothed"
+"""The element of every scene and command that names none, on meshes of linear tetrahedra."""
+
+
+# The least cosine between the normal at the middle of an edge and the normals of its ends: less is another wall's.
+FACING = 0.75
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Elements, and which of a tissue's stiffness they carry: "whole", "shape" or "volume"."""
+
+    elements: Elements
+    carries: str
+
+
+@dataclass(frozen=True, eq=False)
+class Discretisation:
+    """N nodes: the mesh's V, then one on each of `edges` (E, 2), for quadratic elements on a linear mesh.
+
+    table (T, n) node numbers of the tetrahedra: corners, and the middles of `QUADRATIC_EDGES` if quadratic.
+    """
+
+    mesh: TetMesh
+    element: str
+    table: np.ndarray
+    edges: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return len(self.mesh.nodes) + len(self.edges)
+
+    @cached_property
+    def nodes(self) -> np.ndarray:
+        """Rest positions (N, 3) [m]."""
+        return self.interpolated(self.mesh.nodes)
+
+    @property
+    def marks(self) -> np.ndarray:
+        """What tells each node (N, 2) from all others, whatever is cut: the vertex twice, or the ends of its edge."""
+        return np.concatenate([np.repeat(np.arange(len(self.mesh.nodes))[:, None], 2, axis=1), self.edges])
+
+    @cached_property
+    def corner_interpolation(self) -> sp.csr_array:
+        """(N, C): values at the C nodes that are corners to all nodes, linear along each edge."""
+        corner = np.unique(self.table[:, :4])
+        place = np.zeros(self.count, np.int64)
+        place[corner] = np.arange(len(corner))
+        middle, first = np.unique(self.table[:, 4:], return_index=True)
+        ends = self.table[:, QUADRATIC_EDGES].reshape(-1, 2)[first]
+        row = np.concatenate([corner, np.repeat(middle, 2)])
+        column = place[np.concatenate([corner, ends.ravel()])]
+        value = np.repeat([1.0, 0.5], [len(corner), 2 * len(middle)])
+        return sp.csr_array(sp.coo_array((value, (row, column)), shape=(self.count, len(corner))))
+
+    @cached_property
+    def surface(self) -> np.ndarray:
+        """Surface triangles (S, 3) or, if quadratic, (S, 6): corners, then the middles of `TRIANGLE_EDGES`."""
+        corners = self.mesh.surface
+        if self.table.shape[1] == 4:
+            return corners
+        ends, wanted = self.table[:, QUADRATIC_EDGES].reshape(-1, 2), corners[:, TRIANGLE_EDGES].reshape(-1, 2)
+        known, asked = np.split(row_keys(np.vstack([ends, wanted])), [len(ends)])
+        key, first = np.unique(known, return_index=True)
+        middles = self.table[:, 4:].ravel()[first[np.searchsorted(key, asked)]]
+        return np.column_stack([corners, middles.reshape(-1, 3)])
+
+    def parts(self, chosen: np.ndarray) -> tuple[Part, ...]:
+        """Elements over the `chosen` (T,) bool tetrahedra.
+
+        Raises
+        ------
+        InputError
+            Quadratic elements that are folded over.
+        """
+        if self.element == "p1":
+            return (Part(linear_elements(self.mesh, chosen), "whole"),)
+        if self.element == "p2":
+            return (Part(quadratic_elements(self.nodes, self.table, chosen), "whole"),)
+        return Part(edge_elements(self.mesh, chosen), "shape"), Part(node_elements(self.mesh, chosen), "volume")
+
+    def held(self, held: np.ndarray) -> np.ndarray:
+        """Held components (N, 3) from the mesh's own (V, 3).
+
+        An added node is held where its edge lies on a surface triangle whose corners are all held.
+        """
+        out = np.zeros((self.count, 3), bool)
+        out[: len(held)] = held
+        for component in range(3):
+            wall = self.surface[held[self.mesh.surface, component].all(axis=1), 3:]
+            out[wall[wall >= len(held)], component] = True
+        return out
+
+    def sliding(self, normal: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Slide normals (N, 3) from the mesh's own (V, 3); held (V, 3) bool.
+
+        An added node slides where its edge lies on a surface triangle whose corners all slide or are held. Its normal
+        is along the integral of its shape function's gradient, as that of the triangles that meet there, so that no
+        volume passes; where these do not face as its ends do (at the edge of a box, say), of those triangles alone.
+        """
+        out = np.zeros((self.count, 3))
+        out[: len(normal)] = normal
+        if not len(self.edges):
+            return out
+        corners = self.mesh.surface
+        slides = (normal != 0.0).any(axis=1)
+        wall = (slides | held.all(axis=1))[corners].all(axis=1) & slides[corners].any(axis=1)
+        a, b, c = np.moveaxis(self.mesh.nodes[corners], 1, 0)
+        twice = np.cross(b - a, c - a)
+        near, every = np.zeros_like(out), np.zeros_like(out)
+        np.add.at(near, self.surface[wall, 3:], twice[wall, None])
+        np.add.at(every, self.surface[:, 3:], twice[:, None])
+        near, every = unit(near[len(normal) :]), unit(every[len(normal) :])
+        agrees = (np.einsum("nei,ni->ne", normal[self.edges], every) > FACING) | ~slides[self.edges]
+        found = np.where(agrees.all(axis=1, keepdims=True), every, near)
+        out[len(normal) :] = np.where((near != 0.0).any(axis=1, keepdims=True), found, 0.0)
+        return out
+
+    def interpolated(self, field: np.ndarray) -> np.ndarray:
+        """(..., N, 3) from (..., V, 3): linear along each edge."""
+        return np.concatenate([field, field[..., self.edges, :].mean(axis=-2)], axis=-2)
+
+
+def recommended(mesh: TetMesh) -> str:
+    """The element of who names none: `RECOMMENDED`, or p2 on a mesh that brings mid-edge nodes of its own."""
+    return RECOMMENDED if mesh.middles is None else "p2"
+
+
+def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
+    """The nodes and elements of type `element`, one of `ELEMENTS`, over a mesh.
+
+    None: the `recommended` one.
+
+    Raises
+    ------
+    InputError
+        An unknown type; a linear type on a mesh that brings mid-edge nodes of its own.
+    """
+    element = recommended(mesh) if element is None else element
+    if element not in tuple(ELEMENTS):  # which need not be hashable
+        raise InputError(f"no element is called {element!r}: choose one of {', '.join(ELEMENTS)}.")
+    none = np.zeros((0, 2), np.int32)
+    if mesh.middles is not None:
+        if element != "p2":
+            raise InputError(f"the mesh has quadratic tetrahedra, which are no {element}: take p2, or a linear mesh.")
+        return Discretisation(mesh, element, mesh.table, none)
+    if element != "p2":
+        return Discretisation(mesh, element, mesh.tets, none)
+    ends = np.sort(mesh.tets[:, QUADRATIC_EDGES].reshape(-1, 2), axis=1)
+    _, first, place = np.unique(row_keys(ends), return_index=True, return_inverse=True)
+    middles = len(mesh.nodes) + place.reshape(-1, 6).astype(np.int32)
+    return Discretisation(mesh, element, np.hstack([mesh.tets, middles]), ends[first])

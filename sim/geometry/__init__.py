@@ -1,0 +1,1 @@
+"""Tetrahedral meshes and triangulated surfaces, in NumPy alone."""

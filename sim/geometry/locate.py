@@ -1,0 +1,40 @@
+"""Reading one mesh's answer at material points of another: which tetrahedron holds a point, and where in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from .tetmesh import TetMesh
+
+# Tetrahedra whose middles are nearest to a point: in graded meshes the one that holds it is among so many.
+CANDIDATES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Points in a mesh: vertices (n, 4) of the tetrahedron that holds each, and barycentric weights (n, 4)."""
+
+    vertices: np.ndarray
+    weights: np.ndarray
+
+    def read(self, field: np.ndarray) -> np.ndarray:
+        """Values (B, n, k) at the points, linear between the vertices' (B, V, k)."""
+        return np.einsum("nc,bnck->bnk", self.weights, field[:, self.vertices])
+
+
+def locate(mesh: TetMesh, points: np.ndarray) -> Located:
+    """Find points (n, 3) [m]; one outside is read at the place nearest to it by barycentric coordinates."""
+    corners = mesh.nodes[mesh.tets]
+    _, near = KDTree(corners.mean(axis=1)).query(points, k=min(CANDIDATES, len(corners)))
+    near = near.reshape(len(points), -1)
+    a, *others = np.moveaxis(corners[near], 2, 0)
+    edges = np.stack([other - a for other in others], axis=-1)
+    inner = np.linalg.solve(edges, (points[:, None] - a)[..., None])[..., 0]
+    weights = np.concatenate([1.0 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)
+    best = weights.min(axis=-1).argmax(axis=1)
+    row = np.arange(len(points))
+    inside = np.maximum(weights[row, best], 0.0)
+    return Located(mesh.tets[near[row, best]], inside / inside.sum(axis=1, keepdims=True))

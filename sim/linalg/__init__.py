@@ -1,0 +1,1 @@
+"""Conjugate gradients, factors, inverses, multigrid, and which of them preconditions a problem."""

@@ -1,0 +1,72 @@
+"""Smoothed-aggregation algebraic multigrid, for meshes whose stiffness is too large to factorise.
+
+Vanek, Mandel, Brezina 1996, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
+problems", Computing 56:179-196; the coarse levels must represent the rigid motions. PyAMG finds the levels, once, on
+the host (Bell, Olson, Schroder, Southworth 2023, J. Open Source Softw. 8:5495); the cycle is ours, `multigrid.py`.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyamg
+import scipy.sparse as sp
+
+from ..runtime.device import Device
+from .multigrid import Lifted, TwoLevel, regular
+from .pcg import Preconditioner
+
+Direct = Callable[[sp.csc_array, sp.csc_array, np.ndarray], Preconditioner]
+"""Solves K over motions L (n, m) whose unknowns are numbered by node (m,), as `factor.Factor` does."""
+# A level of so few nodes, of six unknowns each, is the last.
+LARGEST_LAST = 1_000
+# Every neighbour counts. Energy-minimising smoothing draws no random numbers: the same mesh gives the same levels.
+SETTING: dict[str, Any] = {
+    "strength": ("symmetric", {"theta": 0.0}),
+    "smooth": ("energy", {"krylov": "cg", "maxiter": 2, "degree": 1}),
+    "improve_candidates": None,
+    "presmoother": None,
+    "postsmoother": None,
+    "coarse_solver": "splu",
+}
+
+
+def algebraic(stiffness: sp.bsr_array, motions: np.ndarray, direct: Direct, device: Device) -> Preconditioner:
+    """One V-cycle on K (3N, 3N) [N/m], positive definite in blocks of nodes, with rigid motions (3N, 6).
+
+    Raises
+    ------
+    RuntimeError
+        K is singular over the last level's motions.
+    """
+    *fine, _ = pyamg.smoothed_aggregation_solver(
+        sp.bsr_matrix(stiffness), B=motions, max_coarse=LARGEST_LAST, **SETTING
+    ).levels
+    if not fine:
+        return _direct(sp.csc_array(stiffness), sp.csc_array(sp.eye_array(len(motions))), 3, direct)
+    *upper, lowest = fine
+    coarse = _direct(sp.csc_array(lowest.A), sp.csc_array(lowest.P), lowest.P.blocksize[1], direct)
+    solver = TwoLevel(coarse, _blocks(lowest.A), device)
+    for level in reversed(upper):
+        solver = TwoLevel(Lifted(sp.bsr_array(level.P), solver, device), _blocks(level.A), device)
+    solver.name = f"algebraic multigrid, {len(fine) + 1} levels"
+    return solver
+
+
+def _direct(stiffness: sp.csc_array, motions: sp.csc_array, size: int, direct: Direct) -> Preconditioner:
+    """Over the motions, `size` to a node, that move anything: of aggregates with few unknowns some do not."""
+    moving = np.flatnonzero(abs(motions).sum(axis=0) > 0.0)
+    return direct(stiffness, motions[:, moving], moving // size)
+
+
+def _blocks(matrix: sp.bsr_matrix) -> sp.bsr_array:
+    return regular(sp.csr_array(matrix), matrix.blocksize[0])
+
+
+def rigid_motions(points: np.ndarray) -> np.ndarray:
+    """Translations and rotations (3N, 6) of points (N, 3); lengths as shares of the body's."""
+    arm = points - points.mean(axis=0)
+    arm /= np.abs(arm).max()
+    turns = [np.cross(axis, arm) for axis in np.eye(3)]
+    moves = [np.broadcast_to(axis, arm.shape) for axis in np.eye(3)]
+    return np.stack([*moves, *turns], axis=-1).reshape(-1, 6)

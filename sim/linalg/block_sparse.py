@@ -1,0 +1,135 @@
+"""A sparse matrix of small dense blocks, times many columns."""
+
+from functools import cache
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..runtime.device import Device
+
+# A row of blocks times x (n, b) on the CPU; blocks are stored by their columns. Eight columns of x together fill vector
+# registers. For one the rows of a block do, WIDE >= ROWS of them: those beyond are the next column's, or padding.
+ROW = """
+    const int b = x.shape[1];
+    int c = 0;
+    for (; c + 8 <= b; c += 8) {
+        real sum[ROWS][8] = {};
+        for (int k = first.data[i]; k < first.data[i + 1]; ++k) {
+            const real* A = block.data + (size_t)k * ROWS * COLUMNS;
+            const real* X = x.data + (size_t)COLUMNS * column.data[k] * b + c;
+            for (int m = 0; m < COLUMNS; ++m)
+                for (int r = 0; r < ROWS; ++r)
+                    for (int l = 0; l < 8; ++l) sum[r][l] += A[m * ROWS + r] * X[m * b + l];
+        }
+        for (int r = 0; r < ROWS; ++r)
+            for (int l = 0; l < 8; ++l) out.data[((size_t)ROWS * i + r) * b + c + l] += factor * sum[r][l];
+    }
+    for (; c < b; ++c) {
+        real sum[COLUMNS][WIDE] = {};
+        for (int k = first.data[i]; k < first.data[i + 1]; ++k) {
+            const real* A = block.data + (size_t)k * ROWS * COLUMNS;
+            const real* X = x.data + (size_t)COLUMNS * column.data[k] * b + c;
+            for (int m = 0; m < COLUMNS; ++m)
+                for (int r = 0; r < WIDE; ++r) sum[m][r] += A[m * ROWS + r] * X[m * b];
+        }
+        for (int m = 1; m < COLUMNS; ++m)
+            for (int r = 0; r < ROWS; ++r) sum[0][r] += sum[m][r];
+        for (int r = 0; r < ROWS; ++r) out.data[((size_t)ROWS * i + r) * b + c] += factor * sum[0][r];
+    }
+"""
+LANES = 4
+
+
+@cache
+def kernel_of(device: Device, rows: int, columns: int) -> wp.Kernel:
+    """Kernel on a graphics card for blocks (rows, columns) of a device's scalar type, over block rows and columns."""
+    scalar = device.scalar
+    mat, vec = wp.types.matrix((rows, columns), scalar), wp.types.vector(columns, scalar)
+    wide = wp.types.vector(rows, scalar)
+
+    @wp.kernel(module="unique")
+    def add_product(
+        first: wp.array(dtype=wp.int32),
+        column: wp.array(dtype=wp.int32),
+        block: wp.array(dtype=mat),
+        factor: scalar,
+        x: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_i += factor sum over j of A_ij x_j."""
+        i, c = wp.tid()
+        total = wide()
+        for k in range(first[i], first[i + 1]):
+            part = vec()
+            for m in range(columns):
+                part[m] = x[columns * column[k] + m, c]
+            total += block[k] * part
+        for m in range(rows):
+            out[rows * i + m, c] += factor * total[m]
+
+    return add_product
+
+
+@cache
+def host_kernel_of(device: Device, rows: int, columns: int) -> wp.Kernel:
+    """The same on the CPU, over block rows."""
+    scalar = device.scalar
+    real = {"float32": "float", "float64": "double"}[device.precision]
+    code = ROW.replace("real", real).replace("WIDE", str(-(-rows // LANES) * LANES))
+
+    @wp.func_native(code.replace("ROWS", str(rows)).replace("COLUMNS", str(columns)))
+    def add_row(
+        i: int,
+        first: wp.array(dtype=wp.int32),
+        column: wp.array(dtype=wp.int32),
+        block: wp.array(dtype=scalar),
+        factor: scalar,
+        x: wp.array2d(dtype=scalar),
+        out: wp.array2d(dtype=scalar),
+    ): ...
+
+    @wp.kernel(module="unique")
+    def add_product(
+        first: wp.array(dtype=wp.int32),
+        column: wp.array(dtype=wp.int32),
+        block: wp.array(dtype=scalar),
+        factor: scalar,
+        x: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_i += factor sum over j of A_ij x_j, in all columns."""
+        add_row(wp.tid(), first, column, block, factor, x, out)
+
+    return add_product
+
+
+class Sparse:
+    """A matrix (m, n) in compressed rows of blocks."""
+
+    def __init__(self, matrix: sp.bsr_array, device: Device):
+        self._device = device
+        self._size: tuple[int, int] = matrix.blocksize
+        self.rows: int = self._size[0] * (len(matrix.indptr) - 1)
+        indices = [device.array(index, wp.int32) for index in (matrix.indptr, matrix.indices)]
+        if device.on_cuda:
+            blocks = device.array(matrix.data, wp.types.matrix(self._size, device.scalar))
+        else:
+            blocks = device.array(np.append(matrix.data.transpose(0, 2, 1), np.zeros(LANES)))
+        self._entries = [*indices, blocks]
+
+    def times(self, x: wp.array) -> wp.array:
+        """A x (m, b) of x (n, b)."""
+        out = self._device.zeros(self.rows, x.shape[1])
+        self.add_to(out, 1.0, x)
+        return out
+
+    def add_to(self, out: wp.array, factor: float, x: wp.array) -> None:
+        """out (m, b) += factor A x, with x (n, b)."""
+        inputs, count = [*self._entries, self._device.scalar(factor), x], self.rows // self._size[0]
+        if self._device.on_cuda:
+            self._device.launch(kernel_of(self._device, *self._size), (count, x.shape[1]), inputs, [out])
+        else:
+            self._device.launch(host_kernel_of(self._device, *self._size), (count,), inputs, [out])

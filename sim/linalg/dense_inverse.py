@@ -1,0 +1,184 @@
+"""CUDA's preconditioner for meshes of a few thousand nodes: the inverse rest stiffness as one dense matrix.
+
+One matrix product serves a whole batch of load cases, where triangular solves would leave the card idle. In single
+precision the inverse is kept in half precision, which the card's tensor cores multiply at their full rate: scaled to a
+unit diagonal, and each column to unit length, its numbers fit half precision's range, and its eleven bits spoil no
+stiff mode (bfloat16's eight do, at nu = 0.49). The only file of this room that uses torch, for its matrix product; it
+is imported by its arm in `precondition` alone.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+import warp as wp
+
+from ..discretisation.problem import Problem
+from ..runtime.columns import add_dots, is_kept
+from ..runtime.device import Device
+from . import block_inverse
+from .half_symv import add_product, tiles_of
+
+# Tensor cores want rows and columns in multiples of this.
+TILE = 64
+# Rows that one thread takes.
+SOME = 8
+# What the matrix is kept in, for each precision of the solver.
+LOW = {"float32": wp.float16, "float64": wp.float64}
+
+
+def fits(rows: int, device: Device) -> bool:
+    """Whether the card can invert `rows` unknowns, in time, and keep the inverse."""
+    kept = wp.types.type_size_in_bytes(LOW[device.precision]) * rows**2
+    return block_inverse.fits(rows, wp.device_to_torch(device.name), kept)
+
+
+@cache
+def kernels_of(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """Kernels into the matrix's unknowns, as numbers of type `low`, and back; each thread takes `some` rows."""
+    scalar = device.scalar
+
+    @wp.kernel(module="unique")
+    def lower(
+        first: wp.array(dtype=wp.int32),
+        column: wp.array(dtype=wp.int32),
+        value: wp.array(dtype=scalar),
+        scale: wp.array(dtype=scalar),
+        square: wp.array(dtype=wp.float64),
+        r: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=low),
+    ):
+        """out_i = scale_i (L^T r)_i / |r|."""
+        block, c = wp.tid()
+        size = scalar(wp.sqrt(square[c]))
+        share = wp.where(size > scalar(0.0), scalar(1.0) / size, scalar(0.0))
+        for j in range(some):
+            i = some * block + j
+            if i < scale.shape[0]:
+                total = scalar(0.0)
+                for k in range(first[i], first[i + 1]):
+                    total += value[k] * r[column[k], c]
+                out[i, c] = low(share * scale[i] * total)
+
+    @wp.kernel(module="unique")
+    def raise_(
+        first: wp.array(dtype=wp.int32),
+        column: wp.array(dtype=wp.int32),
+        value: wp.array(dtype=scalar),
+        square: wp.array(dtype=wp.float64),
+        solved: wp.array2d(dtype=low),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_r = |r| (L x)_r."""
+        block, c = wp.tid()
+        size = scalar(wp.sqrt(square[c]))
+        for j in range(some):
+            r = some * block + j
+            if r < out.shape[0]:
+                total = scalar(0.0)
+                for k in range(first[r], first[r + 1]):
+                    total += value[k] * scalar(solved[column[k], c])
+                out[r, c] = size * total
+
+    return lower, raise_
+
+
+@dataclass(frozen=True, eq=False)
+class Buffers:
+    """Right-hand sides and solutions of one batch width, in the matrix's unknowns; square lengths (b,)."""
+
+    right: wp.array
+    solved: wp.array
+    square: wp.array
+
+
+class Dense:
+    """A rest stiffness K over some motions L, L (L^T K L)^-1 L^T, inverted in double precision.
+
+    stiffness K (3N, 3N) [N/m]; motions L (3N, n), independent columns.
+
+    Raises
+    ------
+    RuntimeError
+        K is not positive definite over these motions: something is not held.
+    """
+
+    on_device = True
+
+    def __init__(self, stiffness: sp.csc_array, motions: sp.csc_array, device: Device):
+        self._device = device
+        where = wp.device_to_torch(device.name)
+        count = len(motions.indptr) - 1
+        rows = block_inverse.halved(sp.csc_array(motions.T @ stiffness @ motions), block_inverse.cuts_of(count), where)
+        block_inverse.invert(rows)
+        scale = torch.cat([-row[:, -len(row) :].diagonal() for row in rows]).sqrt()
+        self._size = -(-count // TILE) * TILE
+        self._inverse = _scaled(rows, scale, self._size, wp.dtype_to_torch(LOW[device.precision]))
+        block_inverse.release(where)
+        self._scale = device.array(scale.cpu().numpy())
+        back = motions @ sp.diags_array(scale.cpu().numpy())
+        self._into, self._back = (_compressed(sp.csr_array(matrix), device) for matrix in (motions.T, back))
+        self._tiles = tiles_of(self._size, device.name)
+        self._rooms: dict[int, Buffers] = {}
+        torch.cuda.synchronize(where)
+
+    def prepare(self, problem: Problem, columns: int) -> None:
+        """The rest stiffness serves every state."""
+
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+        """One dense matrix product, in Warp's stream."""
+        device, count = self._device, r.shape[1]
+        room, some = self._room(count), SOME if count > 1 else 1
+        lower, raise_ = kernels_of(device, room.right.dtype, some)
+        room.square.zero_()
+        add_dots(device, r, r, room.square)
+        inputs = [*self._into, self._scale, room.square, r]
+        device.launch(lower, (-(-self._scale.shape[0] // some), count), inputs, [room.right])
+        if self._halves(count):
+            room.solved.zero_()
+            add_product(self._tiles, wp.from_torch(self._inverse), room.right.flatten(), room.solved.flatten())
+        else:
+            with torch.cuda.stream(wp.stream_to_torch(device.name)):
+                torch.matmul(self._inverse, wp.to_torch(room.right), out=wp.to_torch(room.solved))
+        inputs = [*self._back, room.square, room.solved]
+        device.launch(raise_, (-(-r.shape[0] // some), count), inputs, [out])
+
+    def _halves(self, count: int) -> bool:
+        """Whether so many columns are multiplied by half of the matrix: then all they cost is reading it."""
+        return count == 1 and self._inverse.dtype == torch.float16
+
+    def _room(self, count: int) -> Buffers:
+        """For batches of one width; those of rooms are kept, and the last other."""
+        if count not in self._rooms:
+            self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
+            low, name = LOW[self._device.precision], self._device.name
+            if self._halves(count):
+                low = wp.float32
+            shape = (self._size, -(-count // TILE) * TILE if count > 1 else 1)
+            right, solved = (wp.zeros(shape, dtype=low, device=name) for _ in range(2))
+            self._rooms[count] = Buffers(right, solved, wp.zeros(count, dtype=wp.float64, device=name))
+        return self._rooms[count]
+
+
+def _scaled(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torch.dtype) -> torch.Tensor:
+    """The matrix (size, size) whose negative lower half is in `rows` of blocks, over scales; rows are given back."""
+    out = torch.zeros((size, size), dtype=kind, device=scale.device)
+    while rows:
+        row = rows.pop()
+        stop = row.shape[1]
+        first = stop - len(row)
+        row /= -scale[first:stop, None]
+        row /= scale[:stop]
+        out[first:stop, :stop] = row
+        out[:first, first:stop] = row[:, :first].T
+    return out
+
+
+def _compressed(matrix: sp.csr_array, device: Device) -> list[wp.array]:
+    indices = [device.array(index, wp.int32) for index in (matrix.indptr, matrix.indices)]
+    return [*indices, device.array(matrix.data)]

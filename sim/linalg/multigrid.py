@@ -1,0 +1,181 @@
+"""Levels: Chebyshev smoothing on the rest stiffness, and a coarse solver for what varies slowly.
+
+For quadratic tetrahedra the coarse motions are those of linear ones on the same corners (p-multigrid): Sundar, Stadler,
+Biros 2015, "Comparison of multigrid algorithms for high-order continuous finite element discretizations", Numer. Linear
+Algebra Appl. 22:664-680. The smoother is Chebyshev's polynomial of block Jacobi: Adams et al. 2003, J. Comput. Phys.
+188:593-610. A coarse solver may have two levels itself (`sim/linalg/amg.py`).
+"""
+
+from functools import cache
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..discretisation.constraint import Constraint
+from ..discretisation.problem import Problem
+from ..runtime.columns import combined, dots, gathered, scattered
+from ..runtime.device import Device
+from .block_sparse import Sparse
+from .pcg import Preconditioner
+
+DEGREE = 3
+# The smoother damps eigenvalues from the largest down to this share of it; the coarse solver has the rest.
+DAMPED = 1.0 / 8.0
+POWER_ITERATIONS = 20
+# The power iteration comes from below.
+MARGIN = 1.1
+
+
+@cache
+def kernel_of(device: Device, size: int) -> wp.Kernel:
+    """Kernel of the block-diagonal step, with blocks (size, size)."""
+    scalar = device.scalar
+    mat, vec = wp.types.matrix((size, size), scalar), wp.types.vector(size, scalar)
+
+    @wp.kernel(module="unique")
+    def step(
+        inverse: wp.array(dtype=mat),
+        kept: scalar,
+        added: scalar,
+        r: wp.array2d(dtype=scalar),
+        # outputs
+        d: wp.array2d(dtype=scalar),
+        x: wp.array2d(dtype=scalar),
+    ):
+        """d_i = kept d_i + added D_i^-1 r_i, and x_i += d_i."""
+        i, c = wp.tid()
+        part = vec()
+        for k in range(size):
+            part[k] = r[size * i + k, c]
+        z = inverse[i] * part
+        for k in range(size):
+            new = kept * d[size * i + k, c] + added * z[k]
+            d[size * i + k, c] = new
+            x[size * i + k, c] += new
+
+    return step
+
+
+class TwoLevel:
+    """A symmetric cycle: smooth, correct by the coarse solver, smooth.
+
+    Parameters
+    ----------
+    coarse
+        L A^-1 L^T for some motions L, with A at least L^T K L.
+    stiffness
+        K (n, n) [N/m] at rest in square blocks, positive definite.
+    device
+        Where its arrays live.
+    name
+        What a person calls it.
+    """
+
+    on_device = False  # a cycle makes its arrays as it goes: no captured graph may replay it
+
+    def __init__(self, coarse: Preconditioner, stiffness: sp.bsr_array, device: Device, name: str = "two levels"):
+        self.name = name
+        self._coarse, self._device = coarse, device
+        self._stiffness = Sparse(stiffness, device)
+        self._size = stiffness.blocksize[0]
+        inverse = np.linalg.inv(_diagonal(stiffness))
+        self._inverse = device.array(inverse, wp.types.matrix((self._size, self._size), device.scalar))
+        self._largest = MARGIN * self._power()
+
+    def prepare(self, problem: Problem, columns: int) -> None:
+        """The rest stiffness serves every state."""
+
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+        """One cycle, for the live columns."""
+        if live.all():
+            wp.copy(out, self._cycle(r))
+            return
+        columns = np.flatnonzero(live)
+        scattered(self._device, self._cycle(gathered(self._device, r, columns)), columns, out)
+
+    def _cycle(self, r: wp.array) -> wp.array:
+        x, correction = self._device.zeros(*r.shape), self._device.zeros(*r.shape)
+        every = np.ones(r.shape[1], bool)
+        self._smooth(x, wp.clone(r))
+        self._coarse.apply(self._residual(r, x), every, correction)
+        combined(self._device, x, np.ones(x.shape[1]), correction, x)
+        self._smooth(x, self._residual(r, x))
+        return x
+
+    def _smooth(self, x: wp.array, r: wp.array) -> None:
+        """Add to x the polynomial of its residual r, which is overwritten. Saad 2003, algorithm 12.1."""
+        low = DAMPED * self._largest
+        centre, radius = (self._largest + low) / 2.0, (self._largest - low) / 2.0
+        ratio = radius / centre
+        d = self._device.zeros(*r.shape)
+        self._step(0.0, 1.0 / centre, r, d, x)
+        for _ in range(DEGREE - 1):
+            self._stiffness.add_to(r, -1.0, d)
+            following = 1.0 / (2.0 * centre / radius - ratio)
+            self._step(following * ratio, 2.0 * following / radius, r, d, x)
+            ratio = following
+
+    def _residual(self, r: wp.array, x: wp.array) -> wp.array:
+        out = wp.clone(r)
+        self._stiffness.add_to(out, -1.0, x)
+        return out
+
+    def _step(self, kept: float, added: float, r: wp.array, d: wp.array, x: wp.array) -> None:
+        scalar, step = self._device.scalar, kernel_of(self._device, self._size)
+        inputs = [self._inverse, scalar(kept), scalar(added), r]
+        self._device.launch(step, (r.shape[0] // self._size, r.shape[1]), inputs, [d, x])
+
+    def _power(self) -> float:
+        """The largest eigenvalue of D^-1 K."""
+        device = self._device
+        x = device.array(np.random.default_rng(0).normal(size=(self._stiffness.rows, 1)))
+        largest = 1.0
+        for _ in range(POWER_ITERATIONS):
+            new, sum_ = device.zeros(*x.shape), device.zeros(*x.shape)
+            self._step(0.0, 1.0, self._stiffness.times(x), new, sum_)
+            size = float(np.sqrt(dots(device, new, new)[0]))
+            largest = float(dots(device, x, new)[0] / dots(device, x, x)[0])
+            x = combined(device, device.zeros(*x.shape), np.array([1.0 / size]), new, x)
+        return largest
+
+
+class Lifted:
+    """L M L^T: a preconditioner M of fewer unknowns, for what motions L (m, n), in blocks, can do."""
+
+    on_device = False
+
+    def __init__(self, motions: sp.bsr_array, coarse: Preconditioner, device: Device):
+        self.coarse, self._device = coarse, device
+        self._up, self._down = Sparse(motions, device), Sparse(sp.bsr_array(motions.T), device)
+
+    def prepare(self, problem: Problem, columns: int) -> None:
+        """The rest stiffness serves every state."""
+
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+        """Down, and up again."""
+        right = self._down.times(r)
+        solved = self._device.zeros(*right.shape)
+        self.coarse.apply(right, live, solved)
+        wp.copy(out, self._up.times(solved))
+
+
+def over_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_array:
+    """P K P (3N, 3N) in blocks of nodes, P the projection to what is free; made regular where nothing is."""
+    basis = constraint.basis()
+    projection = sp.csr_array(basis @ basis.T)
+    blocked = sp.eye_array(constraint.held.size) - projection
+    return regular(sp.csr_array(projection @ stiffness @ projection + stiffness.diagonal().mean() * blocked), 3)
+
+
+def regular(matrix: sp.csr_array, size: int) -> sp.bsr_array:
+    """The matrix in blocks (size, size); unknowns of no element get the mean of its diagonal on theirs."""
+    diagonal = matrix.diagonal()
+    missing = np.where(diagonal == 0.0, diagonal.mean(), 0.0)
+    return sp.bsr_array(sp.csr_array(matrix + sp.diags_array(missing)), blocksize=(size, size))
+
+
+def _diagonal(blocks: sp.bsr_array) -> np.ndarray:
+    """Diagonal blocks (N, k, k)."""
+    row = np.repeat(np.arange(len(blocks.indptr) - 1), np.diff(blocks.indptr))
+    return blocks.data[row == blocks.indices]

@@ -1,0 +1,173 @@
+"""Preconditioned conjugate gradients on a batch of columns, and the preconditioners.
+
+Steihaug 1983, "The conjugate gradient method and trust regions in large scale optimization", SIAM J. Numer. Anal.
+20:626-637: where the curvature is negative, or the solution leaves a ball in the preconditioner's norm, the iteration
+stops; what it has is a descent direction, and the shorter it is, the more like the preconditioned gradient.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Protocol
+
+import numpy as np
+import warp as wp
+
+from ..discretisation.problem import Problem
+from ..runtime.columns import combined, dots, norms
+from ..runtime.device import Device
+
+
+class Preconditioner(Protocol):
+    """An approximate inverse of the free curvature, symmetric and positive definite."""
+
+    @property
+    def on_device(self) -> bool:
+        """Whether `apply` only launches work on the device, for batches of one width always in the same arrays.
+
+        A graphics card replays it, whatever is `live`.
+        """
+        ...
+
+    def prepare(self, problem: Problem, columns: int) -> None:
+        """Use the last linearisation, if it matters; the batch has so many columns."""
+        ...
+
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+        """out (3N, b) = M^-1 r (3N, b), in the columns that are `live` (b,); the others may hold anything finite."""
+        ...
+
+
+@cache
+def block_kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
+    """Kernels of the block-Jacobi preconditioner."""
+    scalar, mat, vec = device.scalar, device.matrix, device.vector
+
+    @wp.kernel(module="unique")
+    def invert_blocks(
+        # outputs
+        blocks: wp.array2d(dtype=mat),
+    ):
+        """B <- B^-1; the identity over |B| where B is not positive definite."""
+        i, c = wp.tid()
+        B = blocks[i, c]
+        size = wp.abs(B[0, 0]) + wp.abs(B[1, 1]) + wp.abs(B[2, 2])
+        minor = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
+        tiny = scalar(1.0e-6) * size
+        if B[0, 0] > tiny and minor > tiny * tiny and wp.determinant(B) > tiny * tiny * tiny:
+            blocks[i, c] = wp.inverse(B)
+        else:
+            blocks[i, c] = wp.identity(n=3, dtype=scalar) / wp.max(size, scalar(1.0e-30))
+
+    @wp.kernel(module="unique")
+    def multiply_blocks(
+        blocks: wp.array2d(dtype=mat),
+        r: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_i = B_i r_i."""
+        i, c = wp.tid()
+        x = blocks[i, c] * vec(r[3 * i, c], r[3 * i + 1, c], r[3 * i + 2, c])
+        for k in range(3):
+            out[3 * i + k, c] = x[k]
+
+    return invert_blocks, multiply_blocks
+
+
+class BlockJacobi:
+    """The 3 x 3 diagonal blocks of the current curvature, inverted: for meshes too large to factorise."""
+
+    on_device = False
+
+    def __init__(self, device: Device):
+        self._device = device
+        self._blocks: wp.array | None = None
+
+    def prepare(self, problem: Problem, columns: int) -> None:
+        """Invert the blocks at the last linearisation."""
+        blocks = problem.diagonal(columns)
+        self._device.launch(block_kernels_of(self._device)[0], blocks.shape, [], [blocks])
+        self._blocks = blocks
+
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+        """out = B^-1 r, node by node."""
+        assert self._blocks is not None
+        self._device.launch(block_kernels_of(self._device)[1], self._blocks.shape, [self._blocks, r], [out])
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSolution:
+    """x (3N, b); where the iteration stopped short, at negative curvature or at the radius (b,) bool.
+
+    size (b,): the preconditioner's norm sqrt(x . M x) [J^1/2]; iterations of the batch.
+    """
+
+    x: wp.array
+    truncated: np.ndarray
+    size: np.ndarray
+    iterations: int
+
+
+def conjugate_gradients(
+    problem: Problem,
+    preconditioner: Preconditioner,
+    r: wp.array,
+    tolerance: np.ndarray,
+    most: int,
+    radius: np.ndarray | None = None,
+) -> LinearSolution:
+    """Solve P K P x = r at the last linearisation, per column until |r| <= tolerance (b,), or truncated.
+
+    Parameters
+    ----------
+    r
+        (3N, b) [N], already projected; overwritten with the residual.
+    tolerance
+        (b,) [N], absolute.
+    most
+        Largest number of iterations.
+    radius
+        (b,) [J^1/2]: x stays within it in the preconditioner's norm; where the curvature is negative it goes that far.
+        Without a radius x stops there with what it has, or with the first direction.
+    """
+    device, columns = problem.device, r.shape[1]
+    reach = np.full(columns, np.inf) if radius is None else radius
+    x, z, q = device.zeros(*r.shape), device.zeros(*r.shape), device.zeros(*r.shape)
+
+    def precondition() -> None:
+        preconditioner.apply(r, live, z)
+        problem.constraint.project(z)
+
+    live = norms(device, r) > tolerance
+    precondition()
+    p, rz = wp.clone(z), dots(device, r, z)
+    # Inner products x.Mx, x.Mp and p.Mp follow from the coefficients alone: Conn, Gould, Toint 2000, section 7.5.1.
+    xx, xp, pp = np.zeros(columns), np.zeros(columns), rz
+    truncated = np.zeros(columns, bool)
+    iterations = 0
+    while live.any() and iterations < most:
+        q.zero_()
+        problem.add_curvature(p, q)
+        problem.constraint.project(q)
+        pq = dots(device, p, q)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            longest = np.where(reach < np.inf, (np.sqrt(xp**2 + pp * (reach**2 - xx).clip(0.0)) - xp) / pp, np.inf)
+            alpha = np.where(pq > 0.0, rz / pq, longest)
+        stop = live & (~(pq > 0.0) | (alpha >= longest))
+        alpha = np.minimum(alpha, longest)
+        # Nothing bounds it and nothing is gathered yet: the preconditioned gradient is a descent direction.
+        alpha = np.where(live, np.where(np.isfinite(alpha), alpha, float(iterations == 0)), 0.0)
+        combined(device, x, alpha, p, x)
+        combined(device, r, -alpha, q, r)
+        xx = xx + 2.0 * alpha * xp + alpha**2 * pp
+        truncated |= stop
+        live &= ~stop & (norms(device, r) > tolerance)
+        iterations += 1
+        if not live.any():
+            break
+        precondition()
+        before, rz = np.where(live, rz, 1.0), np.where(live, dots(device, r, z), 0.0)
+        beta = rz / before
+        combined(device, z, beta, p, p)
+        xp, pp = beta * (xp + alpha * pp), rz + beta**2 * pp
+    return LinearSolution(x, truncated, np.sqrt(xx.clip(0.0)), iterations)

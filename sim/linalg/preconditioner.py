@@ -1,0 +1,142 @@
+"""Which preconditioner serves a problem: chosen by its size, its element and its device."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..accuracy import Precision
+from ..discretisation.constraint import Constraint
+from ..discretisation.problem import Problem
+from ..discretisation.space import Discretisation
+from ..errors import InputError
+from ..runtime.device import Device
+from .multifrontal import Factor, node_of
+from .multigrid import Lifted, TwoLevel, over_free
+from .pcg import BlockJacobi, Preconditioner
+
+# On the CPU, above this many unknowns levels cost less than a factor. Of 17,000 nodes, levels against factor: 6.8 and
+# 7.1 s to set up, 16 and 11 ms to apply to one column, 51 and 83 ms to eight. CUDA inverts what fits.
+LARGEST_FACTOR = 50_000
+# Smoothed strains link the neighbours of neighbours: their own factor pays up to this many unknowns.
+LARGEST_SMOOTHED_FACTOR = 40_000
+
+
+def choose_preconditioner(
+    problem: Problem,
+    space: Discretisation,
+    unsmoothed: Callable[[float], sp.csc_array],
+    step: float = math.inf,
+) -> Preconditioner:
+    """The rest stiffness, inverted (CUDA) or factorised where that pays; two levels where it has too many entries.
+
+    Algebraic multigrid where even the coarse level does not fit; block Jacobi where nothing is free to move.
+    `unsmoothed` assembles the rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh, over a step in time
+    [s], as `step` is what the stiffness is taken over.
+
+    Raises
+    ------
+    InputError
+        A free rest stiffness that is singular.
+    """
+    device, constraint = problem.device, problem.constraint
+    if constraint.basis().nnz == 0:
+        return BlockJacobi(device)
+    try:
+        if space.element == "p2":
+            stiffness = problem.rest_curvature(step)
+            if device.on_cuda and _direct_pays(len(constraint.basis().indptr) - 1, device):
+                return _solver(stiffness, constraint, space.nodes, device)
+            lifted = _on_corners(stiffness, space, constraint, device)
+            name = f"p-multigrid on {name_of(lifted.coarse)}"
+            return TwoLevel(lifted, over_free(stiffness, constraint), device, name)
+        if space.element == "smoothed" and problem.rows > LARGEST_SMOOTHED_FACTOR:
+            # An average resists less than what is averaged, so that the coarse solver never overshoots.
+            coarse = _solver(unsmoothed(step), constraint, space.nodes, device)
+            name = f"two levels on {name_of(coarse)}"
+            return TwoLevel(coarse, over_free(problem.rest_curvature(step), constraint), device, name)
+        return _solver(problem.rest_curvature(step), constraint, space.nodes, device)
+    except RuntimeError as error:
+        raise InputError(f"the stiffness at rest cannot be factorised ({error}): is every part held?") from error
+
+
+def name_of(preconditioner: Preconditioner) -> str:
+    """What a person calls it."""
+    match preconditioner:
+        case TwoLevel():
+            return preconditioner.name
+        case Factor():
+            return "sparse factor"
+        case BlockJacobi():
+            return "block Jacobi"
+        case _:
+            return "dense inverse"
+
+
+def is_exact(preconditioner: Preconditioner) -> bool:
+    """Whether it is the inverse of the whole rest stiffness, up to rounding."""
+    return name_of(preconditioner) in ("sparse factor", "dense inverse")
+
+
+def rest_solver(problem: Problem) -> Preconditioner:
+    """The whole free rest stiffness, inverted or factorised, in the problem's own precision.
+
+    Raises
+    ------
+    RuntimeError
+        It is singular.
+    """
+    basis = problem.constraint.basis()
+    device = problem.device
+    return direct(problem.rest_curvature(), basis, node_of(basis), device, device.precision)
+
+
+def _on_corners(stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device) -> Lifted:
+    """What linear tetrahedra on the same corners can do, as far as it is free."""
+    corner, free = np.unique(space.table[:, :4]), constraint.basis()
+    every = sp.csc_array(free @ (free.T @ sp.kron(space.corner_interpolation, sp.eye_array(3))))
+    own = Constraint(constraint.held[corner], constraint.normal[corner], device)
+    coarse = _solver(sp.csc_array(every.T @ stiffness @ every), own, space.nodes[corner], device)
+    return Lifted(sp.bsr_array(sp.csr_array(every), blocksize=(3, 3)), coarse, device)
+
+
+def _solver(stiffness: sp.csc_array, constraint: Constraint, points: np.ndarray, device: Device) -> Preconditioner:
+    """K (3N, 3N) over what is free of nodes at points (N, 3): inverted or factorised where that pays."""
+    basis = constraint.basis()
+    if _direct_pays(len(basis.indptr) - 1, device):
+        return direct(stiffness, basis, node_of(basis), device)
+    from .amg import algebraic, rigid_motions
+
+    motions = basis @ (basis.T @ rigid_motions(points))
+    return algebraic(over_free(stiffness, constraint), motions, partial(direct, device=device), device)
+
+
+def _direct_pays(count: int, device: Device) -> bool:
+    if not device.on_cuda:
+        return count <= LARGEST_FACTOR
+    from .dense_inverse import fits
+
+    return fits(count, device)
+
+
+def direct(
+    stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device, precision: Precision = "float32"
+) -> Preconditioner:
+    """K (3N, 3N) over some motions (3N, n), each of one `node` (n,): inverted where that fits, else factorised.
+
+    A factor is kept in `precision`.
+
+    Raises
+    ------
+    RuntimeError
+        It is singular.
+    """
+    if device.on_cuda and _direct_pays(len(node), device):
+        from .dense_inverse import Dense
+
+        return Dense(stiffness, motions, device)
+    return Factor(stiffness, motions, node, device, precision)

@@ -1,0 +1,84 @@
+"""Static condensation: how stiff the rest of a body is, at rest, for a part of it, and how it follows.
+
+Guyan 1965, "Reduction of stiffness and mass matrices", AIAA J. 3:380.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..discretisation.problem import Problem
+from ..runtime.device import Device
+from .multifrontal import node_of
+from .preconditioner import direct
+
+# Entries beside this share of the largest are what subtraction leaves of zero.
+ROUND_OFF = 1e-9
+# Columns that are solved for together: bounds the memory that it takes.
+STRIP = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Condensation:
+    """What a part of a body feels of the rest.
+
+    rows (m,) of the part's 3n that touch the rest; stiffness (m, m) [N/m] of the rest there; follow (3N, m): how the
+    whole body's rows move when these do, zero in the part itself.
+    """
+
+    rows: np.ndarray
+    stiffness: np.ndarray
+    follow: np.ndarray
+
+
+def condensed(problem: Problem, nodes: np.ndarray, own: sp.csc_array) -> Condensation:
+    """The rest of a body beside the part of `nodes` (n,), whose own elements have the stiffness `own` (3n, 3n) at rest.
+
+    Raises
+    ------
+    RuntimeError
+        The rest is not held even where the part is.
+    """
+    part = (3 * nodes[:, None] + np.arange(3)).ravel()
+    whole, basis = sp.csr_array(problem.rest_curvature()), problem.constraint.basis()
+    beyond = sp.csr_array(whole[part][:, part] - own)
+    rows = np.flatnonzero(abs(beyond).max(axis=1).toarray().ravel() > ROUND_OFF * abs(whole).max())
+    stiffness = beyond[rows][:, rows].toarray()
+    far = sp.csc_array(basis[:, ~np.isin(node_of(basis), nodes)])
+    follow, taken = _followed(whole, far, sp.csc_array(whole[part[rows]].T), problem.device)
+    stiffness -= taken
+    return Condensation(rows, (stiffness + stiffness.T) / 2, follow)
+
+
+def _followed(
+    whole: sp.csr_array, far: sp.csc_array, coupling: sp.csc_array, device: Device
+) -> tuple[np.ndarray, np.ndarray]:
+    """-L (L^T K L)^-1 L^T B (3N, m) and what it takes from the stiffness (m, m), of motions L and a coupling B (3N, m).
+
+    CUDA takes them apart in blocks where these fit.
+    """
+    if device.on_cuda:
+        from . import block_inverse
+
+        where = wp.device_to_torch(device.name)
+        if block_inverse.fits(len(far.indptr) + len(coupling.indptr), where):
+            across, taken = block_inverse.eliminated(
+                sp.csc_array(far.T @ whole @ far), sp.csc_array(far.T @ coupling), where
+            )
+            return -(far.astype(np.float32) @ across), taken
+    fine = Device(device.name, "float64")
+    solver = direct(sp.csc_array(whole), far, node_of(far), fine, "float64")
+    count = len(coupling.indptr) - 1
+    follow, taken = np.zeros((len(whole.indptr) - 1, count), device.precision), np.zeros((count, count))
+    for first in range(0, count, STRIP):
+        some = coupling[:, first : first + STRIP].toarray()
+        out = fine.zeros(*some.shape)
+        solver.apply(fine.array(some), np.ones(some.shape[1], bool), out)
+        moved = out.numpy()
+        follow[:, first : first + STRIP] = -moved
+        taken[:, first : first + STRIP] = coupling.T @ moved
+    return follow, taken

@@ -1,0 +1,1 @@
+"""What one load strains or touches most, solved by itself: nonlinear elimination and contact."""

@@ -1,0 +1,97 @@
+"""Some of a body's tetrahedra by themselves, held where they touch the others: brought to equilibrium between."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..accuracy import FLOOR, Accuracy
+from ..compile import rimmed
+from ..discretisation.problem import Problem
+from ..discretisation.space import Discretisation
+from ..effects import Effect
+from ..linalg.multifrontal import Factor, node_of
+from ..minimisers.lbfgs import Lbfgs
+from ..minimisers.lbfgs_kernels import BROKEN, DONE
+from ..minimisers.newton import find_equilibrium
+from ..minimisers.newton_cg import NewtonCG
+
+# What so many turns of L-BFGS leave is Newton's; a factor with which so many were taken is made anew.
+TURNS, STALE = 400, 25
+# Newton's budgets.
+OUTER, INNER = 60, 60
+
+
+class Rimmed:
+    """A part of one load case, whose rim does not move.
+
+    Parameters
+    ----------
+    problem
+        The whole body's, which has begun the load case alone.
+    effects, space
+        What it was compiled from.
+    chosen
+        (T,) bool: the part's tetrahedra, at least one.
+    constant
+        (3N, 1) [N]: the gradient of the loads, which do not depend on where the body is.
+    u
+        (3N, 1) [m]: where the body is about.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        effects: Iterable[Effect],
+        space: Discretisation,
+        chosen: np.ndarray,
+        constant: wp.array,
+        u: wp.array,
+    ):
+        device, self.nodes = problem.device, np.unique(space.table[chosen])
+        self._rows = (3 * self.nodes[:, None] + np.arange(3)).ravel()
+        part, self._curvature = rimmed(effects, space, problem, chosen, self.nodes)
+        self._part = part.problem
+        part.put(device.array(-constant.numpy()[self._rows]))
+        values = u.numpy()[self._rows]
+        if not (values.any() and self._begin_at(device.array(values))):
+            self._begin_with(self._part.rest_curvature())
+
+    def settled(self, u: wp.array, force: float) -> wp.array:
+        """u (3N, 1) with the part in equilibrium, but for a free gradient of about `force` [N].
+
+        As it is, where the part's forces are not finite.
+        """
+        part, device, values = self._part, self._part.device, u.numpy().copy()
+        part.constraint.begin(values[self._rows], None, None)
+        found = self._lbfgs.descend(device.array(values[self._rows]), np.zeros(1), TURNS, None, np.array([force]))
+        end = found.u
+        if found.status[0] == BROKEN:
+            return u
+        if found.status[0] != DONE:
+            _, _, scale = part.residual(end)
+            aim = float(np.clip(force / scale[0], FLOOR[device.precision], 0.5))
+            budget = Accuracy(aim, OUTER, INNER, device.precision, 0)
+            end = find_equilibrium(part, NewtonCG(self._factor, INNER), end, budget).u
+        if found.steps[0] > STALE:
+            self._begin_at(end)
+        values[self._rows] = end.numpy()
+        return device.array(values)
+
+    def _begin_at(self, u: wp.array) -> bool:
+        """Let L-BFGS begin with the curvature at u (3n, 1), if that is positive definite."""
+        self._part.linearise(u, np.zeros(1, bool))
+        try:
+            self._begin_with(self._curvature())
+        except RuntimeError:
+            return False
+        return True
+
+    def _begin_with(self, stiffness: sp.csc_array) -> None:
+        """Let L-BFGS begin with a stiffness (3n, 3n) [N/m]."""
+        basis = self._part.constraint.basis()
+        self._factor = Factor(stiffness, basis, node_of(basis), self._part.device)
+        self._lbfgs = Lbfgs(self._part, self._factor)

@@ -1,0 +1,198 @@
+"""Equilibrium of soft tissue and hard tools, which touch it in few nodes: a model of the one, the other as it is.
+
+A proximal quasi-Newton method (Lee, Sun, Saunders 2014, "Proximal Newton-type methods for minimizing composite
+functions", SIAM J. Optim. 24:1420-1443). Each step minimises
+
+    s'(u) x + x . B x / 2 + c(u + x),
+
+with s the potential of all that is smooth, B the rest stiffness and what L-BFGS has learnt since, and c the barrier
+of tools, which is no model. c depends on the few nodes that tools can touch, and all else follows them: with H = B^-1,
+x = -H (s'(u) + f), with the tools' forces f on them as `settling` finds them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+from scipy.linalg import LinAlgError
+
+from ..discretisation.problem import Problem
+from ..discretisation.term import Local
+from ..linalg.compliance import Compliance
+from ..linalg.pcg import BlockJacobi, Preconditioner
+from ..minimisers.compact_lbfgs import Pairs, pairs_of
+from ..minimisers.lbfgs import Descended
+from ..minimisers.lbfgs_kernels import BROKEN, DONE, KEPT, LEAST_KEPT, LIVE, MOST_KEPT, OVERSHOOT
+from ..minimisers.residual import Measured
+from ..runtime.threads import one_thread
+from .contact_forces import Softness, settled
+
+CUTS = 8
+# Tools' forces are exact to a share of the whole residual, or of the tolerance.
+FORCING, ENOUGH = 0.03, 0.1
+# A step does well that leaves so much of the free force, and is not cut shorter than this; after so many in a row that
+# do not, and after one that is cut to almost nothing, others go on.
+LEFT, LONG, PATIENCE, SHORTEST = 0.6, 0.5, 3, 0.1
+# Drags: the first that is tried where one is wanted, by how much it grows and shrinks, and how often at most it grows.
+DRAG, GROWTH, TIMES = 0.3, 3.0, 5
+
+
+@dataclass(frozen=True, eq=False)
+class State(Measured):
+    """u (3N,) [m]; the free gradients (3N,) [N] of all that is smooth, and of all; its 2-norm, and its scale."""
+
+    u: np.ndarray
+    smooth: np.ndarray
+    whole: np.ndarray
+    free: float
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class Proximal:
+    """A descent for single loads on a problem with one `Local` barrier, whose constraints stay closed.
+
+    problem
+        What is minimised.
+    preconditioner
+        Of this problem at rest, alike at every state.
+    barrier
+        Its only one.
+    """
+
+    problem: Problem
+    preconditioner: Preconditioner
+    barrier: Local
+
+    @cached_property
+    def compliance(self) -> Compliance:
+        """At the nodes that can be touched."""
+        return Compliance(self.problem, self.preconditioner, self.barrier.touchable)
+
+    def descend(
+        self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
+    ) -> Descended:
+        """As `Lbfgs.descend`, of one column, in at most `most` steps."""
+        rows, kind = self.problem.rows, self.problem.device.precision
+        pairs = pairs_of(learnt or {}, rows, kind)
+        now = self._judged(start.numpy()[:, 0].astype(np.float64))
+        status, step, drag, slow = LIVE if now.finite else BROKEN, 0, 0.0, 0
+        # Threads of BLAS wait for one another, ages where something else runs on their cores.
+        with one_thread():
+            force = self._felt(now)
+            rest = self._answered(now.smooth + self._everywhere(force))
+            while status == LIVE:
+                if now.relative <= tolerance[0]:
+                    status = DONE
+                if status == DONE or step >= most or slow >= PATIENCE:
+                    break
+                exact = max(FORCING * min(now.relative, 1.0), ENOUGH * tolerance[0])
+                aim = self._aimed(now, force, rest, pairs, exact, drag)
+                if aim is None:
+                    break
+                before, (force, drag) = force, aim
+                rest = rest + self.compliance.spread(force - before)
+                t, new = self._searched(now, -rest - pairs.motion(pairs.weights(now.smooth + self._everywhere(force))))
+                if not new.finite:
+                    break
+                step += 1
+                well = t > LONG and new.free <= LEFT * now.free
+                slow = PATIENCE if t < SHORTEST else 0 if well else slow + 1
+                if well:
+                    drag = drag / GROWTH if drag >= DRAG else 0.0
+                elif t < LONG or new.free > now.free:
+                    drag = max(DRAG, GROWTH * drag)
+                if new.relative > tolerance[0]:
+                    moved, change = new.u - now.u, new.smooth - now.smooth
+                    way = self._answered(change)
+                    rest = rest + way
+                    if moved @ change > 0.0:
+                        pairs = pairs.and_one(moved, change, way)
+                now = new
+        u = self.problem.device.array(now.u[:, None])
+        taught = {} if learnt is None else pairs.learnt()
+        return Descended(u, np.array([status]), np.array([step]), np.array([now.relative]), taught)
+
+    def _aimed(
+        self, now: State, force: np.ndarray, rest: np.ndarray, pairs: Pairs, tolerance: float, drag: float
+    ) -> tuple[np.ndarray, float] | None:
+        """The tools' forces (3n,) where the model is in equilibrium, and the drag that this takes.
+
+        `rest` (3N,) [m] is what the body at rest answers the smooth gradient and a `force` (3n,) with. None where no
+        drag makes the model convex.
+        """
+        barrier, rows = self.barrier.reduced(), self.compliance.rows
+        if barrier is None:
+            return np.zeros_like(force), drag
+        free = now.u - rest - pairs.motion(pairs.weights(now.smooth + self._everywhere(force)))
+        soft = Softness(self.compliance, pairs)
+        for _ in range(TIMES):
+            try:
+                found = settled(barrier, soft, now.u[rows], free[rows], force, tolerance, drag)
+            except LinAlgError:  # steps so small that what is learnt from them is round-off
+                return None
+            if found is not None:
+                return found, drag
+            drag = max(DRAG, GROWTH * drag)
+        return None
+
+    def _felt(self, now: State) -> np.ndarray:
+        """Forces (3n,) that balance all that is smooth, where tools touch."""
+        barrier, rows = self.barrier.reduced(), self.compliance.rows
+        if barrier is None:
+            return np.zeros(len(rows))
+        touched = barrier.slope(now.u[rows]).reshape(-1, 3).any(axis=1)
+        return np.where(np.repeat(touched, 3), -now.smooth[rows], 0.0)
+
+    def _everywhere(self, force: np.ndarray) -> np.ndarray:
+        """A force (3n,) on the touchable nodes as one (3N,) on all."""
+        whole = np.zeros(self.problem.rows)
+        whole[self.compliance.rows] = force
+        return whole
+
+    def _searched(self, now: State, x: np.ndarray) -> tuple[float, State]:
+        """How far along a step x (3N,) the energy still falls, or about so, and the state there."""
+        device = self.problem.device
+        t = float(self.problem.longest_step(device.array(now.u[:, None]), device.array(x[:, None]))[0])
+        promised = -float(now.whole @ x)
+        new = self._judged(now.u + t * x)
+        for _ in range(CUTS):
+            ahead = float(new.whole @ x) if new.finite else np.inf
+            if ahead <= OVERSHOOT * abs(promised):
+                break
+            kept = promised / (promised + ahead) if promised > 0.0 and np.isfinite(ahead) else KEPT
+            t *= float(np.clip(kept, LEAST_KEPT, MOST_KEPT))
+            new = self._judged(now.u + t * x)
+        return t, new
+
+    def _answered(self, force: np.ndarray) -> np.ndarray:
+        """How the body at rest moves (3N,) [m] under a force (3N,) [N]."""
+        return self.compliance.answered(force[:, None])[:, 0].astype(np.float64)
+
+    def _judged(self, u: np.ndarray) -> State:
+        """The state u (3N,), as `Problem.residual` measures it."""
+        problem, device = self.problem, self.problem.device
+        place, parts, scale = device.array(u[:, None]), np.zeros((problem.rows, 2)), 0.0
+        for term in problem.terms:
+            own = device.zeros(problem.rows, 1)
+            term.add_gradient(place, own)
+            force = own.numpy()[:, 0]
+            parts[:, int(term is self.barrier)] += force
+            scale = max(scale, float(np.linalg.norm(force)))
+        both = device.array(parts)
+        problem.constraint.project_nodes(both)
+        free = both.numpy().astype(np.float64)
+        smooth, whole = free[:, 0], free.sum(axis=1)
+        size, all_of_it = float(np.linalg.norm(whole)), float(np.linalg.norm(parts.sum(axis=1)))
+        return State(u, smooth, whole, size, max(scale, np.sqrt(max(all_of_it**2 - size**2, 0.0))))
+
+
+def proximal(problem: Problem, preconditioner: Preconditioner) -> Proximal | None:
+    """Of problems that it is for, and preconditioners that are alike at every state."""
+    barriers = [barrier for barrier in problem.barriers if isinstance(barrier, Local)]
+    fits = len(problem.barriers) == len(barriers) == 1 and not isinstance(preconditioner, BlockJacobi)
+    return Proximal(problem, preconditioner, barriers[0]) if fits else None

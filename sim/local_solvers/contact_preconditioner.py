@@ -1,0 +1,63 @@
+"""A preconditioner that knows what is touched: the rest stiffness and the curvature of a barrier on few nodes.
+
+    (K0 + E D E')^-1 = H - H E (1 + D C)^-1 D E' H,    H = K0^-1,  C = E' H E:
+
+Woodbury 1950, with D positive semi-definite. A factor knows nothing of contact, a thousand times as stiff.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+from scipy.linalg import lu_factor, lu_solve
+
+from ..discretisation.problem import Problem
+from ..discretisation.term import Local
+from ..linalg.compliance import Compliance
+from ..linalg.pcg import Preconditioner
+from ..runtime.threads import one_thread
+from .contact_forces import MOST
+
+
+class Touched:
+    """A Preconditioner of batches of one column; of wider ones it is the rest's alone.
+
+    Parameters
+    ----------
+    rest
+        Of the problem at rest.
+    compliance
+        What that does at the nodes that can be touched.
+    barrier
+        What touches them.
+    """
+
+    on_device = False
+
+    def __init__(self, rest: Preconditioner, compliance: Compliance, barrier: Local):
+        self._rest, self._compliance, self._barrier = rest, compliance, barrier
+
+        self._felt: tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
+
+    def prepare(self, problem: Problem, columns: int) -> None:
+        """Take D where the problem was last linearised."""
+        self._rest.prepare(problem, columns)
+        self._felt = None
+        if columns == 1:
+            nodes, curvature = self._barrier.pressed()
+            if 0 < len(nodes) <= MOST:
+                # Threads of BLAS wait for one another, ages where something else runs on their cores.
+                with one_thread():
+                    whole = np.eye(len(curvature)) + curvature @ self._compliance.between(nodes)
+                    self._felt = nodes, curvature, lu_factor(whole)
+
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+        """What the rest does, less what the touched nodes are kept from."""
+        self._rest.apply(r, live, out)
+        if self._felt is not None:
+            z, (nodes, curvature, whole) = out.numpy(), self._felt
+            force = np.zeros((len(self._compliance.rows) // 3, 3))
+            own = z[self._compliance.rows, 0].reshape(-1, 3)[nodes].ravel()
+            with one_thread():
+                force[nodes] = lu_solve(whole, curvature @ own).reshape(-1, 3)
+                out.assign(z - self._compliance.spread(force.ravel())[:, None])

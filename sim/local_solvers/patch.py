@@ -1,0 +1,145 @@
+"""A patch of tissue that a load strains far from its rest stiffness, in equilibrium with a body that keeps its own.
+
+With C the inverse of the body's rest stiffness at the patch's nodes, e the motion that the rest stiffness alone would
+give there, n the internal forces of the patch's elements and K their rest stiffness, the patch moves by
+
+    x = e + C q(x),    q(x) = n(u) + K x - n(u + x):
+
+q is what the elements resist less than at rest, and the body answers it as any other force. This x minimises the energy
+of the elements beside a quadratic one of all else, whose curvature is C^-1 - K. L-BFGS that begins from C finds it: no
+step needs C^-1, for every direction is C times a force, plus steps whose forces are known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import get_blas_funcs
+
+from ..compile import compile_part
+from ..discretisation.problem import Problem
+from ..discretisation.space import Discretisation
+from ..effects import Effect
+from ..minimisers.lbfgs_kernels import KEPT, LEAST_CURVATURE, LEAST_KEPT, MOST_KEPT, OVERSHOOT, PAIRS
+
+TURNS, CUTS = 150, 12
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A step (m,) [m], the change (m,) [N] of the gradient along it, their product [J], and C^-1 times the step."""
+
+    step: np.ndarray
+    change: np.ndarray
+    work: float
+    force: np.ndarray
+
+
+class Patch:
+    """Elements on some nodes of a body.
+
+    Parameters
+    ----------
+    nodes
+        (n,), ascending.
+    part
+        The elements alone.
+    compliance
+        C (m, m) [m/N] of the body at the nodes' rows, m = 3n.
+    """
+
+    def __init__(self, nodes: np.ndarray, part: Problem, compliance: np.ndarray):
+        self.nodes, self.rows = nodes, (3 * nodes[:, None] + np.arange(3)).ravel()
+        self._part, self._compliance = part, compliance
+        (self._product,) = get_blas_funcs(("symv",), (compliance,))  # reads half of it
+        # Arrays on the device, and the same numbers on the host: to make either anew takes as long as a product.
+        self._place, self._way, self._force = (part.device.zeros(part.rows, 1) for _ in range(3))
+        self._place_host, self._way_host, self._force_host = (
+            array.numpy()[:, 0] for array in (self._place, self._way, self._force)
+        )
+        part.linearise(self._place, np.ones(1, bool))
+        constraint = part.constraint
+        self._bound = bool(constraint.held.any() or constraint.normal.any())
+
+    def settled(self, u: np.ndarray, e: np.ndarray, force: float) -> tuple[float, np.ndarray]:
+        """A share s, and the forces f (m,) [N] by which the body moves s e + C f, at u (m,) and e (m,) [m].
+
+        The share is as much of e as no element forbids. The forces are q but for the gradient, whose 2-norm is at most
+        `force` [N]: C q would amplify what that leaves by how much stiffer than at rest the elements have become.
+        """
+        pairs: list[Pair] = []
+        share = self._longest(u, e)
+        x, beside, turns = share * e, np.zeros_like(e), 1  # beside: C^-1 (x - s e)
+        start = self._excess(u, beside)
+        g = self._free(self._excess(u, x) - start)
+        while turns < TURNS and np.linalg.norm(g) > force:
+            d, pull = self._direction(g, pairs)
+            promised = -float(g @ d)
+            if not promised > 0.0:  # round-off, or forces that are not finite
+                break
+            t = 1.0  # a step that an element forbids has forces that are not finite, and is cut
+            for _ in range(CUTS):
+                turns += 1
+                moved = x + t * d
+                new = self._free(beside + t * pull + self._excess(u, moved) - start)
+                slope = float(new @ d)
+                if slope <= OVERSHOOT * promised:
+                    break
+                kept = promised / (promised + slope) if np.isfinite(slope) else KEPT
+                t *= float(np.clip(kept, LEAST_KEPT, MOST_KEPT))
+            else:
+                break
+            work = t * (promised + slope)
+            if work > LEAST_CURVATURE * t * promised:
+                pairs = [*pairs[1 - PAIRS :], Pair(t * d, new - g, work, t * pull)]
+            x, beside, g = moved, beside + t * pull, new
+        return share, beside
+
+    def _direction(self, g: np.ndarray, pairs: list[Pair]) -> tuple[np.ndarray, np.ndarray]:
+        """A step (m,) against the gradient g (m,), and C^-1 times it.
+
+        Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4.
+        """
+        pull, along = -g, []
+        for pair in reversed(pairs):
+            along.append(pair.step @ pull / pair.work)
+            pull -= along[-1] * pair.change
+        d = self._product(1.0, self._compliance.T, pull).astype(g.dtype)
+        for pair, share in zip(pairs, reversed(along), strict=True):
+            more = share - pair.change @ d / pair.work
+            d += more * pair.step
+            pull += more * pair.force
+        return d, pull
+
+    def _excess(self, u: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """n(u + x) - K x (m,)."""
+        np.add(u, x, out=self._place_host)
+        np.negative(x, out=self._way_host)
+        self._force_host.fill(0.0)
+        for term in self._part.terms:
+            term.add_gradient(self._place, self._force)
+            term.add_curvature(self._way, self._force)
+        return self._force_host.copy()
+
+    def _longest(self, u: np.ndarray, d: np.ndarray) -> float:
+        """The longest fraction of the step d (m,) from u (m,)."""
+        self._place_host[:], self._way_host[:] = u, d
+        return float(self._part.longest_step(self._place, self._way)[0])
+
+    def _free(self, g: np.ndarray) -> np.ndarray:
+        """The gradient (m,) along motions that the constraints leave free."""
+        if not self._bound:
+            return g
+        self._force_host[:] = g
+        self._part.constraint.project_nodes(self._force)
+        return self._force_host.copy()
+
+
+def patch_of(
+    effects: Iterable[Effect], space: Discretisation, whole: Problem, chosen: np.ndarray, compliance: np.ndarray
+) -> Patch:
+    """The `chosen` (T,) bool tetrahedra of a body; `compliance` (m, m) [m/N] is the body's at their m rows, at rest."""
+    nodes = np.unique(space.table[chosen])
+    return Patch(nodes, compile_part(effects, space, whole, chosen, nodes), compliance)

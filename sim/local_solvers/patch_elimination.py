@@ -1,0 +1,192 @@
+"""Nonlinear elimination of the few hundred nodes that one load strains most: its patch is settled, the body follows.
+
+Far from rest are only the nodes close to a tool. Each cycle corrects the body with its rest stiffness, brings the patch
+to equilibrium beside it (`patch.py`), and lets the body follow the forces that this takes: two to five looks at all of
+it instead of five to twenty. `elimination.py` does so for batches, with one part for all loads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from ..discretisation.problem import Problem
+from ..discretisation.space import Discretisation
+from ..effects import Effect
+from ..linalg.multifrontal import Factor
+from ..linalg.pcg import Preconditioner
+from ..minimisers.lbfgs import Descended
+from ..minimisers.lbfgs_kernels import BROKEN, DONE, FREE, LIVE, WHOLE
+from ..minimisers.residual import State, balance, constants_of
+from ..runtime.columns import combined
+from ..runtime.threads import one_thread
+from .batch_elimination import NEAR, near_tetrahedra
+from .patch import Patch, patch_of
+
+# A patch has at most so many nodes, and less where what lies beyond has such a share of the forces.
+LARGEST, NEGLIGIBLE = 550, 0.02
+CYCLES = 20
+# A patch is settled to a share of the whole residual, or of the tolerance.
+FORCING, ENOUGH = 0.03, 0.3
+# A patch stays while each cycle leaves at most such a share of the free force.
+LEFT = 0.3
+# A load whose free force was not halved in so many cycles goes elsewhere, and so does one that it rises so far with.
+PATIENCE, RISE = 5, 30.0
+# The near part has about so many nodes at most: its compliance is a matrix of three times as many rows. (Of the default
+# brain's 1,244 it takes a second and 55 MB.)
+LARGEST_NEAR = 2000
+# What a descent has learnt: the nodes (1, n) of its patch.
+NODES = "patch"
+
+
+class Patching:
+    """A descent for single loads on one problem, on the CPU.
+
+    Parameters
+    ----------
+    problem, factor
+        The whole body, and its rest stiffness.
+    effects, space
+        What the problem was compiled from.
+    near
+        (T,) bool: the tetrahedra that a patch may be made of.
+    """
+
+    def __init__(
+        self, problem: Problem, factor: Factor, effects: Iterable[Effect], space: Discretisation, near: np.ndarray
+    ):
+        self._problem, self._factor, self._effects, self._space = problem, factor, tuple(effects), space
+        self._near, self._table = np.flatnonzero(near), space.table[near]
+        self._nodes = np.unique(self._table)
+        self._rows = (3 * self._nodes[:, None] + np.arange(3)).ravel()
+        self._last: tuple[np.ndarray, Patch, np.ndarray] | None = None
+        self._compliance = factor.compliance(self._rows)
+        # A patch's rows of it, and its own columns of these: the last patch stands there.
+        rows, kind = min(3 * LARGEST, len(self._rows)), self._compliance.dtype
+        self._room = np.empty((rows, len(self._rows)), kind), np.empty(rows**2, kind)
+
+    def descend(
+        self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
+    ) -> Descended:
+        """As `Lbfgs.descend`, of one column, in at most `most` cycles.
+
+        What is learnt is the patch. A load that has not got below the free force of its start ends there.
+        """
+        u = wp.clone(start)
+        constant, loud = constants_of(self._problem, u)
+        judged = partial(self._judged, constant, float(loud.numpy().max(initial=0.0)))
+        first = best = now = judged(u)
+        nodes, forces = self._known(learnt), np.zeros(len(start) // 3)
+        status, mark, idle, cycle = LIVE if first.finite else BROKEN, np.inf, 0, 0
+        while status == LIVE:
+            # Forces that explode lower the relative residual.
+            if now.free <= first.free and now.relative <= tolerance[0]:
+                status = DONE
+            best = now if status == DONE or now.free <= best.free else best
+            mark, idle = (now.free, 0) if now.free <= 0.5 * mark else (mark, idle + 1)
+            if status == DONE or idle >= PATIENCE or cycle >= min(CYCLES, most):
+                break
+            force = max(FORCING * now.free, ENOUGH * float(tolerance[0]) * now.scale)
+            new, nodes, here = self._cycle(judged, now, nodes, force)
+            cycle += 1
+            if not (new.finite and new.free <= RISE * first.free):
+                break
+            forces = np.maximum(forces, here / np.linalg.norm(here))
+            if nodes is not None and new.free > LEFT * now.free:
+                nodes = self._strained(forces)
+            now = new
+        taught = {NODES: nodes[None]} if learnt is not None and nodes is not None else {}
+        return Descended(best.u, np.array([status]), np.array([cycle]), np.array([best.relative]), taught)
+
+    def _cycle(
+        self, judged: Callable[[wp.array], State], now: State, nodes: np.ndarray | None, force: float
+    ) -> tuple[State, np.ndarray | None, np.ndarray]:
+        """The next state, the nodes of the patch, and forces (N,) [N]: what is out of balance then, or the patch took.
+
+        There is none where the rest stiffness alone leaves no more than `force` [N], as much as one may leave.
+        """
+        device = self._problem.device
+        if nodes is None:
+            ahead = self._answered(judged, now.u, combined(device, now.g, -2.0, now.g, wp.empty_like(now.g)))
+            if ahead.free <= force:
+                return ahead, None, _norms(ahead.g)
+            nodes = self._strained(_norms(ahead.g))
+        patch, reach = self._patch(nodes)
+        u, g = now.u.numpy()[:, 0], now.g.numpy()[:, 0]
+        with one_thread():
+            e = -(reach @ g[self._rows].astype(reach.dtype)).astype(g.dtype)
+            share, own = patch.settled(u[patch.rows], e, force)
+        pull = device.array(-share * g[:, None])
+        pull.numpy()[patch.rows, 0] += own
+        new = self._answered(judged, now.u, pull)
+        forces = _norms(new.g)
+        forces[patch.nodes] = np.linalg.norm(own.reshape(-1, 3), axis=1)
+        return new, nodes, forces
+
+    def _judged(self, constant: wp.array, square: float, u: wp.array) -> State:
+        """The state u (3N, 1) under loads of this `constant` gradient (3N, 1), `square` of the loudest one's norm."""
+        found = balance(self._problem, u, constant)
+        sums, own = found.sums.numpy()[:, 0], float(found.own.numpy().max())
+        free, largest = sums[FREE], max(square, own, float(sums[WHOLE] - sums[FREE]))
+        return State(u, found.g, float(np.sqrt(free)), float(np.sqrt(largest)))
+
+    def _answered(self, judged: Callable[[wp.array], State], u: wp.array, force: wp.array) -> State:
+        """Where the body moves from u (3N, 1) [m] under a force (3N, 1) [N], at rest, or as far as terms allow."""
+        problem, device, step = self._problem, self._problem.device, self._problem.device.zeros(*u.shape)
+        self._factor.apply(force, np.ones(1, bool), step)
+        problem.constraint.project_nodes(step)  # what is rounded row by row leaves the planes it slides on
+        new = judged(combined(device, u, 1.0, step, wp.empty_like(step)))
+        if new.finite:
+            return new
+        return judged(combined(device, u, float(problem.longest_step(u, step)[0]), step, step))
+
+    def _strained(self, forces: np.ndarray) -> np.ndarray:
+        """The nodes (k,), ascending, of those tetrahedra that have the largest `forces` (N,) at their nodes."""
+        size = forces[self._table].sum(axis=1)
+        size[~np.isfinite(size)] = np.inf
+        order = np.argsort(-size, kind="stable")
+        with np.errstate(over="ignore"):
+            rest = np.cumsum(size[order][::-1] ** 2)[::-1]
+        some = order[: max(1, int((rest > NEGLIGIBLE**2 * rest[0]).sum()))] if np.isfinite(rest[0]) else order
+        nodes, first = np.unique(self._table[some], return_index=True)
+        return np.sort(nodes[np.argsort(first)[:LARGEST]])
+
+    def _known(self, learnt: Mapping[str, np.ndarray] | None) -> np.ndarray | None:
+        """The nodes of a patch that served before, if that was here."""
+        nodes = (learnt or {}).get(NODES)
+        if nodes is None or nodes.shape[1] > LARGEST or not np.isin(nodes, self._nodes).all():
+            return None
+        return nodes[0]
+
+    def _patch(self, nodes: np.ndarray) -> tuple[Patch, np.ndarray]:
+        """All tetrahedra of the near part on these nodes; and how they move (m, M) [m/N] with forces on all of it."""
+        if self._last is None or not np.array_equal(self._last[0], nodes):
+            chosen = np.zeros(len(self._space.table), bool)
+            chosen[self._near] = np.isin(self._table, nodes).all(axis=1)
+            place = np.searchsorted(self._nodes, np.unique(self._space.table[chosen]))
+            rows = (3 * place[:, None] + np.arange(3)).ravel()
+            self._last = None
+            reach, own = self._room[0][: len(rows)], self._room[1][: len(rows) ** 2].reshape(len(rows), len(rows))
+            np.take(self._compliance, rows, axis=0, out=reach, mode="clip")
+            np.take(reach, rows, axis=1, out=own, mode="clip")
+            patch = patch_of(self._effects, self._space, self._problem, chosen, own)
+            self._last = nodes, patch, reach
+        return self._last[1:]
+
+
+def patching(
+    problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
+) -> Patching | None:
+    """For single loads; None on CUDA, without a factor, or without a small opening."""
+    if problem.device.on_cuda or not isinstance(preconditioner, Factor):
+        return None
+    near = near_tetrahedra(space, problem.constraint, min(NEAR, LARGEST_NEAR / space.count))
+    return None if near is None else Patching(problem, preconditioner, effects, space, near)
+
+
+def _norms(force: wp.array) -> np.ndarray:
+    """The size (N,) [N] of a force (3N, 1) at each node."""
+    return np.linalg.norm(force.numpy().reshape(-1, 3), axis=1)

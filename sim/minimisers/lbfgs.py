@@ -1,0 +1,165 @@
+"""L-BFGS from the rest stiffness on a batch of load cases, steered where the numbers are: the host only counts.
+
+One turn evaluates the gradient of every column at its own trial, accepts or cuts that, applies the preconditioner, and
+aims anew: always the same launches, so that a graphics card replays them as one captured graph. Between turns the host
+drops the columns that have ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..arguments import all_finite
+from ..deformation import LEARNT_KEY
+from ..discretisation.problem import Problem
+from ..discretisation.term import Cases
+from ..linalg.pcg import Preconditioner
+from ..runtime.columns import EXACT, WIDTHS, gathered, scattered
+from .lbfgs_kernels import LEFT, LIVE, PAIRS
+from .lbfgs_state import Room, ground_of
+
+# On CUDA the host looks after so many turns; it moves what is live to a room of at most such a share of the width.
+TURNS_ON_CUDA, SMALLER_ON_CUDA, SMALLER = 2, 0.75, 0.85
+# What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
+# the newest pair and how many there are (b,).
+LEARNT = ("s", "w", "sy", "yw", "head", "known")
+# Learnt curvature travels with the answers of so few load cases: a larger batch has no next frame.
+TAUGHT = EXACT
+
+
+@dataclass(frozen=True, eq=False)
+class Descended:
+    """u (3N, b) [m] on the device; (b,) on the host: status, accepted steps, relative residuals; what was `LEARNT`."""
+
+    u: wp.array
+    status: np.ndarray
+    steps: np.ndarray
+    residual: np.ndarray
+    learnt: Mapping[str, np.ndarray]
+
+    @property
+    def left(self) -> np.ndarray:
+        """(k,): columns whose descent did not end, and another may go on with."""
+        return np.flatnonzero((self.status == LIVE) | (self.status == LEFT))
+
+
+class Lbfgs:
+    """L-BFGS on one problem. What the widest batch worked in is kept for the next ones.
+
+    Parameters
+    ----------
+    problem
+        Whose potential is minimised.
+    preconditioner
+        Of this problem at rest.
+    """
+
+    def __init__(self, problem: Problem, preconditioner: Preconditioner):
+        self._problem = problem
+        self._preconditioner = preconditioner
+        self._rooms: dict[int, Room] = {}
+        self._ground: dict[str, wp.array] = {}
+
+    @property
+    def held(self) -> int:
+        """Bytes that are kept."""
+        return sum(array.capacity for array in self._ground.values())
+
+    def descend(
+        self,
+        start: wp.array,
+        tolerance: np.ndarray,
+        most: int,
+        learnt: Mapping[str, np.ndarray] | None = None,
+        force: np.ndarray | None = None,
+        stragglers: float = 0.0,
+        ahead: tuple[wp.array, wp.array] | None = None,
+    ) -> Descended:
+        """Minimise the potential of the batch that the problem has begun, from start (3N, b) [m], in `most` turns.
+
+        The start satisfies the constraints, and no footprint is moved. A column ends at its tolerance (b,), relative as
+        `Problem.residual` has it, or where the free gradient's 2-norm is at most force (b,) [N]. `learnt` is
+        what an earlier descent of the same problem found out, near here it is hoped, if any; None: this one teaches
+        nothing either. The descent stops where at most the share `stragglers` of all columns is still on its way.
+        `ahead` is what is known of the start: the free gradient and, preconditioned, the same (3N, b).
+        Every u is the last accepted state of its column.
+        """
+        device, count = self._problem.device, start.shape[1]
+        u, place = wp.clone(start), np.arange(count)
+        status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
+        teach = learnt is not None and count <= TAUGHT
+        if count == 0:
+            return Descended(u, status, steps, residual, {})
+        smaller = SMALLER_ON_CUDA if device.on_cuda else SMALLER
+        room, turns = self._room(count), 0
+        room.begin(
+            start, tolerance, np.zeros(count) if force is None else force, (learnt or {}) if count <= TAUGHT else {}
+        )
+        if ahead is not None:
+            room.aim(*ahead)
+        while True:
+            more = min(TURNS_ON_CUDA if device.on_cuda else 1, most - turns)
+            room.turn(more)
+            turns += more
+            now = room.columns["status"].numpy()[: len(place)]
+            left = int((now == LIVE).sum())
+            last = turns >= most or left <= stragglers * count
+            if last or (count > TAUGHT and self._width(left) <= smaller * room.width):
+                leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
+                there = place[leave]
+                scattered(device, gathered(device, room.columns["u"], leave), there, u)
+                status[there], steps[there], residual[there] = (
+                    room.columns[name].numpy()[leave] for name in ("status", "steps", "residual")
+                )
+                if last:
+                    learnt = {name: rows_first(room.columns[name]) for name in LEARNT} if teach else {}
+                    return Descended(u, status, steps, residual, learnt)
+                stay = np.flatnonzero(now == LIVE)
+                place, before, room = place[stay], room, self._room(len(stay))
+                room.take(before, stay)
+
+    def _room(self, count: int) -> Room:
+        """For so many columns or a few more."""
+        width = self._width(count)
+        if width > max(self._rooms, default=0):
+            self._rooms, self._ground = {}, {}  # what is there is given back before more is taken
+            self._ground = ground_of(self._problem, width)
+        if width not in self._rooms:
+            self._rooms[width] = Room(self._problem, self._preconditioner, width, self._ground)
+        return self._rooms[width]
+
+    def _width(self, count: int) -> int:
+        if self._problem.device.on_cuda:
+            return next((width for width in WIDTHS if width >= count), -(-count // WIDTHS[-1]) * WIDTHS[-1])
+        return count
+
+
+def rows_first(array: wp.array) -> np.ndarray:
+    """A copy (b, ...) on the host of an array (..., b) in a room."""
+    return np.moveaxis(array.numpy(), -1, 0).copy()  # what stands in a room is written over
+
+
+def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
+    """What an earlier descent on as many rows = 3N left in the history; nothing if that does not fit these cases.
+
+    It only shortens the way: what holds numbers that are not finite is forgotten.
+    """
+    if any(LEARNT_KEY + name not in cases.history for name in LEARNT):
+        return {}
+    found = {name: np.asarray(cases.history[LEARNT_KEY + name]) for name in LEARNT}
+    shape = {"s": (PAIRS, rows), "w": (PAIRS, rows), "sy": (PAIRS, PAIRS), "yw": (PAIRS, PAIRS)}
+    if any(array.shape != (len(cases.loads), *shape.get(name, ())) for name, array in found.items()):
+        return {}
+    most = {"head": PAIRS - 1, "known": PAIRS}
+    if any(array.dtype.kind not in "fiu" for array in found.values()) or not all(
+        ((found[name] >= 0) & (found[name] <= last)).all() for name, last in most.items()
+    ):
+        return {}
+    # Other places hold whatever stood in the room.
+    used = (found["head"][:, None] - np.arange(PAIRS)) % PAIRS < found["known"][:, None]
+    places = {"s": used, "w": used} | dict.fromkeys(("sy", "yw"), used[:, :, None] & used[:, None, :])
+    return found if all(all_finite(found[name][place]) for name, place in places.items()) else {}

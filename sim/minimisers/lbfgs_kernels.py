@@ -1,0 +1,343 @@
+"""The kernels of L-BFGS on many columns: what every load case does next is decided where its numbers are.
+
+Every pair (s, y) of a column, a step and the change of the gradient along it, is kept as s and w = M^-1 y, with M^-1
+the preconditioner. The two loops of Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4 then need inner
+products with s and w alone, and the direction is a sum of these: one pass over the pairs for each.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from ..runtime.columns import CHUNK
+from ..runtime.device import Device
+
+LIVE, DONE, LEFT, BROKEN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+"""What a column is: on its way, in equilibrium, not brought farther here, never finite."""
+# Pairs that each column keeps.
+PAIRS = 8
+# The slope ahead may rise to this share of the promised decrease: a step that overshoots more is cut.
+OVERSHOOT = 0.5
+# A cut keeps at least and at most this share of a step; one that left the numbers keeps the middle share.
+LEAST_KEPT, KEPT, MOST_KEPT = 0.1, 0.25, 0.7
+CUTS = 12
+# Rows, or nodes, that one thread takes, so that what it must know of their column is read once.
+SOME = 16
+# A pair along which the gradient hardly changes, or against the step, says nothing of a positive definite curvature.
+LEAST_CURVATURE = 1e-3
+# Rows of sums that one evaluation gives each column.
+OWN, WHOLE, FREE, SLOPE = 0, 1, 2, 3
+SUMS = 4
+# Rows of products after the 2 m with the pairs.
+GZ, GOLD, YW = 0, 1, 2
+PRODUCTS = 3
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Arithmetic of one scalar type and number of pairs."""
+
+    absorb: wp.Kernel
+    multiply: wp.Kernel
+    judge: wp.Kernel
+    aim: wp.Kernel
+    move: wp.Kernel
+    clamp: wp.Kernel
+
+
+def few_of(device: Device) -> int:
+    """Rows that one thread takes where it keeps much of each."""
+    return 1 if device.on_cuda else 4
+
+
+@cache
+def kernels_of(device: Device, pairs: int) -> Kernels:
+    """Kernels of a device's scalar type for columns that keep so many pairs."""
+    scalar = device.scalar
+    several, few_scalars = (wp.types.vector(length=length, dtype=scalar) for length in (SOME, few_of(device)))
+    weights = wp.types.vector(length=pairs, dtype=wp.float64)
+    products_of_pairs = wp.types.matrix(shape=(pairs, pairs), dtype=wp.float64)
+    m, chunk, some, few = pairs, CHUNK, SOME, few_of(device)
+    overshoot, least_kept, kept, most_kept = OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT
+    cuts, least_curvature = CUTS, LEAST_CURVATURE
+    whole_row, free_row, slope_row = WHOLE, FREE, SLOPE
+    gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW
+
+    @wp.kernel(module="unique")
+    def absorb(
+        # outputs
+        own: wp.array2d(dtype=scalar),
+        total: wp.array2d(dtype=scalar),
+        square: wp.array(dtype=wp.float64),
+    ):
+        """total += own, own = 0, and its square norm."""
+        block, c = wp.tid()
+        squares = wp.float64(0.0)
+        for r in range(block * chunk, wp.min((block + 1) * chunk, own.shape[0])):
+            x = own[r, c]
+            total[r, c] += x
+            own[r, c] = scalar(0.0)
+            squares += wp.float64(x) * wp.float64(x)
+        wp.atomic_add(square, c, squares)
+
+    @wp.kernel(module="unique")
+    def multiply(
+        known: wp.array(dtype=wp.int32),
+        s: wp.array3d(dtype=scalar),
+        w: wp.array3d(dtype=scalar),
+        g: wp.array2d(dtype=scalar),
+        z: wp.array2d(dtype=scalar),
+        new_g: wp.array2d(dtype=scalar),
+        new_z: wp.array2d(dtype=scalar),
+        # outputs
+        products: wp.array2d(dtype=wp.float64),
+    ):
+        """Products of the new gradient g' with every s, every w, z' and z; and y . w of the pair that opens now."""
+        block, c = wp.tid()
+        last = g.shape[0] - 1
+        own = several()
+        gz, gold, yw = scalar(0.0), scalar(0.0), scalar(0.0)
+        for k in range(some):
+            r = wp.min(some * block + k, last)
+            inside = wp.where(some * block + k <= last, scalar(1.0), scalar(0.0))
+            own[k] = inside * new_g[r, c]
+            gz += own[k] * new_z[r, c]
+            gold += own[k] * z[r, c]
+            yw += (own[k] - inside * g[r, c]) * (new_z[r, c] - z[r, c])
+        wp.atomic_add(products, gz_row, c, wp.float64(gz))
+        wp.atomic_add(products, gold_row, c, wp.float64(gold))
+        wp.atomic_add(products, yw_row, c, wp.float64(yw))
+        for i in range(known[c]):
+            sg, wg = scalar(0.0), scalar(0.0)
+            for k in range(some):
+                r = wp.min(some * block + k, last)
+                sg += own[k] * s[i, r, c]
+                wg += own[k] * w[i, r, c]
+            wp.atomic_add(products, i, c, wp.float64(sg))
+            wp.atomic_add(products, m + i, c, wp.float64(wg))
+
+    @wp.kernel(module="unique")
+    def judge(
+        loud: wp.array2d(dtype=wp.float64),
+        own: wp.array2d(dtype=wp.float64),
+        tolerance: wp.array(dtype=wp.float64),
+        force: wp.array(dtype=wp.float64),
+        sums: wp.array2d(dtype=wp.float64),
+        promised: wp.array(dtype=wp.float64),
+        # outputs
+        status: wp.array(dtype=wp.int32),
+        accepted: wp.array(dtype=wp.int32),
+        steps: wp.array(dtype=wp.int32),
+        cut: wp.array(dtype=wp.int32),
+        t: wp.array(dtype=wp.float64),
+        gone: wp.array(dtype=wp.float64),
+        residual: wp.array(dtype=wp.float64),
+        slot: wp.array(dtype=wp.int32),
+        aiming: wp.array(dtype=wp.int32),
+    ):
+        """Accept the trial, or cut the step; the first trial is the start itself. Aiming are those that go on."""
+        c = wp.tid()
+        accepted[c] = 0
+        slot[c] = -1
+        aiming[c] = 0
+        if status[c] != LIVE:
+            return
+        zero = wp.float64(0.0)
+        slope, free, whole = sums[slope_row, c], sums[free_row, c], sums[whole_row, c]
+        scale = wp.max(whole - free, zero)  # the projection is orthogonal
+        for k in range(own.shape[0]):
+            scale = wp.max(scale, own[k, c])
+        for k in range(loud.shape[0]):
+            scale = wp.max(scale, loud[k, c])
+        finite = wp.isfinite(free) and wp.isfinite(slope) and wp.isfinite(scale)
+        relative = wp.sqrt(free)
+        small = relative <= force[c]
+        if scale > zero:
+            relative = relative / wp.sqrt(scale)
+        first = promised[c] == wp.float64(wp.inf)
+        done = finite and (small or relative <= tolerance[c])
+        if done or (finite and slope <= wp.float64(overshoot) * promised[c]):
+            accepted[c] = 1
+            gone[c] = t[c]
+            residual[c] = relative
+            cut[c] = 0
+            if not first:
+                steps[c] = steps[c] + 1
+        elif first:
+            status[c] = BROKEN
+        else:
+            share = wp.float64(kept)
+            if finite:
+                share = wp.clamp(promised[c] / (promised[c] + slope), wp.float64(least_kept), wp.float64(most_kept))
+            t[c] = share * t[c]
+            cut[c] = cut[c] + 1
+            if cut[c] > cuts:
+                status[c] = LEFT
+        if done:
+            status[c] = DONE
+        if status[c] != LIVE:
+            t[c] = zero
+        elif accepted[c] != 0:
+            aiming[c] = 1
+
+    @wp.kernel(module="unique")
+    def aim(
+        aiming: wp.array(dtype=wp.int32),
+        gone: wp.array(dtype=wp.float64),
+        sums: wp.array2d(dtype=wp.float64),
+        products: wp.array2d(dtype=wp.float64),
+        # outputs
+        status: wp.array(dtype=wp.int32),
+        head: wp.array(dtype=wp.int32),
+        known: wp.array(dtype=wp.int32),
+        slot: wp.array(dtype=wp.int32),
+        t: wp.array(dtype=wp.float64),
+        promised: wp.array(dtype=wp.float64),
+        sg: wp.array2d(dtype=wp.float64),
+        wg: wp.array2d(dtype=wp.float64),
+        sy: wp.array3d(dtype=wp.float64),
+        yw: wp.array3d(dtype=wp.float64),
+        along_s: wp.array2d(dtype=scalar),
+        along_w: wp.array2d(dtype=scalar),
+    ):
+        """Take the pair of the accepted step in, and weigh the pairs: d = -M^-1 g + sum of (a_i s_i + b_i w_i).
+
+        The first `known` slots are filled; from slot m - 1 the head goes on to slot 0. The next trial is as long as the
+        last step should have been by the slopes at its ends: where tissue stiffens, whole steps would all be cut.
+        """
+        c = wp.tid()
+        if aiming[c] == 0:
+            return
+        zero = wp.float64(0.0)
+        slope, gz = sums[slope_row, c], products[gz_row, c]
+        rise = slope + promised[c]
+        length = wp.float64(1.0)
+        if rise > zero and wp.isfinite(promised[c]):
+            length = wp.clamp(gone[c] * promised[c] / rise, wp.float64(least_kept), wp.float64(1.0))
+        n = int(-1)
+        # Also false of the first trial, whose promise is infinite.
+        if rise > wp.float64(least_curvature) * promised[c] and products[yw_row, c] > zero:
+            n = (head[c] + 1) % m
+            for i in range(m):
+                change = products[m + i, c] - wg[i, c]
+                sy[i, n, c] = products[i, c] - sg[i, c]
+                yw[i, n, c] = change
+                yw[n, i, c] = change
+            sy[n, n, c] = gone[c] * rise
+            yw[n, n, c] = products[yw_row, c]
+            head[c] = n
+            known[c] = wp.min(known[c] + 1, m)
+            slot[c] = n
+        size = known[c]
+        for i in range(m):
+            sg[i, c] = wp.where(i == n, gone[c] * slope, products[i, c])
+            wg[i, c] = wp.where(i == n, gz - products[gold_row, c], products[m + i, c])
+        # By age, in registers: from here on every number waits for the one before it.
+        by_s, by_w, along, across = weights(), weights(), weights(), weights()
+        curved, crossed = products_of_pairs(), products_of_pairs()
+        for a in range(m):
+            i = (head[c] - a + m) % m
+            along[a] = sg[i, c]
+            across[a] = wg[i, c]
+            for b in range(m):
+                if b <= a:
+                    j = (head[c] - b + m) % m
+                    curved[a, b] = sy[i, j, c]
+                    crossed[a, b] = yw[i, j, c]
+        for a in range(m):  # from the newest pair to the oldest
+            if a < size:
+                value = along[a]
+                for b in range(m):
+                    if b < a:
+                        value -= by_w[b] * curved[a, b]
+                by_w[a] = value / curved[a, a]
+        for k in range(m):  # and back
+            a = m - 1 - k
+            if a < size:
+                value = across[a]
+                for b in range(m):
+                    if b < size:
+                        if b > a:
+                            value -= by_w[b] * crossed[b, a] + by_s[b] * curved[b, a]
+                        else:
+                            value -= by_w[b] * crossed[a, b]
+                by_s[a] = value / curved[a, a] - by_w[a]
+        decrease = gz
+        for a in range(m):
+            if a < size:
+                decrease -= by_w[a] * across[a] + by_s[a] * along[a]
+        if not decrease > zero:  # round-off: begin anew
+            decrease = gz
+            known[c] = 0
+            head[c] = m - 1
+        for a in range(m):
+            i = (head[c] - a + m) % m
+            along_s[i, c] = scalar(by_s[a])
+            along_w[i, c] = scalar(by_w[a])
+        promised[c] = decrease
+        t[c] = length
+        if not (decrease > zero and wp.isfinite(decrease)):
+            status[c] = LEFT
+            t[c] = zero
+
+    @wp.kernel(module="unique")
+    def move(
+        status: wp.array(dtype=wp.int32),
+        accepted: wp.array(dtype=wp.int32),
+        known: wp.array(dtype=wp.int32),
+        slot: wp.array(dtype=wp.int32),
+        gone: wp.array(dtype=wp.float64),
+        along_s: wp.array2d(dtype=scalar),
+        along_w: wp.array2d(dtype=scalar),
+        new_g: wp.array2d(dtype=scalar),
+        new_z: wp.array2d(dtype=scalar),
+        # outputs
+        u: wp.array2d(dtype=scalar),
+        d: wp.array2d(dtype=scalar),
+        g: wp.array2d(dtype=scalar),
+        z: wp.array2d(dtype=scalar),
+        s: wp.array3d(dtype=scalar),
+        w: wp.array3d(dtype=scalar),
+    ):
+        """Where accepted: u += t d, the new pair takes its slot, g = g', z = z', and the next direction."""
+        block, c = wp.tid()
+        if accepted[c] == 0:
+            return
+        taken, last, n = scalar(gone[c]), u.shape[0] - 1, slot[c]
+        step, direction = few_scalars(), few_scalars()
+        for k in range(few):
+            r = wp.min(few * block + k, last)
+            step[k] = taken * d[r, c]
+            direction[k] = -new_z[r, c]
+            if n >= 0:
+                s[n, r, c] = step[k]
+                w[n, r, c] = new_z[r, c] - z[r, c]
+        size = known[c]
+        for i in range(m):  # unrolled: addresses cost more than numbers
+            if i < size:
+                for k in range(few):
+                    r = wp.min(few * block + k, last)
+                    direction[k] += along_w[i, c] * w[i, r, c] + along_s[i, c] * s[i, r, c]
+        live = status[c] == LIVE
+        for k in range(few):
+            r = few * block + k
+            if r <= last:
+                u[r, c] += step[k]
+                if live:
+                    g[r, c] = new_g[r, c]
+                    z[r, c] = new_z[r, c]
+                    d[r, c] = direction[k]
+
+    @wp.kernel(module="unique")
+    def clamp(
+        # outputs
+        bound: wp.array(dtype=scalar),
+        t: wp.array(dtype=wp.float64),
+    ):
+        """t = min(t, bound), and the bound is one again."""
+        c = wp.tid()
+        t[c] = wp.min(t[c], wp.float64(bound[c]))
+        bound[c] = scalar(1.0)
+
+    return Kernels(absorb, multiply, judge, aim, move, clamp)

@@ -1,0 +1,117 @@
+"""The kernels of a trial of L-BFGS: where it goes, and what the gradient is there.
+
+With many columns neighbouring threads take neighbouring columns, and each a few rows. With one column that leaves a
+card idle, and its few threads far apart in memory: there neighbouring threads take neighbouring rows, and sum before
+they add.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from ..runtime.device import Device
+from ..runtime.lanes import lanes_of, summed
+from .lbfgs_kernels import FREE, OWN, SLOPE, SOME, WHOLE
+
+# Rows, or nodes, of one column that one thread takes: on CUDA, on the CPU.
+EACH, EACH_ON_CPU = 2, 1024
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How threads share rows, or nodes: `lanes` neighbours take neighbouring ones in turn, `each` of them so many."""
+
+    lanes: int
+    each: int
+
+    def threads(self, count: int) -> int:
+        """Threads for so many rows, or nodes."""
+        return -(-count // (self.lanes * self.each)) * self.lanes
+
+
+def spread_of(device: Device, columns: int) -> Spread:
+    """How the threads of a device share the rows of so many columns."""
+    if columns > 1:
+        return Spread(1, SOME)
+    return Spread(lanes_of(device), EACH if device.on_cuda else EACH_ON_CPU)
+
+
+@wp.func
+def first_of(thread: int, lanes: int, each: int):
+    """The first of the rows that a thread takes, `lanes` apart."""
+    return thread // lanes * lanes * each + thread % lanes
+
+
+@wp.func
+def alone(value: wp.float64) -> wp.float64:
+    """What `summed` is where no neighbour has a share of the same sum."""
+    return value
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Arithmetic of one scalar type and spread, launched over (threads of rows or nodes, columns)."""
+
+    step: wp.Kernel
+    finish: wp.Kernel
+
+
+@cache
+def kernels_of(device: Device, spread: Spread) -> Kernels:
+    """Kernels of a device's scalar type."""
+    scalar, vec = device.scalar, device.vector
+    lanes, each = spread.lanes, spread.each
+    together = summed if lanes > 1 else alone
+    own_row, whole_row, free_row, slope_row = OWN, WHOLE, FREE, SLOPE
+
+    @wp.kernel(module="unique")
+    def step(
+        u: wp.array2d(dtype=scalar),
+        t: wp.array(dtype=wp.float64),
+        d: wp.array2d(dtype=scalar),
+        # outputs
+        v: wp.array2d(dtype=scalar),
+    ):
+        """v = u + t_c d."""
+        thread, c = wp.tid()
+        length, first = scalar(t[c]), first_of(thread, lanes, each)
+        for k in range(each):
+            r = first + lanes * k
+            if r < u.shape[0]:
+                v[r, c] = u[r, c] + length * d[r, c]
+
+    @wp.kernel(module="unique")
+    def finish(
+        constant: wp.array2d(dtype=scalar),
+        held: wp.array2d(dtype=wp.int8),
+        normal: wp.array(dtype=vec),
+        d: wp.array2d(dtype=scalar),
+        # outputs
+        total: wp.array2d(dtype=scalar),
+        sums: wp.array2d(dtype=wp.float64),
+    ):
+        """Project the gradient; sums: |total - constant|^2, |total|^2, |free|^2, free . d."""
+        thread, c = wp.tid()
+        own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+        first = first_of(thread, lanes, each)
+        for i in range(first, wp.min(first + lanes * each, held.shape[0]), lanes):
+            x = vec(total[3 * i, c], total[3 * i + 1, c], total[3 * i + 2, c])
+            y = x - vec(constant[3 * i, c], constant[3 * i + 1, c], constant[3 * i + 2, c])
+            own += wp.float64(wp.dot(y, y))
+            whole += wp.float64(wp.dot(x, x))
+            n = normal[i]
+            x -= wp.dot(n, x) * n
+            for k in range(3):
+                f = wp.where(held[i, k] == wp.int8(0), x[k], scalar(0.0))
+                total[3 * i + k, c] = f
+                free += wp.float64(f) * wp.float64(f)
+                slope += wp.float64(f) * wp.float64(d[3 * i + k, c])
+        own, whole, free, slope = together(own), together(whole), together(free), together(slope)
+        if thread % lanes == 0:
+            wp.atomic_add(sums, own_row, c, own)
+            wp.atomic_add(sums, whole_row, c, whole)
+            wp.atomic_add(sums, free_row, c, free)
+            wp.atomic_add(sums, slope_row, c, slope)
+
+    return Kernels(step, finish)

@@ -1,0 +1,55 @@
+"""Line search on the directional derivative.
+
+Energies are not compared: in single precision their differences drown in round-off long before the gradient does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from ..discretisation.problem import Problem
+from ..runtime.columns import combined, dots
+from .newton_cg import Direction
+
+# The slope ahead may rise to this share of the promised decrease: a step that overshoots more is cut.
+OVERSHOOT = 0.5
+# A step that was cut and still descends more steeply than this share is lengthened again, so many times at most.
+UNDERSHOOT = 0.5
+REFINEMENTS = 4
+TRIALS = 16
+# A shorter step leads nowhere.
+SHORTEST = 1e-8
+
+
+def search(problem: Problem, u: wp.array, direction: Direction) -> np.ndarray:
+    """Step lengths (b,) in (0, 1] along a direction from u (3N, b); zero where none was found.
+
+    A length is accepted when phi'(t) <= 0.5 x the promised decrease: the energy still falls, or its minimum along
+    the line is not far behind. The search keeps the longest such length and the shortest that goes too far; the
+    secant through the slopes at both gives the next trial.
+    """
+    t = problem.longest_step(u, direction.d)
+    promised = direction.promised
+    low, high = np.zeros(len(t)), np.full(len(t), np.inf)
+    slope_low, slope_high = -promised, np.full(len(t), np.inf)
+    found, refinements = np.zeros(len(t), bool), np.zeros(len(t), int)
+    trial = problem.device.zeros(*u.shape)
+    for _ in range(TRIALS):
+        g = problem.gradient(combined(problem.device, u, t, direction.d, trial))
+        problem.constraint.project(g)
+        slope = dots(problem.device, g, direction.d)
+        slope = np.where(np.isfinite(slope), slope, 3.0 * np.abs(promised))
+        far = ~found & (slope > OVERSHOOT * promised)
+        near = ~found & ~far
+        low, slope_low = np.where(near, t, low), np.where(near, slope, slope_low)
+        high, slope_high = np.where(far, t, high), np.where(far, slope, slope_high)
+        short = near & (slope < -UNDERSHOOT * promised) & np.isfinite(high)
+        refinements += short | (far & (low > 0.0))
+        found |= (near & ~short) | (refinements >= REFINEMENTS)
+        if found.all():
+            break
+        with np.errstate(invalid="ignore"):
+            share = np.clip(slope_low / (slope_low - slope_high), 0.1, 0.7)
+            t = np.where(found, low, low + share * (high - low))
+    return np.where(low >= SHORTEST, low, 0.0)

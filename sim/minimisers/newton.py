@@ -1,0 +1,109 @@
+"""The outer iteration: a direction times a search, until the accuracy or the budget is reached.
+
+Knows terms only by their protocol. Cases that are done leave the batch, so that the rest costs less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..accuracy import Accuracy
+from ..deformation import Outcome
+from ..discretisation.problem import Problem
+from ..runtime.columns import combined, gathered, norms, scattered
+from .line_search import search
+from .newton_cg import Descent
+
+# Inexact Newton: the linear residual is never larger than this share.
+LARGEST_FORCING = 0.25
+# A residual that was not lowered by a tenth in so many steps is held against round-off.
+PATIENCE = 4
+# What the last digit of every displacement does to the residual, times this, is round-off.
+ROUND_OFF = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibrium:
+    """Where the iteration ended: u (3N, B) [m] on the device; outcomes, outer steps, relative residuals (B,)."""
+
+    u: wp.array
+    outcome: np.ndarray
+    iterations: np.ndarray
+    residual: np.ndarray
+    linear_iterations: int
+
+
+def find_equilibrium(problem: Problem, descent: Descent, start: wp.array, accuracy: Accuracy) -> Equilibrium:
+    """Minimise the potential of a problem that has begun a batch, from start (3N, B) [m].
+
+    The last finite, accepted state of every case is returned, whatever its outcome. A case whose forces all vanish
+    beside those of its start is at rest again: no share of them is left to measure a residual against.
+    """
+    device, count = problem.device, start.shape[1]
+    outcome = np.full(count, Outcome.BUDGET, object)
+    iterations, residual = np.zeros(count, int), np.full(count, np.inf)
+    result, u, before, live = wp.clone(start), wp.clone(start), start, np.arange(count)
+    gap, open_gap = problem.gap(u)
+    taken, failed = np.ones(count), np.zeros(count, bool)
+    first, best, idle = np.zeros(count), np.full(count, np.inf), np.zeros(count, int)
+    last_digit = np.finfo(device.precision).eps
+    linear_iterations = 0
+    descent.begin()
+    for step in range(accuracy.outer + 1):
+        g, free, scale = problem.residual(u)
+        first[live] = scale if step == 0 else first[live]
+        if step and open_gap.any():  # what is closed stays closed: directions are projected
+            gap, open_gap = problem.gap(u)
+        vanished = scale <= last_digit**2 * first[live]
+        with np.errstate(invalid="ignore"):
+            relative = np.divide(free, scale, out=np.zeros_like(free), where=~vanished)
+        bad = ~np.isfinite(relative)
+        done = ~bad & ~open_gap & (relative <= accuracy.tolerance)
+        idle[live] = np.where(relative <= 0.9 * best[live], 0, idle[live] + 1)
+        best[live] = np.fmin(best[live], relative)
+        stuck = ~done & ~bad & (failed | (idle[live] >= PATIENCE))
+        if stuck.any():
+            drowned = stuck & ~open_gap & (free <= ROUND_OFF * round_off(problem, u, g))
+            outcome[live[failed]] = Outcome.STALLED
+            outcome[live[drowned]] = Outcome.ROUND_OFF
+            failed |= drowned
+        outcome[live[done]] = Outcome.CONVERGED
+        outcome[live[bad]] = Outcome.NOT_FINITE
+        iterations[live], residual[live] = step, np.where(bad, np.inf, relative)
+        leave = done | bad | failed
+        last = leave.all() or step == accuracy.outer
+        for state, columns in ((u, ~bad & (leave | last)), (before, bad)):
+            scattered(device, gathered(device, state, np.flatnonzero(columns)), live[columns], result)
+        if last:
+            break
+        if leave.any():
+            stay = np.flatnonzero(~leave)
+            problem.keep(stay)
+            descent.keep(device, stay)
+            u, g, gap = (gathered(device, array, stay) for array in (u, g, gap))
+            live, taken, open_gap, relative = live[stay], taken[stay], open_gap[stay], relative[stay]
+        # Superlinear, and never finer than the tolerance needs.
+        forcing = np.clip(np.sqrt(relative), 0.3 * accuracy.tolerance / np.maximum(relative, 1e-300), LARGEST_FORCING)
+        found = descent.find(problem, u, g, gap if open_gap.any() else None, forcing, taken)
+        linear_iterations += found.iterations
+        length = search(problem, u, found)
+        before, u = u, combined(device, u, length, found.d, wp.empty_like(u))
+        # A search that fails is repeated once along a direction of positive definite curvature.
+        failed = (length == 0.0) & (taken == 0.0)
+        taken = length
+    return Equilibrium(result, outcome, iterations, residual, linear_iterations)
+
+
+def round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
+    """How much (b,) [N] the free gradient g (3N, b) at u (3N, b) changes with the last digit of every displacement.
+
+    Below this no residual falls: the displacements that it would take are not among the type's numbers.
+    """
+    device, values = problem.device, u.numpy()
+    sign = np.random.default_rng(0).choice([-1.0, 1.0], (len(values), 1))
+    near = problem.gradient(device.array(values * (1.0 + sign * np.finfo(device.precision).eps)))
+    problem.constraint.project(near)
+    return norms(device, combined(device, near, -1.0, g, near))

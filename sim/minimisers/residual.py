@@ -1,0 +1,105 @@
+"""What is out of balance in a state: the free gradient of the potential, and what it is measured against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+
+from ..discretisation.problem import Problem
+from ..runtime.columns import CHUNK, add_dots, combined
+from . import lbfgs_trial_kernels
+from .lbfgs_kernels import OWN, PAIRS, SUMS, kernels_of
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """What is out of balance: the free gradient g (3N, b) [N] on the device, and its `sums` (SUMS, b) of steering.
+
+    Square norms own (b last) of the gradients of the terms that are not constant. `part` (3N, b) is zero between.
+    """
+
+    g: wp.array
+    part: wp.array
+    sums: wp.array
+    own: wp.array
+
+
+def _balance_room(problem: Problem, count: int) -> Balance:
+    device = problem.device
+    sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
+    return Balance(device.zeros(problem.rows, count), device.zeros(problem.rows, count), sums, own)
+
+
+def balance(
+    problem: Problem, v: wp.array, constant: wp.array, d: wp.array | None = None, room: Balance | None = None
+) -> Balance:
+    """The balance at v (3N, b) [m] of a batch with `constant` gradients (3N, b) [N], and its slope along d (3N, b).
+
+    In the arrays of `room`, if it is given.
+    """
+    device, (rows, count) = problem.device, v.shape
+    room = room or _balance_room(problem, count)
+    varying = [term for term in problem.terms if not term.constant]
+    room.sums.zero_()
+    wp.copy(room.g, constant)
+    if len(varying) == 1:
+        varying[0].add_gradient(v, room.g)
+        room = replace(room, own=room.sums[OWN : OWN + 1])
+    else:
+        absorb = kernels_of(device, PAIRS).absorb
+        room.own.zero_()
+        for number, term in enumerate(varying):
+            term.add_gradient(v, room.part)
+            device.launch(absorb, (-(-rows // CHUNK), count), [], [room.part, room.g, room.own[number]])
+    inputs = [constant, *problem.constraint.nodes, v if d is None else d]
+    spread = lbfgs_trial_kernels.spread_of(device, count)
+    device.launch(
+        lbfgs_trial_kernels.kernels_of(device, spread).finish,
+        (spread.threads(rows // 3), count),
+        inputs,
+        [room.g, room.sums],
+    )
+    return room
+
+
+def constants_of(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
+    """The summed gradient (3N, b) [N] of the terms that are constant, and the square norm (terms, b) of each one's."""
+    device = problem.device
+    total = device.zeros(*u.shape)
+    square = wp.zeros((len(problem.terms), u.shape[1]), dtype=wp.float64, device=device.name)
+    for number, term in enumerate(problem.terms):
+        if term.constant:
+            own = device.zeros(*u.shape)
+            term.add_gradient(u, own)
+            add_dots(device, own, own, square[number])
+            combined(device, total, 1.0, own, total)
+    return total, square
+
+
+class Measured:
+    """The 2-norm [N] of a free gradient, and the norm [N] that it is measured against."""
+
+    free: float
+    scale: float
+
+    @property
+    def relative(self) -> float:
+        """The relative residual."""
+        return self.free / self.scale if self.free else 0.0
+
+    @property
+    def finite(self) -> bool:
+        """Whether it is a state at all: forces that overflow have no scale."""
+        return bool(np.isfinite(self.free) and np.isfinite(self.scale))
+
+
+@dataclass(frozen=True, eq=False)
+class State(Measured):
+    """u (3N, 1) [m], its free gradient g (3N, 1) [N] and that one's 2-norm, and the norm it is measured against."""
+
+    u: wp.array
+    g: wp.array
+    free: float
+    scale: float

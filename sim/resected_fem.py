@@ -1,0 +1,204 @@
+"""Finite elements of a body from which tissue is taken: one solver for each state that it passes through."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+from threading import RLock
+
+import numpy as np
+
+from .accuracy import TRAIN, Accuracy
+from .anatomy import Anatomy
+from .deformation import Deformation, check_start, joined
+from .discretisation.resected_body import Remains, bodies
+from .discretisation.term import Remembering
+from .effects import Effect, Elasticity, Held, Pulsation, Resection
+from .errors import InputError
+from .fem import MIDDLES, Fem
+from .loads import Loads, Resected, check_loads
+from .runtime.exclusive import alone
+
+# The history's key for how many steps (B,) were done.
+DONE = "resection"
+# Shape of a tool's pose.
+POSE = (4, 4)
+# Solvers that are kept.
+KEPT = 4
+
+
+class Operated:
+    """A Deformer: each load case is answered by the finite elements of what is left of the body.
+
+    Vertices of which nothing is left stay where they were in the scan. Histories are those of the whole body, whose
+    elements and nodes that are gone remember nothing. Threads may share it, and take turns, as in `Fem`.
+
+    Parameters
+    ----------
+    bodies
+        After 0, 1, ... all steps.
+    make
+        Makes the solver of one of them.
+    ahead
+        All are made at once, and kept: no load waits for one. Else each when it is first asked for, and a few are kept.
+    """
+
+    def __init__(self, bodies: tuple[Remains, ...], make: Callable[[Anatomy], Fem], ahead: bool = False):
+        self.lock = RLock()
+        self._bodies = bodies
+        self._solver = lru_cache(len(bodies) if ahead else KEPT)(lambda done: make(bodies[done].anatomy))
+        self._rows = lru_cache(None)(lambda done: _rows(self._solver(done)))
+        self._place = lru_cache(None)(lambda done, name: _found(self._rows(0)[name][0], self._rows(done)[name][0]))
+        for done in range(len(bodies) if ahead else 0):
+            self._solver(done)
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The whole body."""
+        return self._bodies[0].anatomy
+
+    def remains(self, done: int) -> Remains:
+        """What is left after so many steps."""
+        return self._bodies[done]
+
+    @alone
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """As `Fem.deform`; `start` may be an answer after other steps, and what is left goes on from it.
+
+        Raises
+        ------
+        InputError
+            As `Fem.deform`; more steps done than there are.
+        """
+        check_loads(loads)
+        if start is not None:
+            check_start(start, len(loads), len(self.anatomy.mesh.nodes))
+        done, most = self._done(loads), len(self._bodies) - 1
+        if (done > most).any():
+            raise InputError(f"Resected.done is {done.max()}, but Resection has {most} steps: give at most that.")
+        same = np.zeros(len(done), bool) if start is None or DONE not in start.history else start.history[DONE] == done
+        order, parts, stages = [], [], []
+        for stage, stays in sorted(set(zip(done.tolist(), same.tolist(), strict=True))) or [(most, False)]:
+            rows = np.flatnonzero((done == stage) & (same == stays))
+            begun = None if start is None else self._begun(start.rows(rows), stage, stays)
+            answer = self._solver(stage).deform(loads.but(Resected).rows(rows), begun, at)
+            order.append(rows)
+            stages.append(stage)
+            parts.append(self._ended(answer, stage))
+        return self._together(parts, stages).rows(np.argsort(np.concatenate(order))) if len(parts) > 1 else parts[0]
+
+    def _done(self, loads: Loads) -> np.ndarray:
+        cause = loads.of(Resected)
+        return np.full(len(loads), len(self._bodies) - 1) if cause is None else cause.done.astype(int)
+
+    def _begun(self, start: Deformation, stage: int, stays: bool) -> Deformation:
+        """An answer as one of the body at a stage, which `stays` what it was or was another."""
+        history = dict(start.history) if stays else self._lasting(start.history, stage)
+        history.pop(DONE, None)
+        for name, place in self._places(history, stage).items():
+            if history[name].shape[1:] == self._shape(name):  # another body's is refused by who reads it
+                history[name] = history[name][place]
+        return replace(start, displacement=self._masked(start, stage), history=history)
+
+    def _ended(self, answer: Deformation, stage: int) -> Deformation:
+        """The answer of the body at a stage as one of the whole body, marked with the steps that it is of."""
+        history = {**answer.history, DONE: np.full(len(answer), float(stage))}
+        for name, place in self._places(history, stage).items():
+            own = history[name]
+            history[name] = np.zeros((len(own), *self._shape(name)), own.dtype)
+            history[name][place] = own
+        return replace(answer, displacement=self._masked(answer, stage), history=history)
+
+    def _masked(self, answer: Deformation, stage: int) -> np.ndarray:
+        """Displacements of an answer with orphaned vertices at rest."""
+        orphaned = self._bodies[stage].anatomy.orphaned[answer.nodes]
+        return np.where(orphaned[:, None], 0.0, answer.displacement)
+
+    def _together(self, parts: list[Deformation], stages: list[int]) -> Deformation:
+        """Answers of the bodies at some stages; where one has no such elements at all, they remember nothing."""
+        histories = [self._lasting(part.history, stage) for part, stage in zip(parts, stages, strict=True)]
+        shapes = {name: value.shape[1:] for history in histories for name, value in history.items()}
+        whole = [
+            {name: np.zeros((len(part), *shape)) for name, shape in shapes.items()} | history
+            for part, history in zip(parts, histories, strict=True)
+        ]
+        return joined([replace(part, history=history) for part, history in zip(parts, whole, strict=True)])
+
+    def _lasting(self, history: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
+        """What means the same in another body: memories of elements and nodes, poses of tools, steps done."""
+        rows = self._rows(stage)
+        return {
+            name: value for name, value in history.items() if name in rows or name == DONE or value.shape[2:] == POSE
+        }
+
+    def _places(self, history: Mapping[str, np.ndarray], stage: int) -> dict[str, tuple[slice, np.ndarray, slice]]:
+        """Of histories of elements and nodes, by name: where in the whole body's those of a stage's are.
+
+        A row is shorter where what is gone relaxed in a longer series.
+        """
+        rows = self._rows(stage) if stage else {}
+        return {name: (slice(None), self._place(stage, name), slice(rows[name][1])) for name in history if name in rows}
+
+    def _shape(self, name: str) -> tuple[int, int]:
+        """Of a history of the whole body's elements or nodes: how many they are, and numbers of each."""
+        marks, width = self._rows(0)[name]
+        return len(marks), width
+
+
+def _rows(fem: Fem) -> dict[str, tuple[np.ndarray, int]]:
+    """Of each history whose rows are elements or nodes: what tells them (n, k) from all others, and their length."""
+    terms = [term for term in fem.problem.terms if isinstance(term, Remembering)]
+    return {MIDDLES: (fem.space.edges, 3)} | {term.name: (term.marks, term.width) for term in terms}
+
+
+def _found(whole: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Where (n,) each of some rows (n, k) is in the whole (m, k)."""
+    _, number = np.unique(np.concatenate([whole, some]), axis=0, return_inverse=True)
+    known, asked = np.split(number.ravel(), [len(whole)])
+    order = np.argsort(known)
+    return order[np.searchsorted(known, asked, sorter=order)]
+
+
+def finite_elements(
+    anatomy: Anatomy,
+    effects: Iterable[Effect],
+    accuracy: Accuracy = TRAIN,
+    device: str = "auto",
+    batch: int | None = None,
+    element: str | None = None,
+    live: bool = False,
+) -> Fem | Operated:
+    """The finite elements that effects ask for, `Resection` among them; else as `Fem`.
+
+    Raises
+    ------
+    InputError
+        As `Fem`; steps that cannot be done.
+    """
+    effects = tuple(effects)
+    cuts = [effect for effect in effects if isinstance(effect, Resection)]
+    if len(cuts) != 1:
+        return Fem(anatomy, effects, accuracy, device, batch, element, live)
+    # Vertices of which nothing is left are held, whoever asks for it.
+    others = [effect for effect in effects if not isinstance(effect, Resection | Held)]
+
+    def make(body: Anatomy) -> Fem:
+        return Fem(body, (*_of(others, anatomy, body), Held()), accuracy, device, batch, element, live)
+
+    return Operated(bodies(anatomy, effects), make, ahead=live)
+
+
+def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
+    """Effects without what they say of regions that are gone altogether."""
+    gone = set(whole.mesh.region.tolist()) - set(body.mesh.region.tolist())
+
+    def kept(effect: Effect) -> Effect | None:
+        if isinstance(effect, Pulsation) and effect.regions is not None:
+            left = tuple(label for label in effect.regions if label not in gone)
+            return replace(effect, regions=left) if left else None
+        if not isinstance(effect, Elasticity):
+            return effect
+        return replace(effect, regions={label: law for label, law in effect.regions.items() if label not in gone})
+
+    return tuple(effect for effect in map(kept, effects) if effect is not None)

@@ -1,0 +1,82 @@
+"""Where arrays live and how wide their numbers are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..accuracy import Precision
+from ..errors import InputError
+
+# No adjoints are taken anywhere in the house: half the code to compile.
+wp.config.enable_backward = False
+# Launches are as wide as the work: no thread takes a second turn, and registers are saved.
+wp.config.default_grid_stride = False
+# Start-up notes would stand among a command's own lines; that no driver is there is said all the same.
+wp.config.log_level = wp.LOG_ERROR
+
+SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}
+
+
+@dataclass(frozen=True)
+class Device:
+    """A Warp device by name and the scalar type of every array on it."""
+
+    name: str
+    precision: Precision
+
+    @property
+    def scalar(self) -> Any:
+        """Warp's scalar type."""
+        return SCALARS[self.precision]
+
+    @property
+    def matrix(self) -> Any:
+        """Warp's 3 x 3 matrix of the scalar type."""
+        return wp.types.matrix((3, 3), self.scalar)
+
+    @property
+    def vector(self) -> Any:
+        """Warp's 3-vector of the scalar type."""
+        return wp.types.vector(3, self.scalar)
+
+    @property
+    def on_cuda(self) -> bool:
+        """Whether arrays live on a graphics card."""
+        return self.name.startswith("cuda")
+
+    def zeros(self, *shape: int) -> wp.array:
+        """A zeroed array of the scalar type."""
+        return wp.zeros(shape, dtype=self.scalar, device=self.name)
+
+    def array(self, values: np.ndarray, dtype: Any = None) -> wp.array:
+        """A copy of `values` on the device, of the scalar type unless `dtype` says otherwise."""
+        return wp.array(np.ascontiguousarray(values), dtype=dtype or self.scalar, device=self.name)
+
+    def launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel here, unless there is nothing to do."""
+        if min(dim) > 0:
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.name, record_tape=False)
+
+
+def find_device(name: str, precision: Precision) -> Device:
+    """The device called "cpu", "cuda", "cuda:1", or "auto": CUDA when there is one.
+
+    Raises
+    ------
+    InputError
+        A device that this machine does not have.
+    """
+    wp.init()
+    present = [device.alias for device in wp.get_devices()]
+    if name == "auto":
+        name = "cuda:0" if "cuda:0" in present else "cpu"
+    alias = "cuda:0" if name == "cuda" else name
+    if alias not in present:
+        no_card = alias.startswith("cuda") and not wp.is_cuda_available()
+        why = ", as no NVIDIA driver with a card was found" if no_card else ""
+        raise InputError(f"there is no device {name!r} here{why}: choose auto or one of {', '.join(present)}.")
+    return Device(alias, precision)

@@ -1,0 +1,98 @@
+"""Whether a batch fits into memory: said before it is solved, with the batch that would."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from ..errors import InputError
+from .device import Device
+
+# Columns of the solver at its widest: pairs of L-BFGS, those that move elsewhere, vectors of the elimination around it.
+WORK_COLUMNS = 60
+# Load cases that are worth solving together: more fill the processor no better.
+WIDEST, WIDEST_ON_CUDA = 64, 16384
+# Copies of the answer on the host while batches are joined, in double precision.
+ANSWER_COPIES = 3
+# Of what is free, this share may be used: other programs live too.
+SHARE = 0.9
+# Where Linux says what a group of processes, a container say, may have and has.
+GROUP = Path("/sys/fs/cgroup")
+COARSER = "take a coarser mesh, or a larger machine."
+
+
+def free_bytes(device: Device) -> int:
+    """Memory that is free: the card's, or what the host and its control group still give."""
+    if device.on_cuda:
+        return int(wp.get_device(device.name).free_memory)
+    return host_bytes()
+
+
+def host_bytes() -> int:
+    """Memory that the host and its control group still give; without bound where neither says."""
+    found = [2**62]
+    for line in _lines(Path("/proc/meminfo")):
+        if line.startswith("MemAvailable:"):
+            found.append(1024 * int(line.split()[1]))
+    most, used, parts = (_lines(GROUP / name) for name in ("memory.max", "memory.current", "memory.stat"))
+    if most and used and most[0].strip().isdigit():
+        # Cached files count as used, and are given up when memory is asked for.
+        cached = sum(int(line.split()[1]) for line in parts if line.startswith("inactive_file "))
+        found.append(int(most[0]) - int(used[0]) + cached)
+    return min(found)
+
+
+def fitting_batch(rows: int, device: Device) -> int:
+    """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it, or half of memory."""
+    column = _column(rows, device)
+    widest = WIDEST_ON_CUDA if device.on_cuda else WIDEST
+    return int(np.clip(free_bytes(device) / 2 / max(column, 1), 1, widest))
+
+
+def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0) -> None:
+    """Refuse `count` load cases of `rows` = 3N unknowns, `batch` together, that would not fit.
+
+    `held` bytes are the solver's own already.
+
+    Raises
+    ------
+    InputError
+        Naming what it takes, what is free, and what would fit.
+    """
+    column = _column(rows, device)
+    free = host_bytes()  # read once: Linux counts for a good part of a millisecond
+    each, host = ANSWER_COPIES * 8 * rows, SHARE * free
+    answers, alone = each * count, 0 if device.on_cuda else column
+    if answers + alone > host:
+        fitting = int((host - alone) / each)
+        raise InputError(
+            f"the answers to {count} loads take about {_gigabytes(answers)}, and {_gigabytes(host)} are free: "
+            + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
+        )
+    room = SHARE * (free_bytes(device) if device.on_cuda else free) + held - (0 if device.on_cuda else answers)
+    columns = min(batch, count)
+    if column * columns > room:
+        fitting = int(room / column)
+        remedy = f"a --batch of {fitting} fits." if fitting else COARSER
+        raise InputError(
+            f"a batch of {columns} loads takes about {_gigabytes(column * columns)}, and {_gigabytes(max(room, 0.0))} "
+            f"are free: {remedy}"
+        )
+
+
+def _column(rows: int, device: Device) -> int:
+    """Bytes that one load case takes while it is solved."""
+    return WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
+
+
+def _gigabytes(amount: float) -> str:
+    return f"{amount / 2**30:.3g} GiB"
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text().splitlines()
+    except OSError:
+        return []

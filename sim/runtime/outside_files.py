@@ -1,0 +1,66 @@
+"""Files that come from outside: whatever is wrong with them is said in one sentence of ours."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+
+
+def path_of(path: object) -> Path:
+    """What names a file.
+
+    Raises
+    ------
+    InputError
+        Anything but text or a path.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"{path!r} names no file: give its path as text, or as a pathlib.Path.")
+    return Path(path)
+
+
+@contextmanager
+def read_as(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
+    """Turn whatever a block raises while it reads `path` into a sentence.
+
+    Parameters
+    ----------
+    kind
+        What the file should be, with its article: "a mesh".
+    remedy
+        A sentence that says what to do.
+
+    Raises
+    ------
+    InputError
+        In place of every exception but an interruption; those that are sentences already begin with the path.
+    """
+    try:
+        with np.errstate(all="ignore"):  # of numbers that damage made
+            yield
+    except InputError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise InputError(f"{path}: {error}") from error
+    except (Exception, SystemExit) as error:  # a damaged byte leads a library to raise anything, or to exit
+        raise InputError(f"{path}: cannot be read as {kind}: {_reason(error)}. {remedy}") from error
+
+
+def _reason(error: BaseException) -> str:
+    """Why, in words that are not a library's."""
+    match error:
+        case MemoryError():
+            return "it asks for more memory than there is"
+        case RecursionError():
+            return "its text is nested too deeply"
+        case OSError(errno=int(number)) if number > 0:
+            return os.strerror(number)[0].lower() + os.strerror(number)[1:]
+        case EOFError():
+            return "it ends too early"
+    return "it is damaged, or of another kind"

@@ -1,0 +1,258 @@
+"""One frame of a live tool on the device: a push, its footprint, and turns of L-BFGS from where the last frame ended.
+
+Everything stands in fixed arrays, so that CUDA replays the frame as one captured graph: a few numbers go up, the answer
+comes down, and what lies between, the state that it starts from included, stays.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from ..discretisation.footprint import Skin
+from ..discretisation.inverted_elements import Inversion
+from ..discretisation.problem import Problem
+from ..linalg.pcg import Preconditioner
+from ..minimisers.lbfgs_kernels import LIVE, PAIRS
+from ..minimisers.lbfgs_state import Room, State, ground_of, standing
+from ..runtime.device import Device
+from ..runtime.lanes import lanes_of, summed
+
+# A frame that takes more turns is not one of a tool that moves smoothly.
+MOST = 60
+# What goes up: point and radius, force, and how far to move on.
+GIVEN = 8
+# What comes down before the displacements; the sums are those of the footprint.
+STATUS, STEPS, RESIDUAL, INVERTED, SUMS = 0, 1, 2, 3, 4
+HEAD = 8
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """What stands around the turns of a frame, in one scalar type."""
+
+    pull: wp.Kernel
+    move_on: wp.Kernel
+    renew: wp.Kernel
+    look: wp.Kernel
+    report: wp.Kernel
+
+
+@cache
+def kernels_of(device: Device) -> Kernels:
+    """Kernels of a device's scalar type, for one column."""
+    scalar, most, m, head, lanes = device.scalar, MOST, PAIRS, HEAD, lanes_of(device)
+
+    @wp.kernel(module="unique")
+    def pull(
+        given: wp.array(dtype=wp.float64),
+        nodes: wp.array(dtype=wp.int32),
+        weight: wp.array2d(dtype=wp.float64),
+        sums: wp.array(dtype=wp.vec4d),
+        # outputs
+        constant: wp.array2d(dtype=scalar),
+        loud: wp.array2d(dtype=wp.float64),
+    ):
+        """Gradient -w_i / (sum of w) F of the push, and its square norm."""
+        i = wp.tid()
+        square = wp.float64(0.0)
+        if i < nodes.shape[0]:
+            share = weight[i, 0] / sums[0][0]
+            for k in range(3):
+                f = scalar(share * given[4 + k])
+                constant[3 * nodes[i] + k, 0] = -f
+                square += wp.float64(f) * wp.float64(f)
+        square = summed(square)
+        if i % lanes == 0:
+            wp.atomic_add(loud, 0, 0, square)
+
+    @wp.kernel(module="unique")
+    def move_on(
+        given: wp.array(dtype=wp.float64),
+        # outputs
+        past: wp.array2d(dtype=scalar),
+        u: wp.array2d(dtype=scalar),
+        d: wp.array2d(dtype=scalar),
+        g: wp.array2d(dtype=scalar),
+        z: wp.array2d(dtype=scalar),
+    ):
+        """u += a (u - past), and u was the past; no direction is known."""
+        r = wp.tid()
+        last = u[r, 0]
+        u[r, 0] = last + scalar(given[7]) * (last - past[r, 0])
+        past[r, 0] = last
+        d[r, 0] = scalar(0.0)
+        g[r, 0] = scalar(0.0)
+        z[r, 0] = scalar(0.0)
+
+    @wp.kernel(module="unique")
+    def renew(
+        # outputs
+        t: wp.array(dtype=wp.float64),
+        promised: wp.array(dtype=wp.float64),
+        residual: wp.array(dtype=wp.float64),
+        loud: wp.array2d(dtype=wp.float64),
+        sg: wp.array2d(dtype=wp.float64),
+        wg: wp.array2d(dtype=wp.float64),
+        steps: wp.array(dtype=wp.int32),
+        cut: wp.array(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
+        turns: wp.array(dtype=wp.int32),
+        going: wp.array(dtype=wp.int32),
+        inverted: wp.array(dtype=wp.int32),
+    ):
+        """About to judge the start; the pairs stay."""
+        t[0] = wp.float64(0.0)
+        promised[0] = wp.float64(wp.inf)
+        residual[0] = wp.float64(wp.inf)
+        loud[0, 0] = wp.float64(0.0)
+        for i in range(m):
+            sg[i, 0] = wp.float64(0.0)
+            wg[i, 0] = wp.float64(0.0)
+        steps[0] = 0
+        cut[0] = 0
+        status[0] = LIVE
+        turns[0] = 0
+        going[0] = 1
+        inverted[0] = 0
+
+    @wp.kernel(module="unique")
+    def look(
+        status: wp.array(dtype=wp.int32),
+        # outputs
+        turns: wp.array(dtype=wp.int32),
+        going: wp.array(dtype=wp.int32),
+    ):
+        """Whether to turn again."""
+        turns[0] = turns[0] + 1
+        going[0] = wp.where(status[0] == LIVE and turns[0] < most, 1, 0)
+
+    @wp.kernel(module="unique")
+    def report(
+        status: wp.array(dtype=wp.int32),
+        steps: wp.array(dtype=wp.int32),
+        residual: wp.array(dtype=wp.float64),
+        inverted: wp.array(dtype=wp.int32),
+        sums: wp.array(dtype=wp.vec4d),
+        u: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array(dtype=wp.float64),
+    ):
+        """All that the host wants to know, in one row."""
+        r = wp.tid()
+        out[head + r] = wp.float64(u[r, 0])
+        if r == 0:
+            out[STATUS] = wp.float64(status[0])
+            out[STEPS] = wp.float64(steps[0])
+            out[RESIDUAL] = residual[0]
+            out[INVERTED] = wp.float64(inverted[0])
+            for k in range(4):
+                out[SUMS + k] = sums[0][k]
+
+    return Kernels(pull, move_on, renew, look, report)
+
+
+class Frame:
+    """Answers one push from the state that stands here, which then is that of the answer.
+
+    Parameters
+    ----------
+    problem, preconditioner
+        Of a body that nothing but pushes load here. The preconditioner serves every state.
+    inversion
+        Of the same discretisation.
+    skin
+        Where tools push.
+    tolerance
+        As `Accuracy` has it.
+    """
+
+    def __init__(
+        self, problem: Problem, preconditioner: Preconditioner, inversion: Inversion, skin: Skin, tolerance: float
+    ):
+        self._device, self._inversion, self._skin = problem.device, inversion, skin
+        self._room = Room(problem, preconditioner, 1, ground_of(problem, 1))
+        self._room.columns["tolerance"].fill_(tolerance)
+        self._room.prepare()
+        self._before = standing(problem, 1, ground_of(problem, 1))
+        self._past = problem.device.zeros(problem.rows, 1)
+        name = problem.device.name
+        self._turns, self._going, self._inverted = (wp.zeros(1, dtype=wp.int32, device=name) for _ in range(3))
+        self._given, self._up = self._both_sides(GIVEN)
+        self._out, self._down = self._both_sides(HEAD + problem.rows)
+        self._imprint = skin.imprint(wp.array(ptr=self._given.ptr, dtype=wp.vec4d, shape=(1,), device=name))
+        self._graph: wp.Graph | None = None
+
+    @property
+    def state(self) -> State:
+        """Of the last answer."""
+        return self._room.state
+
+    @property
+    def before(self) -> State:
+        """What the last answer started from."""
+        return self._before
+
+    def take(self, u: np.ndarray, past: np.ndarray | None, learnt: Mapping[str, np.ndarray]) -> None:
+        """Another state: displacements u (3N, 1) [m], those before them, and learnt pairs, as far as there are any."""
+        columns = self._room.columns
+        columns["u"].assign(u)
+        self._past.assign(u if past is None else past)
+        for name in ("s", "w", "known"):
+            columns[name].zero_()
+        columns["head"].fill_(PAIRS - 1)
+        for name, rows_first in learnt.items():
+            columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
+
+    def push(self, point: np.ndarray, radius: float, force: np.ndarray, share: float) -> np.ndarray:
+        """The answer (HEAD + 3N,) to a push at point (3,) with a footprint's radius [m] and a force (3,) [N].
+
+        From the state that stands here, moved on by a share of the way from the one before. What is returned is
+        written over by the next frame.
+        """
+        self._up.numpy()[:] = (*point, radius, *force, share)
+        device = self._device
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+        else:
+            self._once()
+        if device.on_cuda:
+            wp.synchronize_stream(wp.get_stream(device.name))
+            # What a capture cannot load has been loaded, once there was a step.
+            if self._graph is None and self._down.numpy()[STEPS] > 0:
+                with wp.ScopedCapture(device.name, force_module_load=False) as capture:
+                    self._once()
+                self._graph = capture.graph
+        return self._down.numpy()
+
+    def _once(self) -> None:
+        a, k, device, imprint = self._room.columns, kernels_of(self._device), self._device, self._imprint
+        wp.copy(self._given, self._up)
+        for kind, array in self._before.moved.items():
+            wp.copy(array, self._room.state.moved[kind])
+        self._skin.put(imprint)
+        names = ("t", "promised", "residual", "loud", "sg", "wg", "steps", "cut", "status")
+        outputs = [*(a[name] for name in names), self._turns, self._going, self._inverted]
+        device.launch(k.renew, (1,), [], outputs)
+        vectors = [self._past, *(a[name] for name in ("u", "d", "g", "z"))]
+        device.launch(k.move_on, (len(self._past),), [self._given], vectors)
+        inputs = [self._given, self._skin.numbers, imprint.weight, imprint.sums]
+        lanes = lanes_of(device)
+        device.launch(k.pull, (-(-len(self._skin.numbers) // lanes) * lanes,), inputs, [a["constant"], a["loud"]])
+        wp.capture_while(self._going, self._turn)
+        self._inversion.add_count(a["u"], self._inverted)
+        inputs = [a["status"], a["steps"], a["residual"], self._inverted, imprint.sums, a["u"]]
+        device.launch(k.report, (len(self._past),), inputs, [self._out])
+        wp.copy(self._down, self._out)
+
+    def _turn(self) -> None:
+        self._room.once()
+        inputs = [self._room.columns["status"]]
+        self._device.launch(kernels_of(self._device).look, (1,), inputs, [self._turns, self._going])
+
+    def _both_sides(self, count: int) -> tuple[wp.array, wp.array]:
+        """So many numbers on the device, and as many on the host, from where a card reads without asking."""
+        there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
+        return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)

@@ -1,0 +1,70 @@
+"""Where pushes go on to: a frame starts from its last answer, moved on along the way from the one before that.
+
+Between neighbouring loads the answer is nearly linear in them. Loads q, p with the answers v, u are followed by p' from
+u + a (u - v), a = (p' - p) . (p - q) / |p - q|^2: as far as the load goes on the way that it came; nothing where it
+stands still or turns aside, and back on that way where it returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..loads import Loads, Pushed
+
+# The history's keys: the answer's own loads (B, 2, 7), last those before them; displacements (B, 3N) [m] before it.
+PUSHES, BEFORE = "pushes", "before"
+# A way is followed back to where it began, and on for at most as long again twice.
+BACK, ON = -1.0, 2.0
+
+
+def pushes_of(loads: Loads) -> np.ndarray | None:
+    """Point [m], force [N] and footprint [m] (B, 7) of each load; None where anything but a push acts."""
+    push = loads.only(Pushed)
+    if push is None:
+        return None
+    return np.column_stack([push.point, push.force, push.footprint])
+
+
+def shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """a (B,) for three pushes (B, 7) in turn; zero where one of them has no force, or the last two are the same.
+
+    Lengths are measured against the last footprint, forces against the last force.
+    """
+    forces = np.stack([now, last, before])[:, :, 3:6]
+    size = np.sqrt((forces * forces).sum(axis=2))
+    unit = np.repeat(last[:, 6:], 7, axis=1)
+    unit[:, 3:6] = size[1][:, None]
+    unit[unit == 0.0] = 1.0
+    way, further = (last - before) / unit, (now - last) / unit
+    square = (way * way).sum(axis=1)
+    known = size.all(axis=0) & (square > 0.0)
+    share = (further * way).sum(axis=1) / np.where(known, square, 1.0)
+    return np.where(known, share.clip(BACK, ON), 0.0)
+
+
+def knows(history: Mapping[str, Any], last: np.ndarray) -> bool:
+    """Whether a history says how answers (3N, B) came about."""
+    if BEFORE not in history or PUSHES not in history:
+        return False
+    return history[BEFORE].shape == last.T.shape and history[PUSHES].shape == (last.shape[1], 2, 7)
+
+
+def moved_on(loads: Loads, last: np.ndarray, history: Mapping[str, Any]) -> np.ndarray:
+    """Starts (3N, B) [m] for loads whose last answers (3N, B) have this history; those answers if it tells no way."""
+    now = pushes_of(loads)
+    if now is None or not knows(history, last):
+        return last
+    came, before = history[PUSHES][:, 0], history[PUSHES][:, 1]
+    return last + shares(now, came, before) * (last - history[BEFORE].T)
+
+
+def way_of(now: np.ndarray | None, last: np.ndarray | None, history: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """What the answers to pushes (B, 7) hand on, whose last answers (3N, B) had this history, if there were any."""
+    if now is None:
+        return {}
+    if last is None or PUSHES not in history or history[PUSHES].shape != (len(now), 2, 7):
+        return {PUSHES: np.stack([now, now], axis=1)}
+    return {PUSHES: np.stack([now, history[PUSHES][:, 0]], axis=1), BEFORE: last.T}

@@ -1,0 +1,159 @@
+"""One push after another, each from where the last one ended: what a frame starts from is still on the device.
+
+Whether it is there or comes from the host makes no difference to the answer. Whatever does not go well is left to who
+asked.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from threading import RLock
+from typing import Any
+from weakref import ref
+
+import numpy as np
+
+from ..deformation import LEARNT_KEY, Cost, Deformation, Outcome
+from ..discretisation.inverted_elements import Inversion
+from ..discretisation.problem import Problem
+from ..discretisation.term import Cases
+from ..loads import Loads
+from ..minimisers.lbfgs import LEARNT, learnt_from, rows_first
+from ..minimisers.lbfgs_kernels import DONE
+from ..minimisers.lbfgs_state import State
+from .captured_frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, Frame
+from .extrapolation import BEFORE, PUSHES, knows, pushes_of, shares, way_of
+
+# Components of a cross product, a fifth of the time that NumPy's takes.
+TURNED, BACK = np.array([1, 2, 0]), np.array([2, 0, 1])
+
+
+class Kept(Mapping[str, Any]):
+    """A history of which the learnt pairs stay on the device until they are read, or about to be written over.
+
+    `lock` is that of who answers: another thread may read while the next frame is about to be made.
+    """
+
+    def __init__(self, own: Mapping[str, np.ndarray], state: State, lock: RLock):
+        self._own = dict(own)
+        self._lock = lock
+        self.state: State | None = state
+
+    def settle(self) -> None:
+        """Bring to the host what is still on the device."""
+        with self._lock:
+            if self.state is not None:
+                self._own |= {LEARNT_KEY + name: rows_first(self.state.columns[name]) for name in LEARNT}
+                self.state = None
+
+    def __getitem__(self, key: str) -> Any:
+        if key not in self._own:
+            self.settle()
+        return self._own[key]
+
+    def __iter__(self) -> Iterator[str]:
+        self.settle()
+        return iter(self._own)
+
+    def __len__(self) -> int:
+        self.settle()
+        return len(self._own)
+
+
+class Following:
+    """Answers single pushes that have a start, on meshes whose vertices are the discretisation's nodes.
+
+    Parameters
+    ----------
+    problem, inversion
+        What the frame solves, and who counts its tetrahedra.
+    frame
+        Where that is done.
+    lock
+        Held by who asks for an answer.
+    source
+        What the answers call their solver.
+    """
+
+    def __init__(self, problem: Problem, inversion: Inversion, frame: Frame, lock: RLock, source: str):
+        self._problem, self._inversion, self._frame, self._lock = problem, inversion, frame, lock
+        self._source = source
+        self._nodes = np.arange(problem.rows // 3)
+        self._last: Callable[[], Deformation | None] = _gone
+        # Histories whose pairs stand where the frame ended, and where it began.
+        self._here: Callable[[], Kept | None] = _gone
+        self._there: Callable[[], Kept | None] = _gone
+
+    def answer(self, loads: Loads, start: Deformation, guess: Callable[[], np.ndarray]) -> Deformation | None:
+        """The answer to a push from a start; `guess` looks at it closely and makes displacements (3N, 1) [m] of it.
+
+        None where this is not the place: anything but one push with some force, a start off the constraints or inside
+        out, a descent that does not end well.
+        """
+        clock = time.perf_counter()
+        now = pushes_of(loads)
+        if now is None or len(now) != 1 or not now[0, 3:6].any():
+            return None
+        if start is self._last():
+            last = start.displacement.reshape(-1, 1)
+        else:
+            last = guess()
+            if not self._take(loads, start, last):
+                return None
+        self._make_way()
+        way = way_of(now, last, start.history)
+        share = shares(now, way[PUSHES][:, 1], start.history[PUSHES][:, 1])[0] if knows(start.history, last) else 0.0
+        point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
+        self._last = self._here = _gone
+        found = self._frame.push(point, radius, force, share)
+        if found[STATUS] != DONE or found[INVERTED]:
+            return None
+        history = Kept(way, self._frame.state, self._lock)
+        arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
+        displacement = found[HEAD:].reshape(1, -1, 3).copy()
+        displacement.setflags(write=False)  # as a start, the device's own stands in for it
+        answer = Deformation(
+            displacement=displacement,
+            nodes=self._nodes,
+            outcome=(Outcome.CONVERGED,),
+            iterations=found[STEPS : STEPS + 1].astype(int),
+            residual=found[RESIDUAL : RESIDUAL + 1].copy(),
+            time=loads.times,
+            reaction=np.concatenate([force, arm[TURNED] * force[BACK] - arm[BACK] * force[TURNED]]).reshape(1, 1, 6),
+            history=history,
+            cost=Cost({"equilibrium": time.perf_counter() - clock}),
+            reached=np.ones(1),
+            inverted=np.zeros(1, int),
+            source=self._source,
+        )
+        self._last, self._here = ref(answer), ref(history)
+        return answer
+
+    def _take(self, loads: Loads, start: Deformation, last: np.ndarray) -> bool:
+        """Bring a start to the device, if it is fit for that."""
+        cases = Cases(loads, start.time, start.history)
+        self._problem.begin(cases)
+        u = self._problem.device.array(last)
+        if self._problem.gap(u)[1].any() or self._inversion.count(u).any():
+            return False
+        here = self._here()
+        if here is not None:
+            here.settle()
+        self._last = self._here = _gone
+        past = start.history[BEFORE].T if knows(start.history, last) else None
+        self._frame.take(last, past, learnt_from(cases, len(last)))
+        return True
+
+    def _make_way(self) -> None:
+        """What stands where the last frame ended is about to move to where it began."""
+        there, here = self._there(), self._here()
+        if there is not None:
+            there.settle()
+        if here is not None and here.state is not None:
+            here.state = self._frame.before
+        self._there = self._here
+
+
+def _gone() -> None:
+    """What nobody knows any more."""

@@ -1,0 +1,102 @@
+"""One step towards equilibrium from states that somebody else made, and what is still missing after it.
+
+Near a tool a prediction is far from equilibrium, and a linear solve from there misleads. So what a load strains most is
+first settled by itself, beside the rest (one cycle of nonlinear elimination); then K(u) d = -g is solved for the rest
+of the error, and gone along as far as the line search allows.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..deformation import Outcome
+from ..discretisation.problem import Problem
+from ..discretisation.term import Cases
+from ..linalg.pcg import LinearSolution, conjugate_gradients
+from ..minimisers.line_search import search
+from ..minimisers.newton_cg import Direction
+from ..runtime.columns import combined, dots
+from .strategy import Answer, Ladder
+
+# The linear residual that may be left, and the most iterations: what is settled before leaves so little that more are
+# not seen.
+FORCING, ITERATIONS = 0.2, 12
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Where one step from B states led.
+
+    answer
+        The states there; an outcome is good where the residual is within the tolerance.
+    before
+        (B,) relative residuals where it began.
+    left
+        (3N, B) [m] on the device: how the rest stiffness answers what is still out of balance.
+    seconds
+        Wall time of settling what is strained most, of the linear solve, and of the search along its direction.
+    """
+
+    answer: Answer
+    before: np.ndarray
+    left: wp.array
+    seconds: dict[str, float]
+
+
+def step_from(ladder: Ladder, cases: Cases, guess: np.ndarray) -> Step:
+    """One step from guess (3N, B) [m], which is first put on the constraints; from rest where it lies inside out."""
+    problem, device, count = ladder.problem, ladder.problem.device, len(cases.loads)
+    clocks = [time.perf_counter()]
+    problem.begin(cases)
+    start = device.array(guess)
+    start = device.array(np.where(ladder.inversion.count(start) > 0, 0.0, guess))
+    u = combined(device, start, 1.0, problem.gap(start)[0], start)
+    _, free, scale = problem.residual(u)
+    before = _relative(free, scale)
+    near = ladder.alone if count == 1 and ladder.alone is not None else ladder.near()
+    if near is not None and not problem.constraint.imposes:
+        u = near.descend(u, np.full(count, ladder.accuracy.tolerance), 1).u
+        problem.begin(cases)  # columns that were done have left
+    g, free, _ = problem.residual(u)
+    clocks.append(time.perf_counter())
+    rhs = combined(device, device.zeros(*g.shape), -1.0, g, wp.empty_like(g))
+    found = _solved(problem, ladder, u, rhs, FORCING * free)
+    clocks.append(time.perf_counter())
+    length = search(problem, u, Direction(found.x, dots(device, rhs, found.x), found.iterations))
+    u = combined(device, u, length, found.x, wp.empty_like(u))
+    g, free, scale = problem.residual(u)
+    after, left = _relative(free, scale), wp.zeros_like(g)
+    ladder.preconditioner.apply(g, np.ones(count, bool), left)
+    problem.constraint.project(left)
+    combined(device, wp.zeros_like(left), -1.0, left, left)
+    clocks.append(time.perf_counter())
+    good = after <= ladder.accuracy.tolerance
+    outcome = np.full(count, Outcome.BUDGET, object)
+    outcome[good] = Outcome.CONVERGED
+    steps, reached = np.ones(count, int), good.astype(float)
+    answer = Answer(u, outcome, steps, after, reached, ladder.inversion.count(u), found.iterations)
+    relax, solve, along = np.diff(clocks).tolist()
+    return Step(answer, before, left, {"relax": relax, "solve": solve, "search": along})
+
+
+def _solved(problem: Problem, ladder: Ladder, u: wp.array, rhs: wp.array, tolerance: np.ndarray) -> LinearSolution:
+    """K(u) d = rhs (3N, B) to `tolerance` (B,) [N]; columns whose curvature is negative on the way are solved anew.
+
+    There the curvature at rest stands in wherever the current one is not definite.
+    """
+    found, definite = None, np.zeros(rhs.shape[1], bool)
+    while found is None or (found.truncated & ~definite).any():
+        if found is not None:
+            definite = definite | found.truncated
+        problem.linearise(u, definite)
+        ladder.preconditioner.prepare(problem, rhs.shape[1])
+        found = conjugate_gradients(problem, ladder.preconditioner, wp.clone(rhs), tolerance, ITERATIONS)
+    return found
+
+
+def _relative(free: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    return np.divide(free, scale, out=np.zeros_like(free), where=scale > 0.0)

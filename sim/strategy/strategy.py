@@ -1,0 +1,400 @@
+"""What is tried for a load, rung by rung: from the start, from rest, in load steps. Batches of cases climb together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+import warp as wp
+
+from ..accuracy import Accuracy
+from ..deformation import LEARNT_KEY, Outcome
+from ..discretisation.inverted_elements import Inversion
+from ..discretisation.problem import Problem
+from ..discretisation.term import Cases
+from ..linalg.pcg import Preconditioner
+from ..local_solvers.batch_elimination import Elimination
+from ..local_solvers.clamped_elimination import Vicinity
+from ..local_solvers.contact_descent import Proximal, proximal
+from ..local_solvers.contact_preconditioner import Touched
+from ..local_solvers.patch_elimination import NODES, Patching
+from ..minimisers.lbfgs import Lbfgs, learnt_from
+from ..minimisers.lbfgs_kernels import BROKEN, DONE
+from ..minimisers.newton import find_equilibrium
+from ..minimisers.newton_cg import NewtonCG
+from ..runtime.columns import gathered, scattered
+from ..runtime.device import Device
+
+# L-BFGS has so many turns; what it does not bring to its end is left to Newton. On CUDA, where few columns cost hardly
+# less than one, Newton comes last.
+QUICK, QUICK_ON_CUDA = 60, 800
+# A budget of fewer outer steps is Newton's alone: its steps lead farther.
+FEWEST = 10
+# So many load cases are worth the set-up of a near part, and teach nothing.
+WORTH = 16
+NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
+# Load steps as shares of the load: the first, the least, and what is left of one that failed.
+FIRST_STEP, LEAST_STEP, CUT = 1.0 / 4.0, 1.0 / 64.0, 1.0 / 4.0
+# The next load step is as long as lets expect so many outer steps; one that takes more than the most is too long.
+STEP_OUTER, MOST_STEP_OUTER = 8, 15
+# Tools that go farther than so many gaps at once begin with one that is wider by a power of the closing; until it is
+# their own they are settled to this tolerance.
+WIDE_ENOUGH, CLOSING, OPEN_TOLERANCE = 8.0, 4.0, 0.05
+# A step that failed is tried again, shorter, from a gap so many times as wide.
+WIDER = 16.0
+# What touches is settled in so many steps first; where that ends so near, Newton goes on in as many.
+SETTLING, NEARLY = 16, 0.1
+# Load steps end when the batch has spent so many times the linear iterations that one outer step may take.
+PATIENCE = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, shares of the load reached, inverted tets.
+
+    The linear iterations of the batch; what of the curvature the next frame may know, as history; where tools move,
+    shares (B,) of their way at which they are, and (B,) bool whose way began at rest.
+    """
+
+    u: wp.array
+    outcome: np.ndarray
+    iterations: np.ndarray
+    residual: np.ndarray
+    reached: np.ndarray
+    inverted: np.ndarray
+    linear_iterations: int
+    learnt: Mapping[str, np.ndarray] = field(default_factory=dict)
+    gone: np.ndarray | None = None
+    anew: np.ndarray | None = None
+
+    @property
+    def good(self) -> np.ndarray:
+        """(B,) bool."""
+        return np.array([outcome.good for outcome in self.outcome], bool)
+
+    def put(self, index: np.ndarray, other: Answer, device: Device) -> None:
+        """Write the answer of other cases over some of these (k,); outer steps add up."""
+        scattered(device, other.u, index, self.u)
+        self.iterations[index] += other.iterations
+        for name in ("outcome", "residual", "reached", "inverted"):
+            getattr(self, name)[index] = getattr(other, name)
+
+
+@dataclass(frozen=True, eq=False)
+class Ladder:
+    """The rungs: each takes what the one before it did not bring to equilibrium.
+
+    problem
+        What the cases are posed on.
+    preconditioner
+        Of the problem: L-BFGS starts from it, Newton's linear systems are solved with it.
+    inversion
+        Of the discretisation that the problem is posed on.
+    accuracy
+        Tolerance and budgets.
+    near
+        Makes, or has made, the elimination of the same problem's near part; None: nothing is eliminated.
+    alone
+        What a single load goes through first, if anything.
+    """
+
+    problem: Problem
+    preconditioner: Preconditioner
+    inversion: Inversion
+    accuracy: Accuracy
+    near: Callable[[], Elimination | None] = lambda: None
+    alone: Patching | Vicinity | None = None
+
+    @cached_property
+    def _lbfgs(self) -> Lbfgs:
+        return Lbfgs(self.problem, self.preconditioner)
+
+    @cached_property
+    def _proximal(self) -> Proximal | None:
+        return proximal(self.problem, self.preconditioner)
+
+    @cached_property
+    def _touched(self) -> Preconditioner:
+        """The preconditioner that knows contact: on CUDA half precision is rougher than contact is stiff."""
+        touch = None if self.problem.device.on_cuda else self._proximal
+        return Touched(self.preconditioner, touch.compliance, touch.barrier) if touch else self.preconditioner
+
+    @property
+    def held(self) -> int:
+        """Bytes that L-BFGS keeps for the next batch to stand in."""
+        return self._lbfgs.held
+
+    def climb(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
+        """The equilibria of B cases, each from the first of its guesses (3N, B) [m] that will do; from rest without.
+
+        A start that lies inside out is left alone, and so is a state that does to which a start led: a body turned
+        over or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing.
+        Where nothing acts it stays at rest: the answer is exactly zero.
+        """
+        problem, device, count = self.problem, self.problem.device, len(cases.loads)
+        problem.begin(cases)
+        if not guesses:
+            answer, astray = self._whole(cases), np.zeros(count, bool)
+        else:
+            acts = self._acts(count)
+            guess, astray = self._upright([np.where(acts, one, 0.0) for one in guesses])
+            started = guess.any(axis=0)
+            learnt = NOTHING if astray.any() else learnt_from(cases, problem.rows)
+            if problem.barriers and astray.any():
+                cases = replace(cases, anew=astray.copy())
+                problem.begin(cases)
+            answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
+            lost = np.where(answer.good, answer.inverted > 0, self._lost(answer))
+            again = np.flatnonzero(started & ~astray & lost)
+            if len(again):
+                astray[again] = True
+                some = replace(cases.rows(again), anew=np.ones(len(again), bool))
+                problem.begin(some)
+                answer.put(again, self._whole(some), device)
+        answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
+        anew, lost = astray.copy(), np.flatnonzero(self._lost(answer))
+        if len(lost):
+            found = self._in_steps(cases.rows(lost), answer, lost)
+            anew[lost] |= found.reached > answer.reached[lost]
+            answer.put(lost, found, device)
+        return replace(answer, gone=answer.reached, anew=anew) if problem.barriers else answer
+
+    def _acts(self, count: int) -> np.ndarray:
+        """Which cases (b,) of the batch that has begun any force or imposed motion acts on at rest."""
+        rest = self.problem.device.zeros(self.problem.rows, count)
+        loud = wp.zeros_like(rest)
+        for term in self.problem.terms:
+            if not term.passive:
+                term.add_gradient(rest, loud)
+        acts = (loud.numpy() != 0.0).any(axis=0)
+        if not acts.all():
+            acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.barriers)])
+        return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
+
+    def _rested(self, start: wp.array) -> wp.array:
+        """Start (3N, b) [m], or rest where nothing acts there: in float32 no descent would end in letting go."""
+        acts = self._acts(start.shape[1])
+        return start if acts.all() else self.problem.device.array(np.where(acts, start.numpy(), 0.0))
+
+    def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The first of some guesses (3N, B) [m] of each case that is not inside out; which cases (B,) have none."""
+        device = self.problem.device
+        guess, astray = guesses[0], self.inversion.count(device.array(guesses[0])) > 0
+        for other in guesses[1:]:
+            if astray.any():
+                guess = np.where(astray, other, guess)
+                astray = self.inversion.count(device.array(guess)) > 0
+        return guess, astray
+
+    def _lost(self, answer: Answer) -> np.ndarray:
+        """Which cases (B,) another rung may save: at round-off none is nearer to equilibrium."""
+        return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
+
+    def _whole(
+        self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] | None = NOTHING
+    ) -> Answer:
+        """The whole load at once, of a batch that has begun: eliminations, L-BFGS, Newton, each from where one ended.
+
+        From rest without a start; `learnt` on the way to it, if anything was. Motions that are imposed are left
+        to Newton: it knows how the free nodes follow them. So are steep terms.
+        """
+        problem, device, count = self.problem, self.problem.device, len(cases.loads)
+        most = QUICK_ON_CUDA if device.on_cuda else QUICK
+        # Rest satisfies whatever the batch does not move.
+        imposed = problem.constraint.imposes or (start is not None and problem.gap(start)[1].any())
+        start = device.zeros(problem.rows, count) if start is None else start
+        if problem.paced or (problem.barriers and count > 1):  # it would teach the next frame nothing
+            learnt = None
+        if problem.barriers:
+            return self._moved(cases, start, learnt)
+        if imposed or problem.steep or self.accuracy.outer < FEWEST:
+            return self._thorough(start, self.accuracy.outer)
+        descents: list[tuple[Elimination | Patching | Vicinity | Lbfgs, Mapping[str, np.ndarray] | None]] = [
+            (self._lbfgs, learnt)
+        ]
+        near = self.near() if count >= WORTH else self.alone if count == 1 else None
+        if near is not None:
+            patch = {NODES: cases.history[LEARNT_KEY + NODES]} if LEARNT_KEY + NODES in cases.history else {}
+            descents = [(near, patch), (self._lbfgs, None)]
+        index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
+        answer = Answer(
+            wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
+        )
+        taught: Mapping[str, np.ndarray] = {}
+        for descent, known in descents:
+            found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), most, known)
+            outcome = np.full(len(index), Outcome.BUDGET, object)
+            outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
+            answer.put(index, self._answer(found.u, outcome, found.steps, found.residual, 0), device)
+            taught = {LEARNT_KEY + name: array for name, array in found.learnt.items()}
+            index = index[found.left]
+            if len(index) == 0:
+                break
+            problem.begin(cases.rows(index))
+            start = gathered(device, found.u, found.left)
+        else:
+            answer.put(index, self._thorough(start, self.accuracy.outer), device)
+        return replace(answer, learnt=taught)
+
+    def _touching(
+        self, cases: Cases, start: wp.array, outer: int, gaps: float, learnt: Mapping[str, np.ndarray] | None
+    ) -> Answer:
+        """Of cases whose tools have gone so many times their gap: what touches and what gives apart, then Newton."""
+        problem, touch = self.problem, self._proximal
+        problem.begin(cases)
+        if touch is None or len(cases.loads) > 1 or problem.constraint.imposes or problem.gap(start)[1].any():
+            return self._closed(cases, start, outer, gaps)
+        start = self._rested(start)
+        found = touch.descend(start, np.array([self.accuracy.tolerance]), min(SETTLING, outer), learnt)
+        if found.status[0] == DONE:
+            outcome = np.full(1, Outcome.CONVERGED, object)
+            return replace(self._answer(found.u, outcome, found.steps, found.residual, 0), learnt=found.learnt)
+        spent = found.steps
+        if found.residual[0] <= NEARLY:
+            answer = self._thorough(found.u, min(SETTLING, outer))
+            spent = spent + answer.iterations
+            if answer.good.all():
+                return replace(answer, iterations=spent, learnt=found.learnt)
+        closed = self._closed(cases, start, outer, gaps)
+        return replace(closed, iterations=closed.iterations + spent)
+
+    def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
+        """Newton, of cases whose tools have gone so many times their gap: it is opened first, and closed step by step.
+
+        In a narrow gap tissue would be thrown out of a tool, and caught again, node by node; a wide one leads it.
+        """
+        iterations, linear = np.zeros(start.shape[1], int), 0
+        widest = int(np.ceil(np.log(max(gaps / WIDE_ENOUGH, 1.0)) / np.log(CLOSING)))
+        for times in CLOSING ** np.arange(widest, 0.0, -1.0):
+            self.problem.begin(cases)
+            for term in self.problem.barriers:
+                term.widen(float(times))
+            found = self._thorough(self._rested(start), outer, max(OPEN_TOLERANCE, self.accuracy.tolerance))
+            start, iterations, linear = found.u, iterations + found.iterations, linear + found.linear_iterations
+        self.problem.begin(cases)
+        found = self._thorough(self._rested(start), outer)
+        linear += found.linear_iterations
+        return replace(found, iterations=iterations + found.iterations, linear_iterations=linear)
+
+    def _thorough(self, start: wp.array, outer: int, tolerance: float | None = None) -> Answer:
+        """Newton, in at most so many outer steps, of a batch that has begun."""
+        newton = NewtonCG(self._touched, self.accuracy.inner)
+        accuracy = replace(self.accuracy, outer=outer, tolerance=tolerance or self.accuracy.tolerance)
+        found = find_equilibrium(self.problem, newton, start, accuracy)
+        return self._answer(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
+
+    def _answer(
+        self, u: wp.array, outcome: np.ndarray, steps: np.ndarray, residual: np.ndarray, linear_iterations: int
+    ) -> Answer:
+        reached = np.array([ended.good for ended in outcome], float)
+        return Answer(u, outcome, steps, residual, reached, self.inversion.count(u), linear_iterations)
+
+    def _in_steps(self, cases: Cases, failed: Answer, index: np.ndarray) -> Answer:
+        """From rest, the load raised in steps that grow and shrink; the equilibrium under the largest share found.
+
+        Of cases that are the rows `index` (k,) of what failed; where no larger share is found that stands.
+        """
+        problem, device = self.problem, self.problem.device
+        cases = replace(cases, anew=np.ones(len(index), bool))
+
+        def raised(part: Cases, share: np.ndarray) -> Cases:
+            return replace(part, loads=part.loads.scaled(share), share=share)
+
+        start = device.zeros(problem.rows, len(index))
+        found = self._by_steps(cases, start, raised, FIRST_STEP, self.accuracy.steps)
+        outcome = failed.outcome[index]
+        outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
+        none = np.flatnonzero(found.reached <= failed.reached[index])
+        scattered(device, gathered(device, failed.u, index[none]), none, found.u)
+        found.residual[none], found.reached[none] = failed.residual[index[none]], failed.reached[index[none]]
+        return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
+
+    def _moved(self, cases: Cases, start: wp.array, learnt: Mapping[str, np.ndarray] | None) -> Answer:
+        """From start (3N, b), where the tools were, as far as they may go at once again and again.
+
+        A body at rest on which nothing acts where they end is there, whatever they met on their way.
+        """
+
+        def moved(part: Cases, share: np.ndarray) -> Cases:
+            return replace(part, share=share)
+
+        device, count, most = self.problem.device, len(cases.loads), self.accuracy.steps
+        acting = np.flatnonzero(self._acts(count))
+        if len(acting) == count:
+            return self._by_steps(cases, start, moved, 1.0, most, learnt)
+        at_rest, none = device.zeros(*start.shape), np.zeros(count, int)
+        every = np.full(count, Outcome.CONVERGED, object)
+        answer = Answer(at_rest, every, none, np.zeros(count), np.ones(count), none.copy(), 0)
+        if len(acting):
+            part = gathered(device, start, acting)
+            answer.put(acting, self._by_steps(cases.rows(acting), part, moved, 1.0, most), device)
+        return answer
+
+    def _by_steps(
+        self,
+        cases: Cases,
+        start: wp.array,
+        aimed: Callable[[Cases, np.ndarray], Cases],
+        first: float,
+        most: int,
+        learnt: Mapping[str, np.ndarray] | None = None,
+    ) -> Answer:
+        """From start (3N, b), cases at growing shares: the equilibrium at the largest share found.
+
+        `aimed` makes cases at shares (b,); the `first` step is so long, and none longer than tools may go at once:
+        those that are as long do not count among the `most`. Outcomes are good where the share is 1; on the way
+        round-off will do.
+        """
+        problem, device, count = self.problem, self.problem.device, len(cases.loads)
+        gaps = np.maximum.reduce([np.zeros(count), *(term.gaps(cases) for term in problem.barriers)])
+        u, step, left, spent, done = wp.clone(start), np.full(count, first), most, 0, 1
+        reached, iterations, residual = np.zeros(count), np.zeros(count, int), np.full(count, np.inf)
+        outcome = np.full(count, Outcome.BUDGET, object)
+        lets = outer = self.accuracy.outer
+        if not problem.barriers:
+            lets, outer = STEP_OUTER, min(MOST_STEP_OUTER, outer)
+        while left >= 0:
+            strides = [term.stride(aimed(cases, reached), u) for term in problem.barriers]
+            longest = np.minimum.reduce([np.ones(count), *strides])
+            step = np.minimum(step, longest)
+            live = np.flatnonzero((reached < 1.0) & (step >= LEAST_STEP * np.minimum(1.0, 4.0 * longest)))
+            if len(live) == 0 or spent > PATIENCE * self.accuracy.inner * done:
+                break
+            aim = np.minimum(reached[live] + step[live], 1.0)
+            gone = float(((aim - reached[live]) * gaps[live]).max())
+            left -= int((step < longest)[live].any())
+            found = self._touching(aimed(cases.rows(live), aim), gathered(device, u, live), outer, gone, learnt)
+            learnt, spent = found.learnt or learnt, spent + found.linear_iterations
+            good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
+            done += int(good.any())
+            iterations[live] += found.iterations
+            gaps[live] *= np.where(good, 1.0, WIDER)
+            step[live] *= np.where(good, np.clip(lets / np.maximum(found.iterations, 1), 0.5, 2.0), CUT)
+            scattered(device, gathered(device, found.u, np.flatnonzero(good)), live[good], u)
+            reached[live[good]], residual[live[good]] = aim[good], found.residual[good]
+            outcome[live] = found.outcome
+        short = np.flatnonzero(reached < 1.0)
+        outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
+        if problem.barriers and len(short) < count:
+            problem.begin(aimed(cases, np.ones(count)))
+            pierced = np.logical_or.reduce([term.buried(u) for term in problem.barriers]) & (reached == 1.0)
+            outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
+        if len(short):
+            problem.begin(cases.rows(short))
+            residual[short] = shortfall(problem, gathered(device, u, short))
+        taught = {LEARNT_KEY + name: array for name, array in (learnt or NOTHING).items()}
+        return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent, taught)
+
+
+def shortfall(problem: Problem, u: wp.array) -> np.ndarray:
+    """The relative residual (b,) of u (3N, b) under the whole load, or the share of imposed motion that is missing."""
+    _, free, scale = problem.residual(u)
+    gap, size = problem.constraint.close_gap(u)
+    largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)
+    with np.errstate(invalid="ignore"):  # forces that overflowed
+        share = [np.divide(a, b, out=np.zeros(len(b)), where=b > 0.0) for a, b in ((free, scale), (size, largest))]
+    worse = np.maximum(*share)
+    return np.where(np.isnan(worse), np.inf, worse)

@@ -1,0 +1,1 @@
+"""What touches: rigid tools, and the skull."""

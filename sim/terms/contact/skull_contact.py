@@ -1,0 +1,326 @@
+"""A skull that brain rests against and comes away from: each node has a bone of its own, curved, with an end.
+
+    h = g - n . u - u . H u / 2,    r = r_0 + e . u,    d = |max((h + R, r + R), 0)| - R,
+
+under the bone and inside its opening: with the normal n and its change H along the skull a brain that turns slides
+along the skull, and not off its planes; with the way e into the opening, open cortex rises in it, and not beyond its
+edge, of radius R.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ...anatomy import Anatomy
+from ...discretisation.space import Discretisation
+from ...discretisation.term import Cases
+from ...effects import SkullContact
+from ...runtime.device import Device
+from .barrier import RELAXED, barrier, barrier_curvature, barrier_slope
+from .skull_surface import Bone, bone_of
+
+# A step takes no node farther than this share of its distance to the bone.
+ROOM_KEPT = wp.constant(0.9)
+# Preconditioners count the skull as stiff as this share of the shear modulus over what is felt: between open and shut.
+HALF_SHUT = 0.2
+# How far [m] brain may come at once, from rest and from where it was: the barrier is as wide at first.
+AT_FIRST, AGAIN = 1e-2, 5e-4
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Loops over (skull node, column)."""
+
+    add_energy: wp.Kernel
+    add_gradient: wp.Kernel
+    add_curvature: wp.Kernel
+    add_diagonal: wp.Kernel
+    bound_step: wp.Kernel
+
+
+@wp.struct
+class Wall:
+    """Nodes, normals and bends [1/m] of their bones, ways into the opening, how far inside they are [m].
+
+    How near bone is felt [m], and how many times that far now; areas [m^2]; gap and radius of the bone's edge [m];
+    shear modulus [Pa].
+    """
+
+    nodes: wp.array(dtype=wp.int32)
+    normal: wp.array(dtype=wp.vec3d)
+    bend: wp.array(dtype=wp.mat33d)
+    way: wp.array(dtype=wp.vec3d)
+    inside: wp.array(dtype=wp.float64)
+    felt: wp.array(dtype=wp.float64)
+    area: wp.array(dtype=wp.float64)
+    gap: wp.float64
+    edge: wp.float64
+    times: wp.float64
+    shear: wp.float64
+
+
+@wp.func
+def place(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
+    """(h + R, r + R); where bone is felt farther off, it has stepped back by as much."""
+    gap = wall.gap + (wall.times - wp.float64(1.0)) * wall.felt[s]
+    h = gap - wp.dot(wall.normal[s], x) - wp.float64(0.5) * wp.dot(x, wall.bend[s] * x)
+    return wp.vec2d(h + wall.edge, wall.inside[s] + wp.dot(wall.way[s], x) + wall.edge)
+
+
+@wp.func
+def share(p: wp.vec2d) -> wp.vec2d:
+    """How much d grows as h does, and as r does: of a unit vector away from the bone."""
+    if wp.max(p[0], p[1]) > wp.float64(0.0):
+        return wp.normalize(wp.vec2d(wp.max(p[0], wp.float64(0.0)), wp.max(p[1], wp.float64(0.0))))
+    if p[0] >= p[1]:
+        return wp.vec2d(wp.float64(1.0), wp.float64(0.0))
+    return wp.vec2d(wp.float64(0.0), wp.float64(1.0))
+
+
+@wp.func
+def distance(wall: Wall, p: wp.vec2d) -> wp.float64:
+    """d."""
+    return wp.dot(share(p), p) - wall.edge
+
+
+@wp.func
+def turned(wall: Wall, s: int, x: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.vec3d:
+    """What h falls by, and what r grows by, in such shares."""
+    return along * (wall.normal[s] + wall.bend[s] * x) + across * wall.way[s]
+
+
+@wp.func
+def slope(wall: Wall, s: int, x: wp.vec3d, p: wp.vec2d) -> wp.vec3d:
+    """m: d falls by m . du."""
+    at = share(p)
+    return turned(wall, s, x, at[0], -at[1])
+
+
+@wp.func
+def stiffness(wall: Wall, s: int) -> wp.float64:
+    """w k = w mu / felt [N/m^2]."""
+    return wall.area[s] * wall.shear / (wall.times * wall.felt[s])
+
+
+@wp.func
+def block_of(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
+    """w k (b'' m (x) m + b' d''), without what may be negative of it, the edge's bend, where `definite`."""
+    p = place(wall, s, x)
+    d, m, at = distance(wall, p), slope(wall, s, x, p), share(p)
+    felt = wall.times * wall.felt[s]
+    pressure = barrier_slope(d, felt)
+    K = barrier_curvature(d, felt) * wp.outer(m, m) - pressure * at[0] * wall.bend[s]
+    if definite == 0 and wp.min(at[0], at[1]) > wp.float64(0.0):
+        round = turned(wall, s, x, at[1], at[0])
+        K += pressure / wp.dot(at, p) * wp.outer(round, round)
+    return stiffness(wall, s) * K
+
+
+@wp.func
+def fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.float64:
+    """t at which a distance that is distance - t falls - t^2 bends / 2, bends >= 0, has lost what it may at once."""
+    lost = wp.float64(ROOM_KEPT) * distance
+    root = falls + wp.sqrt(falls * falls + wp.float64(2.0) * lost * bends)
+    if root > wp.float64(2.0) * lost:
+        return wp.float64(2.0) * lost / root
+    return wp.float64(1.0)
+
+
+@cache
+def kernels_of(device: Device) -> Kernels:
+    """Kernels of a device's scalar type; distances are in double precision."""
+    scalar, mat = device.scalar, device.matrix
+
+    @wp.func
+    def motion(u: wp.array2d(dtype=scalar), i: int, c: int) -> wp.vec3d:
+        """u_i in double precision."""
+        return wp.vec3d(wp.float64(u[3 * i, c]), wp.float64(u[3 * i + 1, c]), wp.float64(u[3 * i + 2, c]))
+
+    @wp.kernel(module="unique")
+    def add_energy(
+        u: wp.array2d(dtype=scalar),
+        wall: Wall,
+        # outputs
+        out: wp.array(dtype=wp.float64),
+    ):
+        """E += sum over nodes of w k b(d)."""
+        s, c = wp.tid()
+        d, felt = distance(wall, place(wall, s, motion(u, wall.nodes[s], c))), wall.times * wall.felt[s]
+        if d < felt:
+            wp.atomic_add(out, c, stiffness(wall, s) * barrier(d, felt))
+
+    @wp.kernel(module="unique")
+    def add_gradient(
+        u: wp.array2d(dtype=scalar),
+        wall: Wall,
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """g -= w k b'(d) m."""
+        s, c = wp.tid()
+        x = motion(u, wall.nodes[s], c)
+        p = place(wall, s, x)
+        f = -stiffness(wall, s) * barrier_slope(distance(wall, p), wall.times * wall.felt[s])
+        m = slope(wall, s, x, p)
+        for k in range(3):
+            out[3 * wall.nodes[s] + k, c] += scalar(f * m[k])
+
+    @wp.kernel(module="unique")
+    def add_curvature(
+        p: wp.array2d(dtype=scalar),
+        u: wp.array2d(dtype=scalar),
+        definite: wp.array(dtype=wp.int32),
+        wall: Wall,
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """f += K_ii p_i."""
+        s, c = wp.tid()
+        f = block_of(wall, s, motion(u, wall.nodes[s], c), definite[c]) * motion(p, wall.nodes[s], c)
+        for k in range(3):
+            out[3 * wall.nodes[s] + k, c] += scalar(f[k])
+
+    @wp.kernel(module="unique")
+    def add_diagonal(
+        u: wp.array2d(dtype=scalar),
+        definite: wp.array(dtype=wp.int32),
+        wall: Wall,
+        # outputs
+        out: wp.array2d(dtype=mat),
+    ):
+        """K_ii."""
+        s, c = wp.tid()
+        K = block_of(wall, s, motion(u, wall.nodes[s], c), definite[c])
+        block = mat()
+        for row in range(3):
+            for column in range(3):
+                block[row, column] = scalar(K[row, column])
+        out[wall.nodes[s], c] += block
+
+    @wp.kernel(module="unique")
+    def bound_step(
+        u: wp.array2d(dtype=scalar),
+        du: wp.array2d(dtype=scalar),
+        wall: Wall,
+        # outputs
+        out: wp.array(dtype=scalar),
+    ):
+        """d(u + t du) >= (1 - kept) d: no node that is on its side leaves it at once; d is convex in h and r."""
+        s, c = wp.tid()
+        x, along = motion(u, wall.nodes[s], c), motion(du, wall.nodes[s], c)
+        p = place(wall, s, x)
+        d = distance(wall, p)
+        if d > wp.float64(RELAXED) * wall.times * wall.felt[s]:
+            bends = share(p)[0] * wp.dot(along, wall.bend[s] * along)
+            wp.atomic_min(out, c, scalar(fraction(d, wp.dot(slope(wall, s, x, p), along), bends)))
+
+    return Kernels(add_energy, add_gradient, add_curvature, add_diagonal, bound_step)
+
+
+class Skull:
+    """A Term: the barrier of `barrier.py` between nodes and the bone that was over them at rest.
+
+    Parameters
+    ----------
+    bone
+        Where it is.
+    count
+        N.
+    shear
+        Shear modulus [Pa] of the tissue.
+    device
+        Where its arrays live.
+    """
+
+    name = "skull contact"
+    constant, passive, steep = False, False, True
+
+    def __init__(self, bone: Bone, count: int, shear: float, device: Device):
+        self._device, self._kernels, self._bone = device, kernels_of(device), bone
+        self._wall = Wall()
+        self._wall.nodes = device.array(bone.nodes, wp.int32)
+        self._wall.bend = device.array(bone.bend, wp.mat33d)
+        for name in ("normal", "way"):
+            setattr(self._wall, name, device.array(getattr(bone, name), wp.vec3d))
+        for name in ("inside", "felt", "area"):
+            setattr(self._wall, name, device.array(getattr(bone, name), wp.float64))
+        self._wall.gap, self._wall.edge, self._wall.shear = bone.gap, bone.edge, shear
+        self.widen(1.0)
+        covered = bone.inside < 0.0
+        nodes, normal, times = bone.nodes[covered], bone.normal[covered], (bone.area / bone.felt)[covered]
+        blocks = (HALF_SHUT * shear * times)[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        row = (3 * nodes[:, None, None] + np.arange(3)[:, None]).repeat(3, axis=2)
+        place = row.ravel(), row.swapaxes(1, 2).ravel()
+        self._rest = sp.csc_array(sp.coo_array((blocks.ravel(), place), shape=(3 * count, 3 * count)))
+
+    def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
+        """The skull stays where it is."""
+        return np.ones(len(cases.loads))
+
+    def gaps(self, cases: Cases) -> np.ndarray:
+        """As far as brain may have to come from rest, or else from where it was."""
+        known = np.full(len(cases.loads), cases.displacement is not None)
+        if cases.anew is not None:
+            known &= ~cases.anew
+        return np.where(known, AGAIN, AT_FIRST) / self._bone.felt.min()
+
+    def buried(self, u: wp.array) -> np.ndarray:
+        """The skull is never inside what it holds."""
+        return np.zeros(u.shape[1], bool)
+
+    def widen(self, times: float) -> None:
+        """The barrier as many times as wide, and as much softer; the bone steps back by as much."""
+        self._wall.times = times
+
+    def reaction(self, u: wp.array) -> np.ndarray:
+        """Nobody holds the skull: no tools."""
+        return np.zeros((u.shape[1], 0, 6))
+
+    def begin(self, cases: Cases) -> None:
+        """The gap is its own again."""
+        self.widen(1.0)
+
+    def keep(self, columns: np.ndarray) -> None:
+        """Columns are all alike to the skull."""
+
+    def energy(self, u: wp.array, out: wp.array) -> None:
+        """E += barriers."""
+        self._launch(self._kernels.add_energy, [u], out)
+
+    def add_gradient(self, u: wp.array, out: wp.array) -> None:
+        """g += their slopes."""
+        self._launch(self._kernels.add_gradient, [u], out)
+
+    def linearise(self, u: wp.array, definite: wp.array) -> None:
+        """Curvature is recomputed from u; where `definite`, the bone's edge counts as straight."""
+        self._at = [wp.clone(u), definite]
+
+    def add_curvature(self, p: wp.array, out: wp.array) -> None:
+        """f += K(u) p."""
+        self._launch(self._kernels.add_curvature, [p, *self._at], out)
+
+    def add_diagonal(self, out: wp.array) -> None:
+        """Blocks += diagonal of K(u)."""
+        self._launch(self._kernels.add_diagonal, self._at, out)
+
+    def rest_curvature(self) -> sp.csc_array:
+        """A skull half shut everywhere, for preconditioners: at rest nothing touches, under load some nodes do."""
+        return self._rest
+
+    def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
+        """Nodes stay on their side of the bone; those that are behind it are pushed back."""
+        self._launch(self._kernels.bound_step, [u, du], out)
+
+    def end(self, u: wp.array) -> None:
+        """The skull remembers nothing."""
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array) -> None:
+        self._device.launch(kernel, (len(self._bone.nodes), out.shape[-1]), [*inputs, self._wall], [out])
+
+
+def skull_of(effect: SkullContact, anatomy: Anatomy, space: Discretisation, shear: float, device: Device) -> Skull:
+    """The term of `SkullContact` on tissue with a shear modulus [Pa]."""
+    return Skull(bone_of(anatomy, space, effect.gap), space.count, shear, device)

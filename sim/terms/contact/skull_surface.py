@@ -1,0 +1,132 @@
+"""The bone over a brain, as each node of its surface meets it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ...anatomy import Anatomy
+from ...discretisation.space import Discretisation
+from ...errors import InputError
+from ...geometry.normals import blurred_normals
+from ...geometry.triangles import areas
+from .skull_opening import about_opening, edge_of, inside_opening, rim_of
+
+# The skull is felt in the last of the gap: so far [m] from it, or within all of a narrower one.
+FELT = 1e-4
+# What was under bone stays so far [m] from where it ends, and is barred wherever it goes.
+UNDER_BONE = -1.0
+# The edge of an opening is as round as a mesh can tell, and felt from this share of its radius: on a sharp or a hard
+# one nodes snap from above it to below.
+EDGE_FELT = 0.25
+# The blur through which bone over an opening goes on from that beside it, in the radii of the edge.
+BLUR = 1.5
+# The wall's bend at a node is read off so many nearest nodes, of those whose normals are less than 60 degrees apart.
+NEIGHBOURS, FACING = 16, 0.5
+# Of a quadratic triangle's area each corner's share, and each middle's: all positive, so that no node is forgotten.
+CORNER, MIDDLE = 1.0 / 12.0, 1.0 / 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Bone:
+    """What stands over k nodes of a surface.
+
+    Parameters
+    ----------
+    nodes
+        (k,) their numbers.
+    normal, bend
+        (k, 3) unit vectors towards the bone; (k, 3, 3) [1/m] how they change along it, none of them hollow.
+    inside, way
+        (k,) [m] how far each is inside the opening, negative under bone; (k, 3) unit vectors into it, or zero where it
+        is too far.
+    felt, area
+        (k,) [m] how near each feels bone, [m^2] of surface that it stands for.
+    gap
+        [m] between them at rest.
+    edge
+        [m], the radius of the opening's edge.
+    """
+
+    nodes: np.ndarray
+    normal: np.ndarray
+    bend: np.ndarray
+    inside: np.ndarray
+    way: np.ndarray
+    felt: np.ndarray
+    area: np.ndarray
+    gap: float
+    edge: float
+
+
+def bone_of(anatomy: Anatomy, space: Discretisation, gap: float) -> Bone:
+    """Over what a skull covers, and over the craniotomy near its edge; `gap` [m] at rest. Held nodes stay.
+
+    Raises
+    ------
+    InputError
+        An anatomy none of whose nodes could touch.
+    """
+    held = space.held(anatomy.held).all(axis=1)
+    normal = space.sliding(anatomy.slide_normal, anatomy.held)
+    slides = (normal != 0.0).any(axis=1) & ~held
+    if not slides.any():
+        raise InputError(
+            "SkullContact finds no node that could touch: this anatomy has no slide normals, or holds all."
+        )
+    inside, way, felt = np.full(space.count, UNDER_BONE), np.zeros_like(normal), np.full(space.count, min(FELT, gap))
+    edge, rim = 0.0, rim_of(anatomy)
+    if len(rim):
+        opened = np.zeros(space.count, bool)
+        opened[space.surface[about_opening(anatomy) & anatomy.craniotomy[space.mesh.surface].any(axis=1)]] = True
+        opened &= ~slides & ~held
+        edge = edge_of(space.nodes, rim)
+        normal[opened] = blurred_normals(space.nodes, space.surface[:, :3], space.nodes[opened], BLUR * edge)
+        r, way[opened] = inside_opening(anatomy, space.nodes[opened], normal[opened], edge)
+        inside[opened], felt[opened] = r.clip(0.0), EDGE_FELT * edge
+    nodes = np.flatnonzero(slides | (way != 0.0).any(axis=1))
+    return Bone(
+        nodes,
+        normal[nodes],
+        bend_of(space.nodes[nodes], normal[nodes]),
+        inside[nodes],
+        way[nodes],
+        felt[nodes],
+        _areas(space)[nodes],
+        gap,
+        edge,
+    )
+
+
+def _areas(space: Discretisation) -> np.ndarray:
+    """Of the surface, what each node (N,) [m^2] stands for."""
+    area = areas(space.nodes[space.surface[:, :3]])
+    shares = np.full(3, 1.0 / 3.0) if space.surface.shape[1] == 3 else np.repeat([CORNER, MIDDLE], 3)
+    return np.bincount(space.surface.ravel(), (area[:, None] * shares).ravel(), space.count)
+
+
+def bend_of(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """How unit normals (k, 3) at points (k, 3) [m] of a wall change along it: (k, 3, 3) [1/m], symmetric.
+
+    The least-squares fit of n_j - n_i = H (x_j - x_i) to the nearest points whose normals face the same way, along the
+    wall alone; where the wall is hollow (a negative curvature) it counts as flat.
+    """
+    count = min(NEIGHBOURS, len(points))
+    near = KDTree(points).query(points, count)[1].reshape(len(points), count)
+    across = np.linalg.svd(normal[:, None])[2][:, 1:]  # two directions along the wall
+    step = np.einsum("kja,kia->kij", across, points[near] - points[:, None])
+    turn = np.einsum("kja,kia->kij", across, normal[near] - normal[:, None])
+    weight = np.einsum("kia,ka->ki", normal[near], normal) > FACING
+    x, y = np.moveaxis(step * weight[:, :, None], 2, 0)
+    none = np.zeros_like(x)
+    # Unknowns H_xx, H_xy, H_yy.
+    rows = np.stack([np.stack([x, y, none], axis=2), np.stack([none, x, y], axis=2)], axis=2).reshape(
+        len(points), -1, 3
+    )
+    found = np.linalg.pinv(rows) @ (turn * weight[:, :, None]).reshape(len(points), -1, 1)
+    flat = found[:, [0, 1, 1, 2], 0].reshape(-1, 2, 2)
+    values, vectors = np.linalg.eigh(flat)
+    along = np.einsum("kja,kjm->kam", across, vectors)
+    return np.einsum("kam,km,kbm->kab", along, values.clip(0.0), along)

@@ -1,0 +1,281 @@
+"""Frictionless contact of a body's surface with rigid tools that are moved by pose."""
+
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+
+import numpy as np
+import warp as wp
+
+from ...anatomy import Anatomy
+from ...discretisation.space import Discretisation
+from ...discretisation.term import Cases
+from ...effects import Retraction, ToolContact
+from ...errors import InputError
+from ...geometry.enclosure import enclosed
+from ...geometry.triangles import areas, edge_lengths
+from ...loads import Retracted, Touching
+from ...runtime.device import Device
+from ...tools import Tool, cores_of, distances_to
+from .reduced import HOST, Reduced
+from .tool_kernels import BULGE, Scale, Surface, Tools, kernels_of
+from .tool_path import Way, approach
+
+# Surfaces are looked at in points; between them they are nearer to a tool by at most this share of the gap, which is
+# added to the tool's radius: no point of a surface is inside.
+SAG = 0.25
+# Triangles may be stretched so many times.
+STRETCH = 1.3
+# Of so many poses it is kept where their tools came from: a solver asks again and again.
+KEPT = 4096
+# Of a triangle cut into smaller ones, the farthest point is so many of their edges from the nearest centre.
+FARTHEST = 2.0 / 3.0
+
+
+class Contact:
+    """A Term: the barrier between a body's surface and rigid tools, integrated over the surface at rest.
+
+    Parameters
+    ----------
+    name
+        Unique in its problem.
+    tools
+        Their shapes.
+    way
+        Cases -> from where to where they go; None where no tool is there.
+    nodes, triangles
+        (N, 3) [m] at rest; (S, 3) or (S, 6), what may be touched of the surface.
+    whole
+        (W, 3) corners of the whole surface, outwards.
+    gap
+        Distance [m] at which tissue begins to feel a tool; it is never touched quite.
+    shear
+        Shear modulus [Pa] of the tissue: contact is as stiff as fits it.
+    device
+        Where its arrays live.
+    """
+
+    constant, passive, steep = False, False, True
+
+    def __init__(
+        self,
+        name: str,
+        tools: tuple[Tool, ...],
+        way: Callable[[Cases], Way | None],
+        nodes: np.ndarray,
+        triangles: np.ndarray,
+        whole: np.ndarray,
+        gap: float,
+        shear: float,
+        device: Device,
+    ):
+        self.name = name
+        cores = [core for tool in tools for core in cores_of(tool)]
+        self._owner = np.repeat(np.arange(len(tools)), [len(cores_of(tool)) for tool in tools])
+        self._whole, self._corners = (nodes, whole), [core.corners for core in cores]
+        self._triangles = triangles
+        self._shapes, self._way, self._device = tools, way, device
+        self._kernels = kernels_of(device, triangles.shape[1])
+        corners = nodes[triangles[:, :3]]
+        longest = STRETCH * edge_lengths(corners).max(axis=1)
+        fine = np.sqrt(2.0 * min(core.radius for core in cores) * SAG * gap) / FARTHEST
+        self._surface = Surface()
+        self._surface.rest = device.array(nodes, wp.vec3d)
+        self._surface.table = device.array(triangles, wp.int32)
+        self._surface.pieces = device.array(np.ceil(longest / fine), wp.int32)
+        self._surface.area = device.array(areas(corners), wp.float64)
+        self._tools = Tools()
+        self._tools.centre = device.array(np.array([core.centre for core in cores]), wp.vec3d)
+        self._tools.half = device.array(np.array([core.half for core in cores]), wp.vec3d)
+        self._tools.radius = device.array(np.array([core.radius + SAG * gap for core in cores]), wp.float64)
+        self._asked, self._gap, self._shear = gap, (1.0 - SAG) * gap, shear
+        self.widen(1.0)
+        self._pose: np.ndarray | None = None
+
+    def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
+        """As `Way.stride`: through the air a tool goes as far as it can touch nothing."""
+        way = self._way(cases)
+        if way is None:
+            return np.ones(len(cases.loads))
+        corners = (self._whole[0] + u.numpy().T.reshape(-1, *self._whole[0].shape))[:, self._triangles]
+        middle = corners[:, :, :3].mean(axis=2)
+        reach = BULGE * np.linalg.norm(corners - middle[:, :, None], axis=3).max(axis=2)
+        clear = [
+            [(distances_to(tool, at, points) - far).min() for tool, at in zip(self._shapes, pose, strict=True)]
+            for pose, points, far in zip(way.at(cases.gone), middle, reach, strict=True)
+        ]
+        return way.stride(self._shapes, np.reshape(clear, way.end.shape[:2]).clip(0.0))
+
+    def gaps(self, cases: Cases) -> np.ndarray:
+        """As the farthest-moved tool goes."""
+        way = self._way(cases)
+        return np.zeros(len(cases.loads)) if way is None else way.travel(self._shapes).max(axis=1) / self._gap
+
+    def buried(self, u: wp.array) -> np.ndarray:
+        """In which columns (b,) the middle of a tool, or a corner of what it is made of, is inside the body."""
+        if self._pose is None:
+            return np.zeros(u.shape[1], bool)
+        nodes, surface = self._whole
+        moved = nodes + u.numpy().T.reshape(u.shape[1], -1, 3)
+        inner = [
+            np.concatenate([corners @ T[:3, :3].T + T[:3, 3] for corners, T in zip(self._corners, pose, strict=True)])
+            for pose in self._pose[:, self._owner]
+        ]
+        return np.array([enclosed(points, body, surface).any() for points, body in zip(inner, moved, strict=True)])
+
+    def widen(self, times: float) -> None:
+        """The barrier as many times as wide, and as much softer."""
+        self._scale = Scale()
+        self._scale.gap, self._scale.stiffness = times * self._gap, self._shear / (times * self._gap)
+
+    def begin(self, cases: Cases) -> None:
+        """Put the tools where they are after their share of the way; the gap is its own again."""
+        way = self._way(cases)
+        self._stand(None if way is None else way.at(cases.gone))
+        self.widen(1.0)
+
+    def keep(self, columns: np.ndarray) -> None:
+        """Leave the others' tools."""
+        self._stand(None if self._pose is None else self._pose[columns])
+
+    def energy(self, u: wp.array, out: wp.array) -> None:
+        """E += barriers."""
+        self._launch(self._kernels.add_energy, [u], out, u.shape[1])
+
+    def add_gradient(self, u: wp.array, out: wp.array) -> None:
+        """g += their slopes."""
+        self._launch(self._kernels.add_gradient, [u], out, u.shape[1])
+
+    def linearise(self, u: wp.array, definite: wp.array) -> None:
+        """Curvature is recomputed from u; where `definite`, tools count as flat."""
+        self._at = [wp.clone(u), definite]
+
+    def add_curvature(self, p: wp.array, out: wp.array) -> None:
+        """f += K(u) p."""
+        self._launch(self._kernels.add_curvature, [p, *self._at], out, p.shape[1])
+
+    def add_diagonal(self, out: wp.array) -> None:
+        """Blocks += diagonal of K(u)."""
+        self._launch(self._kernels.add_diagonal, self._at, out, out.shape[1])
+
+    def rest_curvature(self) -> None:
+        """Nothing is touched at rest."""
+
+    def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
+        """No point of the surface passes through a tool."""
+        self._launch(self._kernels.bound_step, [u, du], out, u.shape[1])
+
+    def add_matrix(self, u: wp.array, place: wp.array, definite: bool, out: wp.array) -> None:
+        """As `Dense.add_matrix`."""
+        self._launch(self._kernels.add_matrix, [u, int(definite), place], out, 1)
+
+    @cached_property
+    def touchable(self) -> np.ndarray:
+        """The nodes (n,), ascending, of the surface that tools can touch."""
+        return np.unique(self._triangles)
+
+    @cached_property
+    def _alone(self) -> "tuple[Contact, Reduced]":
+        """The same on the touchable nodes alone, and as a function of where these go."""
+        nodes, own = self._whole[0][self.touchable], np.searchsorted(self.touchable, self._triangles)
+        term = Contact(self.name, self._shapes, self._way, nodes, own, own[:, :3], self._asked, self._shear, HOST)
+        return term, Reduced(term, len(nodes))
+
+    def reduced(self) -> Reduced | None:
+        """Of a batch of one column, with the tools and the gap as they are now; None where no tool is."""
+        if self._pose is None:
+            return None
+        term, reduced = self._alone
+        term._stand(self._pose)
+        term._scale = self._scale
+        return reduced
+
+    def pressed(self) -> tuple[np.ndarray, np.ndarray]:
+        """As `Local.pressed`."""
+        barrier = self.reduced()
+        if barrier is None:
+            return np.zeros(0, int), np.zeros((0, 0))
+        w = self._at[0].numpy().reshape(-1, 3)[self.touchable].ravel()
+        nodes = np.flatnonzero(barrier.slope(w).reshape(-1, 3).any(axis=1))
+        return nodes, barrier.curvature(w, nodes, True)
+
+    def reaction(self, u: wp.array) -> np.ndarray:
+        """(b, tools, 6): force [N] and moment [N m] about its origin that each tool exerts at u (3N, b) [m]."""
+        out = wp.zeros((u.shape[1], len(self._owner), 6), dtype=wp.float64, device=self._device.name)
+        self._launch(self._kernels.add_reaction, [u], out, u.shape[1])
+        return np.add.reduceat(out.numpy(), np.unique(self._owner, return_index=True)[1], axis=1)
+
+    def end(self, u: wp.array) -> np.ndarray | None:
+        """Where the tools are (b, tools, 4, 4): the next way begins there."""
+        return self._pose
+
+    def _stand(self, pose: np.ndarray | None) -> None:
+        self._pose = pose
+        if pose is not None:
+            of_cores = pose[:, self._owner].swapaxes(0, 1)
+            self._tools.rotation = self._device.array(of_cores[:, :, :3, :3], wp.mat33d)
+            self._tools.origin = self._device.array(of_cores[:, :, :3, 3], wp.vec3d)
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:
+        if self._pose is not None:
+            dim = (len(self._surface.table), columns)
+            self._device.launch(kernel, dim, [*inputs, self._surface, self._tools, self._scale], [out])
+
+
+def contact_of(
+    effect: ToolContact | Retraction, anatomy: Anatomy, space: Discretisation, shear: float, device: Device
+) -> Contact:
+    """The term of an effect on tissue with a shear modulus [Pa]."""
+    contact = isinstance(effect, ToolContact)
+    name, tools = ("tool contact", effect.tools) if contact else ("retraction", (effect.blade,))
+    triangles = space.surface[anatomy.bare]
+    if not len(triangles):
+        raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is held or slides.")
+    points, reach = space.nodes[np.unique(triangles)], _reach(space.nodes, triangles)
+
+    @lru_cache(KEPT)
+    def came_from(number: int, pose: bytes) -> np.ndarray:
+        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, reach)
+
+    def clear(pose: np.ndarray) -> np.ndarray:
+        """Where tools (B, tools, 4, 4) came from."""
+        begin = [came_from(number, one.tobytes()) for case in pose for number, one in enumerate(case)]
+        return np.reshape(begin, pose.shape)
+
+    def way(cases: Cases) -> Way | None:
+        last = cases.past(name, (len(tools), 4, 4)) if name in cases.history else None
+        if contact:
+            cause = cases.loads.of(Touching)
+            if cause is None:
+                return None
+            if cause.pose.shape[1] != len(tools):
+                raise InputError(
+                    f"Touching has poses of {cause.pose.shape[1]} tools, but ToolContact has {len(tools)}."
+                )
+            return Way(_begun(last, cases.anew, clear, cause.pose), cause.pose)
+        cause = cases.loads.of(Retracted)
+        if cause is None:
+            return None
+        laid = cause.pose[:, None]
+        held = laid.copy()
+        held[:, 0, :3, 3] += cause.displacement
+        return Way(_begun(last, cases.anew, lambda pose: pose, laid), held)
+
+    return Contact(name, tools, way, space.nodes, triangles, space.surface[:, :3], effect.gap, shear, device)
+
+
+def _begun(
+    last: np.ndarray | None, anew: np.ndarray | None, clear: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
+) -> np.ndarray:
+    """Where ways to poses (B, tools, 4, 4) begin: where tools were last, clear of the body who was nowhere, or anew."""
+    begin = pose.copy() if last is None else last.copy()
+    new = np.ones(len(pose), bool) if last is None else np.zeros(len(pose), bool) if anew is None else anew
+    begin[new] = clear(pose[new])
+    return begin
+
+
+def _reach(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """How far (n,) [m] each of a surface's own nodes, ascending, is at most from the points that are nearest to it."""
+    numbers, table = np.unique(triangles, return_inverse=True)
+    out = np.zeros(len(numbers))
+    np.maximum.at(out, table.reshape(triangles.shape), edge_lengths(nodes[triangles[:, :3]]).max(axis=1)[:, None])
+    return out / np.sqrt(3.0)

@@ -1,0 +1,291 @@
+"""The compiled loops over elements: energy, forces, curvature and bounds of any law on any element."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from ..runtime.device import Device
+from .laws.invariants import cofactor
+from .laws.law import Law
+
+# A step must leave every volume above this share of what it was: the logarithm and its curvature stay moderate.
+VOLUME_KEPT = 0.1
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """The compiled loops over elements of one law."""
+
+    add_energy: wp.Kernel
+    add_gradient: wp.Kernel
+    add_curvature: wp.Kernel
+    add_diagonal: wp.Kernel
+    bound_step: wp.Kernel | None
+    measure: wp.Kernel
+
+
+@cache
+def spreading_of(device: Device) -> wp.Kernel:
+    """Kernel that gives every point in every case its element's coefficients."""
+    scalar = device.scalar
+
+    @wp.kernel(module="unique")
+    def spread(
+        coefficients: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array4d(dtype=scalar),
+    ):
+        """n_eqic = k_ei."""
+        e, q, i, c = wp.tid()
+        out[e, q, i, c] = coefficients[e, i]
+
+    return spread
+
+
+@cache
+def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
+    """Kernels for elements of `size` nodes and laws of `count` coefficients.
+
+    Each launches over (element, column). Elements of `size` 0 have as many nodes as `sizes` says, each its own number.
+    Coefficients are of elements (T,), or where they vary numbers (T, q, count, b) at every point of every case.
+    """
+    scalar, mat, vec = device.scalar, device.matrix, device.vector
+    constants = wp.types.vector(length=count, dtype=scalar)
+    stress, stress_change, density = law.stress, law.stress_change, law.energy
+    kept = VOLUME_KEPT
+    varies = law.at_rest is not None
+    numbers = wp.array4d(dtype=scalar) if varies else wp.array(dtype=constants)
+
+    @wp.func
+    def of_element(coefficients: wp.array(dtype=constants), e: int, q: int, c: int):
+        """Of the whole element, in every case."""
+        return coefficients[e]
+
+    @wp.func
+    def of_point(coefficients: wp.array4d(dtype=scalar), e: int, q: int, c: int):
+        """Of one point in one case."""
+        k = constants()
+        for i in range(count):
+            k[i] = coefficients[e, q, i, c]
+        return k
+
+    @wp.func
+    def same(k: constants):
+        """Nothing varies: at rest they are what they are."""
+        return k
+
+    at, at_rest = (of_element, same) if law.at_rest is None else (of_point, law.at_rest)
+
+    # Loops over nodes are unrolled where `size` is a constant, a fifth less time on the CPU; over points too, they take
+    # thrice as long to compile. Shape gradients sum to zero: only how far nodes moved from node 0 counts.
+    @wp.func
+    def gradient_of(
+        u: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        e: int,
+        q: int,
+        c: int,
+    ):
+        """H = sum over nodes of (u_a - u_0) (x) grad N_a."""
+        H = mat()
+        i = 3 * table[e, 0]
+        origin = vec(u[i, c], u[i + 1, c], u[i + 2, c])
+        for a in range(1, size if size else sizes[e]):
+            i = 3 * table[e, a]
+            H += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]) - origin, gradient[e, q, a])
+        return H
+
+    @wp.func
+    def spread(
+        P: mat,
+        sizes: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        e: int,
+        q: int,
+        c: int,
+        out: wp.array2d(dtype=scalar),
+    ):
+        """f_a += P grad N_a; they sum to zero."""
+        total = vec()
+        for a in range(1, size if size else sizes[e]):
+            i = 3 * table[e, a]
+            f = P * gradient[e, q, a]
+            total += f
+            for k in range(3):
+                wp.atomic_add(out, i + k, c, f[k])
+        i = 3 * table[e, 0]
+        for k in range(3):
+            wp.atomic_sub(out, i + k, c, total[k])
+
+    @wp.kernel(module="unique")
+    def add_energy(
+        u: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        weight: wp.array2d(dtype=scalar),
+        coefficients: numbers,
+        # outputs
+        out: wp.array(dtype=wp.float64),
+    ):
+        """E += sum over points of w psi(H)."""
+        e, c = wp.tid()
+        for q in range(gradient.shape[1]):
+            H = gradient_of(u, sizes, table, gradient, e, q, c)
+            wp.atomic_add(out, c, wp.float64(weight[e, q] * density(H, at(coefficients, e, q, c))))
+
+    @wp.kernel(module="unique")
+    def add_gradient(
+        u: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        weight: wp.array2d(dtype=scalar),
+        coefficients: numbers,
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """f_a += sum over points of w P(H) grad N_a."""
+        e, c = wp.tid()
+        for q in range(gradient.shape[1]):
+            H = gradient_of(u, sizes, table, gradient, e, q, c)
+            P = weight[e, q] * stress(H, at(coefficients, e, q, c))
+            spread(P, sizes, table, gradient, e, q, c, out)
+
+    @wp.kernel(module="unique")
+    def add_curvature(
+        p: wp.array2d(dtype=scalar),
+        where: wp.array2d(dtype=scalar),
+        definite: wp.array(dtype=wp.int32),
+        sizes: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        weight: wp.array2d(dtype=scalar),
+        coefficients: numbers,
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """f_a += sum over points of w dP(H; D) grad N_a; `definite` columns take the curvature at rest."""
+        e, c = wp.tid()
+        for q in range(gradient.shape[1]):
+            k = at(coefficients, e, q, c)
+            H = mat()
+            if definite[c] == 0:
+                H = gradient_of(where, sizes, table, gradient, e, q, c)
+            else:
+                k = at_rest(k)
+            D = gradient_of(p, sizes, table, gradient, e, q, c)
+            P = weight[e, q] * stress_change(H, D, k)
+            spread(P, sizes, table, gradient, e, q, c, out)
+
+    @wp.func
+    def along(H: mat, of: constants, k: int, m: int):
+        """dP for dF = e_k (x) e_m."""
+        D = mat()
+        D[k, m] = scalar(1.0)
+        return stress_change(H, D, of)
+
+    # Unrolled, its many stress changes take ten seconds to compile.
+    @wp.kernel(module="unique", module_options={"max_unroll": 0})
+    def add_diagonal(
+        where: wp.array2d(dtype=scalar),
+        definite: wp.array(dtype=wp.int32),
+        sizes: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        weight: wp.array2d(dtype=scalar),
+        coefficients: numbers,
+        # outputs
+        out: wp.array2d(dtype=mat),
+    ):
+        """K_aa += sum over points of w dP(H; e_j (x) grad N_a) grad N_a, column j of the block.
+
+        Nine stress changes serve all nodes of a point.
+        """
+        e, c = wp.tid()
+        for q in range(gradient.shape[1]):
+            k = at(coefficients, e, q, c)
+            H = mat()
+            if definite[c] == 0:
+                H = gradient_of(where, sizes, table, gradient, e, q, c)
+            else:
+                k = at_rest(k)
+            for j in range(3):
+                X = along(H, k, j, 0)
+                Y = along(H, k, j, 1)
+                Z = along(H, k, j, 2)
+                for a in range(size if size else sizes[e]):
+                    g = gradient[e, q, a]
+                    f = weight[e, q] * ((g[0] * X + g[1] * Y + g[2] * Z) * g)
+                    block = mat()
+                    for i in range(3):
+                        block[i, j] = f[i]
+                    wp.atomic_add(out, table[e, a], c, block)
+
+    @wp.kernel(module="unique")
+    def bound_step(
+        u: wp.array2d(dtype=scalar),
+        du: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        # outputs
+        out: wp.array(dtype=scalar),
+    ):
+        """Halve t until J(t) = det(F + t D) >= kept J(0) on all of [0, t]; J is a cubic in t."""
+        e, c = wp.tid()
+        one = scalar(1.0)
+        for q in range(gradient.shape[1]):
+            H = gradient_of(u, sizes, table, gradient, e, q, c)
+            D = gradient_of(du, sizes, table, gradient, e, q, c)
+            F = wp.identity(n=3, dtype=scalar) + H
+            normal, normal_change = cofactor(F), cofactor(D)
+            a0 = wp.dot(F[0], normal[0])
+            a1 = wp.ddot(normal, D)
+            a2 = wp.ddot(F, normal_change)
+            a3 = wp.dot(D[0], normal_change[0])
+            floor = scalar(kept) * a0
+            t = out[c]
+            zero = scalar(0.0)
+            # Most steps are so short that nothing has to be looked at closely.
+            if a0 + t * (wp.min(a1, zero) + t * (wp.min(a2, zero) + t * wp.min(a3, zero))) >= floor:
+                continue
+            for _ in range(40):
+                low = a0 + t * (a1 + t * (a2 + t * a3))
+                # Stationary points of the cubic inside (0, t), by the root formula that does not cancel.
+                root = a2 * a2 - scalar(3.0) * a1 * a3
+                if root > scalar(0.0):
+                    s = -(a2 + wp.where(a2 >= scalar(0.0), one, -one) * wp.sqrt(root))
+                    if a3 != scalar(0.0):
+                        t1 = s / (scalar(3.0) * a3)
+                        if t1 > scalar(0.0) and t1 < t:
+                            low = wp.min(low, a0 + t1 * (a1 + t1 * (a2 + t1 * a3)))
+                    if s != scalar(0.0):
+                        t2 = a1 / s
+                        if t2 > scalar(0.0) and t2 < t:
+                            low = wp.min(low, a0 + t2 * (a1 + t2 * (a2 + t2 * a3)))
+                if low >= floor:
+                    break
+                t = t / scalar(2.0)
+            wp.atomic_min(out, c, t)
+
+    @wp.kernel(module="unique")
+    def measure(
+        u: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        gradient: wp.array3d(dtype=vec),
+        # outputs
+        out: wp.array3d(dtype=mat),
+    ):
+        """H at every point."""
+        e, c = wp.tid()
+        for q in range(gradient.shape[1]):
+            out[e, q, c] = gradient_of(u, sizes, table, gradient, e, q, c)
+
+    bounded = bound_step if law.needs_positive_volume else None
+    return Kernels(add_energy, add_gradient, add_curvature, add_diagonal, bounded, measure)

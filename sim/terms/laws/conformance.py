@@ -1,0 +1,186 @@
+"""What the solver asks of a tissue law, as checks that anybody can run on a law of their own."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from ...errors import InputError
+from ...material import Tissue, portion
+from ...runtime.device import Device, Precision, find_device
+
+# Random displacement gradients: how many, and their standard deviation at large strain, at small, in single precision.
+COUNT, LARGE, SMALL, SINGLE = 60, 0.3, 1e-6, 1e-3
+# A step of central differences: of the energy, and of the stress.
+STEP, SHORT_STEP = 1e-5, 1e-6
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """Energies (n,), stresses (n, 3, 3) and stress changes (n, 3, 3) of one law, in units of Pa."""
+
+    energy: np.ndarray
+    stress: np.ndarray
+    change: np.ndarray
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """A law's Warp functions on arrays of displacement gradients; `of` is the tissue unless another is given."""
+
+    device: Device
+    kernel: wp.Kernel
+    of: Tissue
+
+    def __call__(self, H: np.ndarray, D: np.ndarray | None = None, of: Tissue | None = None) -> Evaluated:
+        """At gradients H (n, 3, 3), along changes D (n, 3, 3) of them."""
+        return self.at(H, D, (of or self.of).coefficients)
+
+    def at(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
+        """The same with other coefficients."""
+        count, device = len(H), self.device
+        energy = device.zeros(count)
+        stress, change = (wp.zeros(count, dtype=device.matrix, device=device.name) for _ in range(2))
+        given = device.array(H, device.matrix), device.array(H if D is None else D, device.matrix)
+        constants = wp.types.vector(len(coefficients), device.scalar)(*coefficients)
+        device.launch(self.kernel, (count,), [*given, constants], [energy, stress, change])
+        return Evaluated(*(array.numpy().astype(np.float64) for array in (energy, stress, change)))
+
+
+@cache
+def evaluator(of: Tissue, precision: Precision) -> Evaluator:
+    """The functions of a tissue's law on the CPU."""
+    device = find_device("cpu", precision)
+    scalar, mat = device.scalar, device.matrix
+    constants = wp.types.vector(len(of.coefficients), scalar)
+    density, stress_of, change_of = of.functions.energy, of.functions.stress, of.functions.stress_change
+
+    @wp.kernel(module="unique")
+    def evaluate(
+        H: wp.array(dtype=mat),
+        D: wp.array(dtype=mat),
+        c: constants,
+        # outputs
+        energy: wp.array(dtype=scalar),
+        stress: wp.array(dtype=mat),
+        change: wp.array(dtype=mat),
+    ):
+        """psi, P and dP."""
+        i = wp.tid()
+        energy[i] = density(H[i], c)
+        stress[i] = stress_of(H[i], c)
+        change[i] = change_of(H[i], D[i], c)
+
+    return Evaluator(device, evaluate, of)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check of a law: how far it is off, relative to what it is compared with, and how far it may be."""
+
+    name: str
+    error: float
+    limit: float
+
+    @property
+    def kept(self) -> bool:
+        """Whether it is within its limit; an error that is no number is not."""
+        return self.error <= self.limit
+
+    def __str__(self) -> str:
+        return f"{self.name}: off by {self.error:.1e}, at most {self.limit:.0e} allowed"
+
+
+def check_tissue(tissue: Tissue, small_strain: bool = False) -> tuple[Finding, ...]:
+    """Hold a tissue's law to what the solver asks of it, at random strains on the CPU; a few seconds to compile.
+
+    `small_strain`: the law is for small rotations only, as Hooke's, and need not turn with the tissue.
+
+    Raises
+    ------
+    InputError
+        Every check that the law does not pass, with its figures.
+    """
+    with np.errstate(invalid="ignore"):  # of two infinities: no number, and no check is passed by it
+        found = tuple(_findings(tissue, small_strain))
+    broken = [str(finding) for finding in found if not finding.kept]
+    if broken:
+        raise InputError(f"the law {tissue.law} does not hold: {'; '.join(broken)}.")
+    return found
+
+
+def _findings(tissue: Tissue, small_strain: bool) -> Iterator[Finding]:
+    mu, lam = tissue.lame
+    if not (mu > 0.0 and 3.0 * lam + 2.0 * mu > 0.0 and np.isfinite([mu, lam]).all()):
+        raise InputError(f"the law {tissue.law} has the Lamé constants {mu}, {lam} Pa: no tissue is at rest with them.")
+    given, again = np.array(tissue.coefficients), np.array(tissue.coefficients_at(mu, lam))
+    if given.shape != again.shape:
+        raise InputError(
+            f"the law {tissue.law} has {len(given)} coefficients, but {len(again)} at other Lamé constants: "
+            "give as many."
+        )
+    yield Finding("coefficients_at its own Lamé constants are its coefficients", _off(again, given), 1e-12)
+    double, random = evaluator(tissue, "float64"), np.random.default_rng(3)
+    H = random.normal(0.0, LARGE, (3 * COUNT, 3, 3))
+    J = np.linalg.det(np.eye(3) + H)
+    positive = tissue.functions.needs_positive_volume
+    H = H[J > 0.1][:COUNT] if positive else H[np.abs(J) > 0.02][:COUNT]
+    D, E = random.normal(size=(2, *H.shape))
+    here = double(H, D)
+
+    still = double(np.zeros((1, 3, 3)))
+    yield Finding("no energy and no stress at rest", max(_largest(still.stress), abs(still.energy[0])) / mu, 1e-9)
+    small = random.normal(0.0, SMALL, (COUNT, 3, 3))
+    for carries in ("whole", "shape", "volume"):
+        share = portion(tissue, carries)
+        stress = double.at(small, None, tissue.coefficients_at(*share)).stress
+        name = "" if carries == "whole" else f" where elements carry {carries} alone"
+        yield Finding(f"Hooke's law at small strain{name}", _off(stress, hooke(small, *share)), 1e-4)
+    parts = [double.at(H, D, tissue.coefficients_at(*portion(tissue, carries))) for carries in ("shape", "volume")]
+    for name in ("energy", "stress", "change"):
+        shape, volume = (getattr(part, name) for part in parts)
+        yield Finding(f"shape and volume make the whole {name}", _off(shape + volume, getattr(here, name)), 1e-8)
+
+    numeric = np.zeros_like(H)
+    for i, j in np.ndindex(3, 3):
+        step = np.zeros((3, 3))
+        step[i, j] = STEP
+        numeric[:, i, j] = (double(H + step).energy - double(H - step).energy) / (2.0 * STEP)
+    yield Finding("stress is the energy's derivative", _off(numeric, here.stress), 1e-6)
+    numeric = (double(H + SHORT_STEP * D).stress - double(H - SHORT_STEP * D).stress) / (2.0 * SHORT_STEP)
+    yield Finding("stress_change is the stress's derivative", _off(numeric, here.change), 1e-6)
+    one, other = (np.einsum("nij,nij->n", change, way) for change, way in ((here.change, E), (double(H, E).change, D)))
+    yield Finding("stress_change is symmetric", _off(other, one), 1e-8)
+
+    Q, _ = np.linalg.qr(random.normal(size=H.shape))
+    Q *= np.linalg.det(Q)[:, None, None]
+    turned = double(Q @ H @ Q.transpose(0, 2, 1)).energy
+    yield Finding("isotropic: the axes do not matter", _off(turned, here.energy), 1e-8)
+    if not small_strain:
+        turned = double(Q @ (np.eye(3) + H) - np.eye(3)).stress
+        yield Finding("stress turns with the tissue", _off(turned, Q @ here.stress), 1e-8)
+    if positive:
+        inverted = double(np.diag([-2.0, 0.0, 0.0])[None]).energy[0]
+        yield Finding(
+            "infinite energy where J < 0, which needs_positive_volume promises", float(inverted < np.inf), 0.0
+        )
+    single = evaluator(tissue, "float32")
+    strained = random.normal(0.0, SINGLE, (COUNT, 3, 3)).astype(np.float32).astype(np.float64)
+    yield Finding("stress in single precision", _off(single(strained).stress, double(strained).stress), 1e-3)
+
+
+def hooke(H: np.ndarray, mu: float, lam: float) -> np.ndarray:
+    """Hooke's stress (n, 3, 3) [Pa] at displacement gradients (n, 3, 3), of Lamé's constants [Pa]."""
+    trace = np.trace(H, axis1=1, axis2=2)[:, None, None]
+    return mu * (H + H.transpose(0, 2, 1)) + lam * trace * np.eye(3)
+
+
+def _largest(values: np.ndarray) -> float:
+    return float(np.abs(values).max())
+
+
+def _off(found: np.ndarray, wanted: np.ndarray) -> float:
+    """The largest difference, relative to the largest of what is wanted."""
+    return _largest(found - wanted) / max(_largest(wanted), np.finfo(float).tiny)

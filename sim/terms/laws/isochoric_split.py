@@ -1,0 +1,138 @@
+"""How a law parts shape, which relaxes, from volume, which does not; and the strain that its overstress works on."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from ...runtime.device import Device
+from .invariants import cofactor_change, cofactor_excess, exp_less_one, green_strain, log_one_plus, volume_change
+from .law import Law
+
+
+@wp.func
+def isochoric(H: Any):
+    """Fb - I = J^(-1/3) (I + H) - I, exact at small strain."""
+    k = exp_less_one(-log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
+    return H + k * (wp.identity(n=3, dtype=type(k)) + H)
+
+
+@wp.func
+def dilated(H: Any):
+    """J^(1/3) I - I."""
+    k = exp_less_one(log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
+    return k * wp.identity(n=3, dtype=type(k))
+
+
+@wp.func
+def inverse_transpose(H: Any):
+    """(I + H)^-T."""
+    J = type(H[0, 0])(1.0) + volume_change(H)
+    return (wp.identity(n=3, dtype=type(J)) + cofactor_excess(H)) / J
+
+
+@dataclass(frozen=True)
+class Split:
+    """Of a law with coefficients k, at a displacement gradient H and along a change D of it.
+
+    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], E the strain that a stress A [Pa] works on; stress and
+    stress_change(H, D, ...): its derivatives; overstress(H, k) -> S [Pa]: on that strain, the stress of shape.
+    """
+
+    energy: wp.Function
+    stress: wp.Function
+    stress_change: wp.Function
+    overstress: wp.Function
+    needs_positive_volume: bool
+
+
+def split_of(law: Law, device: Device) -> Split:
+    """As the law itself has it, or by the isochoric part of F."""
+    return isochoric_split(law, device) if law.of_shape is None else own_split(law, law.of_shape, device)
+
+
+@cache
+def isochoric_split(law: Law, device: Device) -> Split:
+    """Shape is psi(F) - psi(J^(1/3) I), and E = (Fb^T Fb - I) / 2 with Fb = J^(-1/3) F."""
+    scalar, mat = device.scalar, device.matrix
+    own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
+
+    @wp.func
+    def energy(H: mat, k: Any, less: scalar, A: mat):
+        """psi(F) + less (psi(F) - psi(J^(1/3) I)) + (Cb - I) : A / 2; +inf where J <= 0."""
+        if volume_change(H) <= scalar(-1.0):
+            return scalar(wp.inf)
+        own = own_energy(H, k)
+        return own + less * (own - own_energy(dilated(H), k)) + wp.ddot(green_strain(isochoric(H)), A)
+
+    @wp.func
+    def stress(H: mat, k: Any, less: scalar, A: mat):
+        """(1 + less) P(F) - less p J^(1/3) F^-T + J^(-1/3) (Q - (Q : F) F^-T / 3), p I = P(J^(1/3) I), Q = Fb A."""
+        F, Q, G, V = wp.identity(n=3, dtype=scalar) + H, A + isochoric(H) * A, inverse_transpose(H), dilated(H)
+        wide = scalar(1.0) + V[0, 0]
+        p = own_stress(V, k)[0, 0]
+        level = less * p * wide + wp.ddot(Q, F) / (scalar(3.0) * wide)
+        return (scalar(1.0) + less) * own_stress(H, k) + Q / wide - level * G
+
+    @wp.func
+    def stress_change(H: mat, D: mat, k: Any, less: scalar, A: mat):
+        """dP for dF = D: the derivative of `stress`, factor by factor."""
+        three = scalar(3.0)
+        identity = wp.identity(n=3, dtype=scalar)
+        F, V, G = identity + H, dilated(H), inverse_transpose(H)
+        J, wide = scalar(1.0) + volume_change(H), scalar(1.0) + V[0, 0]
+        swelling = wp.ddot(G, D)
+        widening = wide * swelling / three
+        dG = cofactor_change(F, D) / J - swelling * G
+        Q = A + isochoric(H) * A
+        dQ = (D - swelling / three * F) * A / wide
+        p, dp = own_stress(V, k)[0, 0], own_change(V, widening * identity, k)[0, 0]
+        level = less * p * wide + wp.ddot(Q, F) / (three * wide)
+        pulled = (wp.ddot(dQ, F) + wp.ddot(Q, D) - swelling / three * wp.ddot(Q, F)) / (three * wide)
+        rise = less * (dp * wide + p * widening) + pulled
+        own = (scalar(1.0) + less) * own_change(H, D, k)
+        return own + (dQ - swelling / three * Q) / wide - rise * G - level * dG
+
+    @wp.func
+    def overstress(H: mat, k: Any):
+        """S = Fb^-1 dev(P F^T) Fb^-T = J^(1/3) Fb^-1 (P - (P : Fb) Fb^-T / 3)."""
+        Hb, P = isochoric(H), own_stress(H, k)
+        identity = wp.identity(n=3, dtype=scalar)
+        G, wide = identity + cofactor_excess(Hb), scalar(1.0) + dilated(H)[0, 0]
+        return wide * (wp.transpose(G) * (P - wp.ddot(P, identity + Hb) / scalar(3.0) * G))
+
+    return Split(energy, stress, stress_change, overstress, True)
+
+
+@cache
+def own_split(law: Law, of_shape: wp.Function, device: Device) -> Split:
+    """Shape is the law itself with its coefficients `of_shape`, and E = (F^T F - I) / 2.
+
+    The potential is infinite nowhere that the law is not; the overstress is where J is exactly 0. Tissue that has
+    relaxed to its end obeys the law itself, its shear modulus less and its bulk modulus as it was.
+    """
+    scalar, mat = device.scalar, device.matrix
+    own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
+
+    @wp.func
+    def energy(H: mat, k: Any, less: scalar, A: mat):
+        """psi + less psi_shape + (C - I) : A / 2."""
+        return own_energy(H, k) + less * own_energy(H, of_shape(k)) + wp.ddot(green_strain(H), A)
+
+    @wp.func
+    def stress(H: mat, k: Any, less: scalar, A: mat):
+        """P + less P_shape + F A."""
+        return own_stress(H, k) + less * own_stress(H, of_shape(k)) + A + H * A
+
+    @wp.func
+    def stress_change(H: mat, D: mat, k: Any, less: scalar, A: mat):
+        """dP + less dP_shape + D A."""
+        return own_change(H, D, k) + less * own_change(H, D, of_shape(k)) + D * A
+
+    @wp.func
+    def overstress(H: mat, k: Any):
+        """S = F^-1 P_shape."""
+        return wp.transpose(inverse_transpose(H)) * own_stress(H, of_shape(k))
+
+    return Split(energy, stress, stress_change, overstress, False)

@@ -1,0 +1,160 @@
+"""Ogden's law on isochoric stretches; infinite where J <= 0.
+
+    psi = sum_i c_i / m_i^2 (l1^m_i + l2^m_i + l3^m_i - 3) + K/2 (ln J)^2,  l_k = J^(-1/3) lambda_k
+
+Ogden 1972, Proc. R. Soc. Lond. A 326:565-584, in the uncoupled form of FEBio's theory manual. All is written in the
+eigenvalues e_k of Green's strain, lambda_k^2 = 1 + 2 e_k, and the logarithms y_k = ln l_k, which sum to zero: nothing
+cancels at small strain, and equal stretches are no special case. Coefficients: (K, c_1, m_1, c_2, m_2, ...).
+"""
+
+from typing import Any
+
+import warp as wp
+
+from .invariants import exp_less_one, green_strain, log_one_plus, volume_change
+from .law import Law
+from .spectral import principal_axes
+
+
+@wp.func
+def log_stretches(H: Any, e: Any, N: Any):
+    """ln lambda_k = log1p(2 e_k) / 2; where crushed, ln |F n_k|, of which 1 + 2 e_k keeps fewer digits."""
+    one, two = type(e[0])(1.0), type(e[0])(2.0)
+    x = type(e)()
+    for k in range(3):
+        square = one + two * e[k]
+        if square > one / two:
+            x[k] = log_one_plus(two * e[k]) / two
+        else:
+            f = N[k] + H * N[k]
+            x[k] = wp.log(wp.dot(f, f)) / two
+    return x
+
+
+@wp.func
+def squares(x: Any):
+    """lambda_k^2 = exp(2 x_k)."""
+    two = type(x[0])(2.0)
+    return wp.vector(wp.exp(two * x[0]), wp.exp(two * x[1]), wp.exp(two * x[2]))
+
+
+@wp.func
+def isochoric(x: Any):
+    """y_k = ln l_k: x less its mean."""
+    mean = (x[0] + x[1] + x[2]) / type(x[0])(3.0)
+    return x - wp.vector(mean, mean, mean)
+
+
+@wp.func
+def exp_excess(t: Any):
+    """exp(t) - 1 - t, by its series where the difference would cancel."""
+    one = type(t)(1.0)
+    if wp.abs(t) > one:
+        return wp.exp(t) - one - t
+    tail = one
+    for i in range(16):
+        tail = one + t / type(t)(18 - i) * tail
+    return t * t / type(t)(2.0) * tail
+
+
+@wp.func
+def sinh_ratio(z: Any):
+    """sinh(z) / z."""
+    if z == type(z)(0.0):
+        return type(z)(1.0)
+    return wp.sinh(z) / z
+
+
+@wp.func
+def kirchhoff(H: Any, y: Any, c: Any):
+    """Principal Kirchhoff stresses t_k [Pa] = a_k - mean a + K ln J, with a_k = sum_i c_i / m_i l_k^m_i."""
+    a = type(y)()
+    for i in range(len(c) // 2):
+        for k in range(3):
+            a[k] += c[2 * i + 1] / c[2 * i + 2] * exp_less_one(c[2 * i + 2] * y[k])
+    level = c[0] * log_one_plus(volume_change(H)) - (a[0] + a[1] + a[2]) / type(c[0])(3.0)
+    return a + wp.vector(level, level, level)
+
+
+@wp.func
+def energy(H: Any, c: Any):
+    """psi [Pa] = sum_i c_i / m_i^2 sum_k (exp(m_i y_k) - 1 - m_i y_k) + K/2 (ln J)^2; +inf where J <= 0."""
+    j = volume_change(H)
+    if j <= -type(j)(1.0):
+        return type(j)(wp.inf)
+    log_J = log_one_plus(j)
+    e, N = principal_axes(green_strain(H))
+    x = log_stretches(H, e, N)
+    y = isochoric(x)
+    psi = c[0] / type(j)(2.0) * log_J * log_J
+    for i in range(len(c) // 2):
+        m = c[2 * i + 2]
+        for k in range(3):
+            psi += c[2 * i + 1] / (m * m) * exp_excess(m * y[k])
+    return psi
+
+
+@wp.func
+def stress(H: Any, c: Any):
+    """P [Pa] = F S, with S = sum_k t_k / lambda_k^2 n_k (x) n_k."""
+    e, N = principal_axes(green_strain(H))
+    x = log_stretches(H, e, N)
+    t = kirchhoff(H, isochoric(x), c)
+    S = wp.transpose(N) * wp.diag(wp.cw_div(t, squares(x))) * N
+    return S + H * S
+
+
+@wp.func
+def stiffness_between(k: int, l: int, e: Any, y: Any, c: Any):
+    """b_kl [Pa] = sum_i c_i exp(m_i (y_k + y_l) / 2) sinh(m_i d / 2) / (m_i d / 2) x d / tanh d.
+
+    The divided difference of the a of `kirchhoff` over the eigenvalues e, times the mean of the squared stretches. With
+    tanh d = (e_k - e_l) / (1 + e_k + e_l) for d = ln(lambda_k / lambda_l), it is exact where stretches meet too.
+    """
+    one, two = type(c[0])(1.0), type(c[0])(2.0)
+    tanh = wp.abs(e[k] - e[l]) / (one + e[k] + e[l])
+    d = wp.abs(y[k] - y[l])
+    if tanh < one / two:
+        d = log_one_plus(two * tanh / (one - tanh)) / two
+    total = type(one)(0.0)
+    for i in range(len(c) // 2):
+        m = c[2 * i + 2]
+        total += c[2 * i + 1] * wp.exp(m * (y[k] + y[l]) / two) * sinh_ratio(m * d / two)
+    if tanh > type(one)(0.0):
+        total = total * d / tanh
+    return total
+
+
+@wp.func
+def stress_change(H: Any, D: Any, c: Any):
+    """dP [Pa] for dF = D: D S + F dS, dS in the principal frame by the change G = sym(F^T D) of strain there.
+
+    lambda_k^2 lambda_l^2 dS_kl = (b_kl - t_k - t_l) G_kl, and to each lambda_k^2 dS_kk comes the sum over l of
+    (K + tr b / 9 - (b_kk + b_ll) / 3) G_ll / lambda_l^2.
+    """
+    one, two, three = type(c[0])(1.0), type(c[0])(2.0), type(c[0])(3.0)
+    e, N = principal_axes(green_strain(H))
+    x = log_stretches(H, e, N)
+    y = isochoric(x)
+    t = kirchhoff(H, y, c)
+    q = wp.cw_div(wp.vector(one, one, one), squares(x))
+    G = D + wp.transpose(H) * D
+    G = N * (G + wp.transpose(G)) * wp.transpose(N) / two
+    dS = type(H)()
+    b = type(e)()
+    for k in range(3):
+        b[k] = stiffness_between(k, k, e, y, c)
+        for l in range(k):
+            dS[k, l] = q[k] * q[l] * (stiffness_between(k, l, e, y, c) - t[k] - t[l]) * G[k, l]
+            dS[l, k] = dS[k, l]
+    g = wp.cw_mul(q, wp.get_diag(G))
+    swelling = g[0] + g[1] + g[2]
+    level = (c[0] + (b[0] + b[1] + b[2]) / (three * three)) * swelling - wp.dot(b, g) / three
+    for k in range(3):
+        dS[k, k] = q[k] * ((b[k] - two * t[k]) * g[k] + level - b[k] * swelling / three)
+    S = wp.diag(wp.cw_mul(q, t))
+    S, dS = wp.transpose(N) * S * N, wp.transpose(N) * dS * N
+    return D * S + dS + H * dS
+
+
+LAW = Law("ogden", energy, stress, stress_change, needs_positive_volume=True)

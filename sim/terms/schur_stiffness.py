@@ -1,0 +1,93 @@
+"""What lies around a part of a body, as stiff as at rest: a dense stiffness between the nodes that both share."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ..discretisation.term import Cases
+from ..runtime.columns import add_dots, combined, is_kept
+from ..runtime.dense_product import product_with
+from ..runtime.device import Device
+from ..runtime.rows import add_rows, rows_taken
+
+
+class Exterior:
+    """A Term: u . F u / 2 over some rows of u.
+
+    Parameters
+    ----------
+    rows
+        (m,) of the part's 3N, each once.
+    stiffness
+        F (m, m) [N/m], symmetric.
+    count
+        3N.
+    device
+        Where its arrays live.
+    """
+
+    name = "exterior"
+    constant, passive, steep = False, True, False
+
+    def __init__(self, rows: np.ndarray, stiffness: np.ndarray, count: int, device: Device):
+        self._device = device
+        self._rest = rows, stiffness, count
+        self._rows = device.array(rows, wp.int32)
+        self._product = product_with(stiffness, device)
+        self._rooms: dict[int, tuple[wp.array, wp.array]] = {}
+
+    def begin(self, cases: Cases) -> None:
+        """The exterior remembers nothing."""
+
+    def keep(self, columns: np.ndarray) -> None:
+        """Columns are all alike to the exterior."""
+
+    def energy(self, u: wp.array, out: wp.array) -> None:
+        """E += u . F u / 2."""
+        x, force = self._multiplied(u)
+        add_dots(self._device, combined(self._device, x, -0.5, x, x), force, out)
+
+    def add_gradient(self, u: wp.array, out: wp.array) -> None:
+        """f += F u."""
+        _, force = self._multiplied(u)
+        add_rows(self._device, force, self._rows, out)
+
+    def linearise(self, u: wp.array, definite: wp.array) -> None:
+        """It is linear."""
+
+    def add_curvature(self, p: wp.array, out: wp.array) -> None:
+        """f += F p."""
+        self.add_gradient(p, out)
+
+    def add_diagonal(self, out: wp.array) -> None:
+        """Blocks += those of F."""
+        rows, stiffness, count = self._rest
+        blocks = np.zeros((count // 3, 3, 3))
+        same = rows[:, None] // 3 == rows // 3
+        first, second = np.nonzero(same)
+        blocks[rows[first] // 3, rows[first] % 3, rows[second] % 3] = stiffness[same]
+        out.assign(out.numpy() + blocks[:, None])
+
+    def rest_curvature(self) -> sp.csc_array:
+        """F."""
+        rows, stiffness, count = self._rest
+        place = np.repeat(rows, len(rows)), np.tile(rows, len(rows))
+        return sp.csc_array(sp.coo_array((stiffness.ravel(), place), shape=(count, count)))
+
+    def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
+        """It allows every step."""
+
+    def end(self, u: wp.array) -> None:
+        """It remembers nothing."""
+
+    def _multiplied(self, u: wp.array) -> tuple[wp.array, wp.array]:
+        """The rows (m, b) of u, and F times them; batches as wide as a room find both where the last one did."""
+        shape = (len(self._rows), u.shape[1])
+        if u.shape[1] not in self._rooms:
+            self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
+            self._rooms[u.shape[1]] = self._device.zeros(*shape), self._device.zeros(*shape)
+        x, force = self._rooms[u.shape[1]]
+        self._product(rows_taken(self._device, u, self._rows, x), force)
+        return x, force

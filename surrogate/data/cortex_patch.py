@@ -1,0 +1,115 @@
+"""The open cortex as a surface to draw from: areas, inward normals, and the rim that a footprint must not cross."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from sim.anatomy import Anatomy
+from sim.bodies.open_cortex import distances_to, rim_of
+from sim.errors import InputError
+from sim.geometry.normals import vertex_normals
+from sim.geometry.triangles import areas
+
+if TYPE_CHECKING:
+    from sim.discretisation.footprint import Skin
+
+
+def barycentric_lattice(rows: int) -> np.ndarray:
+    """Corner coordinates (rows^2, 3) of the centres of a triangle's equal pieces, `rows` along each edge."""
+    upright = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(rows) for j in range(rows - i)]
+    turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(rows - 1) for j in range(rows - 1 - i)]
+    share = np.array(upright + turned) / rows
+    return np.column_stack([1.0 - share.sum(axis=1), share])
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The triangles of `Anatomy.open_surface`.
+
+    Parameters
+    ----------
+    nodes
+        (m,) sorted mesh vertices of the patch: those that a footprint inside it loads.
+    triangles
+        (S, 3) positions in `nodes`, outwards.
+    points
+        (m, 3) [m], RAS.
+    """
+
+    nodes: np.ndarray
+    triangles: np.ndarray
+    points: np.ndarray
+
+    @cached_property
+    def areas(self) -> np.ndarray:
+        """Triangle areas (S,) [m^2]."""
+        return areas(self.points[self.triangles])
+
+    @cached_property
+    def inward(self) -> np.ndarray:
+        """Unit inward normals (m, 3) at the nodes, area-weighted."""
+        return -vertex_normals(self.points, self.triangles)
+
+    @cached_property
+    def skin(self) -> Skin:
+        """The patch as tools press it."""
+        # Warp is loaded where a tool is pressed, not where a model is read.
+        from sim.discretisation.footprint import Skin
+        from sim.runtime.device import find_device
+
+        return Skin(self.points, self.triangles, find_device("cpu", "float64"), "open cortex")
+
+    @cached_property
+    def rim(self) -> np.ndarray:
+        """Edges (E, 2, 3) [m] that belong to one triangle only."""
+        return rim_of(self.points, self.triangles)
+
+    def rim_distance(self, points: np.ndarray) -> np.ndarray:
+        """Distances (B,) [m] from `points` (B, 3) to the rim."""
+        return distances_to(self.rim, points)
+
+    def place(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (n, 3) [m] and their unit inward normals (n, 3) from uniform numbers (n, 3); uniform by area."""
+        total = np.cumsum(self.areas)
+        triangle = self.triangles[np.searchsorted(total, uniform[:, 0] * total[-1], side="right")]
+        root = np.sqrt(uniform[:, 1])
+        share = np.stack([1.0 - root, root * (1.0 - uniform[:, 2]), root * uniform[:, 2]], axis=1)
+        point, normal = (np.einsum("nc,nci->ni", share, field[triangle]) for field in (self.points, self.inward))
+        return point, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def normal_near(self, points: np.ndarray) -> np.ndarray:
+        """Unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""
+        return self.inward[nearest(points, self.points)[0]]
+
+    def covered(self, centres: np.ndarray, radius: float) -> float:
+        """Share of the area within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
+        share = barycentric_lattice(4)
+        samples = np.einsum("qc,scx->sqx", share, self.points[self.triangles])
+        inside = nearest(samples.reshape(-1, 3), centres)[1].reshape(len(samples), -1) <= radius
+        return float(inside.mean(axis=1) @ self.areas / self.areas.sum())
+
+
+def open_patch(anatomy: Anatomy) -> Patch:
+    """The open cortex of an anatomy.
+
+    Raises
+    ------
+    InputError
+        A craniotomy that holds no whole triangle.
+    """
+    if not len(anatomy.open_surface):
+        raise InputError("the anatomy has no open cortex for a tool to touch: make one with a wider --craniotomy.")
+    nodes, triangles = np.unique(anatomy.open_surface, return_inverse=True)
+    return Patch(nodes, triangles.reshape(-1, 3), anatomy.mesh.nodes[nodes])
+
+
+def nearest(points: np.ndarray, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the `sites` (n, 3) is nearest to each of the `points` (B, 3), and how far it is: (B,), (B,)."""
+    distance = cdist(points, sites)
+    which = distance.argmin(axis=1)
+    return which, distance[np.arange(len(points)), which]

@@ -1,0 +1,359 @@
+"""Data sets: loads, the displacement of every vertex, and where they come from. HDF5, SI units, RAS.
+
+Layout: `anatomy/` the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/`, each with `displacement`
+(n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` belongs to `loads/`; `unit/` holds
+the small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, y and z in turn;
+of data of poses there is none. What each array is, is written beside it (`legend`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.deformation import Outcome
+from sim.errors import InputError
+from sim.geometry.tetmesh import TetMesh, digest_of
+from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Touching
+from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
+from sim.runtime.outside_files import path_of, read_as
+
+from .answer_rows import checksums, numbered, row_type
+from .cortex_patch import open_patch
+
+CAUSES: dict[str, type[Cause]] = {
+    kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture, Touching)
+}
+FORMAT = "sulcus data 2"
+# Without checksums, and with flags of the rows that were done: it is read, and not gone on with.
+UNCHECKED = "sulcus data 1"
+# The arrays of a mesh; linear ones have no `middles`.
+MESH = ("nodes", "tets", "region", "middles")
+# The name of the hash of all other texts.
+SEAL = "digest of these attributes"
+# Rows read at once.
+CHUNK = 256
+# The greatest motion that can be, in body lengths; and the unit force that cannot move so far [N].
+FARTHEST, FAINTEST = 1.0, 1e-3
+REMEDY = "Make it with `sulcus simulate`."
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A finished data set; displacements stay in the file until they are asked for.
+
+    Parameters
+    ----------
+    path
+        The HDF5 file.
+    anatomy
+        The body that was deformed.
+    loads
+        n load cases.
+    outcome
+        n outcomes; the rows of failed cases hold no equilibrium under the whole load.
+    iterations, residual
+        (n,).
+    unit_good
+        (3 m,) bool: the unit responses that converged.
+    provenance
+        Effects, accuracy, preset, seed, versions: as text.
+
+    Raises
+    ------
+    InputError
+        Columns of another length than the loads, residuals of good cases that are no positive numbers, a ball that has
+        no radius.
+    """
+
+    path: Path
+    anatomy: Anatomy
+    loads: Loads
+    outcome: tuple[Outcome, ...]
+    iterations: np.ndarray
+    residual: np.ndarray
+    unit_good: np.ndarray
+    provenance: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        for name in ("outcome", "iterations", "residual"):
+            if len(getattr(self, name)) != len(self.loads):
+                raise InputError(
+                    f"{self.path}: has {len(self.loads)} loads, but `{name}` of {len(getattr(self, name))}: it is "
+                    "damaged. Simulate anew."
+                )
+        if self.residual.dtype.kind != "f" or self.iterations.dtype.kind not in "iu":
+            raise InputError(f"{self.path}: its residuals or iterations are no numbers: it is damaged. Simulate anew.")
+        wrong = np.flatnonzero(self.good & ~((self.residual >= 0.0) & (self.residual < np.inf)))
+        if len(wrong):
+            raise InputError(
+                f"{self.path}: {numbered(wrong)} of `answers` converged, but to a residual that is no number: it is "
+                "damaged. Simulate anew."
+            )
+        try:
+            good = self.ball is None or 0.0 < self.ball < np.inf
+        except ValueError:
+            good = False
+        if not good:
+            raise InputError(
+                f"{self.path}: its ball has the radius {self.provenance['ball'][:20]!r}, which is none: it is damaged. "
+                "Simulate anew."
+            )
+
+    @property
+    def ball(self) -> float | None:
+        """Radius [m] of the ball whose poses the loads are; None: they are pushes."""
+        return float(self.provenance["ball"]) if "ball" in self.provenance else None
+
+    @property
+    def good(self) -> np.ndarray:
+        """(n,) bool: the cases that converged."""
+        return np.array([outcome.good for outcome in self.outcome], bool)
+
+    def seconds(self, each: str, count: int) -> float | None:
+        """What `count` solves took of `each` kind, "load" or "unit response" [s]; None where the data do not say."""
+        try:
+            found = count * float(self.provenance[f"seconds a {each}"])
+        except (KeyError, ValueError):
+            return None
+        return found if 0.0 <= found < np.inf else None
+
+    def displacement(self, nodes: np.ndarray) -> np.ndarray:
+        """Displacements (n, k, 3) float32 [m] of the vertices `nodes` (k,).
+
+        Raises
+        ------
+        InputError
+            Rows that were damaged, or that hold motions which no body has.
+        """
+        return self._rows("answers", nodes, self.good, 1.0)
+
+    def unit_response(self, nodes: np.ndarray) -> np.ndarray:
+        """Small-strain responses (3 m, k, 3) float32 [m/N] of the vertices `nodes` (k,).
+
+        Raises
+        ------
+        InputError
+            As `displacement`.
+        """
+        return self._rows("unit", nodes, self.unit_good, FAINTEST)
+
+    def _rows(self, group: str, nodes: np.ndarray, good: np.ndarray, force: float) -> np.ndarray:
+        """Some vertices' displacements, of rows in which the `good` move less than they can under a `force`."""
+        size = float(np.linalg.norm(np.ptp(self.anatomy.mesh.nodes, axis=0)))
+        chosen, damaged, absurd = [], [], []
+        with read_as(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
+            for first in range(0, max(len(good), 1), CHUNK):
+                rows, whole = read_rows(file, group, len(self.anatomy.mesh.nodes), first, first + CHUNK)
+                field = rows["displacement"]
+                far = np.abs(field).max(axis=(1, 2)) > FARTHEST * size / force
+                damaged.append(first + np.flatnonzero(~whole | ~np.isfinite(field).all(axis=(1, 2))))
+                absurd.append(first + np.flatnonzero(far & good[first : first + CHUNK]))
+                chosen.append(field[:, nodes])
+        lost, strange = np.concatenate(damaged), np.concatenate(absurd)
+        if len(lost):
+            raise InputError(
+                f"{self.path}: {numbered(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: it solves "
+                "those alone; data of an earlier version are made anew."
+            )
+        if len(strange):
+            raise InputError(
+                f"{self.path}: {numbered(strange)} of `{group}` move by more than the body measures, {size:.3g} m"
+                f"{'' if force == 1.0 else f', under {force:g} N'}: no solver made them. Simulate anew."
+            )
+        return np.concatenate(chosen)
+
+
+def read_dataset(path: str | Path) -> Dataset:
+    """Read what `simulate` wrote.
+
+    Raises
+    ------
+    InputError
+        A file that is missing, unfinished, damaged, not HDF5, or not a data set of this project.
+    """
+    path = path_of(path)
+    if not path.is_file():
+        unfinished = path.with_name(path.name + ".partial")
+        remedy = (
+            f"{unfinished.name} is an unfinished run: give the same `sulcus simulate` again and it goes on"
+            if unfinished.exists()
+            else "make one with `sulcus simulate`"
+        )
+        raise InputError(f"{path}: no such file; {remedy}.")
+    with read_as(path, "a data set", REMEDY), h5py.File(path, "r") as file:
+        said = provenance_of(file)
+        if said.get("format") not in (FORMAT, UNCHECKED):
+            raise InputError(
+                f"{path}: is HDF5, but not a data set that this version knows, {FORMAT!r}: make one with "
+                "`sulcus simulate`."
+            )
+        anatomy, loads = read_embedded(file), read_loads(file)
+        nodes = open_patch(anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
+        if not np.array_equal(stored(file, "unit/node", "iu", (3 * len(nodes),))[:], np.repeat(nodes, 3)):
+            raise InputError(f"{path}: `unit/node` are not the nodes of the open cortex: it is damaged. Simulate anew.")
+        for group, rows in (("answers", len(loads)), ("unit", 3 * len(nodes))):
+            stored(file, f"{group}/displacement", "f", (rows, len(anatomy.mesh.nodes), 3))
+            if said["format"] == UNCHECKED and not stored(file, f"{group}/done", "b", (rows,))[:].all():
+                raise InputError(f"{path}: rows of `{group}` are not done, so it was never finished. Simulate anew.")
+        return Dataset(
+            path,
+            anatomy,
+            loads,
+            read_outcomes(file, "answers"),
+            stored(file, "answers/iterations", "iu", (len(loads),))[:],
+            stored(file, "answers/residual", "f", (len(loads),))[:],
+            np.array([outcome.good for outcome in read_outcomes(file, "unit")], bool),
+            said,
+        )
+
+
+def provenance_of(file: h5py.File) -> dict[str, str]:
+    """What the file says of itself, as text.
+
+    Raises
+    ------
+    InputError
+        Texts that do not have the digest written beside them.
+    """
+    said = {name: str(value) for name, value in file.attrs.items()}
+    if said.get("format") == FORMAT and said.pop(SEAL, None) != digest_of_texts(said):
+        raise InputError(f"{file.filename}: what it says of itself was changed after it was written: simulate anew.")
+    return said
+
+
+def write_provenance(file: h5py.File, said: Mapping[str, str]) -> None:
+    """Store what the file says of itself."""
+    file.attrs.update({**said, SEAL: digest_of_texts(said)})
+
+
+def digest_of_texts(said: Mapping[str, str]) -> str:
+    """Hash of texts and their names."""
+    return digest_of(np.frombuffer(repr(sorted(said.items())).encode(), np.uint8))
+
+
+def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows `first` to `last` (`rows.row_type`) of answers or unit responses, and (B,) bool: whose checksums agree."""
+    here = slice(first, last)
+    displacement = stored(file, f"{group}/displacement", "f", (None, vertices, 3))
+    rows = np.empty(len(range(*here.indices(len(displacement)))), row_type(vertices))
+    rows["displacement"] = displacement[here]
+    for name, kinds in (("outcome", "S"), ("iterations", "iu"), ("residual", "f")):
+        rows[name] = stored(file, f"{group}/{name}", kinds, (len(displacement),))[here]
+    if file.attrs["format"] == UNCHECKED:
+        return rows, np.ones(len(rows), bool)
+    return rows, checksums(rows) == stored(file, f"{group}/checksum", "u", (len(displacement),))[here]
+
+
+def write_embedded(file: h5py.File, anatomy: Anatomy) -> None:
+    """Store the body itself, so that learning needs no other file."""
+    group = file.create_group("anatomy")  # one that HDF5 makes by itself has a date
+    for name, array in zip(MESH, anatomy.mesh.arrays, strict=False):
+        group[name] = array
+    for name in ("held", "slide_normal", "craniotomy"):
+        group[name] = getattr(anatomy, name)
+    group.attrs["digest"] = anatomy.digest
+
+
+def read_embedded(file: h5py.File) -> Anatomy:
+    """The body that a data set embeds.
+
+    Raises
+    ------
+    InputError
+        Arrays that do not have the digest written beside them.
+    """
+    array = {name: stored(file, f"anatomy/{name}", "fiu")[:] for name in MESH if f"anatomy/{name}" in file}
+    sets = {name: stored(file, f"anatomy/{name}", "fb")[:] for name in ("held", "slide_normal", "craniotomy")}
+    anatomy = Anatomy(TetMesh(**array), **sets)
+    if anatomy.digest != file["anatomy"].attrs["digest"]:
+        raise InputError(f"{file.filename}: the anatomy inside was changed after it was written: simulate anew.")
+    return anatomy
+
+
+def write_loads(file: h5py.File, loads: Loads) -> None:
+    """Store every cause's arrays under the cause's name, and the time.
+
+    Raises
+    ------
+    InputError
+        Causes that `read_loads` would not find again: of another kind, or several of one.
+    """
+    group = file.create_group("loads")
+    for cause in loads.causes:
+        if not isinstance(cause, tuple(CAUSES.values())) or len(loads.every(type(cause))) > 1:
+            names = ", ".join(type(cause).__name__ for cause in loads.causes)
+            raise InputError(f"the loads have the causes {names}: a data set holds each of {', '.join(CAUSES)} once.")
+        arrays = group.create_group(type(cause).__name__)
+        for item in fields(cause):
+            arrays[item.name] = getattr(cause, item.name)
+    group["time"] = loads.times
+    group.attrs["digest"] = digest_of_loads(loads)
+
+
+def read_loads(file: h5py.File) -> Loads:
+    """The loads that `write_loads` stored.
+
+    Raises
+    ------
+    InputError
+        Loads that do not have the digest written beside them.
+    """
+    causes = tuple(
+        kind(**{item.name: stored(file, f"loads/{name}/{item.name}", "f")[:] for item in fields(kind)})
+        for name, kind in CAUSES.items()
+        if f"loads/{name}" in file
+    )
+    loads = Loads(causes, stored(file, "loads/time", "f")[:])
+    if file.attrs.get("format") != UNCHECKED and file["loads"].attrs["digest"] != digest_of_loads(loads):
+        raise InputError(f"{file.filename}: the loads inside were changed after they were written: simulate anew.")
+    return loads
+
+
+def digest_of_loads(loads: Loads) -> str:
+    """Hash of every cause's arrays, and of the time."""
+    names = ",".join(sorted(type(cause).__name__ for cause in loads.causes)).encode()
+    ordered = sorted(loads.causes, key=lambda cause: type(cause).__name__)
+    arrays = [getattr(cause, item.name) for cause in ordered for item in fields(cause)]
+    return digest_of(np.frombuffer(names, np.uint8), *arrays, loads.times)
+
+
+def read_outcomes(file: h5py.File, group: str) -> tuple[Outcome, ...]:
+    """How the cases of `answers` or `unit` came about."""
+    return tuple(Outcome[name.decode()] for name in stored(file, f"{group}/outcome", "S")[:])
+
+
+def stored(file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...] | None = None) -> h5py.Dataset:
+    """An array in the file, of one of the NumPy `kinds`, and of a shape where it is given (None: any length).
+
+    Raises
+    ------
+    InputError
+        No array has that name, or it is of another kind or shape, or declares more than such a file can hold.
+    """
+    found = file.get(name)
+    if (
+        not isinstance(found, h5py.Dataset)
+        or found.file.filename != file.filename  # of a link
+        or found.is_virtual
+        or found.external
+    ):
+        raise InputError(f"{file.filename}: has no array `{name}`. {REMEDY}")
+    if found.dtype.kind not in kinds:
+        raise InputError(f"{file.filename}: `{name}` holds {found.dtype}, which it cannot: it is damaged. {REMEDY}")
+    expected = found.shape if shape is None else shape
+    if len(expected) != len(found.shape) or any(
+        a is not None and a != b for a, b in zip(expected, found.shape, strict=True)
+    ):
+        want = " x ".join("n" if length is None else str(length) for length in expected)
+        measured = " x ".join(map(str, found.shape))
+        raise InputError(f"{file.filename}: `{name}` measures {measured}, not {want}: it is damaged. {REMEDY}")
+    most = INFLATION * max(Path(file.filename).stat().st_size, 4096)  # a file that is being written has no size yet
+    if found.nbytes > most or (shape is None and found.nbytes > LARGEST_ARRAY):
+        raise InputError(f"{file.filename}: `{name}` declares more than such a file holds: it is damaged. {REMEDY}")
+    return found

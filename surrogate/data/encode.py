@@ -1,0 +1,77 @@
+"""Loads to features, and displacements to and from a reduced basis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.loads import Pushed
+
+from .cortex_patch import Patch
+
+Encoder = Callable[[Patch, Pushed], np.ndarray]
+
+
+def directions(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
+    """Force magnitudes (B,) [N] and unit directions (B, 3); the direction of no force is zero."""
+    magnitude = np.sqrt(np.einsum("bi,bi->b", pushed.force, pushed.force))
+    # The root of the smallest number: squares of smaller forces are none.
+    return magnitude, pushed.force / np.maximum(magnitude, np.sqrt(np.finfo(float).tiny))[:, None]
+
+
+def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
+    """Forces (B, 3 m) at the patch's nodes, for one newton: the finite elements' own integral over the footprint."""
+    weights = patch.skin.press(pushed.point, pushed.footprint).rows(len(patch.points))
+    shares = np.einsum("bm,bi->bmi", weights.toarray(), directions(pushed)[1])
+    return shares.reshape(len(shares), 3 * len(patch.points))
+
+
+def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
+    """Point [m], unit direction, force [N] and footprint radius [m]: (B, 8).
+
+    The published 13 features describe the load as one node sees it (its distance, its angles); a model of all nodes at
+    once needs the load alone, because the basis knows where the nodes are.
+    """
+    magnitude, direction = directions(pushed)
+    return np.column_stack([pushed.point, direction, magnitude, pushed.footprint])
+
+
+ENCODERS: dict[str, Encoder] = {"nodal": nodal_shares, "tool": tool_features}
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Orthonormal modes of the response of some vertices (proper orthogonal decomposition).
+
+    Parameters
+    ----------
+    nodes
+        (n,) mesh vertices.
+    modes
+        (r, 3 n) float32.
+    """
+
+    nodes: np.ndarray
+    modes: np.ndarray
+
+    def encode(self, response: np.ndarray) -> np.ndarray:
+        """Coefficients (B, r) of responses (B, n, 3) [m/N]."""
+        return response.reshape(len(response), -1) @ self.modes.T
+
+    def decode(self, coefficients: np.ndarray) -> np.ndarray:
+        """Responses (B, n, 3) [m/N] of coefficients (B, r)."""
+        return (coefficients @ self.modes).reshape(len(coefficients), len(self.nodes), 3)
+
+
+def reduce(nodes: np.ndarray, response: np.ndarray, tolerance: float, most: int) -> Basis:
+    """The fewest modes, at most `most`, that leave `tolerance` of the responses (B, n, 3) in the Frobenius norm.
+
+    No mean is taken off: no force, no motion.
+    """
+    matrix = response.reshape(len(response), -1).astype(np.float64)
+    _, size, modes = np.linalg.svd(matrix, full_matrices=False)
+    left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(size**2) / np.sum(size**2)))
+    rank = min(most, int(np.searchsorted(-left, -tolerance)) + 1, len(size))
+    return Basis(nodes, modes[:rank].astype(np.float32))

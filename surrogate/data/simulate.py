@@ -1,0 +1,356 @@
+"""Fill a data set with a deformer's answers, batch by batch, so that a killed run goes on where it stopped."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TypeVar
+
+import h5py
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.deformation import Deformer
+from sim.errors import InputError
+from sim.loads import Loads, Nodal, Touching
+from sim.runtime.atomic_files import check_output, demand_space, written_stream
+from sim.runtime.outside_files import read_as
+from sim.runtime.timing import listened, stage
+
+from .answer_rows import CHECKSUM, checksums, row_type, rows_of
+from .array_meanings import TITLE, explain
+from .cortex_patch import open_patch
+from .dataset import (
+    FORMAT,
+    UNCHECKED,
+    digest_of_loads,
+    provenance_of,
+    read_embedded,
+    read_loads,
+    read_rows,
+    stored,
+    write_embedded,
+    write_loads,
+    write_provenance,
+)
+from .journal import Batch, DamageWarning, Journal, opened
+
+# Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
+# solve with the rest stiffness is the answer.
+UNIT_FORCE = 1e-6
+# What the groups of the file are called where their seconds are told, and what their displacements are told in [m].
+STAGES = {"unit": "unit responses", "answers": "loads"}
+UNITS = {"unit": UNIT_FORCE, "answers": 1.0}
+# From this version of HDF5 on, whatever says where arrays lie has checksums.
+READERS = ("v108", "v108")
+UNTIMED = "not known"  # as wide as a number
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What one call solved anew: rows of unit responses and of loads, and the seconds that each took, with writing."""
+
+    units: int = 0
+    loads: int = 0
+    unit_seconds: float = 0.0
+    load_seconds: float = 0.0
+
+    @property
+    def rows(self) -> int:
+        """All of them."""
+        return self.units + self.loads
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What is asked of a deformer: unit responses, then loads, in batches.
+
+    Parameters
+    ----------
+    deformer, loads
+        As in `simulate`.
+    nodes
+        (m,) vertices that are pushed by a unit force; none where the loads are poses.
+    batch
+        Rows that are solved together.
+    """
+
+    deformer: Deformer
+    loads: Loads
+    nodes: np.ndarray
+    batch: int
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The body."""
+        return self.deformer.anatomy
+
+    @property
+    def row(self) -> np.dtype:
+        """What a row is."""
+        return row_type(len(self.anatomy.mesh.nodes))
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Rows of each group."""
+        return {"unit": 3 * len(self.nodes), "answers": len(self.loads)}
+
+    @property
+    def batches(self) -> list[Batch]:
+        """Group and first row of every batch."""
+        return [(name, first) for name, rows in self.counts.items() for first in range(0, rows, self.batch)]
+
+    def rows(self, batch: Batch) -> np.ndarray:
+        """The numbers of a batch's rows."""
+        name, first = batch
+        return np.arange(first, min(first + self.batch, self.counts[name]))
+
+    def solved(self, batch: Batch) -> np.ndarray:
+        """A batch's rows (`rows.row_type`)."""
+        rows = self.rows(batch)
+        asked = unit_loads(self.anatomy, rows) if batch[0] == "unit" else self.loads.rows(rows)
+        answer = self.deformer.deform(asked).at(np.arange(len(self.anatomy.mesh.nodes)))
+        return rows_of(answer, UNITS[batch[0]])
+
+
+def simulate(
+    path: str | Path,
+    deformer: Deformer,
+    loads: Loads,
+    provenance: Mapping[str, str],
+    batch: int = 64,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Solved:
+    """Answer every load, and the unit forces on the open cortex unless the loads are poses, into an HDF5 file.
+
+    Batches go to `PATH.partial` (`journal`), where a kill at any moment loses one at most: the same call goes on with
+    the same batches, so that the result has the same bytes but for its date. What is damaged there is solved anew. The
+    HDF5 file is written last, and whole. More loads of the same draw extend a finished file, and what is damaged in a
+    finished file is solved anew.
+
+    Parameters
+    ----------
+    deformer
+        Answers `loads` and `Nodal` loads at every vertex.
+    provenance
+        Texts that must agree for a run to go on.
+    progress
+        Told the rows that are done and their total after every batch.
+
+    Raises
+    ------
+    InputError
+        A batch below one, a file that holds something else or is being written, a folder that cannot be written to or
+        has too little room.
+
+    Warns
+    -----
+    DamageWarning
+        Rows that were done before, and are damaged.
+    """
+    path = Path(path)
+    if batch < 1:
+        raise InputError(f"a batch of {batch} solves nothing: give --batch >= 1.")
+    check_output(path, path.suffix)
+    nodes = open_patch(deformer.anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
+    stated = {**provenance, "format": FORMAT, "anatomy": deformer.anatomy.digest, "batch": str(batch)}
+    partial = path.with_name(path.name + ".partial")
+    finished: set[Batch] = set()
+    work = Work(deformer, loads, nodes, batch)
+    if path.exists():
+        before = _earlier(path, stated, loads)
+        if len(before) > len(loads):
+            work = Work(deformer, before, nodes, batch)
+        finished = _whole_batches(path, work)
+        if not partial.exists() and not set(work.batches) - finished and _same_body(path, work):
+            return Solved()
+    size = work.row.itemsize * sum(work.counts.values())
+    held = partial.stat().st_size if partial.exists() else 0
+    demand_space(path, max(size - held, 0) + size, size)
+    said = {
+        **stated,
+        "number of loads": str(len(work.loads)),
+        "hash of the loads": digest_of_loads(work.loads),
+    }
+    with listened() as seconds, opened(partial, said) as journal:
+        solved = _fill(journal, work, finished, progress)
+        with stage(STAGES["answers"]):
+            _write(path, work, {**stated, **_rates(path, solved, seconds)}, journal)
+    partial.unlink(missing_ok=True)
+    return Solved(solved["unit"], solved["answers"], *(seconds[name] for name in STAGES.values()))
+
+
+def unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:
+    """`UNIT_FORCE` at open-cortex node row // 3 along axis row % 3, for each of `rows` (B,)."""
+    force = np.zeros((len(rows), len(anatomy.mesh.nodes), 3))
+    force[np.arange(len(rows)), open_patch(anatomy).nodes[rows // 3], rows % 3] = UNIT_FORCE
+    return Loads((Nodal(force),))
+
+
+def _fill(journal: Journal, work: Work, finished: set[Batch], progress: Callable[[int, int], None]) -> dict[str, int]:
+    """Solve what is in neither file. A second thread writes a batch while the next is solved: one ahead, in order."""
+    total, done = sum(work.counts.values()), 0
+    solved = dict.fromkeys(work.counts, 0)
+    with ThreadPoolExecutor(1) as writer:
+        for name in work.counts:
+            written: Future[None] | None = None
+            with stage(STAGES[name]):
+                for batch in (each for each in work.batches if each[0] == name):
+                    count = len(work.rows(batch))
+                    if batch not in finished and batch not in journal:
+                        rows = work.solved(batch)
+                        if written is not None:
+                            written.result()
+                        written = writer.submit(journal.add, batch, rows.tobytes())
+                        solved[name] += count
+                    done += count
+                    progress(done, total)
+                if written is not None:
+                    written.result()
+    return solved
+
+
+def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
+    """Wall seconds a solve, of each kind that was solved just now; of others as the finished file has it.
+
+    All of one width, so that files made in one run or in several are of one shape.
+    """
+    before: dict[str, str] = {}
+    if path.exists():
+        with h5py.File(path, "r") as file:
+            before = provenance_of(file)
+    rates = {}
+    for name, words in (("unit", "seconds a unit response"), ("answers", "seconds a load")):
+        if solved[name]:
+            rates[words] = f"{seconds[STAGES[name]] / solved[name]:.3e}"
+        else:
+            rates[words] = before.get(words, UNTIMED)
+    return rates
+
+
+def _write(path: Path, work: Work, stated: Mapping[str, str], journal: Journal) -> None:
+    """Write the data set: batches of the journal, and those of the finished file that it takes the place of."""
+    with written_stream(path, path.suffix) as stream, h5py.File(stream, "w", libver=READERS) as file:
+        facts = {
+            "title": TITLE,
+            "length_unit": "m",
+            "force_unit": "N",
+            "frame": "RAS",
+            "tool": _tool(work.loads, stated),
+            "compression": "none: packed, displacements are a sixth smaller",
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "sulcus version": version("sulcus"),
+        }
+        write_provenance(file, {**facts, **stated})
+        write_embedded(file, work.anatomy)
+        write_loads(file, work.loads)
+        arrays = {
+            (name, item): group.create_dataset(item, (rows, *kind.shape), kind.base)
+            for name, rows in work.counts.items()
+            for group in [file.create_group(name)]
+            for item, kind in [(item, work.row[item]) for item in work.row.names or ()] + [("checksum", CHECKSUM)]
+        }
+        file["unit/node"] = np.repeat(work.nodes, 3)
+        explain(file)
+
+        def taken(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+            rows = np.frombuffer(journal.read(batch), work.row) if batch in journal else _kept(path, work, batch)
+            return rows, checksums(rows)
+
+        for batch, (rows, sums) in _ahead(taken, work.batches):
+            here = slice(batch[1], batch[1] + len(rows))
+            for item in work.row.names or ():
+                arrays[batch[0], item][here] = rows[item]
+            arrays[batch[0], "checksum"][here] = sums
+
+
+def _ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
+    """What is made of each batch, in order; a second thread makes the next meanwhile."""
+    with ThreadPoolExecutor(1) as maker:
+        coming = [maker.submit(made, batch) for batch in batches[:1]]
+        for batch, following in zip(batches, [*batches[1:], None], strict=True):
+            ready = coming.pop().result()
+            if following is not None:
+                coming.append(maker.submit(made, following))
+            yield batch, ready
+
+
+def _kept(path: Path, work: Work, batch: Batch) -> np.ndarray:
+    """A batch's rows in a finished file, found undamaged before."""
+    with h5py.File(path, "r") as before:
+        rows, good = _batch(before, work, batch)
+    if not good.all():
+        raise InputError(f"{path}: rows were damaged just now: give the same command again, and they are solved anew.")
+    return rows
+
+
+def _tool(loads: Loads, stated: Mapping[str, str]) -> str:
+    """What acts, in a sentence."""
+    if loads.of(Touching) is None:
+        return "a force on a round footprint that stays with the tissue: see loads/Pushed"
+    return f"a rigid ball, radius {stated.get('ball', 'not told')} m, moved by pose: see loads/Touching"
+
+
+def _batch(file: h5py.File, work: Work, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+    """A batch's rows in a finished file, and which of them are whole."""
+    rows = work.rows(batch)
+    return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
+
+
+def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
+    """The loads of a finished file, which must be the first of `loads` or begin with them, and its texts the same."""
+    with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
+        said = provenance_of(file)
+        if said.get("format") == UNCHECKED:
+            raise InputError(f"{path}: is of an earlier version, whose files do not go on: choose another --out.")
+        for name, wanted in stated.items():
+            found = said.get(name, "nothing")
+            if found != wanted:
+                raise InputError(
+                    f"{path}: was made with {name} {found}, but now {name} is {wanted}: repeat the first command, or "
+                    "choose another --out."
+                )
+        before = read_loads(file)
+    shared = np.arange(min(len(before), len(loads)))
+    if digest_of_loads(before.rows(shared)) != digest_of_loads(loads.rows(shared)):
+        raise InputError(f"{path}: holds other loads than these: choose another --out.")
+    return before
+
+
+def _same_body(path: Path, work: Work) -> bool:
+    """Whether the body in a finished file is undamaged."""
+    with h5py.File(path, "r") as file:
+        try:
+            return read_embedded(file).digest == work.anatomy.digest
+        except InputError:
+            return False
+
+
+def _whole_batches(path: Path, work: Work) -> set[Batch]:
+    """The batches that a finished file holds undamaged.
+
+    A last short batch is none, unless it is the last again: it would have been solved in other company.
+    """
+    held, damaged = set(), []
+    with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
+        rows = {name: len(stored(file, f"{name}/checksum", "u")) for name in work.counts}
+        for batch in work.batches:
+            numbers = work.rows(batch)
+            if numbers[-1] < rows[batch[0]] and (rows[batch[0]] == work.counts[batch[0]] or len(numbers) == work.batch):
+                good = _batch(file, work, batch)[1]
+                damaged += [f"row {row} of `{batch[0]}`" for row in numbers[~good]]
+                held |= {batch} if good.all() else set()
+    if damaged:
+        more = f" and {len(damaged) - 5} more" if damaged[5:] else ""
+        warnings.warn(
+            f"{path}: {', '.join(damaged[:5])}{more}: damaged. They are solved anew, and all else is kept.",
+            DamageWarning,
+            stacklevel=3,
+        )
+    return held

@@ -1,0 +1,242 @@
+"""Loads as surgical tools make them: where a tool touches, how hard, in which direction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.loads import Loads, Pushed
+from sim.material import BRAIN
+
+from .cortex_patch import Patch, nearest, open_patch
+
+ATTEMPTS = 2000
+# Loads drawn together: more would only take more memory. A load has so many random numbers at each attempt.
+BLOCK, NUMBERS = 8192, 8
+# Deeper than this the tool has gone through the tissue; tissue harm begins at 2.7-4 kPa mean contact pressure.
+DEEPEST, HARDEST = 15e-3, 8e3
+# E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) judges a load before it is solved.
+PLANE_MODULUS = BRAIN.young / (1.0 - BRAIN.poisson**2)
+# Radii and forces of a tool at which its nominal loads are counted.
+LATTICE = 200
+
+
+@dataclass(frozen=True)
+class Tool:
+    """The range of a surgical tool's loads.
+
+    Parameters
+    ----------
+    name
+        As `--preset` says it.
+    footprint
+        Least and greatest radius [m], uniform between; a plate counts as the disc of its area.
+    force
+        Least and greatest force [N], log-uniform between unless `even`: then uniform.
+    pressure
+        Least and greatest mean contact pressure F / (pi r^2) [Pa]; a draw outside is repeated.
+    depth
+        Greatest depth by Hertz's formula [m]; a deeper draw is repeated.
+    cone
+        Greatest angle [rad] between the force and the inward normal; uniform by solid angle.
+    """
+
+    name: str
+    footprint: tuple[float, float]
+    force: tuple[float, float]
+    pressure: tuple[float, float] = (0.0, HARDEST)
+    depth: float = DEEPEST
+    cone: float = np.pi / 4.0
+    even: bool = False
+
+    def admits(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+        """Whether (n,) pressure and estimated depth are those of surgery; forces (n,) [N], radii (n,) [m]."""
+        pressure = force / (np.pi * footprint**2)
+        depth = 3.0 * force / (4.0 * PLANE_MODULUS * footprint)
+        return (self.pressure[0] <= pressure) & (pressure <= self.pressure[1]) & (depth <= self.depth)
+
+
+TOOLS = {
+    tool.name: tool
+    for tool in (
+        Tool("palpation", (5e-3, 7.5e-3), (0.05, 0.4), depth=10e-3),
+        Tool("bipolar", (0.5e-3, 1e-3), (0.01, 0.05)),
+        Tool("dissector", (1.5e-3, 2e-3), (0.02, 0.25)),
+        # 5-30 mmHg under plates of 10-20 x 20-40 mm.
+        Tool("spatula", (8e-3, 16e-3), (0.13, 3.2), pressure=(700.0, 4000.0)),
+    )
+}
+# No surgery: a trial of the solver. 1 N on 3 mm would be a flat punch 40 mm deep.
+BRUTAL = Tool("brutal", (3e-3, 10e-3), (0.02, 1.05), pressure=(0.0, np.inf), depth=np.inf, even=True)
+PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)
+
+
+def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
+    """Draw `count` loads on the open cortex; load i depends on the preset, the anatomy, the seed and i alone.
+
+    `mixed` draws the tool first; `brutal` is far beyond surgery. `seed` is the protocol of Tonutti, Gras, Yang 2017,
+    Artif. Intell. Med. 80:39-47, in an order shuffled by the seed: at most 6,600 loads, of which fewer are returned
+    when `count` is larger.
+
+    Raises
+    ------
+    InputError
+        Unknown preset, a count below one, a negative seed, an anatomy without open cortex or (for `seed`) without
+        tumour, or a patch too small for the tool.
+    """
+    if preset not in PRESETS:
+        raise InputError(f"no preset is called {preset!r}: choose one of {', '.join(PRESETS)}.")
+    if count < 1 or seed < 0:
+        raise InputError(f"a count of {count} with seed {seed} draws nothing: give --count >= 1 and --seed >= 0.")
+    patch = open_patch(anatomy)
+    if preset == "seed":
+        return _published(anatomy, patch, count, seed)
+    tools = list(TOOLS.values()) if preset == "mixed" else [{**TOOLS, BRUTAL.name: BRUTAL}[preset]]
+    key = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
+    blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
+    rows = np.concatenate([_drawn(tools, patch, key, block) for block in blocks])
+    return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
+
+
+def refused_share(preset: str) -> float:
+    """The share of a preset's nominal loads, by radius and force, that are not drawn: they press too hard or too deep.
+
+    Nothing is taught of them. Zero of what is no preset of tools.
+    """
+    tools = {**{name: [tool] for name, tool in TOOLS.items()}, "mixed": list(TOOLS.values())}.get(preset, [])
+    middles = (np.arange(LATTICE) + 0.5) / LATTICE
+    first, second = (axis.ravel() for axis in np.meshgrid(middles, middles))
+    shares = [
+        1.0 - tool.admits(np.exp(_between(np.log(tool.force), first)), _between(tool.footprint, second)).mean()
+        for tool in tools
+    ]
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def refused_words(preset: str) -> str:
+    """The same for people, empty where none are refused."""
+    share = refused_share(preset)
+    return (
+        f"{100.0 * share:.0f} % of the nominal loads of {preset} (its forces on its radii) have a pressure or depth "
+        "that surgery has not: they are not drawn, and lie outside the taught range."
+        if share > 0.0
+        else ""
+    )
+
+
+def _drawn(tools: list[Tool], patch: Patch, key: int, block: range) -> np.ndarray:
+    """Point [m], force [N] and footprint [m] of each load of a block: (n, 7)."""
+    kind = (len(tools) * _uniform(key, 0, block)[:, -1]).astype(int)
+    out = np.zeros((len(block), 7))
+    for number, tool in enumerate(tools):
+        rows = np.flatnonzero(kind == number)
+        out[rows] = _drawn_of(tool, patch, key, block, rows)
+    return out
+
+
+def _uniform(key: int, attempt: int, block: range) -> np.ndarray:
+    """Numbers (n, NUMBERS) in [0, 1) of each load of a block.
+
+    Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": its counter makes any load's
+    numbers without those before.
+    """
+    source = np.random.Philox(key=np.array([key, attempt], np.uint64))
+    source.advance(block.start * NUMBERS // 4)  # each count of it makes four numbers
+    return np.random.Generator(source).random((len(block), NUMBERS))
+
+
+def _drawn_of(tool: Tool, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
+    """As `_drawn`, of one tool and some rows (k,) of the block: who does not fit draws again."""
+    out, waiting = np.zeros((len(block), 7)), rows
+    for attempt in range(ATTEMPTS):
+        if not len(waiting):
+            return out[rows]
+        uniform = _uniform(key, attempt, block)[waiting]
+        footprint = _between(tool.footprint, uniform[:, 0])
+        force = (
+            _between(tool.force, uniform[:, 1]) if tool.even else np.exp(_between(np.log(tool.force), uniform[:, 1]))
+        )
+        fits = np.flatnonzero(tool.admits(force, footprint))
+        point, normal = patch.place(uniform[fits, 2:5])
+        inside = patch.rim_distance(point) >= footprint[fits]
+        fits, point, normal = fits[inside], point[inside], normal[inside]
+        direction = _within_cone(normal, tool.cone, uniform[fits, 5:7])
+        out[waiting[fits]] = np.column_stack([point, force[fits, None] * direction, footprint[fits]])
+        waiting = np.delete(waiting, fits)
+    raise InputError(
+        f"in {ATTEMPTS} draws no {tool.name} of radius {1e3 * tool.footprint[0]:g}-{1e3 * tool.footprint[1]:g} mm "
+        "fitted into the open cortex: widen the --craniotomy, or choose a smaller tool with --preset."
+    )
+
+
+def _between(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    return ends[0] + (ends[1] - ends[0]) * uniform
+
+
+def _within_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
+    """Unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniform by solid angle."""
+    cosine = (1.0 - uniform[:, 0] * (1.0 - np.cos(angle)))[:, None]
+    turn = (2.0 * np.pi * uniform[:, 1])[:, None]
+    first, second = across(axis)
+    sideways = np.cos(turn) * first + np.sin(turn) * second
+    return cosine * axis + np.sqrt(1.0 - cosine**2) * sideways
+
+
+def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (n, 3) each that stand upright on unit vectors `axis` (n, 3), and on each other."""
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(axis, first)
+
+
+POSITIONS, DIRECTIONS, MAGNITUDES = 11, 30, np.linspace(0.10, 1.05, 20)
+# The area behind one free surface node of the published mesh.
+PUBLISHED_FOOTPRINT = 7e-3
+PUBLISHED_CONE = np.pi / 3.0
+
+
+def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
+    """11 positions 20-28 mm from the tumour's centre x 30 directions x 20 magnitudes, shuffled.
+
+    The authors do not print their directions: a spherical Fibonacci lattice within 60 degrees of the inward normal
+    stands for them.
+    """
+    if not len(anatomy.tumour_nodes):
+        raise InputError("the anatomy has no tumour, so no position is 20-28 mm from it: choose another --preset.")
+    centre = anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0)
+    distance = np.linalg.norm(patch.points - centre, axis=1)
+    inside = patch.rim_distance(patch.points) >= PUBLISHED_FOOTPRINT
+    near = np.flatnonzero((distance >= 20e-3) & (distance <= 28e-3) & inside)
+    if not len(near):
+        raise InputError(
+            f"the open cortex is {1e3 * distance.min():.1f}-{1e3 * distance.max():.1f} mm from the tumour's centre; "
+            f"no node at 20-28 mm lies {1e3 * PUBLISHED_FOOTPRINT:g} mm inside its rim: make the anatomy with --preset "
+            "seed, or choose another --preset here."
+        )
+    near = near[spread(patch.points[near], POSITIONS)]
+    golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(DIRECTIONS) / (2.0 * np.pi)
+    lattice = np.column_stack([(np.arange(DIRECTIONS) + 0.5) / DIRECTIONS, golden % 1.0])
+    direction = np.array(
+        [_within_cone(np.broadcast_to(patch.inward[node], (DIRECTIONS, 3)), PUBLISHED_CONE, lattice) for node in near]
+    )
+    whole = np.random.default_rng(seed).permutation(len(near) * DIRECTIONS * len(MAGNITUDES))[:count]
+    position, way, magnitude = np.unravel_index(whole, (len(near), DIRECTIONS, len(MAGNITUDES)))
+    force = MAGNITUDES[magnitude, None] * direction[position, way]
+    return Loads((Pushed(patch.points[near[position]], force, np.full(len(whole), PUBLISHED_FOOTPRINT)),))
+
+
+def spread(points: np.ndarray, count: int) -> np.ndarray:
+    """Numbers (k,) of at most `count` of the `points` (n, 3), far from each other: farthest-point sampling.
+
+    Starts at the point nearest to the mean, so that it depends on nothing but the points. Gonzalez 1985, Theor.
+    Comput. Sci. 38:293-306.
+    """
+    chosen = [int(nearest(points.mean(axis=0, keepdims=True), points)[0][0])]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < count and distance.max() > 0.0:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)

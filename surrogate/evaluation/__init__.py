@@ -1,0 +1,1 @@
+"""How far off models are, and whether they keep what they promise."""

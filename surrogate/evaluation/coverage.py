@@ -1,0 +1,105 @@
+"""Whether a model keeps what it promises: its bounds against the errors on loads that it has never seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.deformation import Deformation, Outcome
+from sim.errors import InputError
+from sim.loads import Loads
+
+from ..data.encode import directions
+from ..model.conformal import LEVELS
+from ..model.learned import Learned
+
+TENTHS = 10
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Bounds and errors over n loads.
+
+    Parameters
+    ----------
+    loads
+        n.
+    held
+        Shares of the loads whose error lies below the bound, for `bound.LEVELS`. The error is the largest at the
+        tumour, or that of the distance from tip to tumour.
+    tenths
+        The same for the first level, by tenths of the force, from weak to strong.
+    bound_mm, error_mm
+        Medians over the loads of the bound at the first level, and of the error [mm].
+    extrapolated
+        Loads that the model says it was not taught.
+    """
+
+    loads: int
+    held: tuple[float, float]
+    tenths: tuple[float, ...]
+    bound_mm: float
+    error_mm: float
+    extrapolated: int
+
+    def __str__(self) -> str:
+        held = ", ".join(
+            f"{100 * share:.1f} % at {100 * level:g} %" for share, level in zip(self.held, LEVELS, strict=True)
+        )
+        tenths = " ".join(f"{100 * share:.0f}" for share in self.tenths)
+        return (
+            f"{held}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median error "
+            f"{self.error_mm:.4f} mm; {self.extrapolated} loads outside what was taught"
+        )
+
+
+def coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
+    """How often a model's bounds held, against displacements `truth` (B, n, 3) [m] of the tumour's vertices.
+
+    Raises
+    ------
+    InputError
+        A model without bounds, or fewer loads than tenths.
+    """
+    if model.bounds is None:
+        raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
+    _demand_tenths(loads)
+    answer = model.deform(loads, at=model.anatomy.tumour_nodes)
+    worst = np.linalg.norm(answer.displacement - truth, axis=2).max(axis=1)
+    return _covered(model, loads, answer, worst, answer.bound)
+
+
+def distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
+    """How often the bound of a model's distance held, against the finite elements' distances `truth` (B,) [m].
+
+    Raises
+    ------
+    InputError
+        A model without a bound of its distance, or fewer loads than tenths.
+    """
+    if model.tip is None or model.tip.bound is None:
+        raise InputError("this model has no calibrated bound of its distance: train it anew, with enough loads.")
+    _demand_tenths(loads)
+    answer = model.deform(loads, at=model.nodes)
+    told = model.distance(loads, answer)
+    return _covered(model, loads, answer, np.abs(told.value - truth), told.bound)
+
+
+def _demand_tenths(loads: Loads) -> None:
+    if len(loads) < TENTHS:
+        raise InputError(f"{len(loads)} loads have no tenths: simulate at least {TENTHS}.")
+
+
+def _covered(model: Learned, loads: Loads, answer: Deformation, error: np.ndarray, bound: np.ndarray) -> Coverage:
+    """Errors (B,) [m] against bounds (2, B) [m]."""
+    held = error <= bound
+    by_force = np.array_split(np.argsort(directions(model.asked(loads))[0], kind="stable"), TENTHS)
+    return Coverage(
+        len(loads),
+        (float(held[0].mean()), float(held[1].mean())),
+        tuple(float(held[0][rows].mean()) for rows in by_force),
+        1e3 * float(np.median(bound[0])),
+        1e3 * float(np.median(error)),
+        answer.outcome.count(Outcome.EXTRAPOLATED),
+    )

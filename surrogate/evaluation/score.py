@@ -1,0 +1,175 @@
+"""Error and time of deformers against the finite elements: one row per deformer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from sim.deformation import Deformer
+from sim.loads import Loads
+from sim.runtime.threads import one_thread
+
+from ..model.learned import Learned
+from .solve_counts import Told
+
+WARM_UP, TIMED = 20, 200
+# Fewer loads do not tell the greatest of a thousand.
+FEWEST_FOR_P999 = 1000
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Score:
+    """Distances between prediction and reference over every load x vertex.
+
+    Parameters
+    ----------
+    name
+        Of the deformer.
+    mean_mm, p95_mm, p999_mm, max_mm
+        [mm]; each p999 is None of fewer than `FEWEST_FOR_P999` loads.
+    mean_percent, p95_percent, p999_percent, max_percent
+        Each distance divided by its load's motion, which is the mean displacement of the vertices in the reference [%].
+    worst_mean_mm, worst_p95_mm, worst_p999_mm
+        Of the worst vertex of each load, over the loads [mm]; the largest is `max_mm`.
+    microseconds
+        Median wall time of the whole answer to one load at a time, its bound and limits included, warm-up excluded.
+    bare_microseconds
+        The same of the model alone in NumPy, which compares learners; None of what is no model of this project.
+    told
+        The finite-element solves that the deformer was told, where that is known.
+    """
+
+    name: str
+    mean_mm: float
+    p95_mm: float
+    p999_mm: float | None
+    max_mm: float
+    mean_percent: float
+    p95_percent: float
+    p999_percent: float | None
+    max_percent: float
+    worst_mean_mm: float
+    worst_p95_mm: float
+    worst_p999_mm: float | None
+    microseconds: float
+    bare_microseconds: float | None = None
+    told: Told | None = None
+
+
+def errors(deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Distances (B, n) [m] between the deformer's answers and `truth` (B, n, 3) [m] at `nodes` (n,)."""
+    return np.linalg.norm(deformer.deform(loads, at=nodes).displacement - truth, axis=2)
+
+
+def score(
+    name: str, deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray, told: Told | None = None
+) -> Score:
+    """Hold a deformer to `truth` (B, n, 3) [m] at the vertices `nodes` (n,)."""
+    distance = errors(deformer, loads, truth, nodes)
+    motion = np.linalg.norm(truth, axis=2).mean(axis=1, keepdims=True)
+    return Score(
+        name,
+        *spread(1e3 * distance),
+        *spread(100.0 * distance / motion),
+        *spread(1e3 * distance.max(axis=1))[:3],
+        microseconds(deformer, loads, nodes),
+        bare_microseconds(deformer, loads),
+        told,
+    )
+
+
+def microseconds(deformer: Deformer, loads: Loads, nodes: np.ndarray) -> float:
+    """Median wall time [us] of one load at a time."""
+    return 1e6 * float(np.median(single_seconds(deformer, loads, nodes, TIMED)))
+
+
+def bare_microseconds(deformer: Deformer, loads: Loads) -> float | None:
+    """Median wall time [us] of a learned model alone, of one load at a time, in NumPy; None of other deformers."""
+    if not isinstance(deformer, Learned):
+        return None
+    single = [deformer.asked(loads.rows(slice(row, row + 1))) for row in np.arange(WARM_UP + TIMED) % len(loads)]
+    with one_thread():
+        return 1e6 * float(np.median(_timed(deformer.bare, single)))
+
+
+def single_seconds(deformer: Deformer, loads: Loads, nodes: np.ndarray, count: int) -> list[float]:
+    """Wall times [s] of `count` answers to one load at a time, the loads in turns, warm-up excluded."""
+    single = [loads.rows(slice(row, row + 1)) for row in np.arange(WARM_UP + count) % len(loads)]
+    return _timed(lambda one: deformer.deform(one, at=nodes), single)
+
+
+def _timed(answer: Callable[[T], object], single: Iterable[T]) -> list[float]:
+    """Wall times [s] of one answer after the other, without the warm-up."""
+    seconds = []
+    for one in single:
+        begun = time.perf_counter()
+        answer(one)
+        seconds.append(time.perf_counter() - begun)
+    return seconds[WARM_UP:]
+
+
+def winner(scores: Sequence[Score]) -> Score:
+    """The score of least mean error."""
+    return min(scores, key=lambda row: row.mean_mm)
+
+
+def table(scores: Sequence[Score], motion_mm: float) -> str:
+    """The scores for people, below them the winner of several, and what the learners were told where that is known."""
+    head = (
+        "          mm, all vertices                | mm, worst vertex of a load | % of motion                 "
+        "| us, model in NumPy\n"
+        "learner      mean     p95   p99.9     max |    mean     p95   p99.9    |   mean    p95  p99.9    max "
+        "|      | us, answer with bound"
+    )
+    rows = [
+        f"{row.name:<10}{row.mean_mm:7.4f} {row.p95_mm:7.4f} {_known(row.p999_mm, '7.4f')} {row.max_mm:7.4f} | "
+        f"{row.worst_mean_mm:7.4f} {row.worst_p95_mm:7.4f} {_known(row.worst_p999_mm, '7.4f')}    |"
+        f"{row.mean_percent:7.2f} {row.p95_percent:6.2f} {_known(row.p999_percent, '6.2f')} {row.max_percent:6.2f} |"
+        f"{'' if row.bare_microseconds is None else f'{row.bare_microseconds:.0f}':>5} |{row.microseconds:5.0f}"
+        for row in scores
+    ]
+    best = winner(scores)
+    fastest = min(scores, key=lambda row: row.microseconds)
+    verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
+    said = f"{best.name} wins: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
+    few = [f"p99.9: not known from fewer than {FEWEST_FOR_P999} loads"] if scores[0].p999_mm is None else []
+    return "\n".join([head, *rows, *few, said if len(scores) > 1 else f"{best.name}: {verdict}", *_told(scores)])
+
+
+def _known(value: float | None, form: str) -> str:
+    """A number, or a dash in its column."""
+    return f"{'-':>{form.split('.')[0]}}" if value is None else f"{value:{form}}"
+
+
+def _told(scores: Sequence[Score]) -> list[str]:
+    """The solves that each learner was told, as lines."""
+    known = [(row.name, row.told) for row in scores if row.told is not None]
+    if not known:
+        return []
+    rows = [
+        f"{name:<10}{told.loads:7d} {told.units:7d} {told.series:8d} {told.solves:8d} {told.inside:9d}"
+        f" {'unknown' if told.seconds is None else f'{told.seconds:.1f}':>9}"
+        for name, told in known
+    ]
+    return [
+        "finite-element solves told to the learners above, their wall time, and how many tell of the tumour from "
+        "inside the discs:",
+        "learner     loads    unit   series      all    inside   seconds",
+        *rows,
+    ]
+
+
+def spread(values: np.ndarray) -> tuple[float, float, float | None, float]:
+    """Mean, 95 and 99.9 percentile, and maximum of values (B, ...) of B loads; no 99.9 percentile of too few loads."""
+    p95, p999 = np.percentile(values, (95.0, 99.9))
+    return (
+        float(values.mean()),
+        float(p95),
+        float(p999) if len(values) >= FEWEST_FOR_P999 else None,
+        float(values.max()),
+    )

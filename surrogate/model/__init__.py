@@ -1,0 +1,1 @@
+"""Learned models: a deformer, its bounds, its range, and its file."""

@@ -1,0 +1,141 @@
+"""How far a prediction may be from the finite elements: split conformal bounds with a scale for each load.
+
+Lei, G'Sell, Rinaldo, Tibshirani, Wasserman 2018, "Distribution-free predictive inference for regression", J. Am. Stat.
+Assoc. 113:1094-1111, section 5.2; by classes as in Vovk, Lindsay, Nouretdinov, Gammerman 2003, "Mondrian confidence
+machine": every class of force has quantiles of its own, so that weak loads do not vouch for strong ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from sim.loads import Pushed
+
+from ..regressors.protocol import standardisation
+from .training_range import Measured
+
+LEVELS = (0.95, 0.99)
+# So many calibration loads make a class of force, of which there are at most so many.
+CLASS, CLASSES = 200, 10
+# Of the squared weights, beside the squared misfit of logarithms of unit variance a load.
+RIDGE = 1e-2
+# Of the features, so many say what the load is: force, radius, angle, overhang. The rest say where it is.
+LOAD = 4
+# Fewer errors than ten a term tell no curvature.
+BENDS = 150
+# Standard deviations beyond which a feature counts no further; and the share of the mean below which no error counts.
+FARTHEST, LEAST = 4.0, 1e-3
+# How much a bound grows outside what was taught, for each unit of `Envelope.excess`.
+GROWTH = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """With probability 0.95 (0.99) the largest error over the tumour's vertices is below quantile x scale(load).
+
+    Promised for loads drawn as the calibration loads were; elsewhere it grows, and promises nothing.
+
+    Parameters
+    ----------
+    mean, deviation
+        (f,) of the features that the scale is told from.
+    weights
+        (t,) of the monomials up to the second degree of standardised features; their sum is the logarithm of the scale.
+    edges
+        (k - 1,) forces [N] between the k classes.
+    quantile
+        (2, k): of error over scale, for `LEVELS` and each class.
+    profile
+        (n,) at most one: each vertex's share of the bound, in the order of `Anatomy.tumour_nodes`.
+    """
+
+    mean: np.ndarray
+    deviation: np.ndarray
+    weights: np.ndarray
+    edges: np.ndarray
+    quantile: np.ndarray
+    profile: np.ndarray
+
+    def of(self, features: np.ndarray, force: np.ndarray, excess: np.ndarray) -> np.ndarray:
+        """Bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N] and `Envelope.excess` (B,)."""
+        scale = np.exp(_monomials(_standard(features, self.mean, self.deviation)) @ self.weights)
+        return self.quantile[:, np.searchsorted(self.edges, force)] * scale * (1.0 + GROWTH * excess)
+
+
+def fitted_bound(
+    seen: tuple[np.ndarray, np.ndarray],
+    features: np.ndarray,
+    force: np.ndarray,
+    error: np.ndarray,
+    each: int = CLASS,
+    *,
+    curved: bool = True,
+) -> Bound:
+    """A bound whose scale follows what was `seen`, calibrated on other loads.
+
+    The scale is told the load, not its place: where what was seen lies in few discs of the cortex, a scale that follows
+    the place runs away between them. One that did bounded a distance that was 0.05 mm off by 4.2 mm.
+
+    Parameters
+    ----------
+    seen
+        Features (m, f) and largest errors (m,) [m] of loads that the model was not taught.
+    features, force, error
+        (n, f), (n,) [N] and errors (n, k) [m] at each vertex, of the calibration loads.
+    each
+        Calibration loads of a class of force, at least: fewer than 99 promise nothing at 0.99.
+    curved
+        Whether the scale's logarithm is quadratic in what says the load, if `BENDS` loads were seen, or linear.
+    """
+    mean, deviation = standardisation(seen[0])
+    used = _used(len(mean), LOAD if curved and len(seen[1]) >= BENDS else 0)
+    design = _monomials(_standard(seen[0], mean, deviation))[:, used]
+    wanted = np.log(np.maximum(seen[1], max(LEAST * seen[1].mean(), np.finfo(float).tiny)))
+    penalty = RIDGE * len(design) * np.eye(design.shape[1])
+    penalty[0, 0] = 0.0  # the constant is free
+    weights = np.zeros(len(used))
+    weights[used] = np.linalg.solve(design.T @ design + penalty, design.T @ wanted)
+    worst = error.max(axis=1)
+    ratio = worst / np.exp(_monomials(_standard(features, mean, deviation)) @ weights)
+    count = int(np.clip(len(ratio) // each, 1, CLASSES))
+    edges = np.unique(np.quantile(force, np.arange(1, count) / count))
+    edges = edges[edges < force.max()]  # equal forces are of one class
+    count, member = len(edges) + 1, np.searchsorted(edges, force)
+    quantile = np.array([[conformal(ratio[member == k], level) for k in range(count)] for level in LEVELS])
+    share = np.quantile(error / np.maximum(worst, np.finfo(float).tiny)[:, None], LEVELS[0], axis=0)
+    return Bound(mean, deviation, weights, edges, quantile, share)
+
+
+def features_of(pushed: Pushed, known: Measured) -> np.ndarray:
+    """What an error's size is told from (B, 7): logarithms of force and radius, angle, overhang and point [mm]."""
+    force = np.log(np.maximum(known.magnitude, np.finfo(float).tiny))
+    return np.column_stack([force, np.log(pushed.footprint), known.angle, 1e3 * known.overhang, 1e3 * pushed.point])
+
+
+def conformal(ratio: np.ndarray, level: float) -> float:
+    """The ceil(level (n + 1))-th smallest of `ratio` (n,): infinite, where n is too small for the level."""
+    rank = int(np.ceil(level * (len(ratio) + 1)))
+    return float(np.sort(ratio)[rank - 1]) if rank <= len(ratio) else np.inf
+
+
+def _standard(features: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    return np.clip((features - mean) / deviation, -FARTHEST, FARTHEST)
+
+
+def _monomials(x: np.ndarray) -> np.ndarray:
+    """1, x_i and x_i x_j of (B, f): (B, t)."""
+    first, second = _pairs(x.shape[1])
+    return np.concatenate([np.ones((len(x), 1)), x, x[:, first] * x[:, second]], axis=1)
+
+
+def _used(count: int, curved: int) -> np.ndarray:
+    """Which monomials (t,) bool are fitted: 1, x_i of the load, and x_i x_j of the first `curved` features."""
+    return np.concatenate([[True], np.arange(count) < LOAD, _pairs(count)[1] < curved])
+
+
+def _pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
+    pairs = np.array(list(combinations_with_replacement(range(count), 2)))
+    return pairs[:, 0], pairs[:, 1]

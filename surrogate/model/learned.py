@@ -1,0 +1,374 @@
+"""Learned: a deformer that answers from what it was taught, for the tumour and the open cortex."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.arguments import whole_numbers
+from sim.bodies.tip_distance import tip_gauge
+from sim.deformation import Cost, Deformation, Outcome
+from sim.errors import InputError
+from sim.loads import Loads, Pushed, check_loads
+from sim.material import tissue_from_json
+from sim.runtime.threads import one_thread
+
+from ..data.cortex_patch import Patch, nearest, open_patch
+from ..data.encode import ENCODERS, Basis, directions
+from ..data.indentation import indented
+from ..regressors.force_series import Series
+from ..regressors.protocol import Fitted
+from ..regressors.series_residual import Remainder
+from .conformal import Bound, features_of
+from .tip_distance import Distance, TipModel
+from .training_range import Envelope, Measured, measured
+
+if TYPE_CHECKING:
+    from .single_load import Swift
+
+# Times the strongest force, or the widest footprint, that was taught. Of three loads so strong on the template's brain
+# the finite elements find an equilibrium of none, and at twice the force a prediction is off by up to 31 %.
+FARTHEST = 3.0
+# Taught points are stored in single precision [m].
+STORED = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Encoder, regressor and basis: one summand of the response, on the basis's vertices.
+
+    Parameters
+    ----------
+    encoder
+        A name in `ENCODERS`.
+    regressor
+        From features to coefficients, fitted to responses to one newton.
+    basis
+        From coefficients to responses.
+    """
+
+    encoder: str
+    regressor: Fitted
+    basis: Basis
+
+    def response(self, features: np.ndarray) -> np.ndarray:
+        """Responses (B, n, 3) [m/N] of `basis.nodes` to the encoder's features (B, f)."""
+        return self.basis.decode(self.regressor.predict(features))
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """A sum of parts, as a `Deformer`.
+
+    Every part predicts the response to one newton, which is multiplied by the force: no force, no motion, and a weak
+    load is answered as exactly, in proportion, as a strong one.
+
+    Parameters
+    ----------
+    anatomy
+        The body that it was taught on.
+    parts
+        Added where they overlap.
+    envelope
+        The loads that it was taught.
+    bound
+        Of 95 in 100 held-out loads the worst tumour vertex was within this distance [m] of the finite elements.
+    bounds
+        What it promises of each load, if loads were kept apart to calibrate it.
+    training
+        What it was taught with, as text.
+    ball
+        Radius [m] of the ball whose poses it answers; None: it answers pushes. Where it says force, there is depth [m].
+    tip
+        What it was taught of the distance from tip to tumour, if anything.
+    """
+
+    anatomy: Anatomy
+    parts: tuple[Part, ...]
+    envelope: Envelope
+    bound: float = float("nan")
+    bounds: Bound | None = None
+    training: Mapping[str, str] = field(default_factory=dict)
+    ball: float | None = None
+    tip: TipModel | None = None
+
+    @cached_property
+    def source(self) -> str:
+        """Its learner, and what it learned from, in words: every answer carries them."""
+        told = self.training
+        tissue = str(tissue_from_json(told["tissue"])) if "tissue" in told else "tissue not stated"
+        return f"{told.get('learner', 'learned')}, from finite elements ({told.get('element', 'not stated')}; {tissue})"
+
+    @cached_property
+    def nodes(self) -> np.ndarray:
+        """Sorted mesh vertices (n,) that it knows."""
+        return np.unique(np.concatenate([part.basis.nodes for part in self.parts]))
+
+    @cached_property
+    def _patch(self) -> Patch:
+        return open_patch(self.anatomy)
+
+    @cached_property
+    def _by_basis(self) -> tuple[tuple[list[Part], np.ndarray], ...]:
+        """Parts of one basis, and (V,) the row of each mesh vertex in it, or -1."""
+        groups: dict[int, list[Part]] = {}
+        for part in self.parts:
+            groups.setdefault(id(part.basis.modes), []).append(part)
+        rows = np.full((len(groups), len(self.anatomy.mesh.nodes)), -1)
+        for row, parts in zip(rows, groups.values(), strict=True):
+            row[parts[0].basis.nodes] = np.arange(len(parts[0].basis.nodes))
+        return tuple(zip(groups.values(), rows, strict=True))
+
+    @cached_property
+    def _knows(self) -> np.ndarray:
+        """(V,) bool."""
+        known = np.zeros(len(self.anatomy.mesh.nodes), bool)
+        known[self.nodes] = True
+        return known
+
+    @cached_property
+    def _swift(self) -> Swift | None:
+        """A shorter way for one load, where all that is known of the tumour is a series and what it leaves."""
+        tumour = self.anatomy.tumour_nodes
+        match [parts for parts, row in self._by_basis if (row[tumour] >= 0).any()]:
+            case [[Part("tool", Series() as series, basis)]]:
+                remainder = None
+            case [[Part("tool", Series() as series, basis), Part("tool", Remainder() as remainder)]]:
+                pass
+            case _:
+                return None
+        # Warp is loaded where a model is asked, not where it is read.
+        from .single_load import LANES, Swift
+
+        if not np.array_equal(basis.nodes, tumour) or len(basis.modes) > LANES:
+            return None
+        return Swift(series, remainder, basis, self._patch, self.envelope, self.bounds)
+
+    def _demand_answerable(self, pushed: Pushed, doubtful: np.ndarray) -> None:
+        """Refuse what has no answer to be near to: a footprint off the open cortex, a size far beyond what was taught.
+
+        Of the `doubtful` (k,) rows alone: a load inside the envelope is neither, unless its radius is less than the
+        reach.
+        """
+        if not len(doubtful):
+            return
+        force = ("a force", 1.0, "N") if self.ball is None else ("a depth", 1e3, "mm")
+        for (name, unit, symbol), size, (_, most) in (
+            (force, directions(pushed)[0], self.envelope.force),
+            (("a footprint", 1e3, "mm"), pushed.footprint, self.envelope.footprint),
+        ):
+            far = np.flatnonzero(size > FARTHEST * most)
+            if len(far):
+                raise InputError(
+                    f"load {far[0]} has {name} of {unit * size[far[0]]:.3g} {symbol}, but this model was taught "
+                    f"{unit * most:.3g} {symbol} at most: give up to {FARTHEST:g} times that, or ask the finite "
+                    "elements."
+                )
+        away = nearest(pushed.point[doubtful], self._patch.points)[1]
+        if (away > pushed.footprint[doubtful]).any():  # off all nodes of the cortex, if not off its triangles
+            self._patch.skin.demand_touch(pushed.point, pushed.footprint)
+
+    def _demand_known(self, nodes: np.ndarray) -> None:
+        inside = (nodes >= 0) & (nodes < len(self._knows))
+        strange = ~(inside & self._knows[np.where(inside, nodes, 0)])
+        if strange.any():
+            raise InputError(
+                f"this model knows the {len(self.nodes)} vertices of tumour and open cortex, not vertex "
+                f"{nodes[strange][0]}: ask the finite elements for it."
+            )
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """Predict the static answer to `Pushed` loads, or to `Touching` of its ball; `start` has no influence.
+
+        Raises
+        ------
+        InputError
+            Loads of another kind, or that do not touch the open cortex, or are more than `FARTHEST` times as strong
+            or as wide as any that was taught; a start with other rows; a vertex in `at` that the model does not know.
+        """
+        check_loads(loads)
+        if start is not None and not isinstance(start, Deformation):
+            raise InputError(f"the start is a {type(start).__name__}: give a Deformation, or none.")
+        if start is not None and len(start) != len(loads):
+            raise InputError(
+                f"the start has displacements of shape {start.displacement.shape}: give one row for each of the "
+                f"{len(loads)} load cases."
+            )
+        begun = time.perf_counter()
+        pushed = self.asked(loads)
+        nodes = self.nodes if at is None else whole_numbers("at", at)
+        if len(loads) == 1 and np.array_equal(nodes, self.anatomy.tumour_nodes) and self._swift is not None:
+            displacement, excess, promised = self._swift.answer(pushed)
+            if excess > 0.0 or pushed.footprint[0] < self.envelope.reach + STORED:
+                self._demand_answerable(pushed, np.zeros(1, int))
+            return predicted(displacement, nodes, loads, (excess > 0.0,), begun, promised, self.source)
+        self._demand_known(nodes)
+        with one_thread() if len(loads) == 1 else nullcontext():
+            return self._summed(loads, pushed, nodes, begun)
+
+    def _summed(self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float) -> Deformation:
+        """The sum of the parts, asked at `begun` [s]."""
+        known = measured(self._patch, pushed)
+        excess = self.envelope.excess(pushed, known)
+        small = pushed.footprint < self.envelope.reach + STORED
+        self._demand_answerable(pushed, np.flatnonzero((excess > 0.0) | small))
+        magnitude, direction = directions(pushed)
+        # Beyond the taught forces the response stays what it was at the nearest of them.
+        within = np.clip(magnitude, *self.envelope.force)
+        asked = replace(pushed, force=within[:, None] * direction)
+        features: dict[str, np.ndarray] = {}  # of each encoder that is needed
+        displacement = np.zeros((len(loads), len(nodes), 3))
+        for parts, row_of in self._by_basis:
+            row = row_of[nodes]
+            here = row >= 0
+            if here.any():
+                for encoder in {part.encoder for part in parts} - set(features):
+                    features[encoder] = ENCODERS[encoder](self._patch, asked)
+                coefficients = sum(part.regressor.predict(features[part.encoder]) for part in parts)
+                response = parts[0].basis.decode(np.asarray(coefficients))
+                displacement[:, here] += magnitude[:, None, None] * response[:, row[here]]
+        promised = self._promised(self.bounds, pushed, known, excess)
+        return predicted(displacement, nodes, loads, excess > 0.0, begun, promised, self.source)
+
+    @cached_property
+    def _of_tumour(self) -> tuple[tuple[tuple[Part, ...], np.ndarray], ...]:
+        """Parts of one basis that know of the tumour, and its modes there (r, 3 n)."""
+        tumour, found = self.anatomy.tumour_nodes, []
+        for parts, row in self._by_basis:
+            if (row[tumour] >= 0).all():
+                modes = parts[0].basis.modes
+                found.append((tuple(parts), modes.reshape(len(modes), -1, 3)[:, row[tumour]].reshape(len(modes), -1)))
+        return tuple(found)
+
+    def bare(self, pushed: Pushed) -> np.ndarray:
+        """Displacements (B, n, 3) [m] of the tumour by the model alone, in NumPy: no limits, no bound, no kernel.
+
+        Learners are timed by it: all in one kind of implementation. Forces must lie in the envelope.
+        """
+        magnitude, features = directions(pushed)[0], {}
+        total = np.zeros((len(magnitude), 3 * len(self.anatomy.tumour_nodes)), np.float32)
+        for parts, modes in self._of_tumour:
+            for part in parts:
+                if part.encoder not in features:
+                    features[part.encoder] = ENCODERS[part.encoder](self._patch, pushed)
+                total += part.regressor.predict(features[part.encoder]) @ modes
+        return (magnitude[:, None] * total).reshape(len(magnitude), -1, 3)
+
+    def _promised(self, bound: Bound | None, pushed: Pushed, known: Measured, excess: np.ndarray) -> np.ndarray:
+        """What a bound (2, B) [m] says of loads; NaN where there is none."""
+        if bound is None:
+            return np.full((2, len(excess)), np.nan)
+        # As the motion, so its error: in proportion to a force weaker than any that was taught.
+        weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
+        told = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *self.envelope.force)))
+        return np.where(weaker > 0.0, bound.of(told, known.magnitude, excess), 0.0) * weaker
+
+    def distance(self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None) -> Distance:
+        """Predict the distance from the tool's tip to the tumour, both in the deformed brain: see `TipGauge`.
+
+        Parameters
+        ----------
+        answer
+            What this model answered the loads with, if that is known: of the open cortex and the tumour at least.
+        apart
+            (B,) [m]: the distance in that answer, where it is measured already, as of a tool that is lifted off again.
+
+        Raises
+        ------
+        InputError
+            Loads of another kind, or an answer that does not know the open cortex and the tumour.
+        """
+        pushed = self.asked(loads)
+        if apart is None:
+            if answer is None:
+                answer = self.deform(loads, at=self.nodes)
+            apart = tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.ball)
+        tip = self.tip or TipModel()
+        magnitude, direction = directions(pushed)
+        within = np.clip(magnitude, *self.envelope.force)[:, None] * direction
+        found = tip.corrected(apart, self._patch, replace(pushed, force=within), magnitude)
+        known = measured(self._patch, pushed)
+        return Distance(found, self._promised(tip.bound, pushed, known, self.envelope.excess(pushed, known)))
+
+    def asked(self, loads: Loads) -> Pushed:
+        """What the model is asked: pushes, or the poses of its ball as `indentation.indented` has them.
+
+        Raises
+        ------
+        InputError
+            Loads of another kind.
+        """
+        return only_pushed(loads) if self.ball is None else indented(loads, self.ball, self._patch)
+
+    def margin(self, answer: Deformation) -> np.ndarray:
+        """A field (B, n) [m] over `anatomy.tumour_nodes`, scaled from an answer's bound at 0.95: where it is needed.
+
+        The bound itself is promised, for the largest error; how it is shared out is what calibration loads had.
+
+        Raises
+        ------
+        InputError
+            A model without calibrated bounds.
+        """
+        if self.bounds is None:
+            raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
+        return answer.bound[0][:, None] * self.bounds.profile
+
+
+def predicted(
+    displacement: np.ndarray,
+    nodes: np.ndarray,
+    loads: Loads,
+    outside: Iterable[bool],
+    begun: float,
+    bound: np.ndarray,
+    source: str,
+) -> Deformation:
+    """What a learnt model, asked at `begun` [s], answers loads with; `outside` (B,) of what it was taught or not.
+
+    displacement (B, n, 3) [m] of `nodes` (n,); bound and source as in `Deformation`.
+    """
+    count = len(loads)
+    pushed, unknown = loads.of(Pushed), np.full(count, np.nan)
+    reaction = np.zeros((count, 0 if pushed is None else 1, 6))  # what force a pose takes it was not taught
+    if pushed is not None:
+        reaction[:, 0, :3] = pushed.force
+    return Deformation(
+        displacement,
+        nodes,
+        tuple([Outcome.EXTRAPOLATED if far else Outcome.PREDICTED for far in outside]),
+        np.zeros(count, int),
+        unknown,
+        loads.times,
+        reaction,
+        cost=Cost({"predict": time.perf_counter() - begun}),
+        reached=unknown,
+        inverted=np.full(count, -1),
+        bound=bound,
+        source=source,
+    )
+
+
+def only_pushed(loads: Loads) -> Pushed:
+    """The pushes of loads that are nothing else.
+
+    Raises
+    ------
+    InputError
+        Loads of another kind.
+    """
+    pushed = loads.only(Pushed)
+    if pushed is None:
+        names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
+        raise InputError(
+            f"the loads have the causes {names}, but this model was taught pushing forces only: give `Pushed` alone, "
+            "or ask the finite elements."
+        )
+    return pushed

@@ -1,0 +1,107 @@
+"""Learners of a user's own: registered from their file or package, trained, stored and read like the built-in ones."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import TypeVar
+
+from sim.errors import InputError
+
+from ..data.encode import ENCODERS, Encoder
+from ..regressors.protocol import Regressor
+
+GROUP = "sulcus.learners"
+"""The entry points of packages that bring learners, by the learner's name."""
+RESERVED = frozenset(
+    [
+        "ann",
+        "bayesian",
+        "contact",
+        "contact-gp",
+        "gp",
+        "linear",
+        "pcr",
+        "remainder",
+        "residual",
+        "series",
+        "series-gp",
+        "svr",
+    ]
+)
+"""Names of what comes with sulcus."""
+
+
+@dataclass(frozen=True)
+class Own:
+    """A learner that somebody registered: a name in `ENCODERS`, and who makes its regressor."""
+
+    encoder: str
+    regressor: type[Regressor]
+
+
+OWN: dict[str, Own] = {}
+K = TypeVar("K", bound=type[Regressor])
+
+
+def learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:
+    """Register a class of `Regressor` under a name; it is made without arguments.
+
+    `encoder`: which features of a load it learns from, a name in `encode.ENCODERS` or a function (Patch, Pushed) ->
+    (B, f).
+
+    Raises
+    ------
+    InputError
+        A name that is taken, an encoder that there is not, a class that lacks what a `Regressor` has.
+    """
+    if callable(encoder):
+        ENCODERS[name], encoder = encoder, name
+    elif encoder not in ENCODERS:
+        raise InputError(f"no encoder is called {encoder!r}: choose one of {', '.join(ENCODERS)}, or give a function.")
+
+    def register(kind: K) -> K:
+        missing = [what for what in ("fit", "predict", "state", "restored") if not hasattr(kind, what)]
+        if missing:
+            raise InputError(
+                f"the learner {name} has no {', '.join(missing)}: see surrogate.regressors.protocol.Regressor."
+            )
+        if name in RESERVED or (name in OWN and _file(OWN[name].regressor) != _file(kind)):
+            raise InputError(f"a learner is called {name!r} already: choose another name.")
+        OWN[name] = Own(encoder, kind)
+        return kind
+
+    return register
+
+
+def find_own(name: str) -> Own | None:
+    """A learner that was registered, if need be by the package whose entry point has its name; None without one.
+
+    Raises
+    ------
+    InputError
+        A package that cannot be imported, or that registers no learner of its entry point's name.
+    """
+    if name in OWN:
+        return OWN[name]
+    for point in entry_points(group=GROUP, name=name):
+        try:
+            point.load()
+        except Exception as error:
+            raise InputError(f"the learner {name} of {point.value} cannot be loaded ({error}).") from error
+        if name not in OWN:
+            raise InputError(f"{point.value} registers no learner called {name}: let it say @learner({name!r}).")
+        return OWN[name]
+    return None
+
+
+def name_of(kind: type) -> str | None:
+    """The name under which a class was registered."""
+    return next((name for name, own in OWN.items() if own.regressor is kind), None)
+
+
+def _file(kind: type) -> str | None:
+    """Where a class is written: a mended file may register its learner again."""
+    return getattr(sys.modules.get(kind.__module__), "__file__", None)

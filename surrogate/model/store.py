@@ -1,0 +1,212 @@
+"""Models on disk: one `.npz` of plain arrays with a JSON header, no pickle."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.geometry.tetmesh import digest_of
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import path_of, read_as
+
+from ..data.encode import Basis
+from ..regressors.ann import Ann
+from ..regressors.ball_contact import Contact
+from ..regressors.bayesian import Bayesian
+from ..regressors.compliance_table import Linear
+from ..regressors.force_series import Series
+from ..regressors.gp import Gp
+from ..regressors.pcr import Pcr
+from ..regressors.protocol import Fitted, Regressor
+from ..regressors.series_residual import Remainder
+from ..regressors.svr import Svr
+from .conformal import Bound
+from .learned import Learned, Part
+from .npz_archive import Archive
+from .own_learners import find_own, name_of
+from .tip_distance import TipModel
+from .training_range import Envelope
+from .vetting import demand_finite, demand_sound
+
+FORMAT = "sulcus model 2"
+REGRESSORS: dict[str, type[Regressor]] = {
+    "linear": Linear,
+    "pcr": Pcr,
+    "ann": Ann,
+    "svr": Svr,
+    "gp": Gp,
+    "bayesian": Bayesian,
+}
+# These know the tool's features, and their meaning.
+FITTED: dict[str, type[Fitted]] = {**REGRESSORS, "series": Series, "remainder": Remainder, "contact": Contact}
+
+
+def save(path: str | Path, models: Mapping[str, Learned]) -> None:
+    """Write models of one anatomy under their names; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        No model, models of different anatomies, a name that does not end in .npz, a folder that cannot be written, a
+        state that is more than arrays of numbers or text, or a regressor that nobody registered.
+    """
+    digests = {model.anatomy.digest for model in models.values()}
+    if len(digests) != 1:
+        raise InputError(f"{path}: a file holds models of one anatomy, not of {len(digests)}.")
+    arrays: dict[str, np.ndarray] = {}
+
+    def put(array: np.ndarray) -> str:
+        if not isinstance(array, np.ndarray) or array.dtype.hasobject:
+            raise InputError(f"{path}: a learner's state holds a {type(array).__name__} that is no array of numbers.")
+        name = digest_of(array)  # parts that models share are stored once
+        arrays[name] = array
+        return name
+
+    header = {
+        "format": FORMAT,
+        "anatomy": digests.pop(),
+        "versions": {name: version(name) for name in ("sulcus", "numpy")},
+        "models": {name: _described(model, put) for name, model in models.items()},
+    }
+    with written_whole(path, ".npz") as partial:
+        np.savez_compressed(partial, header=np.array(json.dumps(header)), **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
+    """Read the models of an anatomy, by name.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or not a model file of this project, that was taught on another anatomy, or that holds
+        a model which cannot be.
+    """
+    path = path_of(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
+    with read_as(path, "a model", "Make one with `sulcus train`."), path.open("rb") as raw:
+        archive = Archive(raw)
+        header = json.loads(archive.text("header"))
+        if header["format"] != FORMAT:
+            raise InputError(f"{path}: has the format {str(header['format'])[:40]!r}, not {FORMAT!r}: train it anew.")
+        if header["anatomy"] != anatomy.digest:
+            raise InputError(
+                f"{path}: was taught on the anatomy {str(header['anatomy'])[:40]}, but this one is {anatomy.digest}: "
+                "use the mesh that it was made for, or run `sulcus simulate` and `sulcus train` for this one."
+            )
+        arrays = archive.arrays(_keys(header["models"].values()))
+        models = {name: _rebuilt(description, arrays, anatomy) for name, description in header["models"].items()}
+        for name, model in models.items():
+            demand_sound(name, model)
+        return models
+
+
+def _keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
+    """The names of all arrays that models refer to."""
+    for description in descriptions:
+        for part in description["parts"]:
+            yield from (part["nodes"], part["modes"], *part["state"].values())
+        yield description["envelope"]["points"]
+        tip = description.get("tip") or {}
+        for named in (description["bounds"], tip.get("bound"), tip.get("correction")):
+            yield from (named or {}).values()
+
+
+def _own_name(regressor: Fitted) -> str:
+    name = name_of(type(regressor))
+    if name is None:
+        raise InputError(f"{type(regressor).__name__} was never registered: see surrogate.model.own_learners.learner.")
+    return name
+
+
+def _kind(name: str) -> type[Fitted]:
+    """The class that a model file names: a built-in one, or one that the user has registered or installed."""
+    if name in FITTED:
+        return FITTED[name]
+    own = find_own(name)
+    if own is None:
+        raise InputError(
+            f"a model here was made by the learner {name!r}, which is not this package's own: name the file that "
+            "registers it by --plugin, or install the package that brings it."
+        )
+    return own.regressor
+
+
+def _described(model: Learned, put: Any) -> dict[str, Any]:
+    names = {kind: name for name, kind in FITTED.items()}
+    parts = [
+        {
+            "encoder": part.encoder,
+            "regressor": names.get(type(part.regressor)) or _own_name(part.regressor),
+            "state": {name: put(array) for name, array in part.regressor.state().items()},
+            "nodes": put(part.basis.nodes),
+            "modes": put(part.basis.modes),
+        }
+        for part in model.parts
+    ]
+    envelope = {**asdict(model.envelope), "points": put(model.envelope.points)}
+    return {
+        "parts": parts,
+        "envelope": envelope,
+        "bound": model.bound,
+        "bounds": _put_bound(model.bounds, put),
+        "training": dict(model.training),
+        "ball": model.ball,
+        "tip": None if model.tip is None else _described_tip(model.tip, put),
+    }
+
+
+def _described_tip(tip: TipModel, put: Any) -> dict[str, Any]:
+    known = tip.correction
+    correction = None if known is None else {name: put(array) for name, array in known.state().items()}
+    return {"correction": correction, "bound": _put_bound(tip.bound, put)}
+
+
+def _rebuilt_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray]) -> TipModel | None:
+    if description is None:
+        return None
+    known = description["correction"]
+    state = {} if known is None else {name: arrays[key] for name, key in known.items()}
+    demand_finite(state)
+    correction = None if known is None else Gp.restored(state)
+    return TipModel(correction, _rebuilt_bound(description["bound"], arrays))
+
+
+def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
+    return None if bound is None else {name: put(array) for name, array in vars(bound).items()}
+
+
+def _rebuilt_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray]) -> Bound | None:
+    return None if names is None else Bound(**{name: arrays[key] for name, key in names.items()})
+
+
+def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:
+    parts = []
+    for part in description["parts"]:
+        state = {name: arrays[key] for name, key in part["state"].items()}
+        demand_finite(state)
+        basis = Basis(arrays[part["nodes"]], arrays[part["modes"]])
+        parts.append(Part(part["encoder"], _kind(part["regressor"]).restored(state), basis))
+    envelope = dict(description["envelope"])
+    envelope["points"] = arrays[envelope["points"]]
+    for name in ("force", "footprint"):
+        envelope[name] = tuple(envelope[name])
+    return Learned(
+        anatomy,
+        tuple(parts),
+        Envelope(**envelope),
+        description["bound"],
+        _rebuilt_bound(description["bounds"], arrays),
+        description["training"],
+        # Older files do not have these.
+        description.get("ball"),
+        _rebuilt_tip(description.get("tip"), arrays),
+    )

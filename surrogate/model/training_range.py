@@ -1,0 +1,109 @@
+"""The range of loads that a model was taught: outside it, a prediction says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from sim.loads import Pushed
+
+from ..data.cortex_patch import Patch, nearest
+from ..data.encode import directions
+
+# Round-off must not put a taught load outside.
+SLACK = 1e-6
+
+
+class Measured(NamedTuple):
+    """Force [N], angle to the inward normal [rad], footprint beyond the rim [m]: (B,) each."""
+
+    magnitude: np.ndarray
+    angle: np.ndarray
+    overhang: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Envelope:
+    """Bounds of the taught loads.
+
+    Parameters
+    ----------
+    points
+        (n, 3) taught points [m].
+    reach
+        The farthest that a taught point lies from the nearest other one [m]: so densely the cortex was taught.
+    overhang
+        Greatest footprint radius less distance to the rim [m].
+    angle
+        Greatest angle [rad] between force and inward normal.
+    force
+        Least and greatest [N]. Below the least the response is in proportion, so weaker loads lie inside.
+    footprint
+        Least and greatest radius [m].
+    line_force
+        Greatest force over radius [N/m], to which the indentation of a round tool is in proportion.
+    """
+
+    points: np.ndarray
+    reach: float
+    overhang: float
+    angle: float
+    force: tuple[float, float]
+    footprint: tuple[float, float]
+    line_force: float
+
+    def holds(self, patch: Patch, pushed: Pushed) -> np.ndarray:
+        """(B,) bool: whether each load lies inside."""
+        return self.excess(pushed, measured(patch, pushed)) == 0.0
+
+    def excess(self, pushed: Pushed, known: Measured) -> np.ndarray:
+        """How far outside each load lies (B,), in shares of what was taught; zero inside.
+
+        The largest of: millimetres beyond the reach or over the rim, radians beyond the angle, and the shares by which
+        force, radius and force over radius are too large or too small.
+        """
+        magnitude, angle, overhang = known
+        beyond = np.stack(
+            [
+                1e3 * (nearest(pushed.point, self.points)[1] - self.reach - SLACK),
+                1e3 * (overhang - self.overhang - SLACK),
+                np.where(magnitude == 0.0, 0.0, angle - self.angle - SLACK),
+                magnitude / self.force[1] - 1.0 - SLACK,
+                magnitude / (self.line_force * pushed.footprint) - 1.0 - SLACK,
+                self.footprint[0] / pushed.footprint - 1.0 - SLACK,
+                pushed.footprint / self.footprint[1] - 1.0 - SLACK,
+            ]
+        )
+        return np.maximum(beyond.max(axis=0), 0.0)
+
+
+def envelope_of(patch: Patch, taught: Pushed) -> Envelope:
+    """The envelope of the `taught` loads, of which nothing but these loads tells."""
+    magnitude, angle, overhang = measured(patch, taught)
+    return Envelope(
+        taught.point.astype(np.float32),
+        _reach(taught.point),
+        float(overhang.max()),
+        float(angle.max()),
+        (float(magnitude.min()), float(magnitude.max())),
+        (float(taught.footprint.min()), float(taught.footprint.max())),
+        float((magnitude / taught.footprint).max()),
+    )
+
+
+def _reach(point: np.ndarray) -> float:
+    """The greatest distance [m] of a point (n, 3) from the nearest other one: zero of one alone."""
+    if len(point) < 2:
+        return 0.0
+    return float(KDTree(point).query(point, 2)[0][:, 1].max())
+
+
+def measured(patch: Patch, pushed: Pushed) -> Measured:
+    """What decides whether loads lie inside."""
+    magnitude, direction = directions(pushed)
+    cosine = np.einsum("bi,bi->b", direction, patch.normal_near(pushed.point))
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return Measured(magnitude, angle, pushed.footprint - patch.rim_distance(pushed.point))

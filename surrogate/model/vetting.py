@@ -1,0 +1,140 @@
+"""Models that come from a file: what no training makes is refused before anything is answered by it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+
+from ..data.cortex_patch import open_patch
+from ..data.encode import ENCODERS, Basis
+from .conformal import LEVELS, Bound
+from .learned import Learned, Part
+from .training_range import Envelope
+
+# Of tool features, and so of what bounds are told from.
+FEATURES = 7
+
+
+def demand_sound(name: str, model: Learned) -> None:
+    """Refuse a model that cannot be.
+
+    Raises
+    ------
+    InputError
+        Parts, an envelope or bounds that no training makes; the text says which.
+    """
+    try:
+        _demand(len(model.parts) > 0, "it has no parts")
+        for part in model.parts:
+            _check_part(part, model)
+        _check_envelope(model.envelope)
+        _demand(isinstance(model.bound, float) and not model.bound < 0.0, "its bound is no distance")
+        _demand(model.ball is None or _positive(model.ball), "its ball has no radius")
+        texts = (*model.training, *model.training.values())
+        _demand(all(isinstance(text, str) for text in texts), "what it says of its training is no text")
+        if model.bounds is not None:
+            _check_bounds(model.bounds, len(model.anatomy.tumour_nodes))
+        if model.tip is not None and model.tip.bound is not None:
+            _check_bounds(model.tip.bound, 1)  # of one distance
+    except InputError as error:
+        raise InputError(f"the model {name!r} cannot be: {error}. Make one with `sulcus train`.") from error
+
+
+def demand_finite(state: Mapping[str, np.ndarray]) -> None:
+    """Refuse what a regressor cannot have learnt.
+
+    Raises
+    ------
+    InputError
+        Arrays that are no finite numbers.
+    """
+    for name, array in state.items():
+        _demand(
+            array.dtype.kind in "fiub" and bool(np.isfinite(array).all()),
+            f"a regressor's {name!r} are no finite numbers. Make a model with `sulcus train`.",
+        )
+
+
+def _check_part(part: Part, model: Learned) -> None:
+    _demand(part.encoder in ENCODERS, f"no encoder is called {part.encoder!r}")
+    _check_basis(part.basis, model.anatomy)
+    features = _probe(part.encoder, model)
+    found = part.regressor.predict(features)
+    _demand(
+        found.shape == (len(features), len(part.basis.modes)) and bool(np.isfinite(found).all()),
+        "it answers no load that it was taught",
+    )
+
+
+def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
+    nodes, modes = basis.nodes, basis.modes
+    _demand(nodes.ndim == 1 and nodes.dtype.kind in "iu" and len(nodes) > 0, "its nodes are no vertex numbers")
+    _demand(nodes.min() >= 0 and nodes.max() < len(anatomy.mesh.nodes), "its nodes lie outside the mesh")
+    # They rise; where one basis has the tumour and the cortex, once more from the start.
+    rises = np.diff(nodes.astype(np.int64)) > 0
+    _demand(
+        bool(np.sum(~rises) <= 1) and len(np.unique(nodes)) == len(nodes), "its nodes are not sorted, or come twice"
+    )
+    known = np.union1d(anatomy.tumour_nodes, open_patch(anatomy).nodes)
+    _demand(bool(np.isin(nodes, known).all()), "its nodes are none of tumour and open cortex")
+    _demand(modes.ndim == 2 and modes.shape[1] == 3 * len(nodes), "its modes are not those of its nodes")
+    _demand(modes.dtype.kind == "f" and bool(np.isfinite(modes).all()), "its modes are no finite numbers")
+
+
+def _probe(encoder: str, model: Learned) -> np.ndarray:
+    """Features of a load that the model was taught, made without what presses a tool."""
+    if encoder == "nodal":
+        return np.ones((1, 3 * len(open_patch(model.anatomy).nodes)))
+    envelope = model.envelope
+    _check_envelope(envelope)
+    inward = open_patch(model.anatomy).normal_near(envelope.points[:1].astype(float))[0]
+    return np.array([[*envelope.points[0], *inward, envelope.force[1], envelope.footprint[1]]], float)
+
+
+def _check_envelope(envelope: Envelope) -> None:
+    points = envelope.points
+    _demand(
+        points.ndim == 2 and points.shape[1] == 3 and len(points) > 0 and bool(np.isfinite(points).all()),
+        "its taught points are none",
+    )
+    for name in ("force", "footprint"):
+        span = getattr(envelope, name)
+        _demand(len(span) == 2 and all(map(_positive, span)) and span[0] <= span[1], f"its range of {name} is none")
+    for name in ("reach", "angle"):
+        value = getattr(envelope, name)
+        _demand(value == 0.0 or _positive(value), f"its {name} is none")
+    _demand(bool(np.isfinite(envelope.overhang)) and _positive(envelope.line_force), "its range of loads is none")
+
+
+def _check_bounds(bounds: Bound, count: int) -> None:
+    for name, array in vars(bounds).items():
+        _demand(array.dtype.kind == "f" and not np.isnan(array).any(), f"{name!r} of its bounds are no numbers")
+    terms = 1 + FEATURES + FEATURES * (FEATURES + 1) // 2
+    shapes = {
+        "mean": (FEATURES,),
+        "deviation": (FEATURES,),
+        "weights": (terms,),
+        "quantile": (len(LEVELS), len(bounds.edges) + 1),
+        "profile": (count,),
+    }
+    for name, shape in shapes.items():
+        _demand(getattr(bounds, name).shape == shape, f"{name!r} of its bounds have another shape")
+    told = np.concatenate([bounds.mean, bounds.deviation, bounds.weights])
+    _demand(bool(np.isfinite(told).all() and (bounds.deviation > 0.0).all()), "the scale of its bounds is none")
+    _demand(bounds.edges.ndim == 1 and bool((np.diff(bounds.edges) > 0.0).all()), "its classes of force do not rise")
+    _demand(bool((bounds.quantile >= 0.0).all()), "its bounds are negative")
+    _demand(bool((bounds.quantile[1] >= bounds.quantile[0]).all()), "its bounds shrink with their probability")
+    _demand(bool(((bounds.profile >= 0.0) & (bounds.profile <= 1.0)).all()), "a vertex's share of its bounds is none")
+
+
+def _positive(value: float) -> bool:
+    return 0.0 < value < np.inf
+
+
+def _demand(good: bool, reason: str) -> None:
+    if not good:
+        raise InputError(reason)

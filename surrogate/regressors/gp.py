@@ -1,0 +1,135 @@
+"""A Gaussian process from a load to the coefficients of a reduced basis: it also tells its own deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+
+from sim.runtime.threads import one_thread
+
+from .protocol import filled, standardisation
+
+# Lengths in standard deviations of a feature, and noise against the variance of an output.
+LENGTHS, NOISE = (0.05, 1e3), (1e-8, 1.0)
+START_LENGTH, START_NOISE = 3.0, 1e-4
+
+
+@dataclass(eq=False)
+class Gp:
+    """Matern 5/2 kernel with a length for each feature; all outputs share it and the noise.
+
+    Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equations 2.25, 2.26, 4.17, 5.9. The
+    hyperparameters maximise the likelihood of at most `rows` rows, of the `strongest` outputs; every row is conditioned
+    on, up to `most`, beyond which a random subset stands for the data.
+
+    Parameters
+    ----------
+    rows, most
+        Cost grows with their cubes.
+    strongest
+        Outputs of largest variance that count in the likelihood, each in units of a variance of its own.
+    seed
+        Of the subsets.
+    """
+
+    rows: int = 600
+    most: int = 4000
+    strongest: int = 20
+    seed: int = 0
+
+    def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
+        """Learn from rows X (n, f), Y (n, r)."""
+        vars(self).pop("_factor", None)
+        order = np.random.default_rng(self.seed).permutation(len(X))[: self.most]
+        self.mean_, self.deviation_ = standardisation(X)
+        x = ((X - self.mean_) / self.deviation_)[order]
+        self.offset_ = Y.mean(axis=0)
+        y = (Y - self.offset_)[order]
+        spread = y[: self.rows].std(axis=0)
+        loudest = np.argsort(-spread, kind="stable")[: self.strongest]
+        loudest = loudest[spread[loudest] > 0.0]
+        start = np.log(np.append(np.full(X.shape[1], START_LENGTH), START_NOISE))
+        if len(loudest):
+            with one_thread():
+                fitted = minimize(
+                    negative_likelihood,
+                    start,
+                    args=(x[: self.rows], y[: self.rows, loudest] / spread[loudest]),
+                    jac=True,
+                    method="L-BFGS-B",
+                    bounds=[*[tuple(np.log(LENGTHS))] * X.shape[1], tuple(np.log(NOISE))],
+                    options={"maxiter": 100},
+                )
+            start = fitted.x
+        self.length_, self.noise_ = np.exp(start[:-1]), np.exp(start[-1])
+        self.seen_ = x / self.length_
+        self.dual_ = cho_solve(self._factor, y)
+        return self
+
+    def predict(self, X: np.ndarray) -> np.ndarray:
+        """Coefficients (B, r) float32 of features (B, f): the mean of the posterior."""
+        return (matern(self._distance(X)) @ self.dual_ + self.offset_).astype(np.float32)
+
+    def deviation(self, X: np.ndarray) -> np.ndarray:
+        """Standard deviation (B,) of the posterior, noise included, against that of the prior."""
+        near = matern(self._distance(X))
+        known = solve_triangular(self._factor[0], near.T, lower=True, check_finite=False)
+        return np.sqrt(np.maximum(1.0 - np.einsum("nb,nb->b", known, known), 0.0) + self.noise_)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Standardisation, lengths (f,), noise, the rows seen (n, f) in lengths, and their dual coefficients (n, r)."""
+        names = ("mean", "deviation", "offset", "length", "noise", "seen", "dual")
+        return {name: np.asarray(getattr(self, f"{name}_")) for name in names}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """From `state`."""
+        return filled(cls(), state)
+
+    def _distance(self, X: np.ndarray) -> np.ndarray:
+        return cdist((X - self.mean_) / (self.deviation_ * self.length_), self.seen_)
+
+    @cached_property
+    def _factor(self) -> tuple[np.ndarray, bool]:
+        """Cholesky factor of the covariance of the rows seen: not stored, it is made from them when it is asked for."""
+        covariance = matern(cdist(self.seen_, self.seen_))
+        covariance.flat[:: len(covariance) + 1] += self.noise_
+        return cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
+
+
+def matern(distance: np.ndarray) -> np.ndarray:
+    """(1 + s + s^2/3) exp(-s), s = sqrt(5) distance: equation 4.17."""
+    s = np.sqrt(5.0) * distance
+    return (1.0 + s + s * s / 3.0) * np.exp(-s)
+
+
+def negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
+    """Minus the log marginal likelihood of x (n, f), y (n, r), less a constant, and its gradient (f + 1,).
+
+    `log` (f + 1,) holds the logarithms of the lengths and of the noise. Each output's variance is the most likely one,
+    y^T K^-1 y / n, so that one K serves them all.
+    """
+    count, outputs = y.shape
+    u = x / np.exp(log[:-1])
+    distance = cdist(u, u)
+    covariance = matern(distance)
+    noise = np.exp(log[-1])
+    covariance.flat[:: count + 1] += noise
+    factor = cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
+    dual = cho_solve(factor, y, check_finite=False)
+    misfit = np.einsum("nr,nr->r", y, dual)
+    value = 0.5 * count * np.log(misfit / count).sum() + outputs * np.log(np.diagonal(factor[0])).sum()
+    # The derivative by K, of which every other is a trace with dK (equation 5.9).
+    slope = outputs * cho_solve(factor, np.eye(count), check_finite=False)
+    slope -= dual * (count / misfit) @ dual.T
+    s = np.sqrt(5.0) * distance
+    pull = slope * (5.0 / 3.0 * (1.0 + s) * np.exp(-s))  # dK / d log(length_j) = this x (u_ij - u_kj)^2
+    by_length = np.einsum("i,if->f", pull.sum(axis=1), u * u) - np.einsum("if,if->f", u, pull @ u)
+    return float(value), np.append(by_length, 0.5 * noise * np.trace(slope))

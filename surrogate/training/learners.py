@@ -1,0 +1,121 @@
+"""What each learner is made of: the summands of its response, fitted to displacements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from sim.errors import InputError
+from sim.loads import Pushed
+
+from ..data.cortex_patch import Patch
+from ..data.encode import ENCODERS, Basis, directions, reduce, tool_features
+from ..model.learned import Part
+from ..model.own_learners import find_own, name_of
+from ..regressors.ann import Ann
+from ..regressors.gp import Gp
+from ..regressors.pcr import Pcr
+from ..regressors.protocol import Fitted, Teachable
+from ..regressors.series_residual import Remainder
+from ..regressors.svr import Svr
+from .condense_contact import side_by_side
+from .shared_inputs import COARSE, EXPANDED, TOUCHED, Classroom, Expansion, Lesson
+from .tuning import Tuned
+
+# Settings to choose from, the usual ones first: units in a layer and weight decay; C and epsilon in quartile ranges.
+ANN = tuple(partial(Ann, hidden, decay) for hidden in (64, 128) for decay in (1e-2, 3e-3))
+SVR = tuple(partial(Svr, c, tube) for c in (1.0 / 1.349, 10.0, 100.0) for tube in (1.0 / 13.49, 1e-2, 3e-3, 1e-3))
+# Encoder and regressor of each but the table itself; principal components are those of the forces at the nodes.
+LEARNT: dict[str, tuple[str, Callable[[], Teachable]]] = {
+    "pcr": ("nodal", Pcr),
+    "ann": ("tool", partial(Tuned, ANN)),
+    "svr": ("tool", partial(Tuned, SVR)),
+    "gp": ("tool", Gp),
+    "residual": ("tool", partial(Tuned, ANN)),
+}
+# Those that poses teach: where the ball is stands for what it presses with.
+POSED = ("gp", "ann", "svr")
+
+
+def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
+    """The summands of one learner, taught with a lesson: for the tumour, and for the cortex beside it."""
+    known = room.expansion
+    if name in EXPANDED:
+        tumour, more = room.series
+        cortex = () if more is None else (*known.cortex_table, more)
+        if name == "series":
+            return (tumour, *cortex)
+        learnt = _taught(("tool", Remainder), (tumour,), tumour.basis, known.patch, lesson.loads, lesson.tumour)
+        if more is None:
+            return (tumour, learnt)
+        left = _taught(("tool", Remainder), cortex, more.basis, known.patch, lesson.loads, lesson.cortex)
+        return (tumour, learnt, *cortex, left)
+    if name == "linear":
+        return (room.table, *known.cortex_table)
+    if name in TOUCHED:
+        contact, left = _touched(known, lesson)
+        if name == "contact":
+            return (contact,)
+        return (contact, *(_taught(LEARNT["gp"], (), nodes, known.patch, lesson.loads, rest) for nodes, rest in left))
+    if known.data.ball is not None:
+        both = ((known.tumour, lesson.tumour), (known.cortex, lesson.cortex))
+        return tuple(
+            _taught(_learnt(name), (), nodes, known.patch, lesson.loads, truth) for nodes, truth in both if len(nodes)
+        )
+    before = (room.table,) if name == "residual" else ()
+    learnt = _taught(_learnt(name), before, known.tumour, known.patch, lesson.loads, lesson.tumour)
+    return (*before, learnt, *known.cortex_table)
+
+
+def _learnt(name: str) -> tuple[str, Callable[[], Teachable]]:
+    """Encoder and regressor of a learner, a user's own too."""
+    if name in LEARNT:
+        return LEARNT[name]
+    own = find_own(name)
+    assert own is not None, name  # who trains has looked
+    return own.encoder, own.regressor
+
+
+def _touched(known: Expansion, lesson: Lesson) -> tuple[Part, list[tuple[np.ndarray, np.ndarray]]]:
+    """The ball on tissue that stiffens as a lesson has it, and what that leaves of it: vertices, and (B, n, 3) [m]."""
+    contact, bases, _ = known.contact
+    features, size = tool_features(known.patch, lesson.loads), directions(lesson.loads)[0][:, None, None]
+    truth = [lesson.tumour, lesson.cortex][: len(bases)]
+    coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
+    alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
+    part = Part("tool", contact.taught(features, coefficients, alike), side_by_side(bases))
+    answered = np.split(size * part.response(features), [len(known.tumour)], axis=1)
+    return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
+
+
+def _taught(
+    kind: tuple[str, Callable[[], Teachable]],
+    before: tuple[Part, ...],
+    on: Basis | np.ndarray,
+    patch: Patch,
+    loads: Pushed,
+    truth: np.ndarray,
+) -> Part:
+    """A part for what those `before` leave of `truth` (B, n, 3) [m]: `on` a basis, or on vertices (n,)."""
+    response = truth / directions(loads)[0][:, None, None]
+    for part in before:
+        response = response - part.response(ENCODERS[part.encoder](patch, loads))
+    basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE)
+    encoder, make = kind
+    X, Y = ENCODERS[encoder](patch, loads), basis.encode(response)
+    regressor = make().fit(X, Y)
+    if name_of(type(regressor)) is not None:
+        _check_own(regressor, X, Y)
+    return Part(encoder, regressor, basis)
+
+
+def _check_own(regressor: Fitted, X: np.ndarray, Y: np.ndarray) -> None:
+    """Refuse a user's regressor that does not answer what it was taught with finite coefficients of its shape."""
+    found = np.asarray(regressor.predict(X))
+    if found.shape != Y.shape or not np.isfinite(found).all():
+        raise InputError(
+            f"the learner {name_of(type(regressor))} answers {X.shape[0]} loads with numbers of shape {found.shape}: "
+            f"let `predict` give {Y.shape}, all finite."
+        )

@@ -1,0 +1,335 @@
+"""What every learner of a data set is given: loads and answers, and what its finite elements say without learning."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import REFERENCE
+from sim.effects import pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Pushed
+from sim.material import tissue_from_json
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import read_as
+
+from ..data.cortex_patch import Patch, open_patch
+from ..data.dataset import Dataset
+from ..data.disc_split import Split
+from ..data.encode import ENCODERS, Basis, directions, reduce
+from ..data.tool_loads import spread
+from ..evaluation.solve_counts import Told
+from ..model.applicability import taught_skull
+from ..model.learned import Part, only_pushed
+from ..regressors.ball_contact import Contact
+from ..regressors.compliance_table import Linear
+from ..regressors.force_series import SPANS, TERMS, Series
+from ..regressors.left_out_tables import filled
+from .condense_contact import condensed, side_by_side
+from .tabulate_series import radii_between, tabulated, with_middles
+
+# Share of the responses that a learner's basis may lose, and its most modes; the same of the tables, and of the series.
+COARSE = (1e-3, 60)
+TABLE_TOLERANCE = 1e-4
+FINE = (2e-4, 64)
+# The same of the bases that series are tabulated in, made of what is had at so many places far from each other.
+WIDE, FEW = (1e-5, 192), 40
+# Learners that ask the finite elements how linear tissue gives; the second learns what that leaves.
+TOUCHED = ("contact", "contact-gp")
+# Those that ask the finite elements for their series, of which the second learns what it leaves.
+EXPANDED = ("series", "series-gp")
+# Components of motion that are read at once there: bounds the memory that it takes.
+STRIP = 1536
+
+
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """Loads and what they did to the tumour and to the rest of the open cortex.
+
+    Parameters
+    ----------
+    loads
+        B pushes.
+    tumour, cortex
+        Displacements (B, n, 3) [m].
+    """
+
+    loads: Pushed
+    tumour: np.ndarray
+    cortex: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """What a data set's finite elements say without learning: compliance, power series, contact; made when asked for.
+
+    Answers to the data's loads tell nothing of it. The series is tabulated in wide bases, of what it is itself at a few
+    places, so that a table grows neither with the tumour nor with the cortex.
+
+    Parameters
+    ----------
+    data
+        Its anatomy, tissue and element; its loads say how wide tools are.
+    device
+        Where the finite elements work.
+    progress
+        Hears which place is done, and of how many.
+    kept
+        Where the series' table is read from, and written to where there is none: of these data, as the caller knows.
+    """
+
+    data: Dataset
+    device: str = "auto"
+    progress: Callable[[int, int], object] = lambda done, total: None
+    kept: Path | None = None
+
+    @cached_property
+    def patch(self) -> Patch:
+        """The open cortex."""
+        return open_patch(self.data.anatomy)
+
+    @cached_property
+    def tumour(self) -> np.ndarray:
+        """Vertices of the tumour."""
+        return self.data.anatomy.tumour_nodes
+
+    @cached_property
+    def cortex(self) -> np.ndarray:
+        """Vertices of the open cortex beside the tumour's."""
+        return np.setdiff1d(self.patch.nodes, self.tumour)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Where the series is tabulated (P, 3) [m]: nodes of the open cortex, and middles of its edges."""
+        return with_middles(self.patch)[1]
+
+    @cached_property
+    def table(self) -> Part:
+        """The tumour's compliance."""
+        return self.compliance(self.tumour)
+
+    @cached_property
+    def cortex_table(self) -> tuple[Part, ...]:
+        """The cortex's compliance, if there is more than the tumour."""
+        return (self.compliance(self.cortex),) if len(self.cortex) else ()
+
+    def bases(self, lesson: Lesson, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
+        """What a lesson's loads do to the tumour, and to the cortex, if there is more, beyond its compliance.
+
+        `tumour` and `cortex` are what may be left of it, as a share, and the most modes.
+        """
+        size = directions(lesson.loads)[0][:, None, None]
+        at_tumour = reduce(self.tumour, lesson.tumour / size, *tumour)
+        if not len(self.cortex):
+            return [at_tumour]
+        # A dent as small as its tool is no sum of a few modes, but what nonlinearity adds to it is.
+        linear = sum(part.response(ENCODERS[part.encoder](self.patch, lesson.loads)) for part in self.cortex_table)
+        return [at_tumour, reduce(self.cortex, lesson.cortex / size - linear, *cortex)]
+
+    def on(self, bases: list[Basis], left_out: np.ndarray) -> list[Series]:
+        """The series as coefficients of the `bases` of a lesson, without some places (P,) bool.
+
+        Raises
+        ------
+        InputError
+            Data that do not say what tissue they are of.
+        """
+        triangles = with_middles(self.patch)[0]
+        found = []
+        for table, wide, basis in zip(self.tabulated.tables, self.tabulated.bases, bases, strict=True):
+            known = filled(self.places, table @ (wide.modes @ basis.modes.T), left_out)
+            exact = Series(self.patch.points, triangles, self.radii, known)
+            found.append(Series.restored(exact.state()))  # what is used is what can be stored
+        return found
+
+    @cached_property
+    def contact(self) -> tuple[Contact, list[Basis], float]:
+        """The ball on linear tissue, the bases of tumour and cortex whose coefficients it answers with, and seconds.
+
+        Raises
+        ------
+        InputError
+            Data that do not say what tissue they are of.
+        """
+        begun = time.perf_counter()
+        contact, bases = condensed(self._fem(), self._known)
+        return contact, bases, time.perf_counter() - begun
+
+    def compliance(self, nodes: np.ndarray, left_out: np.ndarray | None = None) -> Part:
+        """The compliance table of some vertices, from the unit responses, in as many modes as it needs.
+
+        Those of nodes of the open cortex that are `left_out` (m,) bool are interpolated from the others'.
+        """
+        response = self.data.unit_response(nodes)
+        if left_out is not None:
+            by_node = response.reshape(len(left_out), 3, len(nodes), 3)
+            response = filled(self.patch.points, by_node, left_out).reshape(response.shape)
+        basis = reduce(nodes, response, TABLE_TOLERANCE, len(response))
+        return Part("nodal", Linear().fit(np.eye(len(response)), basis.encode(response)), basis)
+
+    @cached_property
+    def tabulated(self) -> Tabulated:
+        """The series at every place.
+
+        Raises
+        ------
+        InputError
+            Data that do not say what tissue they are of.
+        """
+        if self.kept is not None and self.kept.exists():
+            with (
+                read_as(self.kept, "a table of the series", "Delete it: it is made anew."),
+                self.kept.open("rb") as raw,
+                np.load(raw) as file,
+            ):
+                bases = [Basis(nodes, file[f"modes{k}"]) for k, nodes in enumerate(self._known)]
+                return Tabulated(bases, file["table"], float(file["seconds"]))
+        begun = time.perf_counter()
+        bases, table = self._tabulate(self._fem())
+        found = Tabulated(bases, table, time.perf_counter() - begun)
+        if self.kept is not None:
+            modes = {f"modes{k}": basis.modes for k, basis in enumerate(bases)}
+            with written_whole(self.kept, ".npz") as partial:
+                np.savez(partial, table=table, seconds=np.array(found.seconds), **modes)  # pyright: ignore[reportArgumentType]
+        return found
+
+    def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray]:
+        """Every motion at a few places, the bases that these span, and what is at all places as their coefficients."""
+        count = len(self.places)
+        few = np.sort(spread(self.places, FEW))
+        every, motions = np.concatenate(self._known), []
+        for first in range(0, 3 * len(every), STRIP):
+            components = np.eye(3 * len(every))[first : first + STRIP].reshape(-1, len(every), 3)
+            reading = fem.reading(every, components)
+            motions.append(tabulated(fem, self.places[few], self.radii, reading, lambda n, _: self.progress(n, count)))
+        cuts = 3 * np.cumsum([len(nodes) for nodes in self._known])[:-1]
+        parts = np.split(np.concatenate(motions, axis=-1), cuts, axis=-1)
+        # The cortex's first order is in its compliance.
+        orders = (SPANS, SPANS[1:])
+        bases = [_spanned(*each) for each in zip(self._known, parts, orders, strict=False)]
+        whole = side_by_side(bases)
+        reading = fem.reading(whole.nodes, whole.modes.reshape(len(whole.modes), -1, 3))
+        table = np.empty((count, *parts[0].shape[1:3], reading.count), np.float32)
+        others = np.setdiff1d(np.arange(count), few)
+        table[few] = np.concatenate([part @ basis.modes.T for part, basis in zip(parts, bases, strict=True)], axis=-1)
+        if len(others):
+            table[others] = tabulated(
+                fem, self.places[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count)
+            )
+        return bases, table
+
+    @cached_property
+    def _known(self) -> list[np.ndarray]:
+        """Vertices of the tumour, and of the cortex, if there is more."""
+        return [nodes for nodes in (self.tumour, self.cortex) if len(nodes)]
+
+    @cached_property
+    def radii(self) -> np.ndarray:
+        """At which the series is tabulated (R,) [m]: from the narrowest tool of the data to the widest."""
+        footprint = only_pushed(self.data.loads).footprint
+        return radii_between(float(footprint.min()), float(footprint.max()))
+
+    def _fem(self) -> Fem:
+        said = self.data.provenance
+        if "tissue" not in said:
+            raise InputError(
+                f"{self.data.path}: does not say what tissue it is of, so no series or contact can be had of it: "
+                "choose other learners, or simulate anew."
+            )
+        effects = pushed_effects(self.data.anatomy, tissue_from_json(said["tissue"]), taught_skull(said))
+        return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=said.get("element"))
+
+
+@dataclass(frozen=True, eq=False)
+class Tabulated:
+    """A table of the series: bases of tumour and cortex, what all places have of both, and the seconds it took.
+
+    Parameters
+    ----------
+    bases
+        One, or two.
+    table
+        (P, R, 19, r) float32: coefficients of the bases' modes, one after the other.
+    seconds
+        [s].
+    """
+
+    bases: list[Basis]
+    table: np.ndarray
+    seconds: float
+
+    @property
+    def tables(self) -> list[np.ndarray]:
+        """The part of each basis."""
+        return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Classroom:
+    """What every learner of a data set is given, made when it is asked for.
+
+    What finite elements say of the tumour under forces inside the discs left out is not among it. Of the cortex beside
+    the tumour they say all: a dent is no sum of dents elsewhere; and so they do of contact, which is made of it.
+
+    Parameters
+    ----------
+    basis_from
+        The lesson whose responses the series' bases span.
+    expansion
+        Of the same data.
+    split
+        What was left out, if anything.
+    """
+
+    basis_from: Lesson
+    expansion: Expansion
+    split: Split | None = None
+
+    @cached_property
+    def series(self) -> tuple[Part, Part | None]:
+        """The finite elements' series at the tumour, and at the cortex what it adds to the compliance there."""
+        bases = self.expansion.bases(self.basis_from, FINE, COARSE)
+        found = self.expansion.on(bases, self._left_out(self.expansion.places))
+        at_cortex = Part("tool", found[1].from_second_order(), bases[1]) if len(bases) > 1 else None
+        return Part("tool", found[0], bases[0]), at_cortex
+
+    @cached_property
+    def table(self) -> Part:
+        """The tumour's compliance."""
+        left_out = self._left_out(self.expansion.patch.points)
+        return self.expansion.compliance(self.expansion.tumour, left_out) if left_out.any() else self.expansion.table
+
+    def told(self, name: str, lesson: Lesson) -> Told:
+        """The solves that a learner of `LEARNERS` or `OF_POSES` is told, a user's own too."""
+        known, data, loads = self.expansion, self.expansion.data, len(lesson.loads.point)
+        units = series = inside = 0
+        seconds = [data.seconds("load", loads)]
+        if data.ball is None and (len(known.cortex) or name in ("linear", "residual")):
+            units = len(data.unit_good)
+            seconds.append(data.seconds("unit response", units))
+        if name in TOUCHED:
+            contact, _, took = known.contact
+            units, inside = contact.points.size, 3 * int(self._left_out(contact.points).sum())
+            seconds.append(took)
+        if name in EXPANDED:
+            places = int((~self._left_out(known.places)).sum())
+            series = places * len(known.radii) * TERMS
+            seconds.append(known.tabulated.seconds * places / len(known.places))
+        total = None if None in seconds else float(sum(filter(None, seconds)))
+        return Told(loads, units, series, inside, total)
+
+    def _left_out(self, points: np.ndarray) -> np.ndarray:
+        return np.zeros(len(points), bool) if self.split is None else self.split.covers(points)
+
+
+def _spanned(nodes: np.ndarray, motions: np.ndarray, orders: Sequence[slice]) -> Basis:
+    """The wide basis of motions (F, R, 19, 3 n) of vertices (n,): of some of the orders, which count alike."""
+    rows = [motions[:, :, order].reshape(-1, len(nodes), 3) for order in orders]
+    tiny = np.finfo(np.float32).tiny
+    return reduce(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *WIDE)

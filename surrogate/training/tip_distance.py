@@ -1,0 +1,82 @@
+"""Teaching models the distance from tip to tumour: a correction, kept where it helps, and a calibrated bound."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim.bodies.tip_distance import TipGauge
+from sim.loads import Loads
+
+from ..data.cortex_patch import Patch
+from ..data.encode import directions
+from ..model.conformal import fitted_bound
+from ..model.learned import Learned
+from ..model.tip_distance import MOST, TipModel, fitted_correction
+
+# Calibration loads of a class of force. A tip snaps through with the cortex, so that the tail of its errors grows with
+# the force: classes are as small as 99 in 100 allows.
+CLASS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Loads, and the finite elements' distances (B,) [m] from tip to tumour under them."""
+
+    loads: Loads
+    distance: np.ndarray
+
+    def rows(self, index: np.ndarray | slice) -> Measured:
+        """Some of them: numbers, a slice, or (B,) bool."""
+        return Measured(self.loads.rows(index), self.distance[index])
+
+
+def measured_distances(
+    gauge: TipGauge, loads: Loads, displacement: np.ndarray, nodes: np.ndarray, ball: float | None
+) -> Measured:
+    """Measure what the finite elements answered loads with: displacement (B, n, 3) [m] of vertices (n,)."""
+    return Measured(loads, gauge.distances(loads, displacement, nodes, ball))
+
+
+def distance_errors(model: Learned, known: Measured) -> np.ndarray:
+    """How far (B,) [m] a model's distances are from the finite elements'."""
+    return np.abs(model.distance(known.loads).value - known.distance)
+
+
+def with_correction(model: Learned, patch: Patch, known: Measured) -> Learned:
+    """The model, taught how far off its distances are under the loads that it was taught, or under some of them."""
+    plain, some = replace(model, tip=TipModel()), known.rows(slice(None, None, -(-len(known.loads) // MOST)))
+    off = some.distance - plain.distance(some.loads).value
+    return replace(model, tip=TipModel(fitted_correction(patch, model.asked(some.loads), off)))
+
+
+def corrected_if_better(
+    model: Learned, patch: Patch, taught: Measured, held_out: Measured
+) -> tuple[Learned, np.ndarray]:
+    """The model with a correction, if that brings held-out distances nearer on average; and their errors (B,) [m]."""
+    candidates = [replace(model, tip=TipModel()), with_correction(model, patch, taught)]
+    error = [distance_errors(each, held_out) for each in candidates]
+    best = int(error[1].mean() < error[0].mean())
+    return candidates[best], error[best]
+
+
+def calibrated_distance(
+    model: Learned, seen: tuple[np.ndarray, np.ndarray], features: np.ndarray, known: Measured
+) -> Learned:
+    """The model with a bound of its distance, whose scale follows what was `seen`, calibrated on other loads.
+
+    The logarithm of its scale is linear in the load: a tip snaps through with the cortex here and there.
+
+    Parameters
+    ----------
+    seen
+        Features (m, f) and errors (m,) [m] of loads that the model was not taught.
+    features, known
+        (B, f), and what the finite elements say, of the calibration loads.
+    """
+    assert model.tip is not None
+    force = directions(model.asked(known.loads))[0]
+    error = distance_errors(model, known)[:, None]
+    bound = fitted_bound(seen, features, force, error, CLASS, curved=False)
+    return replace(model, tip=replace(model.tip, bound=bound))

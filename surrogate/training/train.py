@@ -1,0 +1,291 @@
+"""From a data set to models, their scores, and what they promise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim.bodies.tip_distance import tip_gauge
+from sim.errors import InputError
+from sim.loads import Loads, Pushed
+from sim.runtime.timing import stage
+
+from ..data.cortex_patch import Patch
+from ..data.dataset import Dataset
+from ..data.disc_split import APART, MOST_APART, Split, leave_discs_out
+from ..data.encode import directions
+from ..data.indentation import indented
+from ..evaluation.coverage import TENTHS, Coverage, coverage, distance_coverage
+from ..evaluation.score import Score, errors, score
+from ..model.conformal import CLASS, LEVELS, conformal, features_of, fitted_bound
+from ..model.learned import Learned, only_pushed
+from ..model.own_learners import OWN, find_own
+from ..model.training_range import Envelope, envelope_of, measured
+from .learners import LEARNT, POSED, parts_of
+from .shared_inputs import EXPANDED, TOUCHED, Classroom, Expansion, Lesson
+from .tip_distance import (
+    Measured,
+    calibrated_distance,
+    corrected_if_better,
+    distance_errors,
+    measured_distances,
+    with_correction,
+)
+
+# Of pushes, and of poses.
+LEARNERS = ("linear", *LEARNT, *EXPANDED)
+OF_POSES = (*TOUCHED, *POSED)
+# Fewer could not promise 95 in 100. So many tell the bounds' scale too, by one in three: they are drawn as what is
+# promised. Of fewer, the errors on the discs tell it.
+FEWEST_APART, ENOUGH_APART, SCALE = 19, 3 * CLASS, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """Models by learner, how they scored on the discs left out, and what those were.
+
+    `motion` is the mean displacement [m] of the tumour over the held-out loads, `calibrated` the number of loads by
+    which the models' bounds were calibrated, `taught` that of those which the models were taught. `left_out` says by
+    learner how often bounds held on the discs left out, where nothing is promised: those of the scored model,
+    of which loads outside the discs tell all, one in three the scale and the others how much of it.
+    `distance_left_out` says the same of the distance from tip to tumour.
+    """
+
+    models: dict[str, Learned]
+    scores: tuple[Score, ...]
+    split: Split
+    motion: float
+    calibrated: int
+    taught: int
+    left_out: dict[str, Coverage]
+    distance_left_out: dict[str, Coverage]
+
+
+def learners_for(data: Dataset) -> tuple[str, ...]:
+    """All that a data set can teach: series and contact need finite elements, of a tissue that the data names."""
+    told = "tissue" in data.provenance
+    kinds = LEARNERS if data.ball is None else OF_POSES
+    return tuple(name for name in kinds if told or name not in (*EXPANDED, *TOUCHED))
+
+
+def check_learners(names: Sequence[str], of_poses: bool, where: str) -> None:
+    """Refuse learners that data of pushes, or of poses, cannot teach. `where` names the data in the sentence.
+
+    Raises
+    ------
+    InputError
+        No name, an unknown one, or one of the other kind of data.
+    """
+    kinds, others, held = (OF_POSES, LEARNERS, "poses") if of_poses else (LEARNERS, OF_POSES, "pushes")
+    unknown = [name for name in names if name not in (*kinds, *others) and find_own(name) is None]
+    if unknown or not names:
+        allowed = ", ".join((*kinds, *OWN))
+        raise InputError(
+            f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {allowed}; "
+            "a file with one of your own is named by --plugin."
+        )
+    strange = [name for name in names if name in others and name not in kinds]
+    if strange:
+        raise InputError(
+            f"{where}: holds {held}, of which {', '.join(strange)} cannot be had: choose from {', '.join(kinds)}."
+        )
+
+
+def train(
+    data: Dataset,
+    learners: Sequence[str] | None = None,
+    progress: Callable[[str], object] = lambda learner: None,
+    split: Split | None = None,
+    most: int | None = None,
+    expansion: Expansion | None = None,
+) -> Trained:
+    """Fit `learners`, by default all that the data can teach: first to be scored, then to be used.
+
+    Scored is what was taught outside discs of the cortex, on the loads inside them. What is returned was taught all
+    those loads, and its bounds were calibrated on others, which no fit has seen. Another `split`, with a row for each
+    load that converged, calibrates nothing and returns what was taught by it.
+
+    Every model knows the tumour and the open cortex; the cortex is not scored, and the compliance table's where the
+    learner is not one of `EXPANDED`. Cases that did not converge are left aside.
+
+    Parameters
+    ----------
+    progress
+        Hears the name of each learner that is done.
+    most
+        Loads that are taught, at most; those that calibrate or test are not counted.
+    expansion
+        The series of these data, by default made anew wherever there is a device: minutes on a CPU, so that whoever
+        trains on them again hands it on.
+
+    Raises
+    ------
+    InputError
+        Unknown learners, or such as loads of the data's kind do not teach, nothing to teach, data with other causes
+        than `Pushed` or the `Touching` of a ball, an anatomy without tumour, too few loads, or unit responses that did
+        not converge.
+    """
+    wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
+    check_learners(wanted, of_poses=data.ball is not None, where=str(data.path))
+    if most is not None and most < 1:
+        raise InputError(f"{most} loads teach nothing: give at least 1.")
+    if not data.unit_good.all():
+        raise InputError(
+            f"{data.path}: {int((~data.unit_good).sum())} unit responses did not converge, so there is no compliance "
+            "table: simulate anew with a looser --tolerance."
+        )
+    loads = data.loads.rows(np.flatnonzero(data.good))
+    shared = expansion or Expansion(data)
+    patch, nodes = shared.patch, shared.tumour
+    pushed = _asked(data, loads, patch)
+    if not len(nodes):
+        raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
+    apart = np.zeros(len(loads), bool)
+    if split is None:
+        apart[len(loads) - min(len(loads) // APART, MOST_APART) :] = True
+        split = _without(leave_discs_out(pushed.point[~apart], patch), apart)
+    with stage("read"):
+        truth = data.displacement(nodes)[data.good]
+        cortex = data.displacement(shared.cortex)[data.good]
+        at = np.concatenate([nodes, shared.cortex])
+        both = np.concatenate([truth, cortex], axis=1)
+        told = measured_distances(tip_gauge(data.anatomy), loads, both, at, data.ball)
+
+    def lesson(rows: np.ndarray) -> Lesson:
+        return Lesson(_rows(pushed, rows), truth[rows], cortex[rows])
+
+    chosen = [_first(split.taught, most), *([_first(~apart, most)] if apart.any() else [])]
+    lessons = [lesson(rows) for rows in chosen]
+    rooms = [Classroom(each, shared, left) for each, left in zip(lessons, (split, None), strict=False)]
+    test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
+    tested, left = (_rows(pushed, rows) for rows in (split.test, apart))
+    beside = np.zeros(0, int)
+    envelopes = [envelope_of(patch, lessons[0].loads)]
+    if apart.any():
+        beside = np.flatnonzero(~split.covers(left.point))
+        envelopes.append(envelope_of(patch, lessons[1].loads))
+    models, scores, left_out, distance_left_out = {}, [], {}, {}
+    for name in wanted:
+        with stage(f"learn {name}"):
+            model = Learned(
+                data.anatomy,
+                parts_of(name, rooms[0], lessons[0]),
+                envelopes[0],
+                training={"learner": name, **data.provenance},
+                ball=data.ball,
+            )
+        with stage("score"):
+            solves = rooms[0].told(name, lessons[0])
+            scores.append(score(name, model, test, truth[split.test], nodes, solves))
+            held_out = errors(model, test, truth[split.test], nodes).max(axis=1)
+            model, off = corrected_if_better(model, patch, told.rows(chosen[0]), told.rows(split.test))
+        features = _features(patch, tested, envelopes[0])
+        seen, seen_distance = (features, held_out), (features, off)
+        models[name] = replace(model, bound=min(conformal(held_out, LEVELS[0]), float(held_out.max())))
+        if len(beside) >= 2 * FEWEST_APART and len(test) >= TENTHS:
+            with stage("calibrate"):
+                known = fresh.rows(beside), truth[apart][beside]
+                left_out[name] = coverage(_bounded(model, patch, *known, nodes), test, truth[split.test])
+                bounded = _distance_bounded(model, patch, told.rows(apart).rows(beside))
+                distance_left_out[name] = distance_coverage(bounded, test, told.distance[split.test])
+        if apart.any():
+            with stage(f"learn {name}"):
+                parts = parts_of(name, rooms[1], lessons[1])
+                models[name] = replace(models[name], parts=parts, envelope=envelopes[1])
+                if model.tip is not None and model.tip.correction is not None:
+                    models[name] = with_correction(models[name], patch, told.rows(chosen[1]))
+        if apart.sum() >= ENOUGH_APART:
+            with stage("calibrate"):
+                models[name] = _bounded(models[name], patch, fresh, truth[apart], nodes)
+                models[name] = _distance_bounded(models[name], patch, told.rows(apart))
+        elif apart.sum() >= FEWEST_APART:
+            with stage("calibrate"):
+                models[name] = _calibrated(models[name], patch, seen, fresh, truth[apart], nodes)
+                features = _features(patch, left, models[name].envelope)
+                models[name] = calibrated_distance(models[name], seen_distance, features, told.rows(apart))
+        progress(name)
+    motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
+    return Trained(
+        models,
+        tuple(scores),
+        split,
+        motion,
+        int(apart.sum()),
+        len(lessons[-1].loads.point),
+        left_out,
+        distance_left_out,
+    )
+
+
+def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> Learned:
+    """With bounds that nothing but these loads tell: some tell the scale, the others how much of it."""
+    scale, share = _scale_and_share(len(loads))
+    known = loads.rows(scale)
+    error = errors(model, known, truth[scale], nodes).max(axis=1)
+    seen = _features(patch, model.asked(known), model.envelope), error
+    return _calibrated(model, patch, seen, loads.rows(share), truth[share], nodes)
+
+
+def _distance_bounded(model: Learned, patch: Patch, known: Measured) -> Learned:
+    """The same of the distance from tip to tumour."""
+    scale, share = (known.rows(rows) for rows in _scale_and_share(len(known.loads)))
+    features = [_features(patch, model.asked(some.loads), model.envelope) for some in (scale, share)]
+    return calibrated_distance(model, (features[0], distance_errors(model, scale)), features[1], share)
+
+
+def _scale_and_share(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which of `count` loads tell the bounds' scale, one in `SCALE`, and which how much of it."""
+    tells = np.arange(count) % SCALE == 0
+    return np.flatnonzero(tells), np.flatnonzero(~tells)
+
+
+def _calibrated(
+    model: Learned,
+    patch: Patch,
+    seen: tuple[np.ndarray, np.ndarray],
+    loads: Loads,
+    truth: np.ndarray,
+    nodes: np.ndarray,
+) -> Learned:
+    """With bounds whose scale follows what was `seen` (features and errors), calibrated on other loads."""
+    pushed = model.asked(loads)
+    error = errors(model, loads, truth, nodes)
+    features = _features(patch, pushed, model.envelope)
+    return replace(model, bounds=fitted_bound(seen, features, directions(pushed)[0], error))
+
+
+def _features(patch: Patch, pushed: Pushed, envelope: Envelope) -> np.ndarray:
+    """What a model's bounds are told of loads (B, 7), as `Learned.deform` tells them."""
+    known = measured(patch, pushed)
+    return features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *envelope.force)))
+
+
+def _first(rows: np.ndarray, most: int | None) -> np.ndarray:
+    """The first `most` of the chosen rows (B,) bool."""
+    return rows if most is None else rows & (np.cumsum(rows) <= most)
+
+
+def _without(split: Split, apart: np.ndarray) -> Split:
+    """A split of the rows that are not `apart` (B,), as one of all rows."""
+    disc = np.full(len(apart), -2)
+    disc[~apart] = split.disc
+    return replace(split, disc=disc)
+
+
+def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
+    """What loads of a data set ask of a model, as `Learned.asked` has it."""
+    if data.ball is not None:
+        return indented(loads, data.ball, patch)
+    if loads.only(Pushed) is None:
+        raise InputError(
+            "the data holds other loads than `Pushed`, which the learners do not take: simulate pushes, or one ball's "
+            "poses."
+        )
+    return only_pushed(loads)
+
+
+def _rows(pushed: Pushed, rows: np.ndarray) -> Pushed:
+    """Those of the chosen rows (B,) bool."""
+    return Pushed(pushed.point[rows], pushed.force[rows], pushed.footprint[rows])
