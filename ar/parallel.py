@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import warp as wp
 
-# Pictures are never differentiated, and start-up notes would stand among a command's own lines.
-wp.config.enable_backward = False
-wp.config.log_level = wp.LOG_ERROR
+forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
+"""`wp.kernel` without adjoint, launched as wide as the work: pictures are not differentiated here."""
 
 
 def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str) -> None:

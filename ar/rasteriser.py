@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from .camera import Camera
-from .parallel import in_bands, launch_in_bands, run_length
+from .parallel import forward_kernel, in_bands, launch_in_bands, run_length
 
 NOTHING = np.uint64(0xFFFFFFFFFFFFFFFF)
 
@@ -218,7 +218,7 @@ def draw_triangle(
                         wp.atomic_min(nearest, row, column, (bits << wp.uint64(32)) | wp.uint64(face))
 
 
-@wp.kernel
+@forward_kernel
 def keep_nearest(
     q: wp.array(dtype=wp.vec3d),
     triangles: wp.array(dtype=wp.vec3i),
@@ -235,7 +235,7 @@ def keep_nearest(
         draw_triangle(face, q, triangles, near, begin, end, nearest)
 
 
-@wp.kernel
+@forward_kernel
 def read_nearest(
     begin: wp.int32,
     end: wp.int32,

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from .camera import Camera
+from .parallel import forward_kernel
 from .rasteriser import Fragments, checked_mesh
 
 
@@ -30,7 +31,7 @@ def raycast(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: f
         return Fragments(face.numpy(), weights.numpy(), depth.numpy())
 
 
-@wp.kernel
+@forward_kernel
 def cast_rays(
     mesh: wp.uint64,
     rays: wp.array2d(dtype=wp.vec3f),

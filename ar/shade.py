@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from .parallel import forward_kernel
+
 # A caster must be this much nearer to the lamp [m] than what it shades.
 BIAS = wp.constant(0.0002)
 # Half the width of the shadow's soft rim [shadow-map pixel].
@@ -119,7 +121,7 @@ def tone(x: wp.float32, curve: wp.array(dtype=wp.uint8)) -> wp.uint8:
     return curve[wp.int32(wp.min(x * (1.0 / BRIGHTEST), 1.0) * wp.float32(curve.shape[0] - 1))]
 
 
-@wp.kernel
+@forward_kernel
 def shade(
     begin: wp.int32,
     end: wp.int32,

@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from surrogate.model.own_learners import learner
+from surrogate import learner
 from surrogate.regressors.protocol import standardisation
 
 NEIGHBOURS = 8

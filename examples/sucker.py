@@ -12,10 +12,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from scenes.script.scene import Scene
-from scenes.script.tool_paths import lay
-from sim.effects import Bonded, Elasticity, Held, ToolContact
-from sim.tools import Core
+from scenes import Scene, lay
+from sim import Bonded, Core, Elasticity, Held, ToolContact
 
 MM = 1e-3
 

@@ -12,9 +12,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from sim.discretisation.body import Body
-from sim.discretisation.term import Cases
-from sim.errors import InputError
+from sim import Body, Cases, InputError
 from sim.runtime.columns import gathered
 from sim.runtime.device import Device
 
@@ -144,7 +142,7 @@ def kernels_of(device: Device) -> Kernels:
 
 
 class VeinsTerm:
-    """A `sim.discretisation.term.Term`: it resists, does not depend on the loads, and remembers nothing."""
+    """A `sim.Term`: it resists, does not depend on the loads, and remembers nothing."""
 
     name = "veins"
     constant, passive, steep = False, True, False

@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from sim import Law
 from sim.terms.laws.invariants import cofactor_excess, exp_less_one, green_strain, log_one_plus, volume_change
-from sim.terms.laws.law import Law
 
 
 @wp.func

@@ -1,1 +1,5 @@
 """What tissue does: meshes, laws, loads, and the finite elements that answer them."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -150,14 +150,14 @@ def compile_problem(
             case ToolDisplacement():
                 pass  # a constraint: `_impose` reads the loads
             case Resection():
-                raise InputError("Resection changes the body: make its solver with `operated.finite_elements`.")
+                raise InputError("Resection changes the body: make its solver with `sim.finite_elements`.")
             case OwnEffect():
                 own.append(effect.term(Body(anatomy, space, skin, device)))
             case _:
                 allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
                 raise InputError(
                     f"no effect is called {type(effect).__name__}: choose from {allowed}; "
-                    "or let your own have cause, remembers and term, as sim.effects.OwnEffect does."
+                    "or let your own have cause, remembers and term, as sim.OwnEffect does."
                 )
     check_held(anatomy.mesh, held, normal)
     _check_names((*terms, *barriers), own)
@@ -173,9 +173,7 @@ def _check_names(terms: Iterable[Term], own: Iterable[Term]) -> None:
     taken = {term.name for term in terms}
     for term in own:
         if not isinstance(term, Term):
-            raise InputError(
-                f"an effect of your own made a {type(term).__name__}: let it make a sim.discretisation.term.Term."
-            )
+            raise InputError(f"an effect of your own made a {type(term).__name__}: let it make a sim.Term.")
         if term.name in taken:
             raise InputError(f"two terms are called {term.name!r}: give yours another name.")
         taken.add(term.name)

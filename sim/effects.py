@@ -153,7 +153,7 @@ class Resection:
     """Tissue is taken away, step after step; `Resected` loads say how many steps are done, without them all are.
 
     The wall of the cavity is free surface. What a step loosens (a piece joined by no face to anything held) goes with
-    it. `operated.finite_elements` makes what solves it.
+    it. `sim.finite_elements` makes what solves it.
 
     What is left remembers what it went through. Left out: the stress that the scan's own equilibrium holds, so that
     without another load nothing moves.

@@ -230,7 +230,7 @@ class Fem:
     def corrected(
         self, loads: Loads, answer: Deformation, at: np.ndarray
     ) -> tuple[Deformation, np.ndarray, np.ndarray]:
-        """One step towards equilibrium from somebody's answers at every vertex, as `correction.step_from`.
+        """One step towards equilibrium from somebody's answers at every vertex, as `newton_correction.step_from`.
 
         The answers after it, at every vertex; the relative residual (B,) before it; and what is still missing
         (B, n, 3) [m] at vertices `at` (n,), as the rest stiffness has it.

@@ -319,7 +319,7 @@ def _checked(cause: Cause) -> Cause:
     if not isinstance(cause, BuiltIn) and not (is_dataclass(cause) and hasattr(cause, "magnitude")):
         allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
         raise InputError(
-            f"{name} is no cause: choose from {allowed}; or make your own as sim.loads.OwnCause says, with a magnitude."
+            f"{name} is no cause: choose from {allowed}; or make your own as sim.OwnCause says, with a magnitude."
         )
     arrays = {key: numbers(f"{name}.{key}", value) for key, value in vars(cause).items()}
     whole_field = isinstance(cause, Nodal | Prescribed)

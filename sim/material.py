@@ -166,7 +166,7 @@ def _built_in(law: str) -> Law:
 class Tissue(Protocol):
     """What a region may be made of: `Material`, `Ogden`, or a law of your own as a frozen dataclass.
 
-    `conformance.check_tissue` holds one to what the solver asks of it.
+    `sim.check_tissue` holds one to what the solver asks of it.
     """
 
     @property
@@ -215,7 +215,7 @@ def check_described(tissue: object) -> None:
     if missing:
         raise InputError(
             f"{type(tissue).__name__} is no tissue: it has no {', '.join(missing)}. "
-            "Give a Material, an Ogden, or what `sim.material.Tissue` asks for."
+            "Give a Material, an Ogden, or what `sim.Tissue` asks for."
         )
 
 

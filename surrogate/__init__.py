@@ -1,1 +1,5 @@
 """What was learnt about tissue: data sets, regressors, and deformers made of them."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

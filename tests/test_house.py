@@ -68,7 +68,12 @@ JOBS = {
     "numpy": {"sim/loads.py", "sim/deformation.py", "ar/camera.py", "surrogate/data/dataset.py"},  # the borders
 }
 """Libraries with several jobs: these files, at least, must import them."""
-IMPORT_NAMES = {"opencv-python-headless": "cv2", "scikit-learn": "sklearn", "warp-lang": "warp"}
+IMPORT_NAMES = {
+    "opencv-python-headless": "cv2",
+    "scikit-learn": "sklearn",
+    "lazy-loader": "lazy_loader",
+    "warp-lang": "warp",
+}
 FILES = sorted(path for room in ROOMS for path in (HOUSE / room).rglob("*.py"))
 
 
@@ -267,6 +272,14 @@ def test_no_path_of_one_machine():
         assert not machine.search(path.read_text()), name_of(path)
 
 
+def test_files_that_are_named_are_there():
+    """In documents and docstrings; a name in a folder that was just named stands alone."""
+    named = re.compile(r"(?<![\w/.-])(?:sim|surrogate|ar|scenes|tests|examples|benchmarks)/[\w/]+\.py\b")
+    for path in [*FILES, *HOUSE.glob("*.md"), *(HOUSE / "docs").glob("*.md")]:
+        missing = [name for name in named.findall(path.read_text()) if not (HOUSE / name).exists()]
+        assert not missing, f"{name_of(path)} names {missing}"
+
+
 def fresh(code, *words):
     """Run code in a new interpreter; what it prints."""
     done = subprocess.run([sys.executable, "-c", code, *words], cwd=HOUSE, capture_output=True, text=True, check=False)
@@ -280,6 +293,25 @@ def test_the_command_line_waits_for_nothing():
     assert fresh(f"import scenes.cli; {print_heavy}").strip() == "[]"
     assert "torch" not in fresh(f"import scenes.commands.solve, scenes.commands.anatomy, sim.fem; {print_heavy}")
     assert "viser" not in fresh(f"import scenes.commands.check, scenes.play.checks, scenes.play.episode; {print_heavy}")
+
+
+def test_public_names_are_there_and_importing_them_changes_no_setting():
+    fresh(
+        "import sys; import sim, surrogate, ar, scenes; packages = (sim, surrogate, ar, scenes)\n"
+        "assert not {'numpy', 'warp', 'torch', 'cv2'} & set(sys.modules)\n"
+        "import warp, torch, cv2, scipy.linalg, sklearn, threadpoolctl\n"
+        "def settings():\n"
+        "    config = {name: value for name, value in vars(warp.config).items() if not name.startswith('_')}\n"
+        "    blas = [(pool['prefix'], pool['num_threads']) for pool in threadpoolctl.threadpool_info()]\n"
+        "    return config, blas, torch.get_num_threads(), cv2.getNumThreads(), cv2.useOptimized()\n"
+        "before = settings()\n"
+        "for package in packages:\n"
+        "    for name in package.__all__:\n"
+        "        getattr(package, name)\n"
+        "assert settings() == before\n"
+    )
+    for room in ROOMS:
+        assert (HOUSE / room / "py.typed").exists()
 
 
 def test_a_machine_that_only_trains_needs_no_meshes_and_no_pages():

@@ -187,7 +187,7 @@ IMPORT = "from scenes.script.scene import Scene"
     ("text", "words"),
     [
         ("", "my.py: has no SCENE. Let it say SCENE = Scene"),
-        ("SCENE = 'press'", "my.py: its SCENE is a str. Make it a scenes.script.scene.Scene."),
+        ("SCENE = 'press'", "my.py: its SCENE is a str. Make it a scenes.Scene."),
         ("\nSCENE = Scene(", r"my.py, line 2: is no Python \('\(' was never closed\). Mend the file."),
         ("one = 1\nSCENE = one / 0\n", "my.py, line 2: raised ZeroDivisionError: division by zero. Mend the file."),
         ("import no_such_module", "line 1: raised ModuleNotFoundError: No module named 'no_such_module'"),

@@ -256,7 +256,7 @@ def find_scene(name: str) -> Scene:
     ------
     InputError
         No scene of that name; a file that is missing, does not run, has no SCENE, one whose path gives no Touch, or one
-        of a tissue that fails `sim.terms.laws.conformance.check_tissue`.
+        of a tissue that fails `sim.check_tissue`.
     """
     if name.endswith(".py"):
         return _own_scene(name)
@@ -274,7 +274,7 @@ def _own_scene(path: str) -> Scene:
     if found is None:
         raise InputError(f"{path}: has no SCENE. Let it say SCENE = Scene(...), as the built-in scenes do.")
     if not isinstance(found, Scene):
-        raise InputError(f"{path}: its SCENE is a {type(found).__name__}. Make it a scenes.script.scene.Scene.")
+        raise InputError(f"{path}: its SCENE is a {type(found).__name__}. Make it a scenes.Scene.")
     for time in found.times.tolist():
         try:
             touch = found.path(time)
@@ -282,9 +282,7 @@ def _own_scene(path: str) -> Scene:
             raise InputError(told(FilePath(path).absolute(), error)) from error
         if not isinstance(touch, Touch):
             what = type(touch).__name__
-            raise InputError(
-                f"{path}: at {time:g} s its path gives a {what}. Make it a scenes.script.tool_paths.Touch."
-            )
+            raise InputError(f"{path}: at {time:g} s its path gives a {what}. Make it a scenes.Touch.")
     for effect in found.effects:
         if isinstance(effect, Elasticity):
             for tissue in (effect.default, *effect.regions.values()):

@@ -10,7 +10,7 @@ from ..anatomy import Anatomy
 from ..discretisation.space import Discretisation
 from ..effects import Bonded
 from ..geometry.triangles import areas
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 
 # Tractions are means over so far [m] round a node: at the rim of an opening they have no limit, but a mean.
 ROUND = 5e-3
@@ -21,7 +21,7 @@ def kernel_of(device: Device) -> wp.Kernel:
     """The kernel of a device's scalar type, over (patch, column)."""
     scalar = device.scalar
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def strain(
         force: wp.array2d(dtype=scalar),
         first: wp.array(dtype=wp.int32),

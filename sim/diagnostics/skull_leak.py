@@ -7,7 +7,7 @@ import warp as wp
 
 from ..anatomy import Anatomy
 from ..discretisation.space import Discretisation
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 
 # Points (6, 3), barycentric, and weights (6,) on a triangle: exact to degree 4 (Dunavant 1985, Table I).
 _A, _B = 0.445948490915965, 0.091576213509771
@@ -43,7 +43,7 @@ def kernel_of(device: Device) -> wp.Kernel:
     """The kernel of a device's scalar type, over (surface node, column)."""
     scalar = device.scalar
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def sweep(
         u: wp.array2d(dtype=scalar),
         nodes: wp.array(dtype=wp.int32),

@@ -14,7 +14,7 @@ import warp as wp
 
 from ..errors import InputError
 from ..runtime.columns import CHUNK, combined, gathered
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 
 # A normal, of which held components leave less than this, says nothing about the others.
 LEAST_NORMAL = 1e-6
@@ -38,7 +38,7 @@ def kernels_of(device: Device) -> Kernels:
     scalar, vec = device.scalar, device.vector
     chunk = CHUNK
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def project(
         held: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
@@ -53,7 +53,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             v[3 * i + k, c] = wp.where(held[i, k] == wp.int8(0), x[k], scalar(0.0))
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def close(
         held: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
@@ -73,7 +73,7 @@ def kernels_of(device: Device) -> Kernels:
             r = 3 * i + k
             gap[r, c] = wp.where(held[i, k] == wp.int8(0), slip[k], value[r, c] - x[k])
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def average(
         weight: wp.array2d(dtype=scalar),
         v: wp.array2d(dtype=scalar),
@@ -88,7 +88,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             wp.atomic_add(out, k, c, total[k])
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def spread(
         weight: wp.array2d(dtype=scalar),
         amount: wp.array2d(dtype=scalar),

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..errors import InputError
-from ..runtime.device import Device, find_device
+from ..runtime.device import Device, find_device, forward_kernel
 
 # Triangles are divided until their longest edge is below this share of the footprint's radius.
 FINENESS = 0.12
@@ -239,7 +239,7 @@ def _joined(place: wp.vec3d, length: wp.float64) -> wp.vec4d:
     return wp.vec4d(place[0], place[1], place[2], length)
 
 
-@wp.kernel
+@forward_kernel
 def _search(
     corners: wp.array2d(dtype=wp.vec3d),
     ball: wp.array(dtype=wp.vec4d),
@@ -262,7 +262,7 @@ def _search(
                 found[chunk, c] = _joined(nearest, far)
 
 
-@wp.kernel
+@forward_kernel
 def _settle(
     found: wp.array2d(dtype=wp.vec4d),
     # outputs
@@ -278,7 +278,7 @@ def _settle(
     nearest[group, c] = best
 
 
-@wp.kernel
+@forward_kernel
 def _press(
     corners: wp.array2d(dtype=wp.vec3d),
     ball: wp.array(dtype=wp.vec4d),

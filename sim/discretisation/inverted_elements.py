@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from .element import linear_elements, quadratic_elements
 from .space import Discretisation
 
@@ -21,7 +21,7 @@ def kernel_of(device: Device, size: int, points: int) -> wp.Kernel:
     scalar, vec = device.scalar, device.vector
     least = COLLAPSED
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def count_inverted(
         u: wp.array2d(dtype=scalar),
         table: wp.array2d(dtype=wp.int32),

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 
 # A row of blocks times x (n, b) on the CPU; blocks are stored by their columns. Eight columns of x together fill vector
 # registers. For one the rows of a block do, WIDE >= ROWS of them: those beyond are the next column's, or padding.
@@ -48,7 +48,7 @@ def kernel_of(device: Device, rows: int, columns: int) -> wp.Kernel:
     mat, vec = wp.types.matrix((rows, columns), scalar), wp.types.vector(columns, scalar)
     wide = wp.types.vector(rows, scalar)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_product(
         first: wp.array(dtype=wp.int32),
         column: wp.array(dtype=wp.int32),
@@ -90,7 +90,7 @@ def host_kernel_of(device: Device, rows: int, columns: int) -> wp.Kernel:
         out: wp.array2d(dtype=scalar),
     ): ...
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_product(
         first: wp.array(dtype=wp.int32),
         column: wp.array(dtype=wp.int32),

@@ -18,7 +18,7 @@ import warp as wp
 
 from ..discretisation.problem import Problem
 from ..runtime.columns import add_dots, is_kept
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from . import block_inverse
 from .half_symv import add_product, tiles_of
 
@@ -41,7 +41,7 @@ def kernels_of(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Kerne
     """Kernels into the matrix's unknowns, as numbers of type `low`, and back; each thread takes `some` rows."""
     scalar = device.scalar
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def lower(
         first: wp.array(dtype=wp.int32),
         column: wp.array(dtype=wp.int32),
@@ -64,7 +64,7 @@ def kernels_of(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Kerne
                     total += value[k] * r[column[k], c]
                 out[i, c] = low(share * scale[i] * total)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def raise_(
         first: wp.array(dtype=wp.int32),
         column: wp.array(dtype=wp.int32),

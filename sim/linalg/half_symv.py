@@ -6,6 +6,8 @@ Reading is all that one column costs, so that half of the matrix is half of the 
 import numpy as np
 import warp as wp
 
+from ..runtime.device import forward_kernel
+
 # Rows and columns of a tile, which one block of as many threads takes: eight warps of 32 rows each.
 TILE = 256
 
@@ -71,7 +73,7 @@ def _add_tile(
 ): ...
 
 
-@wp.kernel(module="unique")
+@forward_kernel(module="unique")
 def _add_product(
     tiles: wp.array(dtype=wp.vec2i),
     matrix: wp.array2d(dtype=wp.float16),

@@ -15,7 +15,7 @@ import warp as wp
 from ..discretisation.constraint import Constraint
 from ..discretisation.problem import Problem
 from ..runtime.columns import combined, dots, gathered, scattered
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from .block_sparse import Sparse
 from .pcg import Preconditioner
 
@@ -33,7 +33,7 @@ def kernel_of(device: Device, size: int) -> wp.Kernel:
     scalar = device.scalar
     mat, vec = wp.types.matrix((size, size), scalar), wp.types.vector(size, scalar)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def step(
         inverse: wp.array(dtype=mat),
         kept: scalar,

@@ -14,7 +14,7 @@ import warp as wp
 
 from ..discretisation.problem import Problem
 from ..runtime.columns import combined, dots, norms
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 
 
 class Preconditioner(Protocol):
@@ -42,7 +42,7 @@ def block_kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
     """Kernels of the block-Jacobi preconditioner."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def invert_blocks(
         # outputs
         blocks: wp.array2d(dtype=mat),
@@ -58,7 +58,7 @@ def block_kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
         else:
             blocks[i, c] = wp.identity(n=3, dtype=scalar) / wp.max(size, scalar(1.0e-30))
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def multiply_blocks(
         blocks: wp.array2d(dtype=mat),
         r: wp.array2d(dtype=scalar),

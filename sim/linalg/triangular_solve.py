@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..accuracy import Precision
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from ..runtime.parallel_loops import together
 from .symbolic import Front
 
@@ -90,7 +90,7 @@ def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
         xs: wp.array2d(dtype=scalar),
     ): ...
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def up(
         fronts: wp.array2d(dtype=wp.int64),
         border: wp.array(dtype=wp.int32),
@@ -102,7 +102,7 @@ def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
         """Eliminate front by front in each row of xs (b, n)."""
         climb(wp.tid(), fronts, border, panel, work, xs)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def down(
         fronts: wp.array2d(dtype=wp.int64),
         border: wp.array(dtype=wp.int32),
@@ -130,7 +130,7 @@ ADD = """
 def _add(part: wp.array2d(dtype=wp.float64), place: wp.array(dtype=wp.int64), whole: wp.array2d(dtype=wp.float64)): ...
 
 
-@wp.kernel(module="unique")
+@forward_kernel(module="unique")
 def _add_part(
     part: wp.array2d(dtype=wp.float64),
     place: wp.array(dtype=wp.int64),

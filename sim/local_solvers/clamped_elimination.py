@@ -1,9 +1,9 @@
 """Nonlinear elimination without an inverse: what a load strains much is in equilibrium before the body around it moves.
 
-Where the rest stiffness is known only nearly (levels), the surroundings of a part cannot be condensed. So the vicinity
-of a load, held at its rim (`rim.py`), is brought to equilibrium by itself, and L-BFGS minimises what is left, a
-function of the body around it, whose curvature the rest stiffness knows well. Cai, Keyes 2002, "Nonlinearly
-preconditioned inexact Newton algorithms", SIAM J. Sci. Comput. 24:183-200.
+Where the rest stiffness is known only nearly (levels), the surroundings of a part cannot be condensed. So the part of
+the body near a load, held at its rim (`clamped_part.py`), is brought to equilibrium by itself, and L-BFGS minimises
+what is left, a function of the body around it, whose curvature the rest stiffness knows well. Cai, Keyes 2002,
+"Nonlinearly preconditioned inexact Newton algorithms", SIAM J. Sci. Comput. 24:183-200.
 """
 
 from __future__ import annotations

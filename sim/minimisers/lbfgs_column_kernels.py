@@ -7,7 +7,7 @@ from functools import cache
 
 import warp as wp
 
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from ..runtime.lanes import summed
 from .lbfgs_kernels import GOLD, GZ, YW
 from .lbfgs_trial_kernels import first_of, spread_of
@@ -20,7 +20,7 @@ def multiply_of(device: Device, pairs: int) -> wp.Kernel:
     lanes, each = spread.lanes, spread.each
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def multiply(
         known: wp.array(dtype=wp.int32),
         s: wp.array3d(dtype=scalar),

@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from ..runtime.columns import CHUNK
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 
 LIVE, DONE, LEFT, BROKEN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 """What a column is: on its way, in equilibrium, not brought farther here, never finite."""
@@ -64,7 +64,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
     whole_row, free_row, slope_row = WHOLE, FREE, SLOPE
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def absorb(
         # outputs
         own: wp.array2d(dtype=scalar),
@@ -81,7 +81,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             squares += wp.float64(x) * wp.float64(x)
         wp.atomic_add(square, c, squares)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def multiply(
         known: wp.array(dtype=wp.int32),
         s: wp.array3d(dtype=scalar),
@@ -117,7 +117,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             wp.atomic_add(products, i, c, wp.float64(sg))
             wp.atomic_add(products, m + i, c, wp.float64(wg))
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def judge(
         loud: wp.array2d(dtype=wp.float64),
         own: wp.array2d(dtype=wp.float64),
@@ -181,7 +181,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
         elif accepted[c] != 0:
             aiming[c] = 1
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def aim(
         aiming: wp.array(dtype=wp.int32),
         gone: wp.array(dtype=wp.float64),
@@ -281,7 +281,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
             status[c] = LEFT
             t[c] = zero
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def move(
         status: wp.array(dtype=wp.int32),
         accepted: wp.array(dtype=wp.int32),
@@ -329,7 +329,7 @@ def kernels_of(device: Device, pairs: int) -> Kernels:
                     z[r, c] = new_z[r, c]
                     d[r, c] = direction[k]
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def clamp(
         # outputs
         bound: wp.array(dtype=scalar),

@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from ..runtime.lanes import lanes_of, summed
 from .lbfgs_kernels import FREE, OWN, SLOPE, SOME, WHOLE
 
@@ -65,7 +65,7 @@ def kernels_of(device: Device, spread: Spread) -> Kernels:
     together = summed if lanes > 1 else alone
     own_row, whole_row, free_row, slope_row = OWN, WHOLE, FREE, SLOPE
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def step(
         u: wp.array2d(dtype=scalar),
         t: wp.array(dtype=wp.float64),
@@ -81,7 +81,7 @@ def kernels_of(device: Device, spread: Spread) -> Kernels:
             if r < u.shape[0]:
                 v[r, c] = u[r, c] + length * d[r, c]
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def finish(
         constant: wp.array2d(dtype=scalar),
         held: wp.array2d(dtype=wp.int8),

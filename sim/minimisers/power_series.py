@@ -17,7 +17,7 @@ import warp as wp
 from ..discretisation.problem import Problem
 from ..runtime.columns import combined
 from ..runtime.dense_product import product_with
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 
 # The largest displacement in a difference, in edges: its square is the error, at worst 3 parts in 100,000 of the third
 # order here. What round-off and linear solves leave grows with its inverse square.
@@ -29,7 +29,7 @@ def mixing_kernel(device: Device) -> wp.Kernel:
     """The kernel of `mixed` for a device's scalar type."""
     scalar = device.scalar
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def mix(
         x: wp.array2d(dtype=scalar),
         weight: wp.array2d(dtype=scalar),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .device import Device
+from .device import Device, forward_kernel
 from .lanes import lanes_of, summed
 
 # Rooms of L-BFGS fit batches of so few columns exactly: what these learn goes from one to the next.
@@ -36,7 +36,7 @@ def kernels_of(device: Device) -> Kernels:
     scalar = device.scalar
     chunk, lanes = CHUNK, lanes_of(device)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def dot(
         x: wp.array2d(dtype=scalar),
         y: wp.array2d(dtype=scalar),
@@ -50,7 +50,7 @@ def kernels_of(device: Device) -> Kernels:
             total += wp.float64(x[r, c]) * wp.float64(y[r, c])
         wp.atomic_add(out, c, total)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def dot_alone(
         x: wp.array2d(dtype=scalar),
         y: wp.array2d(dtype=scalar),
@@ -66,7 +66,7 @@ def kernels_of(device: Device) -> Kernels:
         if r % lanes == 0:
             wp.atomic_add(out, 0, total)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def combine(
         x: wp.array2d(dtype=scalar),
         factor: wp.array(dtype=scalar),
@@ -78,7 +78,7 @@ def kernels_of(device: Device) -> Kernels:
         r, c = wp.tid()
         out[r, c] = x[r, c] + factor[c] * y[r, c]
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_multiple(
         x: wp.array2d(dtype=scalar),
         factor: scalar,
@@ -90,7 +90,7 @@ def kernels_of(device: Device) -> Kernels:
         r, c = wp.tid()
         out[r, c] = x[r, c] + factor * y[r, c]
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def unstack(
         x: wp.array2d(dtype=scalar),
         nodes: wp.array(dtype=wp.int32),
@@ -109,7 +109,7 @@ def kernels_of(device: Device) -> Kernels:
 def moving_kernels_of(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
     """Kernels that take columns out of arrays of any type, and put them back."""
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def gather(
         x: wp.array2d(dtype=dtype),
         columns: wp.array(dtype=wp.int32),
@@ -120,7 +120,7 @@ def moving_kernels_of(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
         r, c = wp.tid()
         out[r, c] = x[r, columns[c]]
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def scatter(
         x: wp.array2d(dtype=dtype),
         columns: wp.array(dtype=wp.int32),

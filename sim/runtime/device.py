@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,8 @@ import warp as wp
 from ..accuracy import Precision
 from ..errors import InputError
 
-# No adjoints are taken anywhere in the house: half the code to compile.
-wp.config.enable_backward = False
-# Launches are as wide as the work: no thread takes a second turn, and registers are saved.
-wp.config.default_grid_stride = False
-# Start-up notes would stand among a command's own lines; that no driver is there is said all the same.
-wp.config.log_level = wp.LOG_ERROR
+forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
+"""`wp.kernel` without adjoint, which nobody asks for, and launched as wide as the work, which saves registers."""
 
 SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}
 
@@ -65,11 +62,15 @@ class Device:
 def find_device(name: str, precision: Precision) -> Device:
     """The device called "cpu", "cuda", "cuda:1", or "auto": CUDA when there is one.
 
+    Starts Warp, and silences the notes that it prints by default.
+
     Raises
     ------
     InputError
         A device that this machine does not have.
     """
+    if wp.config.log_level == wp.LOG_INFO:  # its start-up notes would stand among a command's own lines
+        wp.config.log_level = wp.LOG_ERROR
     wp.init()
     present = [device.alias for device in wp.get_devices()]
     if name == "auto":

@@ -5,7 +5,7 @@ from functools import cache
 
 import warp as wp
 
-from .device import Device
+from .device import Device, forward_kernel
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ def kernels_of(device: Device) -> Kernels:
     """Kernels of a device's scalar type."""
     scalar = device.scalar
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def take(
         x: wp.array2d(dtype=scalar),
         rows: wp.array(dtype=wp.int32),
@@ -33,7 +33,7 @@ def kernels_of(device: Device) -> Kernels:
         i, c = wp.tid()
         out[i, c] = x[rows[i], c]
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def put(
         x: wp.array2d(dtype=scalar),
         rows: wp.array(dtype=wp.int32),
@@ -44,7 +44,7 @@ def kernels_of(device: Device) -> Kernels:
         i, c = wp.tid()
         out[rows[i], c] = x[i, c]
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add(
         x: wp.array2d(dtype=scalar),
         rows: wp.array(dtype=wp.int32),

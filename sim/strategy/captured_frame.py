@@ -17,7 +17,7 @@ from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs_kernels import LIVE, PAIRS
 from ..minimisers.lbfgs_state import Room, State, ground_of, standing
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from ..runtime.lanes import lanes_of, summed
 
 # A frame that takes more turns is not one of a tool that moves smoothly.
@@ -45,7 +45,7 @@ def kernels_of(device: Device) -> Kernels:
     """Kernels of a device's scalar type, for one column."""
     scalar, most, m, head, lanes = device.scalar, MOST, PAIRS, HEAD, lanes_of(device)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def pull(
         given: wp.array(dtype=wp.float64),
         nodes: wp.array(dtype=wp.int32),
@@ -68,7 +68,7 @@ def kernels_of(device: Device) -> Kernels:
         if i % lanes == 0:
             wp.atomic_add(loud, 0, 0, square)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def move_on(
         given: wp.array(dtype=wp.float64),
         # outputs
@@ -87,7 +87,7 @@ def kernels_of(device: Device) -> Kernels:
         g[r, 0] = scalar(0.0)
         z[r, 0] = scalar(0.0)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def renew(
         # outputs
         t: wp.array(dtype=wp.float64),
@@ -118,7 +118,7 @@ def kernels_of(device: Device) -> Kernels:
         going[0] = 1
         inverted[0] = 0
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def look(
         status: wp.array(dtype=wp.int32),
         # outputs
@@ -129,7 +129,7 @@ def kernels_of(device: Device) -> Kernels:
         turns[0] = turns[0] + 1
         going[0] = wp.where(status[0] == LIVE and turns[0] < most, 1, 0)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def report(
         status: wp.array(dtype=wp.int32),
         steps: wp.array(dtype=wp.int32),

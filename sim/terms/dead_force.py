@@ -11,7 +11,7 @@ from ..discretisation.footprint import Skin
 from ..discretisation.term import Cases
 from ..loads import Loads, Nodal, Pushed, check_field
 from ..runtime.columns import CHUNK, gathered
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ def kernels_of(device: Device) -> Kernels:
     scalar = device.scalar
     chunk = CHUNK
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def spread(
         weight: wp.array2d(dtype=wp.float64),
         sums: wp.array(dtype=wp.vec4d),
@@ -42,7 +42,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             force[3 * i + k, c] += scalar(weight[i, c] / sums[c][0] * whole[c, k])
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def subtract(
         nodes: wp.array(dtype=wp.int32),
         force: wp.array2d(dtype=scalar),
@@ -54,7 +54,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             out[3 * nodes[i] + k, c] -= force[3 * i + k, c]
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def subtract_work(
         nodes: wp.array(dtype=wp.int32),
         force: wp.array2d(dtype=scalar),

@@ -5,7 +5,7 @@ from functools import cache
 
 import warp as wp
 
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from .laws.invariants import cofactor
 from .laws.law import Law
 
@@ -30,7 +30,7 @@ def spreading_of(device: Device) -> wp.Kernel:
     """Kernel that gives every point in every case its element's coefficients."""
     scalar = device.scalar
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def spread(
         coefficients: wp.array2d(dtype=scalar),
         # outputs
@@ -121,7 +121,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
         for k in range(3):
             wp.atomic_sub(out, i + k, c, total[k])
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_energy(
         u: wp.array2d(dtype=scalar),
         sizes: wp.array(dtype=wp.int32),
@@ -138,7 +138,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
             H = gradient_of(u, sizes, table, gradient, e, q, c)
             wp.atomic_add(out, c, wp.float64(weight[e, q] * density(H, at(coefficients, e, q, c))))
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_gradient(
         u: wp.array2d(dtype=scalar),
         sizes: wp.array(dtype=wp.int32),
@@ -156,7 +156,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
             P = weight[e, q] * stress(H, at(coefficients, e, q, c))
             spread(P, sizes, table, gradient, e, q, c, out)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_curvature(
         p: wp.array2d(dtype=scalar),
         where: wp.array2d(dtype=scalar),
@@ -190,7 +190,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
         return stress_change(H, D, of)
 
     # Unrolled, its many stress changes take ten seconds to compile.
-    @wp.kernel(module="unique", module_options={"max_unroll": 0})
+    @forward_kernel(module="unique", module_options={"max_unroll": 0})
     def add_diagonal(
         where: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
@@ -226,7 +226,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
                         block[i, j] = f[i]
                     wp.atomic_add(out, table[e, a], c, block)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def bound_step(
         u: wp.array2d(dtype=scalar),
         du: wp.array2d(dtype=scalar),
@@ -273,7 +273,7 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
                 t = t / scalar(2.0)
             wp.atomic_min(out, c, t)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def measure(
         u: wp.array2d(dtype=scalar),
         sizes: wp.array(dtype=wp.int32),

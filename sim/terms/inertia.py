@@ -11,7 +11,7 @@ from ..discretisation.element import quadratic_elements
 from ..discretisation.space import Discretisation
 from ..discretisation.term import Cases
 from ..runtime.columns import CHUNK, Rooms
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 
 # Shares of a quadratic tetrahedron's mass: its consistent mass matrix' diagonal, scaled to the whole. Row sums would be
 # negative at corners.
@@ -33,7 +33,7 @@ def kernels_of(device: Device) -> Kernels:
     scalar, mat = device.scalar, device.matrix
     chunk = CHUNK
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_energy(
         mass: wp.array(dtype=scalar),
         weight: wp.array(dtype=scalar),
@@ -51,7 +51,7 @@ def kernels_of(device: Device) -> Kernels:
                 total += wp.float64(mass[i]) * away * away
         wp.atomic_add(out, c, wp.float64(0.5) * wp.float64(weight[c]) * total)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_force(
         mass: wp.array(dtype=scalar),
         weight: wp.array(dtype=scalar),
@@ -66,7 +66,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             out[3 * i + k, c] += mass[i] * weight[c] * (x[3 * i + k, c] - aimed * aim[3 * i + k, c])
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_blocks(
         mass: wp.array(dtype=scalar),
         weight: wp.array(dtype=scalar),

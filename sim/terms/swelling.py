@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.term import Cases
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from .laws.law import Law
 
 
@@ -84,7 +84,7 @@ def kernels_of(device: Device) -> Kernels:
     """Kernels of a device's scalar type."""
     scalar, mat = device.scalar, device.matrix
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def fill(
         swells: wp.array(dtype=scalar),
         wider: wp.array(dtype=scalar),
@@ -96,7 +96,7 @@ def kernels_of(device: Device) -> Kernels:
         e, q, c = wp.tid()
         out[e, q, place, c] = swells[e] * wider[c]
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def shrink(
         swells: wp.array(dtype=scalar),
         wider: wp.array(dtype=scalar),

@@ -12,7 +12,7 @@ law parts shape from volume, as Ogden's, psi(F) - psi(J^(1/3) I) is psi(Fb), and
 others psi(Fb) must not be taken away from psi(F): it outgrows it where tissue is crushed, which then collapses.
 
 The stable neo-Hookean law is finite where J = 0, and Cb is not: whatever pulls on Cb makes it collapse. It is parted in
-its own way (`split.own_split`): mu relaxes and K does not, the step's potential is psi - (1 - f) psi_shape + C : A / 2,
+its own way (`own_split`): mu relaxes and K does not, the step's potential is psi - (1 - f) psi_shape + C : A / 2,
 and S pulls on C = F^T F, as in finite linear viscoelasticity (Christensen 1980, "A Nonlinear Theory of Viscoelasticity
 for Application to Elastomers", J. Appl. Mech. 47:762-768).
 """
@@ -26,7 +26,7 @@ import warp as wp
 
 from ..discretisation.term import Cases
 from ..material import Pairs
-from ..runtime.device import Device
+from ..runtime.device import Device, forward_kernel
 from .laws.invariants import exp_less_one
 from .laws.isochoric_split import split_of
 from .laws.law import Law
@@ -106,7 +106,7 @@ def kernels_of(law: Law, device: Device, count: int) -> Kernels:
     overstress = split_of(law, device).overstress
     six = SIX
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def fade(
         share: wp.array2d(dtype=scalar),
         tau: wp.array2d(dtype=scalar),
@@ -130,7 +130,7 @@ def kernels_of(law: Law, device: Device, count: int) -> Kernels:
                 pull += half * (half * past[c, p, six * (i + 1) + k] - share[e, i] * past[c, p, k])
             out[e, q, first + 1 + k, c] = pull
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def advance(
         share: wp.array2d(dtype=scalar),
         tau: wp.array2d(dtype=scalar),

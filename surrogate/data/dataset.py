@@ -238,7 +238,7 @@ def digest_of_texts(said: Mapping[str, str]) -> str:
 
 
 def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows `first` to `last` (`rows.row_type`) of answers or unit responses, and (B,) bool: whose checksums agree."""
+    """Rows `first` to `last` (`row_type`) of answers or unit responses, and (B,) bool: whose checksums agree."""
     here = slice(first, last)
     displacement = stored(file, f"{group}/displacement", "f", (None, vertices, 3))
     rows = np.empty(len(range(*here.indices(len(displacement)))), row_type(vertices))

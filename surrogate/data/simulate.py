@@ -112,7 +112,7 @@ class Work:
         return np.arange(first, min(first + self.batch, self.counts[name]))
 
     def solved(self, batch: Batch) -> np.ndarray:
-        """A batch's rows (`rows.row_type`)."""
+        """A batch's rows (`answer_rows.row_type`)."""
         rows = self.rows(batch)
         asked = unit_loads(self.anatomy, rows) if batch[0] == "unit" else self.loads.rows(rows)
         answer = self.deformer.deform(asked).at(np.arange(len(self.anatomy.mesh.nodes)))

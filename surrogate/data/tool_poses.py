@@ -32,7 +32,7 @@ def ball_of(preset: str, radius: float | None = None) -> Ball:
 
 
 def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, radius: float | None = None) -> Loads:
-    """Draw `count` poses of the preset's ball, pressed into the open cortex; load i depends as in `sampling.draw`.
+    """Draw `count` poses of the preset's ball, pressed into the open cortex; load i depends as in `surrogate.draw`.
 
     Places and directions are those of the preset's forces: uniform by area, its footprint inside the rim, within the
     tool's cone. Depths are uniform from 0.05 to 0.9 of the radius, and no deeper than the tool goes.

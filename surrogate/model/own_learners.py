@@ -65,9 +65,7 @@ def learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:
     def register(kind: K) -> K:
         missing = [what for what in ("fit", "predict", "state", "restored") if not hasattr(kind, what)]
         if missing:
-            raise InputError(
-                f"the learner {name} has no {', '.join(missing)}: see surrogate.regressors.protocol.Regressor."
-            )
+            raise InputError(f"the learner {name} has no {', '.join(missing)}: see surrogate.Regressor.")
         if name in RESERVED or (name in OWN and _file(OWN[name].regressor) != _file(kind)):
             raise InputError(f"a learner is called {name!r} already: choose another name.")
         OWN[name] = Own(encoder, kind)

@@ -58,7 +58,7 @@ class Limits:
 
 @wp.func
 def angle_of(limits: Limits, load: Load) -> wp.float64:
-    """Between force and inward normal at the nearest node [rad]: `envelope.measured`."""
+    """Between force and inward normal at the nearest node [rad]: `training_range.measured`."""
     least = wp.float64(wp.inf)
     cosine = ZERO
     for j in range(limits.node.shape[0]):

@@ -6,6 +6,8 @@ time goes into calls. Coefficients lie side by side in vectors, over which the c
 
 import warp as wp
 
+from sim.runtime.device import forward_kernel
+
 from ..regressors.force_series import BESIDE, STENCIL, TERMS
 from ..regressors.series_residual import FEATURES
 from .single_load_bound import ONE, ZERO, Limits, Load, angle_of, double, excess_of, overhang_of, promised
@@ -104,7 +106,7 @@ def between_radii(table: Table, radius: wp.float64):
 
 @wp.func
 def forms(d: wp.vec3d, force: wp.float64) -> products:
-    """d_i, then d_i d_j F, then d_i d_j d_k F^2: `series.forms`."""
+    """d_i, then d_i d_j F, then d_i d_j d_k F^2: `force_series.forms`."""
     form = products()
     second = wp.int32(3)
     third = wp.int32(9)
@@ -176,7 +178,7 @@ def left_over(process: Process, load: Load) -> wide_double:
     return (load.within * load.within * load.within + process.faint) * total
 
 
-@wp.kernel(module="unique", module_options={"max_unroll": 0})
+@forward_kernel(module="unique", module_options={"max_unroll": 0})
 def answer(
     asked: wp.array(dtype=wp.float64),
     table: Table,

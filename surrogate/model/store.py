@@ -123,7 +123,7 @@ def _keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
 def _own_name(regressor: Fitted) -> str:
     name = name_of(type(regressor))
     if name is None:
-        raise InputError(f"{type(regressor).__name__} was never registered: see surrogate.model.own_learners.learner.")
+        raise InputError(f"{type(regressor).__name__} was never registered: see surrogate.learner.")
     return name
 
 

@@ -32,7 +32,7 @@ TEXT = (
 def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     """The graph of a model: of the tumour, or of all that it knows.
 
-    Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.loads.Pushed` has
+    Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has
     them. Where an answer stands on a compliance table, that of the cortex always, also `weight` (B, m): the share of
     the force that each of the nodes `pressed` (m,) of the open cortex bears, as `footprint_weights` of
     `sim.discretisation.footprint` integrates it over `Patch`: no operator of a graph could.

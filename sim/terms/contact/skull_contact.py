@@ -18,7 +18,7 @@ from ...anatomy import Anatomy
 from ...discretisation.space import Discretisation
 from ...discretisation.term import Cases
 from ...effects import SkullContact
-from ...runtime.device import Device
+from ...runtime.device import Device, forward_kernel
 from .barrier import RELAXED, barrier, barrier_curvature, barrier_slope
 from .skull_surface import Bone, bone_of
 
@@ -139,7 +139,7 @@ def kernels_of(device: Device) -> Kernels:
         """u_i in double precision."""
         return wp.vec3d(wp.float64(u[3 * i, c]), wp.float64(u[3 * i + 1, c]), wp.float64(u[3 * i + 2, c]))
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_energy(
         u: wp.array2d(dtype=scalar),
         wall: Wall,
@@ -152,7 +152,7 @@ def kernels_of(device: Device) -> Kernels:
         if d < felt:
             wp.atomic_add(out, c, stiffness(wall, s) * barrier(d, felt))
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_gradient(
         u: wp.array2d(dtype=scalar),
         wall: Wall,
@@ -168,7 +168,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             out[3 * wall.nodes[s] + k, c] += scalar(f * m[k])
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_curvature(
         p: wp.array2d(dtype=scalar),
         u: wp.array2d(dtype=scalar),
@@ -183,7 +183,7 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             out[3 * wall.nodes[s] + k, c] += scalar(f[k])
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_diagonal(
         u: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
@@ -200,7 +200,7 @@ def kernels_of(device: Device) -> Kernels:
                 block[row, column] = scalar(K[row, column])
         out[wall.nodes[s], c] += block
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def bound_step(
         u: wp.array2d(dtype=scalar),
         du: wp.array2d(dtype=scalar),

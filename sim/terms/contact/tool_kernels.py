@@ -5,7 +5,7 @@ from functools import cache
 
 import warp as wp
 
-from ...runtime.device import Device
+from ...runtime.device import Device, forward_kernel
 from .barrier import barrier, barrier_curvature, barrier_slope
 
 # A step takes no point farther than this share of its distance from the middle of a tool.
@@ -158,7 +158,7 @@ def kernels_of(device: Device, size: int) -> Kernels:
             reach = wp.max(reach, wp.length(at[a] - middle))
         return touch_of(middle, tools, k, c).distance < gap + bulge * reach
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_energy(
         u: wp.array2d(dtype=scalar),
         surface: Surface,
@@ -179,7 +179,7 @@ def kernels_of(device: Device, size: int) -> Kernels:
                         total += barrier(touch_of(N * at, tools, k, c).distance, scale.gap)
                 wp.atomic_add(out, c, weight * total)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_gradient(
         u: wp.array2d(dtype=scalar),
         surface: Surface,
@@ -210,7 +210,7 @@ def kernels_of(device: Device, size: int) -> Kernels:
             out += barrier_slope(touch.distance, gap) * touch.bend
         return out
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_curvature(
         p: wp.array2d(dtype=scalar),
         u: wp.array2d(dtype=scalar),
@@ -235,7 +235,7 @@ def kernels_of(device: Device, size: int) -> Kernels:
                             total += wp.outer(N, weight * (curvature_at(touch, scale.gap, definite[c]) * (N * along)))
                 spread(surface, total, s, c, out)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_diagonal(
         u: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
@@ -263,7 +263,7 @@ def kernels_of(device: Device, size: int) -> Kernels:
                                         block[row, column] = scalar(N[a] * N[a] * H[row, column])
                                 wp.atomic_add(out, surface.table[s, a], c, block)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_matrix(
         u: wp.array2d(dtype=scalar),
         definite: int,
@@ -294,7 +294,7 @@ def kernels_of(device: Device, size: int) -> Kernels:
                                                 share = N[a] * N[b] * H[row, column]
                                                 wp.atomic_add(out, first + row, second + column, share)
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def add_reaction(
         u: wp.array2d(dtype=scalar),
         surface: Surface,
@@ -318,7 +318,7 @@ def kernels_of(device: Device, size: int) -> Kernels:
                             wp.atomic_add(out, c, k, row, force[row])
                             wp.atomic_add(out, c, k, 3 + row, moment[row])
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def bound_step(
         u: wp.array2d(dtype=scalar),
         du: wp.array2d(dtype=scalar),

@@ -9,7 +9,7 @@ import warp as wp
 
 from ...errors import InputError
 from ...material import Tissue, portion
-from ...runtime.device import Device, Precision, find_device
+from ...runtime.device import Device, Precision, find_device, forward_kernel
 
 # Random displacement gradients: how many, and their standard deviation at large strain, at small, in single precision.
 COUNT, LARGE, SMALL, SINGLE = 60, 0.3, 1e-6, 1e-3
@@ -57,7 +57,7 @@ def evaluator(of: Tissue, precision: Precision) -> Evaluator:
     constants = wp.types.vector(len(of.coefficients), scalar)
     density, stress_of, change_of = of.functions.energy, of.functions.stress, of.functions.stress_change
 
-    @wp.kernel(module="unique")
+    @forward_kernel(module="unique")
     def evaluate(
         H: wp.array(dtype=mat),
         D: wp.array(dtype=mat),
