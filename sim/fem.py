@@ -44,9 +44,8 @@ from .strategy.captured_frame import Frame
 from .strategy.extrapolation import moved_on, pushes_of, way_of
 from .strategy.frame_sequence import Following
 from .strategy.newton_correction import step_from
-from .strategy.preconditioner_pace import KEPT, alike
-from .strategy.rate_free_steps import Still
 from .strategy.strategy import FEWEST, Answer, Ladder, shortfall
+from .strategy.time_steps import KEPT, Still, alike
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"
@@ -72,7 +71,7 @@ class Fem:
         Most load cases that are solved together; None: as many as are worth it on this device. Quadratic elements with
         levels go one by one on the CPU.
     element
-        One of `discretisation.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
+        One of `space.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
     live
         Loads will be asked for one at a time: on the CPU it takes a second more to set up, and each load half as long.
 

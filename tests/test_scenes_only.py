@@ -58,7 +58,7 @@ OF_EFFECT = {
     "ToolContact": TOOLS,
     "Retraction": TOOLS,
     "SkullContact": cost(
-        "contact.barrier contact.skull_contact contact.skull_opening contact.skull_surface",
+        "contact.barrier contact.skull_contact contact.skull_surface",
         "contact.skull_contact:add_gradient",
         "Bone Skull",
     ),

@@ -17,6 +17,7 @@ from scenes.cli import main
 from scenes.commands import report as command
 from scenes.report import finite_elements
 from scenes.report.adaptation import debulked, debulked_study, simulate_debulked, simulating_seconds
+from scenes.report.artefact_time import series_seconds, tabulate_series
 from scenes.report.finite_elements import HALVED, OWN, Elements
 from scenes.report.learner import Learner, counts, measure_learner
 from scenes.report.measure import measured
@@ -24,7 +25,6 @@ from scenes.report.page import Section, write_report
 from scenes.report.reference import Truth, beyond_of, reference_of, solve_reference
 from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, row_from_json, row_to_json
 from scenes.report.rows import UNBUILT, every, learners, rows, star
-from scenes.report.series_time import series_seconds, tabulate_series
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import pushed_effects
 from sim.errors import InputError

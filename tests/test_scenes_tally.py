@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from scenes.play.page_tally import RECENT, Row, Tally
 from scenes.play.page_text import table
-from scenes.play.pareto import unbeaten
+from surrogate.evaluation.choose import unbeaten
 
 
 def test_the_front_is_whom_nobody_beats_in_both():

@@ -17,11 +17,11 @@ from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Gravity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.geometry.submersion import parts_under
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Posture, posture, push
 from sim.material import Material
 from sim.runtime.device import find_device
+from sim.terms.gravity import parts_under
 
 G = 9.80665
 DRY, FLUID = 1040.0 * G, 1007.0 * G  # [N/m^3]

@@ -23,7 +23,7 @@ from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal, Touching
 from sim.material import Material
 from sim.runtime.device import find_device
-from sim.strategy.preconditioner_pace import alike
+from sim.strategy.time_steps import alike
 from sim.terms.inertia import lumped_mass
 from sim.tools import Ball, distances_to
 

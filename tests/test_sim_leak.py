@@ -13,7 +13,7 @@ from sim.discretisation.element import quadratic_elements
 from sim.discretisation.space import discretise
 from sim.effects import pushed_effects
 from sim.fem import MIDDLES, Fem
-from sim.geometry.normals import unit, vertex_normals
+from sim.geometry.surface import unit, vertex_normals
 from sim.geometry.tetmesh import TetMesh, oriented
 from sim.loads import push
 from sim.material import BRAIN

@@ -7,9 +7,8 @@ import pytest
 import warp as wp
 
 from sim.minimisers import lbfgs_trial_kernels
-from sim.minimisers.lbfgs_column_kernels import multiply_of
 from sim.minimisers.lbfgs_kernels import PAIRS, PRODUCTS, SOME, SUMS, kernels_of
-from sim.minimisers.lbfgs_trial_kernels import spread_of
+from sim.minimisers.lbfgs_trial_kernels import multiply_of, spread_of
 from sim.runtime.columns import add_dots
 from sim.runtime.device import find_device
 

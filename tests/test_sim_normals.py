@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from boxes import blurred_faces
 
-from sim.geometry.normals import blurred_normals, unit, vertex_normals
+from sim.geometry.surface import blurred_normals, unit, vertex_normals
 
 BALL = trimesh.creation.icosphere(subdivisions=5, radius=0.07)  # edges of 2.5 mm
 ARM = unit(BALL.vertices)
@@ -76,5 +76,5 @@ def test_a_mesh_far_coarser_than_the_blur_faces_outward_too():
 
 def test_more_points_than_are_summed_at_once(monkeypatch):
     whole = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3)
-    monkeypatch.setattr("sim.geometry.normals.TOGETHER", 7)
+    monkeypatch.setattr("sim.geometry.surface.TOGETHER", 7)
     np.testing.assert_array_equal(blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3), whole)

@@ -13,8 +13,7 @@ from sim.effects import Elasticity, Held, NodalForce, SkullContact
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.terms.contact.skull_opening import edge_of, inside_opening, rim_of
-from sim.terms.contact.skull_surface import EDGE_FELT, FELT, bone_of
+from sim.terms.contact.skull_surface import EDGE_FELT, FELT, bone_of, edge_of, inside_opening, rim_of
 
 MESH = box((10, 6, 3), 0.05)
 HEIGHT = MESH.nodes[:, 2].max()

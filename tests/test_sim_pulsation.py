@@ -21,7 +21,7 @@ from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Pulsation, Resection, Slide, Wave
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.geometry.normals import unit
+from sim.geometry.surface import unit
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Resected
 from sim.material import Tissue

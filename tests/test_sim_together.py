@@ -11,7 +11,7 @@ from sim.compile import compile_problem
 from sim.effects import Elasticity, Held
 from sim.linalg.preconditioner import rest_solver
 from sim.runtime.device import find_device
-from sim.runtime.parallel_loops import LEAST, cores, together
+from sim.runtime.threads import LEAST, cores, together
 
 
 def test_every_task_is_done_when_it_returns():

@@ -116,7 +116,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
 
 
 def _tabulate(study: Study, bar: tqdm) -> None:
-    from ..report.series_time import tabulate_series
+    from ..report.artefact_time import tabulate_series
 
     tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"))
     bar.set_postfix_str("")

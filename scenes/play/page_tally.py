@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .pareto import unbeaten
+from surrogate.evaluation.choose import unbeaten
 
 # Loads that are kept of each deformer, the last ones.
 RECENT = 120

@@ -21,7 +21,7 @@ from surrogate.training.train import train
 from .adaptation import debulked_study, simulating_seconds
 from .reference import beyond_of
 from .row import Figures, Row, against_reference, figures_between, of_times
-from .series_time import series_seconds
+from .artefact_time import series_seconds
 from .study import Study
 
 FEWEST_TAUGHT = 64

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..bench.loglog_chart import Curve, Dot, Panel, drawn
 
-from ..play.pareto import unbeaten
+from surrogate.evaluation.choose import unbeaten
 from .row import ERROR, TOLERANCE_ALONE, Figures, Row
 
 SIZE = (880, 560)

@@ -7,7 +7,7 @@ import numpy as np
 from ..anatomy import Anatomy
 from ..errors import InputError
 from ..geometry.geodesic import distances
-from ..geometry.normals import vertex_normals
+from ..geometry.surface import vertex_normals
 from ..geometry.tetmesh import TetMesh
 from .placement import STEM
 

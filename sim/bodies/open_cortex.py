@@ -11,8 +11,7 @@ from ..anatomy import Anatomy
 from ..arguments import numbers
 from ..errors import InputError
 from ..geometry.closest_point import closest
-from ..geometry.normals import unit, vertex_normals
-from ..geometry.triangles import areas
+from ..geometry.surface import areas, unit, vertex_normals
 
 # A place so near to the rim [m] lies on it.
 ON_RIM = 1e-9

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from ..anatomy import Anatomy
 from ..discretisation.space import Discretisation
 from ..effects import Bonded
-from ..geometry.triangles import areas
+from ..geometry.surface import areas
 from ..runtime.device import Device, forward_kernel
 
 # Tractions are means over so far [m] round a node: at the rim of an opening they have no limit, but a mean.

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import InputError
-from ..geometry.normals import unit
+from ..geometry.surface import unit
 from ..geometry.tetmesh import QUADRATIC_EDGES, TRIANGLE_EDGES, TetMesh, row_keys
 from .element import Elements, linear_elements, quadratic_elements
 from .smoothed import edge_elements, node_elements

@@ -17,7 +17,7 @@ from .multigrid import Lifted, TwoLevel, regular
 from .pcg import Preconditioner
 
 Direct = Callable[[sp.csc_array, sp.csc_array, np.ndarray], Preconditioner]
-"""Solves K over motions L (n, m) whose unknowns are numbered by node (m,), as `factor.Factor` does."""
+"""Solves K over motions L (n, m) whose unknowns are numbered by node (m,), as `multifrontal.Factor` does."""
 # A level of so few nodes, of six unknowns each, is the last.
 LARGEST_LAST = 1_000
 # Every neighbour counts. Energy-minimising smoothing draws no random numbers: the same mesh gives the same levels.

@@ -3,7 +3,7 @@
 An exchange of the first unknowns of a symmetric matrix with their right-hand sides makes [[-A^-1, A^-1 B^T],
 [B A^-1, C - B A^-1 B^T]] of [[A, B^T], [B, C]]: Goodnight 1979, "A tutorial on the SWEEP operator", Am. Stat.
 33:149-158. Of all unknowns it leaves the inverse, in n^3 operations and 4 n^2 bytes of double precision, where a
-library's factor and inverse stand beside each other. Uses torch, as `dense` does.
+library's factor and inverse stand beside each other. Uses torch, as `dense_inverse` does.
 """
 
 from __future__ import annotations

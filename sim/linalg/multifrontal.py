@@ -20,8 +20,7 @@ from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from ..accuracy import Precision
 from ..discretisation.problem import Problem
 from ..runtime.device import Device
-from ..runtime.parallel_loops import cores, together
-from ..runtime.threads import one_thread
+from ..runtime.threads import cores, one_thread, together
 from .symbolic import Front, fronts_of
 from .triangular_solve import Sweep, add_lower
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..accuracy import Precision
 from ..runtime.device import Device, forward_kernel
-from ..runtime.parallel_loops import together
+from ..runtime.threads import together
 from .symbolic import Front
 
 # Upwards: x_own gives way to the first k of t = panel^T x_own, and the border takes the rest. Four rows of a panel at a

@@ -33,9 +33,8 @@ from ..linalg.schur import condensed
 from ..minimisers.lbfgs import Descended, Lbfgs
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, FREE, LIVE, WHOLE
 from ..minimisers.residual import balance, constants_of
-from ..runtime.columns import combined, gathered, scattered
+from ..runtime.columns import combined, gathered, put_rows, rows_taken, scattered
 from ..runtime.dense_product import product_with
-from ..runtime.rows import put_rows, rows_taken
 
 # The near part: such a share of the tetrahedra, where the free surface is at most such a share of all of it.
 NEAR, LARGEST_OPENING = 0.2, 0.25

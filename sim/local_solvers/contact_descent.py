@@ -7,7 +7,7 @@ functions", SIAM J. Optim. 24:1420-1443). Each step minimises
 
 with s the potential of all that is smooth, B the rest stiffness and what L-BFGS has learnt since, and c the barrier
 of tools, which is no model. c depends on the few nodes that tools can touch, and all else follows them: with H = B^-1,
-x = -H (s'(u) + f), with the tools' forces f on them as `settling` finds them.
+x = -H (s'(u) + f), with the tools' forces f on them as `contact_forces` finds them.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
 from ..runtime.columns import add_dots, combined, gathered
 from . import lbfgs_trial_kernels
-from .lbfgs_column_kernels import multiply_of
 from .lbfgs_kernels import DONE, PAIRS, PRODUCTS, SOME, SUMS, few_of, kernels_of
+from .lbfgs_trial_kernels import multiply_of
 from .residual import Balance, balance, constants_of
 
 Shapes = Mapping[str, tuple[int, ...]]

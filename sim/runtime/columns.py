@@ -1,4 +1,4 @@
-"""Arithmetic on batches of columns: arrays (rows, b) on the device, one column per load case."""
+"""Arithmetic on batches of columns: arrays (rows, b) on the device, one column per load case, and on some rows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 
 from .device import Device, forward_kernel
-from .lanes import lanes_of, summed
 
 # Rooms of L-BFGS fit batches of so few columns exactly: what these learn goes from one to the next.
 EXACT = 4
@@ -217,3 +216,92 @@ def _index(device: Device, columns: np.ndarray | wp.array) -> wp.array:
 def _flat(x: wp.array) -> wp.array:
     """A view (rows, b) of x (..., b)."""
     return x.reshape((int(np.prod(x.shape[:-1])), x.shape[-1]))
+
+
+@dataclass(frozen=True)
+class RowKernels:
+    """What moves rows of one scalar type."""
+
+    take: wp.Kernel
+    put: wp.Kernel
+    add: wp.Kernel
+
+
+@cache
+def row_kernels_of(device: Device) -> RowKernels:
+    """Kernels of a device's scalar type."""
+    scalar = device.scalar
+
+    @forward_kernel(module="unique")
+    def take(
+        x: wp.array2d(dtype=scalar),
+        rows: wp.array(dtype=wp.int32),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_ic = x_rows(i)c."""
+        i, c = wp.tid()
+        out[i, c] = x[rows[i], c]
+
+    @forward_kernel(module="unique")
+    def put(
+        x: wp.array2d(dtype=scalar),
+        rows: wp.array(dtype=wp.int32),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_rows(i)c = x_ic."""
+        i, c = wp.tid()
+        out[rows[i], c] = x[i, c]
+
+    @forward_kernel(module="unique")
+    def add(
+        x: wp.array2d(dtype=scalar),
+        rows: wp.array(dtype=wp.int32),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_rows(i)c += x_ic."""
+        i, c = wp.tid()
+        out[rows[i], c] += x[i, c]
+
+    return RowKernels(take, put, add)
+
+
+def rows_taken(device: Device, x: wp.array, rows: wp.array, out: wp.array | None = None) -> wp.array:
+    """A copy (m, b) of some rows of x (n, b); in `out`, if it is given."""
+    if out is None:
+        out = wp.empty((len(rows), x.shape[1]), dtype=x.dtype, device=device.name)
+    device.launch(row_kernels_of(device).take, (len(rows), x.shape[1]), [x, rows], [out])
+    return out
+
+
+def put_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
+    """Copy x (m, b) to some rows of out (n, b)."""
+    device.launch(row_kernels_of(device).put, x.shape, [x, rows], [out])
+
+
+def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
+    """Add x (m, b) to some rows of out (n, b), each of them once."""
+    device.launch(row_kernels_of(device).add, x.shape, [x, rows], [out])
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    for (int half = 16; half; half >>= 1) value += __shfl_down_sync(0xffffffffu, value, half);
+#endif
+    return value;
+"""
+)
+def summed(value: wp.float64) -> wp.float64:
+    """The sum over the threads that run in step, valid in the first of them; on the CPU the value itself.
+
+    All of them must be here, which launches over multiples of `lanes_of` see to.
+    """
+    ...
+
+
+def lanes_of(device: Device) -> int:
+    """How many threads run in step."""
+    return 32 if device.on_cuda else 1

@@ -17,8 +17,8 @@ from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs_kernels import LIVE, PAIRS
 from ..minimisers.lbfgs_state import Room, State, ground_of, standing
+from ..runtime.columns import lanes_of, summed
 from ..runtime.device import Device, forward_kernel
-from ..runtime.lanes import lanes_of, summed
 
 # A frame that takes more turns is not one of a tool that moves smoothly.
 MOST = 60

@@ -13,7 +13,7 @@ from ..discretisation.element import Elements, hooke_stiffness
 from ..discretisation.term import Cases
 from ..runtime.columns import Rooms
 from ..runtime.device import Device
-from ..runtime.parallel_loops import cores, together
+from ..runtime.threads import cores, together
 from .element_kernels import kernels_of, spreading_of
 from .laws.law import Law
 from .state_source import Source

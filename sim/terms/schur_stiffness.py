@@ -7,10 +7,9 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..discretisation.term import Cases
-from ..runtime.columns import add_dots, combined, is_kept
+from ..runtime.columns import add_dots, add_rows, combined, is_kept, rows_taken
 from ..runtime.dense_product import product_with
 from ..runtime.device import Device
-from ..runtime.rows import add_rows, rows_taken
 
 
 class Exterior:

@@ -12,8 +12,7 @@ from scipy.spatial.distance import cdist
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import distances_to, rim_of
 from sim.errors import InputError
-from sim.geometry.normals import vertex_normals
-from sim.geometry.triangles import areas
+from sim.geometry.surface import areas, vertex_normals
 
 if TYPE_CHECKING:
     from sim.discretisation.footprint import Skin

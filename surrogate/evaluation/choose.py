@@ -1,8 +1,8 @@
-"""Which deformer to take, given how far off it may be or how long it may take."""
+"""Which deformer to take, given how far off it may be or how long it may take, and which of them no other beats."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sim.errors import InputError
@@ -61,3 +61,12 @@ def _error(offer: Offer) -> tuple[float, float]:
 
 def _time(offer: Offer) -> tuple[float, float]:
     return offer.median_ms, offer.error_mm
+
+
+def unbeaten(places: Mapping[str, tuple[float, float]]) -> frozenset[str]:
+    """Names whose two numbers no other equals or undercuts in both: the Pareto front, equals included."""
+    return frozenset(
+        name
+        for name, (time, error) in places.items()
+        if not any(t <= time and e <= error and (t, e) != (time, error) for t, e in places.values())
+    )

@@ -26,7 +26,7 @@ class Coverage:
     loads
         n.
     held
-        Shares of the loads whose error lies below the bound, for `bound.LEVELS`. The error is the largest at the
+        Shares of the loads whose error lies below the bound, for `conformal.LEVELS`. The error is the largest at the
         tumour, or that of the distance from tip to tumour.
     tenths
         The same for the first level, by tenths of the force, from weak to strong.

@@ -34,7 +34,7 @@ def push_of(point: Wire, force: Wire, footprint: Wire) -> Push:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Angle (B, 1) to the inward normal [rad] and footprint beyond the rim (B, 1) [m], as `envelope.Measured`."""
+    """Angle (B, 1) to the inward normal [rad] and footprint beyond the rim (B, 1) [m], as `training_range.Measured`."""
 
     angle: Wire
     overhang: Wire

@@ -11,8 +11,7 @@ from ...discretisation.space import Discretisation
 from ...discretisation.term import Cases
 from ...effects import Retraction, ToolContact
 from ...errors import InputError
-from ...geometry.enclosure import enclosed
-from ...geometry.triangles import areas, edge_lengths
+from ...geometry.surface import areas, edge_lengths, enclosed
 from ...loads import Retracted, Touching
 from ...runtime.device import Device
 from ...tools import Tool, cores_of, distances_to
