@@ -56,9 +56,9 @@ def torn(
 ) -> Torn:
     """Solve one load; let go what bears too much, as well as what slides and is pulled; hold what would pass the skull.
 
-    Brittle: no energy is left in what is torn, and it does not heal. The traction is the mean over `bond_traction.ROUND`, so
-    that a tear grows by patches of that size whatever the mesh. What let go meets the plane across its normal at rest,
-    without a gap: an active set of constraints, in which a strength near zero is a skull that only presses.
+    Brittle: no energy is left in what is torn, and it does not heal. The traction is the mean over
+    `bond_traction.ROUND`, so that a tear grows by patches of that size whatever the mesh. What let go meets the plane
+    across its normal at rest, without a gap: an active set of constraints, in which a strength near zero is a skull that only presses.
 
     Parameters
     ----------
