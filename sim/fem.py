@@ -6,12 +6,11 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache, cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from threading import RLock
 
 import numpy as np
 import scipy.sparse as sp
-import warp as wp
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
@@ -27,14 +26,12 @@ from .discretisation.space import discretise
 from .discretisation.term import Cases
 from .effects import Bonded, Effect, Elasticity
 from .errors import InputError
-from .linalg.preconditioner import choose_preconditioner, is_exact, name_of
+from .linalg.preconditioner import choose_preconditioner
 from .linalg.rest_solver import Resting
 from .loads import Displaced, Loads, Nodal, Pushed
-from .local_solvers.batch_elimination import eliminating
-from .local_solvers.clamped_elimination import vicinity_of
-from .local_solvers.patch_elimination import patching
 from .minimisers.lbfgs import TAUGHT
 from .minimisers.power_series import Reading, factors, taylor, terms_of
+from .minimisers.residual import shortfall
 from .runtime.columns import unstacked
 from .runtime.device import find_device
 from .runtime.exclusive import alone
@@ -44,7 +41,8 @@ from .strategy.captured_frame import Frame
 from .strategy.extrapolation import moved_on, pushes_of, way_of
 from .strategy.frame_sequence import Following
 from .strategy.newton_correction import step_from
-from .strategy.strategy import FEWEST, Answer, Ladder, shortfall
+from .strategy.plan import local_solvers, plan_for
+from .strategy.strategy import Answer, Ladder
 from .strategy.time_steps import KEPT, Still, alike
 
 # The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
@@ -105,23 +103,23 @@ class Fem:
         self._skin = Skin(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
         problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
         preconditioner = choose_preconditioner(problem, self.space, self._unsmoothed)
-        self.preconditioner = name_of(preconditioner)
-        plain = problem.plain  # what shortcuts solve apart is elastic, and nothing else
-        near = cache(partial(eliminating, problem, preconditioner, self.effects, self.space) if plain else lambda: None)
-        if problem.device.on_cuda:
-            near()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
-        vicinity = vicinity_of(problem, preconditioner, self.effects, self.space) if plain else None
         fitting = fitting_batch(problem.rows, problem.device) if batch is None else at_least("batch", batch, 1)
-        self.batch = fitting if vicinity is None else 1  # each load has a vicinity of its own
-        patching_pays = live and plain and vicinity is None
-        patch = patching(problem, preconditioner, self.effects, self.space) if patching_pays else None
+        self.plan = plan_for(problem, preconditioner, self.space, accuracy, fitting, live)
+        parts = local_solvers(self.plan, problem, preconditioner, self.effects, self.space)
+        if problem.device.on_cuda:
+            parts[0]()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
         inversion = Inversion(self.space, problem.device)
         self._leak = Leak(anatomy, self.space, problem.device)
         bonded = (effect for effect in self.effects if isinstance(effect, Bonded))
         self._bond = next((Bond(effect, anatomy, self.space, problem.device) for effect in bonded), None)
-        self._ladder = Ladder(problem, preconditioner, inversion, accuracy, near, vicinity or patch)
+        self._ladder = Ladder(problem, preconditioner, inversion, accuracy, self.plan, *parts)
         self._paced = lru_cache(KEPT)(self._ladder_over)
         self._resting = Resting(problem, preconditioner, accuracy.inner)
+
+    @property
+    def batch(self) -> int:
+        """Most load cases that are solved together."""
+        return self.plan.batch
 
     @cached_property
     def description(self) -> str:
@@ -179,7 +177,7 @@ class Fem:
 
     def _ladder_over(self, step: float) -> Ladder:
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed, step)
-        return Ladder(self.problem, preconditioner, self._ladder.inversion, self.accuracy)
+        return Ladder(self.problem, preconditioner, self._ladder.inversion, self.accuracy, self.plan)
 
     def _batches(self, count: int) -> Iterator[slice]:
         """The rows of each batch, at least one."""
@@ -188,13 +186,9 @@ class Fem:
     @cached_property
     def _following(self) -> Following | None:
         """Who answers frame after frame on CUDA. The CPU waits for nothing that this would spare it."""
-        cuda = self.problem.device.on_cuda and wp.is_conditional_graph_supported()
-        return self._follower() if cuda and is_exact(self._ladder.preconditioner) else None
+        return self._follower() if self.plan.frames else None
 
-    def _follower(self) -> Following | None:
-        """None where nodes are not the mesh's own, a budget is too small to be spent elsewhere, or more acts."""
-        if len(self.space.edges) or self.accuracy.outer < FEWEST or not self.problem.plain:
-            return None
+    def _follower(self) -> Following:
         ladder = self._ladder
         frame = Frame(self.problem, ladder.preconditioner, ladder.inversion, self._skin, self.accuracy.tolerance)
         return Following(self.problem, ladder.inversion, frame, self.lock, self.description)

@@ -58,7 +58,8 @@ def torn(
 
     Brittle: no energy is left in what is torn, and it does not heal. The traction is the mean over
     `bond_traction.ROUND`, so that a tear grows by patches of that size whatever the mesh. What let go meets the plane
-    across its normal at rest, without a gap: an active set of constraints, in which a strength near zero is a skull that only presses.
+    across its normal at rest, without a gap: an active set of constraints, in which a strength near zero is a skull
+    that only presses.
 
     Parameters
     ----------

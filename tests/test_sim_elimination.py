@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from boxes import base_held
-from openings import EFFECTS, FINE, LAWS_AND_ELEMENTS, MESH, TOTAL, begun, body, descent_of, equilibria, loads_of
+from openings import EFFECTS, FINE, LAWS_AND_ELEMENTS, TOTAL, begun, body, descent_of, equilibria, loads_of
 from oracle import tissue
 
 from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN, Accuracy
 from sim.bodies.meshfile import read_anatomy
 from sim.compile import compile_part, compile_problem
-from sim.discretisation.space import discretise
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
@@ -24,6 +22,7 @@ from sim.linalg.schur import condensed
 from sim.local_solvers.batch_elimination import PATIENCE, Elimination, eliminating, near_tetrahedra
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from sim.runtime.device import find_device
+from sim.strategy.plan import Step
 from sim.terms.schur_stiffness import Exterior
 from surrogate.data.tool_loads import draw
 
@@ -145,21 +144,15 @@ def test_the_condensed_surroundings_are_the_schur_complement() -> None:
     np.testing.assert_allclose(around.follow, moved[:, around.rows], atol=1e-5)
 
 
-def test_a_body_without_a_small_opening_has_no_near_part() -> None:
-    anatomy = base_held(MESH)
-    problem = compile_problem((Elasticity(tissue("linear")), *EFFECTS), anatomy, find_device("cpu", "float64"))
-    assert eliminating(problem, rest_solver(problem), (Elasticity(tissue("linear")),), discretise(MESH)) is None
-
-
 def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
     anatomy, space = body()
     effects = (Elasticity(tissue("stable-neo-hookean")), *EFFECTS)
     fem = Fem(anatomy, effects, Accuracy(tolerance=FINE), "cpu", element="p1")
     many = np.repeat(TOTAL, 4, axis=0)
-    fem._ladder = replace(fem._ladder, near=lambda: None)
+    fem._ladder = replace(fem._ladder, plan=replace(fem.plan, many=None))
     plain = fem.deform(loads_of(many))
     near = eliminating(fem.problem, rest_solver(fem.problem), effects, space)
-    fem._ladder = replace(fem._ladder, near=lambda: near)
+    fem._ladder = replace(fem._ladder, plan=replace(fem.plan, many=Step.NEAR), near=lambda: near)
     for cycles in (12, 3):
         monkeypatch.setattr("sim.local_solvers.batch_elimination.CYCLES", cycles)
         found = fem.deform(loads_of(many))

@@ -10,6 +10,7 @@ from conftest import make_box
 
 from sim.accuracy import LIVE, Accuracy
 from sim.deformation import Deformation, Outcome, guess
+from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
@@ -18,6 +19,7 @@ from sim.minimisers.lbfgs import LEARNT
 from sim.strategy import frame_sequence
 from sim.strategy.captured_frame import MOST
 from sim.strategy.frame_sequence import Kept
+from sim.strategy.plan import can_follow
 
 BODY = make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3)
 EFFECTS = (Elasticity(), Held(), ToolForce())
@@ -144,9 +146,9 @@ def test_vertices_are_picked_from_the_same_answer(fem):
 
 
 def test_a_body_of_another_element_or_a_small_budget_is_not_followed():
-    assert Fem(BODY, EFFECTS, replace(LIVE, outer=5), "cpu", element="p1")._follower() is None
-    assert Fem(BODY, EFFECTS, LIVE, "cpu", element="p2")._follower() is None
-    assert MOST > 20
+    linear, quadratic = (discretise(BODY.mesh, element) for element in ("p1", "p2"))
+    assert can_follow(linear, LIVE) and MOST > 20
+    assert not can_follow(linear, replace(LIVE, outer=5)) and not can_follow(quadratic, LIVE)
 
 
 def test_a_start_that_cannot_be_taken_leaves_no_state_behind(fem):

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from boxes import base_held, box
-from openings import EFFECTS, FINE, LAWS_AND_ELEMENTS, TOTAL, begun, descent_of, equilibria, loads_of
-from oracle import tissue
+from openings import FINE, LAWS_AND_ELEMENTS, TOTAL, begun, descent_of, equilibria, loads_of
 
 from scenes.script.shipped_files import template_path
-from sim.accuracy import TRAIN, Accuracy
+from sim.accuracy import TRAIN
 from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Outcome
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
-from sim.linalg.pcg import BlockJacobi
-from sim.linalg.preconditioner import rest_solver
 from sim.local_solvers.patch import Patch
 from sim.local_solvers.patch_elimination import CYCLES, NODES, PATIENCE, patching
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
@@ -115,24 +111,6 @@ def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
     x = e + inner @ force
     taken = -patch._excess(np.zeros_like(e), x)  # nothing is strained yet
     np.testing.assert_allclose(patch._free(force), patch._free(taken), atol=1e-6 * np.abs(force).max())
-
-
-@pytest.mark.parametrize("kind", ["wide", "levels"])
-def test_where_it_would_not_serve_there_is_none(kind: str) -> None:
-    law = "stable-neo-hookean"
-    if kind == "wide":
-        fem = Fem(
-            base_held(box((3, 3, 3), 0.1)),
-            (Elasticity(tissue(law)), Held(), ToolForce()),
-            Accuracy(),
-            "cpu",
-            element="p1",
-        )
-        found = patching(fem.problem, rest_solver(fem.problem), fem.effects, fem.space)
-    else:
-        problem, space = begun(law)
-        found = patching(problem, BlockJacobi(problem.device), (Elasticity(tissue(law)), *EFFECTS), space)
-    assert found is None
 
 
 def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest(monkeypatch: pytest.MonkeyPatch) -> None:

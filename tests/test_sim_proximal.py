@@ -16,7 +16,7 @@ from sim.fem import Fem
 from sim.linalg.compliance import BLOCK, Compliance
 from sim.linalg.pcg import Preconditioner
 from sim.loads import Loads, Touching
-from sim.local_solvers.contact_descent import Proximal, proximal
+from sim.local_solvers.contact_descent import Proximal
 from sim.local_solvers.contact_preconditioner import Touched
 from sim.material import Material
 from sim.minimisers.compact_lbfgs import Pairs, pairs_of
@@ -54,7 +54,7 @@ def solver(accuracy: Accuracy) -> Fem:
 def parts() -> tuple[Fem, Proximal]:
     """A solver, and its descent."""
     fem = solver(Accuracy(1e-6))
-    found = proximal(fem.problem, fem._ladder.preconditioner)
+    found = fem._ladder._proximal
     assert found is not None
     return fem, found
 

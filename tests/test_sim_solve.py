@@ -84,6 +84,14 @@ def test_the_file_written_is_the_mesh_in_metres(solve, tmp_path: Path) -> None:
     np.testing.assert_array_equal(out.cells_dict["tetra"], MESH.tets)
 
 
+def test_the_solvers_are_explained_where_that_is_asked(solve) -> None:
+    data = {"fixed": BASE.astype(float), "force": FORCE}
+    silent, told = solve(data), solve(data, "--explain")
+    assert "plan" not in silent.report and "Newton-CG" not in silent.errors
+    assert told.report["plan"] and all(line in told.errors for line in told.report["plan"])
+    np.testing.assert_array_equal(told.displacement, silent.displacement)
+
+
 def test_millimetres_give_the_same_answer(solve) -> None:
     value = np.where(TOP[:, None], [0.0, 0.0, -2e-3], 0.0)
     fixed = (BASE | TOP).astype(int)

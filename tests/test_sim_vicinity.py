@@ -14,7 +14,7 @@ from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, push
-from sim.local_solvers.clamped_elimination import Vicinity, vicinity_of
+from sim.local_solvers.clamped_elimination import Vicinity
 from sim.local_solvers.clamped_part import Rimmed
 from sim.minimisers.lbfgs_kernels import DONE, LIVE
 from sim.minimisers.residual import constants_of
@@ -30,14 +30,7 @@ def pressed(down: float) -> Loads:
 
 def fem_and_vicinity() -> tuple[Fem, Vicinity]:
     fem = Fem(BODY, EFFECTS, Accuracy(1e-8), "cpu", element="p2")
-    vicinity = vicinity_of(fem.problem, fem._ladder.preconditioner, EFFECTS, fem.space)
-    assert vicinity is not None
-    return fem, vicinity
-
-
-def test_it_is_for_levels_alone() -> None:
-    fem = Fem(BODY, EFFECTS, Accuracy(1e-8), "cpu", element="p1")
-    assert vicinity_of(fem.problem, fem._ladder.preconditioner, EFFECTS, fem.space) is None
+    return fem, Vicinity(fem.problem, fem._ladder.preconditioner, EFFECTS, fem.space)
 
 
 def test_finds_the_equilibrium() -> None:
@@ -45,7 +38,7 @@ def test_finds_the_equilibrium() -> None:
     fem, vicinity = fem_and_vicinity()
     load = pressed(0.6)
     answer = fem.deform(load)
-    fem._ladder = replace(fem._ladder, alone=None)
+    fem._ladder = replace(fem._ladder, plan=replace(fem.plan, single=None))
     expected = fem.deform(load)
     moved = np.abs(expected.displacement).max()
     assert answer.outcome[0].good and moved > 5e-3
@@ -110,7 +103,7 @@ def test_a_law_that_forbids_inversion_is_taken_as_far_as_it_goes(law: str, down:
     load = push(np.array([0.05, 0.05, 0.1]), np.array([aside, 0.0, -down]), 0.02)
     fem = Fem(body, (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(1e-6), "cpu", element="p2")
     answer = fem.deform(load)
-    fem._ladder = replace(fem._ladder, alone=None)
+    fem._ladder = replace(fem._ladder, plan=replace(fem.plan, single=None))
     expected = fem.deform(load)
     assert answer.outcome[0].good and expected.outcome[0].good and answer.inverted[0] == 0
     moved = np.abs(expected.displacement).max()

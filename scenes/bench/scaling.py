@@ -94,7 +94,7 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
             outer += list(answer.iterations)
             good += sum(outcome.good for outcome in answer.outcome)
     return Row(
-        size, batch, len(anatomy.mesh.nodes), len(anatomy.mesh.tets), fem.preconditioner, batch, made,
+        size, batch, len(anatomy.mesh.nodes), len(anatomy.mesh.tets), fem.plan.preconditioner, batch, made,
         float(np.median(seconds)) / batch, float(np.median(outer)), len(outer), good,
         resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, max(card) / 2**30,
     )  # fmt: skip

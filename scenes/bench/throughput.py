@@ -151,7 +151,7 @@ def rows(
         again = _double(fem, judge, loads)
         done()
         yield Row(
-            material.law, material.poisson, trial.element, fem.space.count, fem.preconditioner, set_up, preset,
+            material.law, material.poisson, trial.element, fem.space.count, fem.plan.preconditioner, set_up, preset,
             len(loads), min(converged), float(np.median(steps)), float(np.percentile(steps, 99)), tuple(seconds),
             some.seconds, len(again), float(again.max()),
         )  # fmt: skip

@@ -26,7 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
+    from sim.accuracy import TRAIN
     from sim.effects import ToolForce
+    from sim.fem import Fem
 
     from ..bench.stages import machine, rows
     from ..play.deformers import open_theatre
@@ -52,6 +54,10 @@ def run(args: argparse.Namespace) -> int:
         found.append(row)
         p95 = "" if row.p95 is None else f"{row.p95:.3g}"
         print(f"| {row.name} | {row.median:.3g} | {p95} | {row.unit} | {row.note} |", file=table, flush=True)
+    fem = theatre.fem(scene, TRAIN, args.batch)
+    plan = fem.plan.explain() if isinstance(fem, Fem) else ()
+    if plan:
+        print("\nHow the finite elements go about a load:\n", *(f"- {line}" for line in plan), sep="\n", file=table)
     if args.json:
-        print(json.dumps({"machine": where, "rows": [asdict(row) for row in found]}))
+        print(json.dumps({"machine": where, "plan": plan, "rows": [asdict(row) for row in found]}))
     return 0

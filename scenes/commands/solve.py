@@ -50,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     # What the file says: who compares with another program means its constraints.
     add_skull_argument(parser, ("slide", "bonded", "contact"))
     add_force(parser)
+    parser.add_argument("--explain", action="store_true", help="say first which solvers are tried, in which order")
     parser.add_argument("--json", action="store_true", help="changes nothing: the result is one JSON line in any case")
 
 
@@ -73,6 +74,9 @@ def run(args: argparse.Namespace) -> int:
     # The file's own elements: who compares with another program means the same discretisation.
     element = args.element or ("p1" if anatomy.mesh.middles is None else "p2")
     fem = Fem(anatomy, effects, accuracy, args.device, element=element)
+    plan = fem.plan.explain() if args.explain else ()
+    for line in plan:
+        print(line, file=sys.stderr)
     deformation = fem.deform(loads, start_of(file, args.mesh, UNITS[args.unit]))
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
@@ -101,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
         "largest_displacement_mm": round(1e3 * float(np.linalg.norm(deformation.displacement[0], axis=1).max()), 6),
         "out": str(out),
     }
-    print(json.dumps(report))
+    print(json.dumps({**report, "plan": plan} if plan else report))
     return 0 if outcome.good else 1
 
 

@@ -28,7 +28,7 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
 from ..linalg.pcg import Preconditioner
-from ..linalg.preconditioner import is_exact, rest_solver
+from ..linalg.preconditioner import rest_solver
 from ..linalg.schur import condensed
 from ..minimisers.lbfgs import Descended, Lbfgs
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, FREE, LIVE, WHOLE
@@ -142,35 +142,41 @@ class Elimination:
         return out
 
 
-def near_tetrahedra(space: Discretisation, constraint: Constraint, share: float = NEAR) -> np.ndarray | None:
-    """(T,) bool: the share nearest to where the surface is free; None where that is no small part of it."""
+def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
+    """Whether a part of the surface is free, and no large one."""
+    return 0 < len(_free(space, constraint)) <= LARGEST_OPENING * len(np.unique(space.mesh.surface))
+
+
+def near_tetrahedra(space: Discretisation, constraint: Constraint, share: float = NEAR) -> np.ndarray:
+    """(T,) bool: the share nearest to where the surface is free."""
     mesh = space.mesh
-    surface = np.unique(mesh.surface)
-    free = surface[~constraint.held[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
-    if not 0 < len(free) <= LARGEST_OPENING * len(surface):
-        return None
-    distance, _ = KDTree(mesh.nodes[free]).query(mesh.nodes[mesh.tets].mean(axis=1))
+    distance, _ = KDTree(mesh.nodes[_free(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
     return distance <= np.quantile(distance, share)
+
+
+def _free(space: Discretisation, constraint: Constraint) -> np.ndarray:
+    """Vertices (n,) of the surface that neither are held nor slide."""
+    surface = np.unique(space.mesh.surface)
+    return surface[~constraint.held[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
 
 
 def eliminating(
     problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> Elimination | None:
-    """Of the tissue near the opening; None on a body without a small one, and where the preconditioner is no inverse.
+    """Of the tissue near the opening, which is small; None where that is too nearly singular to be taken apart.
 
-    Levels, which solve nearly, would leave a share of every correction to the next cycle.
+    The preconditioner is an inverse: levels, which solve nearly, would leave a share of every correction to the next
+    cycle.
     """
     device = problem.device
-    chosen = near_tetrahedra(space, problem.constraint) if is_exact(preconditioner) else None
-    if chosen is None:
-        return None
+    chosen = near_tetrahedra(space, problem.constraint)
     nodes = np.unique(space.table[chosen])
     own = compile_part(effects, space, problem, chosen, nodes)
     try:
         around = condensed(problem, nodes, own.rest_curvature())
         part = surrounded(own, around.rows, around.stiffness)
         solver = rest_solver(part.problem)
-    except RuntimeError:  # too nearly singular to be taken apart
+    except RuntimeError:
         return None
     return Elimination(
         problem=problem,

@@ -19,7 +19,6 @@ from ..discretisation.element import linear_elements
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
-from ..linalg.multigrid import TwoLevel
 from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
@@ -43,7 +42,7 @@ FORCING, ENOUGH, OVERSHOOT = 0.1, 0.5, 0.5
 
 @dataclass(frozen=True, eq=False)
 class Vicinity:
-    """A descent for single loads on one problem.
+    """A descent for single loads on one problem: quadratic elements, whose rest stiffness has levels and no inverse.
 
     problem, preconditioner
         The whole body's.
@@ -147,15 +146,6 @@ class Vicinity:
     def _slopes(self) -> np.ndarray:
         every = np.ones(len(self.space.mesh.tets), bool)
         return linear_elements(self.space.mesh, every).gradient[:, 0].astype(np.float32)
-
-
-def vicinity_of(
-    problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
-) -> Vicinity | None:
-    """For single loads on quadratic elements, on the CPU, where the rest stiffness has levels and no inverse."""
-    if problem.device.on_cuda or space.element != "p2" or not isinstance(preconditioner, TwoLevel):
-        return None
-    return Vicinity(problem, preconditioner, effects, space)
 
 
 def _ended(best: State, status: int, cycle: int) -> Descended:

@@ -23,7 +23,7 @@ from scipy.linalg import LinAlgError
 from ..discretisation.problem import Problem
 from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
-from ..linalg.pcg import BlockJacobi, Preconditioner
+from ..linalg.pcg import Preconditioner
 from ..minimisers.compact_lbfgs import Pairs, pairs_of
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, KEPT, LEAST_KEPT, LIVE, MOST_KEPT, OVERSHOOT
@@ -189,10 +189,3 @@ class Proximal:
         smooth, whole = free[:, 0], free.sum(axis=1)
         size, all_of_it = float(np.linalg.norm(whole)), float(np.linalg.norm(parts.sum(axis=1)))
         return State(u, smooth, whole, size, max(scale, np.sqrt(max(all_of_it**2 - size**2, 0.0))))
-
-
-def proximal(problem: Problem, preconditioner: Preconditioner) -> Proximal | None:
-    """Of problems that it is for, and preconditioners that are alike at every state."""
-    barriers = [barrier for barrier in problem.barriers if isinstance(barrier, Local)]
-    fits = len(problem.barriers) == len(barriers) == 1 and not isinstance(preconditioner, BlockJacobi)
-    return Proximal(problem, preconditioner, barriers[0]) if fits else None

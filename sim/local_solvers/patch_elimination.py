@@ -17,7 +17,6 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
 from ..linalg.multifrontal import Factor
-from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, FREE, LIVE, WHOLE
 from ..minimisers.residual import State, balance, constants_of
@@ -177,14 +176,10 @@ class Patching:
         return self._last[1:]
 
 
-def patching(
-    problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
-) -> Patching | None:
-    """For single loads; None on CUDA, without a factor, or without a small opening."""
-    if problem.device.on_cuda or not isinstance(preconditioner, Factor):
-        return None
+def patching(problem: Problem, factor: Factor, effects: Iterable[Effect], space: Discretisation) -> Patching:
+    """For single loads on the CPU, on a body with a small opening."""
     near = near_tetrahedra(space, problem.constraint, min(NEAR, LARGEST_NEAR / space.count))
-    return None if near is None else Patching(problem, preconditioner, effects, space, near)
+    return Patching(problem, factor, effects, space, near)
 
 
 def _norms(force: wp.array) -> np.ndarray:

@@ -103,3 +103,14 @@ class State(Measured):
     g: wp.array
     free: float
     scale: float
+
+
+def shortfall(problem: Problem, u: wp.array) -> np.ndarray:
+    """The relative residual (b,) of u (3N, b) under the whole load, or the share of imposed motion that is missing."""
+    _, free, scale = problem.residual(u)
+    gap, size = problem.constraint.close_gap(u)
+    largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)
+    with np.errstate(invalid="ignore"):  # forces that overflowed
+        share = [np.divide(a, b, out=np.zeros(len(b)), where=b > 0.0) for a, b in ((free, scale), (size, largest))]
+    worse = np.maximum(*share)
+    return np.where(np.isnan(worse), np.inf, worse)

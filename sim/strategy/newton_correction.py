@@ -57,7 +57,7 @@ def step_from(ladder: Ladder, cases: Cases, guess: np.ndarray) -> Step:
     u = combined(device, start, 1.0, problem.gap(start)[0], start)
     _, free, scale = problem.residual(u)
     before = _relative(free, scale)
-    near = ladder.alone if count == 1 and ladder.alone is not None else ladder.near()
+    near = ladder.local(count) or ladder.near()
     if near is not None and not problem.constraint.imposes:
         u = near.descend(u, np.full(count, ladder.accuracy.tolerance), 1).u
         problem.begin(cases)  # columns that were done have left

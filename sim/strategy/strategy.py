@@ -14,27 +14,22 @@ from ..accuracy import Accuracy
 from ..deformation import LEARNT_KEY, Outcome
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
-from ..discretisation.term import Cases
+from ..discretisation.term import Cases, Local
 from ..linalg.pcg import Preconditioner
 from ..local_solvers.batch_elimination import Elimination
 from ..local_solvers.clamped_elimination import Vicinity
-from ..local_solvers.contact_descent import Proximal, proximal
+from ..local_solvers.contact_descent import Proximal
 from ..local_solvers.contact_preconditioner import Touched
 from ..local_solvers.patch_elimination import NODES, Patching
 from ..minimisers.lbfgs import Lbfgs, learnt_from
 from ..minimisers.lbfgs_kernels import BROKEN, DONE
 from ..minimisers.newton import find_equilibrium
 from ..minimisers.newton_cg import NewtonCG
+from ..minimisers.residual import shortfall
 from ..runtime.columns import gathered, scattered
 from ..runtime.device import Device
+from .plan import Plan, Step
 
-# L-BFGS has so many turns; what it does not bring to its end is left to Newton. On CUDA, where few columns cost hardly
-# less than one, Newton comes last.
-QUICK, QUICK_ON_CUDA = 60, 800
-# A budget of fewer outer steps is Newton's alone: its steps lead farther.
-FEWEST = 10
-# So many load cases are worth the set-up of a near part, and teach nothing.
-WORTH = 16
 NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
 # Load steps as shares of the load: the first, the least, and what is left of one that failed.
 FIRST_STEP, LEAST_STEP, CUT = 1.0 / 4.0, 1.0 / 64.0, 1.0 / 4.0
@@ -95,16 +90,19 @@ class Ladder:
         Of the discretisation that the problem is posed on.
     accuracy
         Tolerance and budgets.
+    plan
+        Which solvers are tried, and in which order.
     near
-        Makes, or has made, the elimination of the same problem's near part; None: nothing is eliminated.
+        Makes, or has made, what `plan` solves by itself for many loads.
     alone
-        What a single load goes through first, if anything.
+        What it solves by itself for one.
     """
 
     problem: Problem
     preconditioner: Preconditioner
     inversion: Inversion
     accuracy: Accuracy
+    plan: Plan
     near: Callable[[], Elimination | None] = lambda: None
     alone: Patching | Vicinity | None = None
 
@@ -114,7 +112,16 @@ class Ladder:
 
     @cached_property
     def _proximal(self) -> Proximal | None:
-        return proximal(self.problem, self.preconditioner)
+        if self.plan.contact is not Step.CONTACT:
+            return None
+        (barrier,) = self.problem.barriers
+        assert isinstance(barrier, Local)
+        return Proximal(self.problem, self.preconditioner, barrier)
+
+    def local(self, count: int) -> Elimination | Patching | Vicinity | None:
+        """What solves a part by itself for so many loads, if anything does."""
+        step = self.plan.local(count)
+        return None if step is None else self.near() if step is Step.NEAR else self.alone
 
     @cached_property
     def _touched(self) -> Preconditioner:
@@ -202,20 +209,19 @@ class Ladder:
         to Newton: it knows how the free nodes follow them. So are steep terms.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
-        most = QUICK_ON_CUDA if device.on_cuda else QUICK
         # Rest satisfies whatever the batch does not move.
-        imposed = problem.constraint.imposes or (start is not None and problem.gap(start)[1].any())
+        imposed = problem.constraint.imposes or (start is not None and bool(problem.gap(start)[1].any()))
         start = device.zeros(problem.rows, count) if start is None else start
         if problem.paced or (problem.barriers and count > 1):  # it would teach the next frame nothing
             learnt = None
         if problem.barriers:
             return self._moved(cases, start, learnt)
-        if imposed or problem.steep or self.accuracy.outer < FEWEST:
+        if Step.LBFGS not in self.plan.steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
         descents: list[tuple[Elimination | Patching | Vicinity | Lbfgs, Mapping[str, np.ndarray] | None]] = [
             (self._lbfgs, learnt)
         ]
-        near = self.near() if count >= WORTH else self.alone if count == 1 else None
+        near = self.local(count)
         if near is not None:
             patch = {NODES: cases.history[LEARNT_KEY + NODES]} if LEARNT_KEY + NODES in cases.history else {}
             descents = [(near, patch), (self._lbfgs, None)]
@@ -225,7 +231,7 @@ class Ladder:
         )
         taught: Mapping[str, np.ndarray] = {}
         for descent, known in descents:
-            found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), most, known)
+            found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), self.plan.turns, known)
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
             answer.put(index, self._answer(found.u, outcome, found.steps, found.residual, 0), device)
@@ -387,14 +393,3 @@ class Ladder:
             residual[short] = shortfall(problem, gathered(device, u, short))
         taught = {LEARNT_KEY + name: array for name, array in (learnt or NOTHING).items()}
         return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent, taught)
-
-
-def shortfall(problem: Problem, u: wp.array) -> np.ndarray:
-    """The relative residual (b,) of u (3N, b) under the whole load, or the share of imposed motion that is missing."""
-    _, free, scale = problem.residual(u)
-    gap, size = problem.constraint.close_gap(u)
-    largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)
-    with np.errstate(invalid="ignore"):  # forces that overflowed
-        share = [np.divide(a, b, out=np.zeros(len(b)), where=b > 0.0) for a, b in ((free, scale), (size, largest))]
-    worse = np.maximum(*share)
-    return np.where(np.isnan(worse), np.inf, worse)

@@ -1,0 +1,126 @@
+"""Which solvers answer a load: the table says what is done, and what is done is what the table says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boxes import base_held, box
+from conftest import make_box
+from openings import EFFECTS, TOTAL, body, loads_of
+
+from sim.accuracy import TRAIN, Accuracy
+from sim.effects import Effect, Elasticity, Held, Inertia, Retraction, ToolContact, ToolForce
+from sim.fem import Fem
+from sim.local_solvers.batch_elimination import Elimination
+from sim.local_solvers.clamped_elimination import Vicinity
+from sim.local_solvers.patch_elimination import Patching
+from sim.minimisers.lbfgs import Lbfgs
+from sim.strategy import strategy
+from sim.strategy.plan import FEWEST, TURNS, WORTH, Plan, Step
+from sim.tools import Ball, Spatula
+
+BODY, PUSHED = body()[0], (Elasticity(), *EFFECTS)
+WIDE = {"anatomy": base_held(box((3, 3, 3), 0.1)), "effects": (Elasticity(), Held(), ToolForce())}
+POSED = {"anatomy": make_box(), "effects": (Elasticity(), Held(), ToolContact((Ball(7e-3),)))}
+LAST = (Step.LBFGS, Step.NEWTON)
+
+
+def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accuracy = TRAIN, **more) -> Plan:
+    return Fem(anatomy, effects, accuracy, "cpu", **{"element": "p1", **more}).plan
+
+
+@pytest.mark.parametrize(
+    ("more", "one", "few", "many"),
+    [
+        ({}, LAST, LAST, (Step.NEAR, *LAST)),
+        ({"element": "smoothed"}, LAST, LAST, (Step.NEAR, *LAST)),
+        ({"live": True}, (Step.PATCH, *LAST), LAST, (Step.NEAR, *LAST)),
+        ({"element": "p2"}, (Step.CLAMPED, *LAST), LAST, LAST),
+        ({"element": "p2", "live": True}, (Step.CLAMPED, *LAST), LAST, LAST),
+        ({**WIDE, "live": True}, LAST, LAST, LAST),
+        ({"effects": (*PUSHED, Inertia()), "live": True}, LAST, LAST, LAST),
+        ({"accuracy": replace(TRAIN, outer=FEWEST - 1)}, *3 * [(Step.NEWTON,)]),
+        (POSED, *3 * [(Step.NEWTON,)]),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)
+def test_the_table(more, one, few, many):
+    plan = planned(**more)
+    assert [plan.steps(count) for count in (1, 2, WORTH)] == [one, few, many]
+    assert plan.steps(WORTH, imposed=True) == (Step.NEWTON,) and not plan.frames
+
+
+def test_contact_is_settled_apart_where_one_kind_of_tool_is_all_that_touches():
+    assert planned(**POSED).contact is Step.CONTACT and planned().contact is None
+    both = (*POSED["effects"], Retraction(Spatula(12e-3, 20e-3, 1e-3)))
+    assert planned(**{**POSED, "effects": both}).contact is Step.NEWTON
+
+
+def test_quadratic_loads_go_one_by_one():
+    assert planned(element="p2", batch=8).batch == 1 and planned(batch=8).batch == 8
+
+
+@pytest.mark.parametrize(
+    ("count", "more"), [(1, {"live": True}), (2, {"live": True}), (WORTH, {}), (1, {"element": "p2"})]
+)
+def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
+    """Each step that is asked passes every load on, so that all are heard."""
+    tried = []
+    kinds = {Elimination: Step.NEAR, Patching: Step.PATCH, Vicinity: Step.CLAMPED, Lbfgs: Step.LBFGS}
+
+    def deaf(kind):
+        original = kind.descend
+
+        def descend(self, start, tolerance, most, *rest, **named):
+            if kind is Lbfgs and self is not fem._ladder._lbfgs:  # that of a part
+                return original(self, start, tolerance, most, *rest, **named)
+            tried.append(kinds[kind])
+            assert most == TURNS
+            return original(self, start, np.full(start.shape[1], 1e-30), 1, *rest, **named)
+
+        return descend
+
+    def newton(*given):
+        tried.append(Step.NEWTON)
+        return found(*given)
+
+    fem, found = Fem(BODY, PUSHED, TRAIN, "cpu", **{"element": "p1", **more}), strategy.find_equilibrium
+    for kind in kinds:
+        monkeypatch.setattr(kind, "descend", deaf(kind))
+    monkeypatch.setattr(strategy, "find_equilibrium", newton)
+    answer = fem.deform(loads_of(np.tile(TOTAL[1], (count, 1))))
+    assert all(outcome.good for outcome in answer.outcome)
+    assert tuple(tried) == fem.plan.steps(count)
+
+
+@pytest.mark.parametrize(
+    ("more", "said", "unsaid"),
+    [
+        (
+            {},
+            (f"Batches of {WORTH} loads and more", "L-BFGS", f"at most {TURNS} evaluations", "sparse factor"),
+            ("A single load",),
+        ),
+        (
+            {"live": True},
+            ("A single load begins with nonlinear elimination: the few hundred nodes",),
+            ("moved by pose",),
+        ),
+        ({"element": "p2"}, ("clamped at its rim", "One load is solved at a time", "multigrid"), ("loads and more",)),
+        (
+            {"accuracy": replace(TRAIN, outer=3, steps=0)},
+            ("Every load is solved by Newton-CG",),
+            ("L-BFGS", "load steps"),
+        ),
+        (POSED, ("moved by pose", "proximal"), ("L-BFGS from",)),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)
+def test_it_is_told_in_sentences(more, said, unsaid):
+    lines = planned(**more).explain()
+    text = " ".join(lines)
+    assert all(line[0].isupper() and line.endswith(".") and len(line.split()) < 32 for line in lines), lines
+    assert all(words in text for words in said), text
+    assert not any(words in text for words in unsaid), text
