@@ -35,7 +35,7 @@ def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
         )
     device, surface = fem.problem.device, fem.space.surface
     with fem.lock:
-        fem.problem.begin(Cases(loads, answer.time, answer.history, share=np.zeros(len(answer))))
+        fem.problem.begin(Cases(loads, answer.time, answer.memory, share=np.zeros(len(answer))))
         u = device.array(answer.displacement.reshape(-1, 3 * count).T)
         gradient = device.zeros(*u.shape)
         for term in fem.problem.barriers:

@@ -14,9 +14,6 @@ from .arguments import all_finite, as_array, numbers, whole_numbers
 from .errors import InputError
 from .loads import Loads
 
-# Begins the history's keys of what only shortens the way to the next answer: whoever reads it may forget it.
-LEARNT_KEY = "l-bfgs "
-
 
 class Outcome(Enum):
     """How an answer came about; the value is the sentence that a user reads."""
@@ -75,8 +72,10 @@ class Deformation:
         iterations, and NaN for the residual that it did not compute.
     reaction
         (B, tools, 6): force [N] and moment about the tool's point [N m] that each tool exerts.
-    history
-        Per term, opaque: what must travel to the next call.
+    memory
+        What the tissue and the tools remember: by the name of a term, rows (B, ...). The next answer needs it.
+    warm
+        What makes the next answer faster, rows (B, ...): it may be dropped, and is neither stored nor compared.
     cost
         Seconds by stage.
     reached
@@ -105,7 +104,8 @@ class Deformation:
     residual: np.ndarray
     time: np.ndarray
     reaction: np.ndarray
-    history: Mapping[str, Any] = field(default_factory=dict)
+    memory: Mapping[str, Any] = field(default_factory=dict)
+    warm: Mapping[str, Any] = field(default_factory=dict)
     cost: Cost = Cost()
     reached: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     inverted: np.ndarray = field(default_factory=lambda: np.array(-1))
@@ -142,7 +142,8 @@ class Deformation:
             leaked=self.leaked[index],
             bond=self.bond[index],
             bound=self.bound[:, index],
-            history={name: value[index] for name, value in self.history.items()},
+            memory={name: value[index] for name, value in self.memory.items()},
+            warm={name: value[index] for name, value in self.warm.items()},
         )
 
     def at(self, nodes: np.ndarray) -> Deformation:
@@ -168,12 +169,15 @@ class Deformation:
 
 
 def joined(parts: Sequence[Deformation]) -> Deformation:
-    """Answers of the same vertices, one part after the other; seconds add up, and of histories stays what all have."""
+    """Answers of the same vertices, one part after the other; seconds add up, and of memories stays what all have."""
 
     def stacked(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    shared = set.intersection(*(set(part.history) for part in parts))
+    def shared(name: str) -> dict[str, np.ndarray]:
+        held = [getattr(part, name) for part in parts]
+        return {key: np.concatenate([one[key] for one in held]) for key in sorted(set.intersection(*map(set, held)))}
+
     stages = parts[0].cost.seconds
     return Deformation(
         displacement=stacked("displacement"),
@@ -183,7 +187,8 @@ def joined(parts: Sequence[Deformation]) -> Deformation:
         residual=stacked("residual"),
         time=stacked("time"),
         reaction=stacked("reaction"),
-        history={key: np.concatenate([part.history[key] for part in parts]) for key in sorted(shared)},
+        memory=shared("memory"),
+        warm=shared("warm"),
         cost=Cost({stage: sum(part.cost.seconds[stage] for part in parts) for stage in stages}),
         reached=stacked("reached"),
         inverted=stacked("inverted"),
@@ -200,7 +205,7 @@ def check_start(start: Deformation, count: int, vertices: int) -> None:
     Raises
     ------
     InputError
-        What is no deformation; displacements of another shape; times or a history of other rows, or not finite.
+        What is no deformation; displacements of another shape; times or a memory of other rows, or not finite.
     """
     if not isinstance(start, Deformation):
         raise InputError(f"the start is a {type(start).__name__}: give a Deformation, or none.")
@@ -209,10 +214,10 @@ def check_start(start: Deformation, count: int, vertices: int) -> None:
             f"the start has displacements of shape {np.shape(start.displacement)}: give every vertex of {count} load "
             f"cases, ({count}, {vertices}, 3)."
         )
-    for name, values in {"time": start.time, **start.history}.items():
+    for name, values in {"time": start.time, **start.memory, **start.warm}.items():
         array = as_array(f"the start's {name!r}", values)
         good = array.dtype.kind in "fiu" and array.shape[:1] == (count,)
-        if not good or not (name.startswith(LEARNT_KEY) or all_finite(array)):
+        if not good or not (name in start.warm or all_finite(array)):
             raise InputError(
                 f"the start's {name!r} are no {count} rows of finite numbers: start from an answer to {count} loads as "
                 "it came, or from rest."

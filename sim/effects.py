@@ -121,7 +121,7 @@ class Inertia:
     """Tissue keeps its velocity: answers follow one another in time, one step of backward Euler each.
 
     The step is the time of the loads less the time of the start, at which the nodes stood where the start has them,
-    with the velocities of its history; at rest without one. Where no time passes the body and the tools that touch
+    with the velocities of its memory; at rest without one. Where no time passes the body and the tools that touch
     it stay as they are, whatever acts. Backward Euler is of first order in the step and damps what swings faster than
     that: energy does not grow, and one long step is statics.
 

@@ -16,7 +16,7 @@ from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
 from .arguments import at_least, vertex_numbers
 from .compile import check_causes, compile_problem
-from .deformation import LEARNT_KEY, Cost, Deformation, check_start, joined
+from .deformation import Cost, Deformation, check_start, joined
 from .diagnostics.bond_traction import Bond
 from .diagnostics.skull_leak import Leak
 from .discretisation.footprint import Skin
@@ -45,7 +45,7 @@ from .strategy.plan import local_solvers, plan_for
 from .strategy.strategy import Answer, Ladder
 from .strategy.time_steps import KEPT, Still, alike
 
-# The history's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
+# The memory's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
 MIDDLES = "mid-edge nodes"
 
 
@@ -140,7 +140,7 @@ class Fem:
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Static equilibrium under every load case.
 
-        `start` (B rows, every vertex) is the first guess and brings history; at rest without one. `at` (n,) picks
+        `start` (B rows, every vertex) is the first guess and brings its memory; at rest without one. `at` (n,) picks
         vertices of the answer.
 
         Raises
@@ -159,7 +159,8 @@ class Fem:
         last = None if start is None else self.guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads)))
         if start is not None and last is not None:
-            cases = Cases(loads, start.time, start.history, last.T.reshape(len(loads), self.space.count, 3))
+            before = last.T.reshape(len(loads), self.space.count, 3)
+            cases = Cases(loads, start.time, start.memory, before, warm=start.warm)
         some = alike(cases.steps, self.batch) if self.problem.paced else None
         batches = some or [(math.inf, rows) for rows in self._batches(len(loads))]
         parts = []
@@ -216,7 +217,7 @@ class Fem:
             As `deform`; tissue that keeps its velocity, whose answers are steps in time.
         """
         self._check_static(loads)
-        self.problem.begin(Cases(loads, answer.time, answer.history))
+        self.problem.begin(Cases(loads, answer.time, answer.memory))
         return shortfall(self.problem, self.problem.device.array(self.guess(loads, answer)))
 
     @alone
@@ -236,7 +237,7 @@ class Fem:
         self._check_static(loads)
         at = self._vertices(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
-        guess, cases = self.guess(loads, answer), Cases(loads, answer.time, answer.history)
+        guess, cases = self.guess(loads, answer), Cases(loads, answer.time, answer.memory)
         parts = []
         for rows in self._batches(len(loads)):
             step = step_from(self._ladder, cases.rows(rows), guess[:, rows])
@@ -311,18 +312,18 @@ class Fem:
         vertices = len(self._anatomy.mesh.nodes)
         check_start(start, len(loads), vertices)
         full = self.space.interpolated(start.at(np.arange(vertices)).displacement)
-        if len(self.space.edges) and MIDDLES in start.history:
-            full[:, vertices:] += Cases(loads, start.time, start.history).past(MIDDLES, (len(self.space.edges), 3))
+        if len(self.space.edges) and MIDDLES in start.memory:
+            full[:, vertices:] += Cases(loads, start.time, start.memory).past(MIDDLES, (len(self.space.edges), 3))
         return full.reshape(len(loads), self.problem.rows).T
 
     def _solve(
         self, ladder: Ladder | Still, cases: Cases, last: np.ndarray | None, at: np.ndarray | None
     ) -> Deformation:
         clock = time.perf_counter()
-        guesses = () if last is None else (moved_on(cases.loads, last, cases.history), last)
+        guesses = () if last is None else (moved_on(cases.loads, last, cases.warm), last)
         found = ladder.climb(cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
-        way = way_of(pushes_of(cases.loads), last, cases.history) if len(cases.loads) <= TAUGHT else {}
+        way = way_of(pushes_of(cases.loads), last, cases.warm) if len(cases.loads) <= TAUGHT else {}
         return self._answered(cases, found, way, at, seconds)
 
     def _answered(
@@ -333,10 +334,10 @@ class Fem:
         at: np.ndarray | None,
         seconds: Mapping[str, float],
     ) -> Deformation:
-        """What was found, as a deformation: reactions, and `more` history; it took `seconds` by stage."""
+        """What was found, as a deformation: reactions, and `more` that is warm; it took `seconds` by stage."""
         solved = time.perf_counter()
         self.problem.begin(replace(cases, share=found.gone, anew=found.anew))
-        history = {**self.problem.end(found.u), **found.learnt, **more}
+        memory = dict(self.problem.end(found.u))
         displaced = cases.loads.of(Displaced) is not None
         held = self.problem.gradient(found.u) if displaced or self._bond else None
         on_footprint = self.problem.constraint.force_on_footprint(held) if displaced else None
@@ -346,7 +347,7 @@ class Fem:
         if at is None and len(self.space.edges):
             whole = unstacked(self.problem.device, found.u, np.arange(self.space.count))
             displacement = np.ascontiguousarray(whole[:, : len(nodes)])
-            history[MIDDLES] = whole[:, len(nodes) :] - self.space.interpolated(displacement)[:, len(nodes) :]
+            memory[MIDDLES] = whole[:, len(nodes) :] - self.space.interpolated(displacement)[:, len(nodes) :]
         else:
             displacement = unstacked(self.problem.device, found.u, nodes)
         return Deformation(
@@ -357,7 +358,8 @@ class Fem:
             residual=found.residual,
             time=cases.loads.times,
             reaction=reaction,
-            history=history,
+            memory=memory,
+            warm={**found.learnt, **more},
             cost=Cost({**seconds, "reactions": time.perf_counter() - solved}),
             reached=found.reached,
             inverted=found.inverted,
@@ -380,11 +382,8 @@ class Fem:
 
 
 def _joined(parts: list[Deformation]) -> Deformation:
-    """Batches, one after the other, as one deformation. What they learnt is not for all of them."""
-    if len(parts) == 1:
-        return parts[0]
-    kept = [{key: value for key, value in part.history.items() if not key.startswith(LEARNT_KEY)} for part in parts]
-    return joined([replace(part, history=history) for part, history in zip(parts, kept, strict=True)])
+    """Batches, one after the other, as one deformation. What is warm in one is not for all of them."""
+    return parts[0] if len(parts) == 1 else joined([replace(part, warm={}) for part in parts])
 
 
 def solver_named(element: str, effects: Iterable[Effect]) -> str:

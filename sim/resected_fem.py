@@ -20,7 +20,7 @@ from .fem import MIDDLES, Fem
 from .loads import Loads, Resected, check_loads
 from .runtime.exclusive import alone
 
-# The history's key for how many steps (B,) were done.
+# The memory's key for how many steps (B,) were done.
 DONE = "resection"
 # Shape of a tool's pose.
 POSE = (4, 4)
@@ -31,7 +31,7 @@ KEPT = 4
 class Operated:
     """A Deformer: each load case is answered by the finite elements of what is left of the body.
 
-    Vertices of which nothing is left stay where they were in the scan. Histories are those of the whole body, whose
+    Vertices of which nothing is left stay where they were in the scan. Memories are those of the whole body, whose
     elements and nodes that are gone remember nothing. Threads may share it, and take turns, as in `Fem`.
 
     Parameters
@@ -77,7 +77,7 @@ class Operated:
         done, most = self._done(loads), len(self._bodies) - 1
         if (done > most).any():
             raise InputError(f"Resected.done is {done.max()}, but Resection has {most} steps: give at most that.")
-        same = np.zeros(len(done), bool) if start is None or DONE not in start.history else start.history[DONE] == done
+        same = np.zeros(len(done), bool) if start is None or DONE not in start.memory else start.memory[DONE] == done
         order, parts, stages = [], [], []
         for stage, stays in sorted(set(zip(done.tolist(), same.tolist(), strict=True))) or [(most, False)]:
             rows = np.flatnonzero((done == stage) & (same == stays))
@@ -94,21 +94,21 @@ class Operated:
 
     def _begun(self, start: Deformation, stage: int, stays: bool) -> Deformation:
         """An answer as one of the body at a stage, which `stays` what it was or was another."""
-        history = dict(start.history) if stays else self._lasting(start.history, stage)
-        history.pop(DONE, None)
-        for name, place in self._places(history, stage).items():
-            if history[name].shape[1:] == self._shape(name):  # another body's is refused by who reads it
-                history[name] = history[name][place]
-        return replace(start, displacement=self._masked(start, stage), history=history)
+        memory = dict(start.memory) if stays else self._lasting(start.memory, stage)
+        memory.pop(DONE, None)
+        for name, place in self._places(memory, stage).items():
+            if memory[name].shape[1:] == self._shape(name):  # another body's is refused by who reads it
+                memory[name] = memory[name][place]
+        return replace(start, displacement=self._masked(start, stage), memory=memory, warm=start.warm if stays else {})
 
     def _ended(self, answer: Deformation, stage: int) -> Deformation:
         """The answer of the body at a stage as one of the whole body, marked with the steps that it is of."""
-        history = {**answer.history, DONE: np.full(len(answer), float(stage))}
-        for name, place in self._places(history, stage).items():
-            own = history[name]
-            history[name] = np.zeros((len(own), *self._shape(name)), own.dtype)
-            history[name][place] = own
-        return replace(answer, displacement=self._masked(answer, stage), history=history)
+        memory = {**answer.memory, DONE: np.full(len(answer), float(stage))}
+        for name, place in self._places(memory, stage).items():
+            own = memory[name]
+            memory[name] = np.zeros((len(own), *self._shape(name)), own.dtype)
+            memory[name][place] = own
+        return replace(answer, displacement=self._masked(answer, stage), memory=memory)
 
     def _masked(self, answer: Deformation, stage: int) -> np.ndarray:
         """Displacements of an answer with orphaned vertices at rest."""
@@ -117,37 +117,37 @@ class Operated:
 
     def _together(self, parts: list[Deformation], stages: list[int]) -> Deformation:
         """Answers of the bodies at some stages; where one has no such elements at all, they remember nothing."""
-        histories = [self._lasting(part.history, stage) for part, stage in zip(parts, stages, strict=True)]
-        shapes = {name: value.shape[1:] for history in histories for name, value in history.items()}
+        memories = [self._lasting(part.memory, stage) for part, stage in zip(parts, stages, strict=True)]
+        shapes = {name: value.shape[1:] for memory in memories for name, value in memory.items()}
         whole = [
-            {name: np.zeros((len(part), *shape)) for name, shape in shapes.items()} | history
-            for part, history in zip(parts, histories, strict=True)
+            {name: np.zeros((len(part), *shape)) for name, shape in shapes.items()} | memory
+            for part, memory in zip(parts, memories, strict=True)
         ]
-        return joined([replace(part, history=history) for part, history in zip(parts, whole, strict=True)])
+        return joined([replace(part, memory=memory, warm={}) for part, memory in zip(parts, whole, strict=True)])
 
-    def _lasting(self, history: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
+    def _lasting(self, memory: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
         """What means the same in another body: memories of elements and nodes, poses of tools, steps done."""
         rows = self._rows(stage)
         return {
-            name: value for name, value in history.items() if name in rows or name == DONE or value.shape[2:] == POSE
+            name: value for name, value in memory.items() if name in rows or name == DONE or value.shape[2:] == POSE
         }
 
-    def _places(self, history: Mapping[str, np.ndarray], stage: int) -> dict[str, tuple[slice, np.ndarray, slice]]:
-        """Of histories of elements and nodes, by name: where in the whole body's those of a stage's are.
+    def _places(self, memory: Mapping[str, np.ndarray], stage: int) -> dict[str, tuple[slice, np.ndarray, slice]]:
+        """Of memories of elements and nodes, by name: where in the whole body's those of a stage's are.
 
         A row is shorter where what is gone relaxed in a longer series.
         """
         rows = self._rows(stage) if stage else {}
-        return {name: (slice(None), self._place(stage, name), slice(rows[name][1])) for name in history if name in rows}
+        return {name: (slice(None), self._place(stage, name), slice(rows[name][1])) for name in memory if name in rows}
 
     def _shape(self, name: str) -> tuple[int, int]:
-        """Of a history of the whole body's elements or nodes: how many they are, and numbers of each."""
+        """Of a memory of the whole body's elements or nodes: how many they are, and numbers of each."""
         marks, width = self._rows(0)[name]
         return len(marks), width
 
 
 def _rows(fem: Fem) -> dict[str, tuple[np.ndarray, int]]:
-    """Of each history whose rows are elements or nodes: what tells them (n, k) from all others, and their length."""
+    """Of each memory whose rows are elements or nodes: what tells them (n, k) from all others, and their length."""
     terms = [term for term in fem.problem.terms if isinstance(term, Remembering)]
     return {MIDDLES: (fem.space.edges, 3)} | {term.name: (term.marks, term.width) for term in terms}
 

@@ -107,7 +107,7 @@ def torn(
 def _reaction(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
     """What holds the body (3N, 1) [N]."""
     problem = fem.problem
-    problem.begin(Cases(loads, answer.time, answer.history))
+    problem.begin(Cases(loads, answer.time, answer.memory))
     return problem.gradient(problem.device.array(fem.guess(loads, answer)))
 
 

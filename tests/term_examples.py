@@ -77,9 +77,9 @@ def of_effects(*effects: object) -> Callable[[Device], Term]:
 def cases() -> Cases:
     forces = Nodal(RNG.normal(size=(3, len(MESH.nodes), 3)))
     pushes = Pushed(np.full((3, 3), [0.05, 0.05, 0.1]), RNG.normal(size=(3, 3)), np.array([0.01, 0.02, 0.03]))
-    history = {name: 1e-3 * RNG.normal(size=(3, len(MESH.nodes), 3)) for name in ("spring", "inertia")}
+    memory = {name: 1e-3 * RNG.normal(size=(3, len(MESH.nodes), 3)) for name in ("spring", "inertia")}
     start = 1e-3 * RNG.normal(size=(3, len(MESH.nodes), 3))
-    return Cases(Loads((forces, pushes), np.array([1.0, 2.0, 3.0])), np.array([0.5, 0.0, 2.9]), history, start)
+    return Cases(Loads((forces, pushes), np.array([1.0, 2.0, 3.0])), np.array([0.5, 0.0, 2.9]), memory, start)
 
 
 def postures() -> Cases:
@@ -125,7 +125,7 @@ STRONG = Pulsation(Wave(1.0, 0.2), Wave(0.2, 0.05))
 
 
 def relaxing(law: str, element: str = "p1", *effects: object) -> Example:
-    """A viscoelastic law amid its history; the first case is a body at rest so far, at once."""
+    """A viscoelastic law amid its memory; the first case is a body at rest so far, at once."""
     space = discretise(MESH, element)
     tissues = replace(tissue(law), prony=SERIES)
     part = space.parts(np.ones(len(MESH.tets), bool))[0]

@@ -75,7 +75,7 @@ def potential(fem: Fem, loads: Loads, answer: Deformation) -> float:
     Springs of moduli g_i mu beside a spring: e:e mu (1 - sum g) + sum mu g_i |e - a_i|^2, with 2 mu e = S and
     2 mu g_i (e - a_i) = H_i; all but sum mu g_i |a_i|^2 is the problem's own energy where no time passes.
     """
-    now = Cases(Loads(loads.causes, answer.time), answer.time, answer.history, answer.displacement)
+    now = Cases(Loads(loads.causes, answer.time), answer.time, answer.memory, answer.displacement)
     fem.problem.begin(now)
     out = wp.zeros(1, dtype=wp.float64, device="cpu")
     for term in fem.problem.terms:
@@ -84,8 +84,8 @@ def potential(fem: Fem, loads: Loads, answer: Deformation) -> float:
     stored = float(out.numpy()[0])
     tissue = next(effect.default for effect in fem.effects if isinstance(effect, Elasticity))
     assert tissue is not None
-    for name in (name for name in answer.history if name.startswith("visco")):
-        S, *H = np.moveaxis(answer.history[name][0].reshape(-1, 1 + len(tissue.prony), 6), 1, 0)
+    for name in (name for name in answer.memory if name.startswith("visco")):
+        S, *H = np.moveaxis(answer.memory[name][0].reshape(-1, 1 + len(tissue.prony), 6), 1, 0)
         for (share, _), left in zip(tissue.prony, H, strict=True):
             square = (left - share * S) ** 2 @ [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]
             stored += float(square @ BODY.mesh.volumes) / (4.0 * share * tissue.lame[0])
@@ -103,7 +103,7 @@ def test_energy_does_not_grow(name: str, step: float, damping: float) -> None:
     for number in range(1, STEPS + 1):
         answer = fem.deform(Loads(loads.causes, begun + number * step), answer)
         assert answer.outcome[0].good
-        kinetic.append(0.5 * float((mass[:, None] * answer.history["inertia"][0] ** 2).sum()))
+        kinetic.append(0.5 * float((mass[:, None] * answer.memory["inertia"][0] ** 2).sum()))
         stored.append(potential(fem, loads, answer))
     total = np.add(kinetic, stored)
     span = total[0] - total[-1]

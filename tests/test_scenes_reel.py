@@ -59,9 +59,9 @@ REMEMBERING = {
 
 def same(one: Deformation, other: Deformation) -> bool:
     """Bit for bit, what is remembered too."""
-    assert set(one.history) == set(other.history)
+    assert set(one.memory) == set(other.memory)
     pairs = [(one.displacement, other.displacement), (one.time, other.time)]
-    pairs += [(np.asarray(one.history[name]), np.asarray(other.history[name])) for name in one.history]
+    pairs += [(np.asarray(one.memory[name]), np.asarray(other.memory[name])) for name in one.memory]
     return all(np.array_equal(a, b) for a, b in pairs)
 
 

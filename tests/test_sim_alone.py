@@ -12,7 +12,7 @@ import pytest
 from boxes import base_held, box
 
 from sim.accuracy import LIVE, REFERENCE, Accuracy
-from sim.deformation import LEARNT_KEY, Deformation
+from sim.deformation import Deformation
 from sim.effects import Elasticity, Held, NodalForce, Resection, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, Resected, push
@@ -36,7 +36,7 @@ def pushes(thread: int) -> list[Loads]:
 def same(one: Deformation, other: Deformation) -> None:
     for name in ("displacement", "reaction", "residual", "iterations"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    assert set(one.history) == set(other.history)
+    assert set(one.memory) == set(other.memory)
 
 
 def at_once(work: Callable[[int], list[T]]) -> list[list[T]]:
@@ -100,7 +100,7 @@ def test_a_body_that_is_cut_shared_by_threads() -> None:
 
 
 def test_what_an_answer_left_on_the_device_is_its_own_while_others_answer() -> None:
-    """Frame after frame, each thread on its own way; histories are read after others have moved on."""
+    """Frame after frame, each thread on its own way; what is warm is read after others have moved on."""
     fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), LIVE, "cpu", element="p1")
     fem._following = fem._follower()
 
@@ -110,13 +110,13 @@ def test_what_an_answer_left_on_the_device_is_its_own_while_others_answer() -> N
         for number in range(1, 5):
             answers.append(fem.deform(push(point + [1e-3 * number, 0.0, 0.0], force, 0.02), answers[-1]))
             if number % 2:
-                dict(answers[-1].history)
+                dict(answers[-1].warm)
         return answers
 
     alone = [work(thread) for thread in range(THREADS)]
-    assert isinstance(alone[0][-1].history, Kept)
-    names = [LEARNT_KEY + name for name in ("head", "known")]
+    assert isinstance(alone[0][-1].warm, Kept)
+    names = ("head", "known")
     for theirs, own in zip(at_once(work), alone, strict=True):
         for one, other in zip(theirs, own, strict=True):
             same(one, other)
-            assert all(np.array_equal(one.history[name], other.history[name]) for name in names)
+            assert all(np.array_equal(one.warm[name], other.warm[name]) for name in names)

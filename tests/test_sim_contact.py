@@ -64,7 +64,7 @@ def seven_by_seven(fem: Fem, found: Deformation) -> np.ndarray:
     space = fem.space
     u = found.displacement[0]
     if len(space.edges):
-        middles = space.interpolated(u)[len(u) :] + found.history["mid-edge nodes"][0]
+        middles = space.interpolated(u)[len(u) :] + found.memory["mid-edge nodes"][0]
         u = np.vstack([u, middles])
     steps = np.linspace(0.0, 1.0, 7)
     y, z = (grid.ravel() for grid in np.meshgrid(steps, steps))

@@ -121,10 +121,10 @@ def test_hard_contact_ends_as_it_says(name: str) -> None:
         assert start.inverted[0] == 0
         points = lattice(BLOCK, start)
         # Where the tools are that the answer is of, asked for or reached.
-        for tool, pose in zip(hard.tools, start.history["tool contact"][0], strict=True):
+        for tool, pose in zip(hard.tools, start.memory["tool contact"][0], strict=True):
             assert distances_to(tool, pose, points).min() > -YIELDS * hard.gap
         if start.outcome[0].good:
-            np.testing.assert_array_equal(start.history["tool contact"][0], np.stack(poses))
+            np.testing.assert_array_equal(start.memory["tool contact"][0], np.stack(poses))
     assert start is not None
     assert start.outcome[0] in hard.ends
 
@@ -154,7 +154,7 @@ def test_an_answer_that_fell_short_says_where_the_tool_is() -> None:
     short = fem.deform(touching(at(0.03, 0.03, HEIGHT - 9e-3)))
     assert short.outcome == (Outcome.BUDGET,)
     assert 0.0 < short.reached[0] < 1.0
-    stood = short.history["tool contact"][0]
+    stood = short.memory["tool contact"][0]
     assert stood[0, 2, 3] > HEIGHT - 9e-3
     there = solver(Hard((), accuracy=Accuracy(1e-6))).deform(touching(*stood))
     np.testing.assert_allclose(short.displacement, there.displacement, atol=1e-5)
@@ -233,7 +233,7 @@ def skewed() -> np.ndarray:
             lambda: solver(Hard((), (BALL, BALL))).deform(
                 touching(DOWN, DOWN), solver(Hard(())).deform(touching(DOWN))
             ),
-            r"history of tool contact has shape \(1, 1, 4, 4\), not \(1, 2, 4, 4\): start from .* tools",
+            r"memory of tool contact has shape \(1, 1, 4, 4\), not \(1, 2, 4, 4\): start from .* tools",
         ),
         (lambda: ToolContact((BALL,), 0.0), r"ToolContact\.gap is 0\.0 m"),
         (lambda: Retraction(Spatula(0.01, 0.01, 1e-3), np.inf), r"Retraction\.gap is inf"),

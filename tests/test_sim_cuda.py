@@ -109,7 +109,7 @@ def test_steps_in_time(box, law, moving, element, precision):
     on_cpu, on_cuda = answers
     off = np.abs(on_cpu.displacement - on_cuda.displacement).max()
     assert off <= 3.0 * BOUND[precision] * np.abs(on_cpu.displacement).max()
-    assert set(on_cpu.history) >= {f"viscoelasticity {law}" + (" of shape" if element == "smoothed" else "")}
+    assert set(on_cpu.memory) >= {f"viscoelasticity {law}" + (" of shape" if element == "smoothed" else "")}
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
@@ -212,7 +212,7 @@ def test_frames_stay_on_the_card(box):
     for load in loads[1:]:
         answers.append(fem.deform(load, answers[-1]))
         other = host.deform(load, other)
-        assert isinstance(answers[-1].history, Kept) and answers[-1].outcome == other.outcome
+        assert isinstance(answers[-1].warm, Kept) and answers[-1].outcome == other.outcome
         off = np.abs(answers[-1].displacement - other.displacement).max()
         assert off <= 0.02 * np.abs(other.displacement).max()  # both stop at LIVE's residual
     np.testing.assert_allclose(fem.residual(loads[-1], answers[-1]), answers[-1].residual, rtol=0.05)

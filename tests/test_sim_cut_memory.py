@@ -63,7 +63,7 @@ class TestMemory:
             last = made.deform(Loads((Prescribed(lifted), Resected(done)), np.array([time])), last)
             assert last.outcome[0].good
             found.append(last)
-            last = replace(last, history={}) if forgets and frame == cut - 1 else last
+            last = replace(last, memory={}) if forgets and frame == cut - 1 else last
         return found
 
     @pytest.mark.parametrize("element", ELEMENTS)
@@ -83,12 +83,12 @@ class TestMemory:
     def test_what_fades_follows_its_series(self, element: str) -> None:
         """Of a held stretch each part of the stress is g exp(-t / tau) of what it was at once, across the cut."""
         found = self.run(element, {}, 3)
-        (name,) = (name for name in found[0].history if "visco" in name)
-        at_once = found[0].history[name][0, :, :6]
+        (name,) = (name for name in found[0].memory if "visco" in name)
+        at_once = found[0].memory[name][0, :, :6]
         stretched = np.abs(at_once).max(axis=1) > 1.0
         assert stretched.sum() >= 6
         for answer, time in zip(found, self.TIMES, strict=True):
-            left = answer.history[name][0, stretched].reshape(stretched.sum(), 3, 6)
+            left = answer.memory[name][0, stretched].reshape(stretched.sum(), 3, 6)
             for part, (share, tau) in enumerate(RELAXING.prony, start=1):
                 expected = share * np.exp(-time / tau) * at_once[stretched]
                 np.testing.assert_allclose(left[:, part], expected, atol=1e-6 * np.abs(at_once).max())
@@ -120,14 +120,14 @@ class TestMemory:
             loads = replace(lying([0]), time=np.array([time]))
             one, other = plain.deform(loads.but(Resected), one), made.deform(loads, other)
             np.testing.assert_array_equal(one.displacement, other.displacement)
-            assert {"inertia", "viscoelasticity neo-hookean"} <= set(one.history) == set(other.history) - {"resection"}
-            for name, value in one.history.items():
-                np.testing.assert_array_equal(value, other.history[name])
+            assert {"inertia", "viscoelasticity neo-hookean"} <= set(one.memory) == set(other.memory) - {"resection"}
+            for name, value in one.memory.items():
+                np.testing.assert_array_equal(value, other.memory[name])
 
     def test_a_history_of_another_body_is_a_sentence(self) -> None:
         made = finite_elements(BODY, (Elasticity(RELAXING), Held(), STEPS), TIGHT, "cpu", element="p1")
         strange = replace(
-            guess(np.zeros((1, len(MESH.nodes), 3))), history={"viscoelasticity neo-hookean": np.ones((1, 7, 18))}
+            guess(np.zeros((1, len(MESH.nodes), 3))), memory={"viscoelasticity neo-hookean": np.ones((1, 7, 18))}
         )
         with pytest.raises(InputError, match="start from an answer of the same mesh"):
             made.deform(Loads((Resected(np.array([1])),)), strange)

@@ -155,8 +155,8 @@ def test_a_deformation_speaks_of_the_meshs_own_vertices(fem: Fem) -> None:
     found = fem.deform(push([0.05, 0.05, 0.1 / 3.0], [[0.0, 0.0, -0.3], [0.0, 0.1, 0.0]], 0.02))
     assert found.displacement.shape == (2, len(THIN.nodes), 3)
     np.testing.assert_array_equal(found.nodes, np.arange(len(THIN.nodes)))
-    assert found.history[MIDDLES].shape == (2, len(fem.space.edges), 3)
-    assert np.abs(found.history[MIDDLES]).max() > 1e-5
+    assert found.memory[MIDDLES].shape == (2, len(fem.space.edges), 3)
+    assert np.abs(found.memory[MIDDLES]).max() > 1e-5
     assert fem.deform(
         push([0.05, 0.05, 0.1 / 3.0], [0.0, 0.0, -0.3], 0.02), at=np.array([7, 3])
     ).displacement.shape == (1, 2, 3)
@@ -166,7 +166,7 @@ def test_a_start_without_mid_edge_nodes_serves_too(fem: Fem) -> None:
     """From elements that have none: they begin in the middle between their ends."""
     loads = push([0.05, 0.05, 0.1 / 3.0], [0.0, 0.0, -0.3], 0.02)
     found = fem.deform(loads)
-    bare = fem.deform(loads, replace(found, history={}))
+    bare = fem.deform(loads, replace(found, memory={}))
     assert bare.iterations[0] > 0
     np.testing.assert_allclose(bare.displacement, found.displacement, atol=1e-9)
 

@@ -158,7 +158,7 @@ def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves(monkeypatc
         found = fem.deform(loads_of(many))
         assert all(outcome.good for outcome in found.outcome)
         assert (found.iterations != plain.iterations).any()
-        assert all(len(value) == len(many) for value in found.history.values())
+        assert all(len(value) == len(many) for value in found.memory.values())
         largest = np.abs(plain.displacement).max()
         np.testing.assert_allclose(found.displacement, plain.displacement, atol=1e-5 * largest)
 

@@ -50,29 +50,29 @@ def ride(fem: Fem, count: int = 6) -> list[Deformation]:
 
 
 def same(one: Deformation, other: Deformation) -> bool:
-    assert set(one.history) == set(other.history)
+    assert set(one.warm) == set(other.warm)
     names = ("displacement", "iterations", "residual", "reaction", "reached", "inverted", "time", "nodes")
     pairs = [(getattr(one, name), getattr(other, name)) for name in names]
-    pairs += [(one.history[name], other.history[name]) for name in one.history]
+    pairs += [(one.warm[name], other.warm[name]) for name in one.warm]
     return one.outcome == other.outcome and all(np.array_equal(*pair) for pair in pairs)
 
 
 def test_frames_are_those_of_the_ladder(fem):
     plain = Fem(BODY, EFFECTS, LIVE, "cpu", element="p1")
     for own, other in zip(ride(fem)[1:], ride(plain)[1:], strict=True):
-        assert isinstance(own.history, Kept) and own.outcome == other.outcome == (Outcome.CONVERGED,)
+        assert isinstance(own.warm, Kept) and own.outcome == other.outcome == (Outcome.CONVERGED,)
         assert own.iterations[0] == other.iterations[0]
         np.testing.assert_allclose(own.displacement, other.displacement, atol=1e-4 * np.abs(other.displacement).max())
         np.testing.assert_allclose(own.reaction, other.reaction, rtol=1e-9, atol=1e-12)
         assert own.residual[0] == pytest.approx(other.residual[0], rel=0.02) and own.residual[0] <= LIVE.tolerance
-        assert set(own.history) == set(other.history)
-        assert own.history["l-bfgs known"].shape == (1,)
+        assert set(own.warm) == set(other.warm)
+        assert own.warm["known"].shape == (1,)
 
 
 def test_a_start_is_the_same_on_the_device_and_on_the_host(fem):
     last = ride(fem)[-1]
     here = fem.deform(pushed(5e-3), last)
-    brought = fem.deform(pushed(5e-3), replace(last, history={**last.history}))
+    brought = fem.deform(pushed(5e-3), replace(last, warm={**last.warm}))
     assert same(here, brought)
 
 
@@ -95,7 +95,7 @@ def test_only_what_is_kept_leaves_the_device(fem, monkeypatch):
     kept = last
     for number in range(3):
         last = fem.deform(pushed(5e-3 + 5e-4 * number), last)
-    assert len(read) == len(LEARNT) and kept.history["l-bfgs s"].any()
+    assert len(read) == len(LEARNT) and kept.warm["s"].any()
     assert len(read) == len(LEARNT)
 
 
@@ -111,10 +111,10 @@ def test_what_does_not_go_well_is_the_ladders(fem):
     with pytest.raises(InputError, match="does not touch the surface"):
         fem.deform(pushed(0.5), last)
     lifted = fem.deform(pushed(4e-3, 0.0).scaled(np.zeros(1)), last)
-    assert not lifted.displacement.any() and not isinstance(lifted.history, Kept)
-    assert isinstance(fem.deform(pushed(4e-3), lifted).history, Kept)
+    assert not lifted.displacement.any() and not isinstance(lifted.warm, Kept)
+    assert isinstance(fem.deform(pushed(4e-3), lifted).warm, Kept)
     vast = fem.deform(pushed(4e-3, 60.0), last)
-    assert not isinstance(vast.history, Kept)
+    assert not isinstance(vast.warm, Kept)
     assert same(fem.deform(pushed(4e-3), last), fem.deform(pushed(4e-3), replace(last)))
 
 
@@ -124,8 +124,8 @@ def test_a_start_that_is_not_fit_is_the_ladders(fem):
     assert torn.outcome == (Outcome.CONVERGED_ANEW,)
     loose = good.displacement.copy()
     loose[0, BODY.held.any(axis=1)] += 1e-4
-    assert not isinstance(fem.deform(pushed(1e-3), guess(loose)).history, Kept)
-    assert isinstance(fem.deform(pushed(1e-3), guess(good.displacement)).history, Kept)
+    assert not isinstance(fem.deform(pushed(1e-3), guess(loose)).warm, Kept)
+    assert isinstance(fem.deform(pushed(1e-3), guess(good.displacement)).warm, Kept)
 
 
 def test_a_start_may_name_its_vertices_in_any_order(fem):

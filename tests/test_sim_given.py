@@ -11,11 +11,12 @@ import pytest
 from boxes import base_held, box
 
 from sim.accuracy import LIVE, Accuracy
-from sim.deformation import LEARNT_KEY, Deformation, guess
+from sim.deformation import Deformation, guess
 from sim.effects import Elasticity, Held, Inertia, Resection, ToolForce
 from sim.errors import InputError
 from sim.fem import MIDDLES, Fem
 from sim.loads import Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Resected, Retracted, Touching, posture, push
+from sim.minimisers.lbfgs import LEARNT
 from sim.resected_fem import finite_elements
 
 BODY = base_held(box((3, 3, 3), 0.1))
@@ -193,8 +194,12 @@ def test_an_accuracy_of_nonsense(budget: dict[str, Any], sentence: str) -> None:
     assert Accuracy(**{"tolerance": np.float32(1e-3), "outer": np.int32(4)}).outer == 4
 
 
-def spoilt(answer: Deformation, **history: Any) -> Deformation:
-    return replace(answer, history={**answer.history, **history})
+def spoilt(answer: Deformation, **memory: Any) -> Deformation:
+    return replace(answer, memory={**answer.memory, **memory})
+
+
+def warmed(answer: Deformation, **warm: Any) -> Deformation:
+    return replace(answer, warm={**answer.warm, **warm})
 
 
 def test_starts_that_are_none(fem: Fem, cut: Any) -> None:
@@ -209,10 +214,10 @@ def test_starts_that_are_none(fem: Fem, cut: Any) -> None:
             (good.at(np.array([1, 2])), r"shape \(1, 2, 3\)"),
             (replace(good, time=np.array([np.nan])), "the start's 'time' are no 1 rows of finite numbers"),
             (replace(good, time=np.zeros(3)), "the start's 'time'"),
-            (spoilt(good, before=np.full((1, 192), np.nan)), "the start's 'before'"),
-            (spoilt(good, pushes=np.array("x")), "the start's 'pushes'"),
-            (spoilt(good, pushes=np.zeros((4, 2, 7))), "the start's 'pushes'"),
-            (spoilt(good, pushes=good.history["pushes"] * 1j), "the start's 'pushes'"),
+            (spoilt(good, inertia=np.full((1, 64, 3), np.nan)), "the start's 'inertia'"),
+            (warmed(good, pushes=np.array("x")), "the start's 'pushes'"),
+            (warmed(good, pushes=np.zeros((4, 2, 7))), "the start's 'pushes'"),
+            (warmed(good, pushes=good.warm["pushes"] * 1j), "the start's 'pushes'"),
         ]
         for start, sentence in wrong:
             with pytest.raises(InputError, match=sentence):
@@ -227,19 +232,19 @@ def test_starts_that_are_none(fem: Fem, cut: Any) -> None:
 def test_what_was_learnt_and_is_not_finite_is_forgotten(fem: Fem, value: float) -> None:
     first = fem.deform(PUSH)
     start = fem.deform(PUSH.scaled(1.1), first)
-    key = LEARNT_KEY + "s"
-    assert start.history[LEARNT_KEY + "known"][0] > 0
-    found = fem.deform(PUSH.scaled(1.2), spoilt(start, **{key: np.full_like(start.history[key], value)}))
-    plain = {name: array for name, array in start.history.items() if not name.startswith(LEARNT_KEY)}
-    other = fem.deform(PUSH.scaled(1.2), replace(start, history=plain))
-    np.testing.assert_array_equal(found.displacement, other.displacement)
+    assert start.warm["known"][0] > 0
+    for name, rest in (("s", {"pushes", "before"}), ("before", {*LEARNT, "pushes"})):
+        found = fem.deform(PUSH.scaled(1.2), warmed(start, **{name: np.full_like(start.warm[name], value)}))
+        left = {key: array for key, array in start.warm.items() if key in rest}
+        other = fem.deform(PUSH.scaled(1.2), replace(start, warm=left))
+        np.testing.assert_array_equal(found.displacement, other.displacement)
 
 
 def test_mid_edge_nodes_of_another_body() -> None:
     body = Fem(BODY, EFFECTS, LIVE, "cpu", element="p2")
     answer = body.deform(PUSH)
-    wrong = spoilt(answer, **{MIDDLES: answer.history[MIDDLES][:, :, :2]})
-    with pytest.raises(InputError, match=f"the start's history of {MIDDLES} has shape"):
+    wrong = spoilt(answer, **{MIDDLES: answer.memory[MIDDLES][:, :, :2]})
+    with pytest.raises(InputError, match=f"the start's memory of {MIDDLES} has shape"):
         body.deform(PUSH, wrong)
 
 

@@ -108,9 +108,9 @@ def test_damping_is_the_exponential_of_a_free_flight() -> None:
     for steps in (10, 20):
         velocity = np.where(BLOCK.held, 0.0, 1.0)[None]
         answer = guess(np.zeros_like(velocity))
-        object.__setattr__(answer, "history", {"inertia": velocity})
+        object.__setattr__(answer, "memory", {"inertia": velocity})
         answer = after(fem, answer, steps, 0.2 / steps)
-        errors.append(answer.history["inertia"][0, -1, 0] - np.exp(-1.0))
+        errors.append(answer.memory["inertia"][0, -1, 0] - np.exp(-1.0))
     assert errors[1] < 0.02
     assert errors[0] / errors[1] == pytest.approx(2.0, abs=0.1)
 
@@ -142,7 +142,7 @@ def test_energy_never_grows_under_loads_that_stay(step: float, poisson: float) -
     mass = lumped_mass(DENSITY, fem.space)
 
     def total(answer: Deformation) -> float:
-        velocity = answer.history.get("inertia", np.zeros((1, 1, 3)))[0]
+        velocity = answer.memory.get("inertia", np.zeros((1, 1, 3)))[0]
         potential = still.energy(still.device.array(answer.displacement.reshape(-1, 1)))[0]
         return float(potential + 0.5 * (mass[:, None] * velocity**2).sum())
 
@@ -162,7 +162,7 @@ def test_one_long_step_is_statics(element: str) -> None:
     still = Fem(BLOCK, effects, TIGHT, "cpu", element=element).deform(Loads((pull,)))
     moving = Fem(BLOCK, [*effects, Inertia()], TIGHT, "cpu", element=element).deform(Loads((pull,), np.array([1e4])))
     np.testing.assert_allclose(moving.displacement, still.displacement, atol=1e-7 * np.abs(still.displacement).max())
-    assert np.abs(moving.history["inertia"]).max() < 1e-5
+    assert np.abs(moving.memory["inertia"]).max() < 1e-5
 
 
 def test_runs_are_pure_and_may_be_cut_or_interleaved() -> None:
@@ -178,8 +178,8 @@ def test_runs_are_pure_and_may_be_cut_or_interleaved() -> None:
     again = after(second, begun, 2, 0.01, force)
     for run in (cut, again):
         np.testing.assert_array_equal(run.displacement, straight.displacement)
-        np.testing.assert_array_equal(run.history["inertia"], straight.history["inertia"])
-    assert straight.history["inertia"].shape == (1, first.space.count, 3)
+        np.testing.assert_array_equal(run.memory["inertia"], straight.memory["inertia"])
+    assert straight.memory["inertia"].shape == (1, first.space.count, 3)
 
 
 def test_where_no_time_passes_a_body_stays_as_it_is() -> None:
@@ -190,9 +190,9 @@ def test_where_no_time_passes_a_body_stays_as_it_is() -> None:
     assert first.outcome[0].good and not first.displacement.any()
     moving = after(fem, first, 2, 0.01, force)
     paused = fem.deform(Loads((Nodal(2.0 * force),), moving.time), moving)
-    assert moving.displacement.any() and moving.history["inertia"].any()
+    assert moving.displacement.any() and moving.memory["inertia"].any()
     np.testing.assert_array_equal(paused.displacement, moving.displacement)
-    np.testing.assert_array_equal(paused.history["inertia"], moving.history["inertia"])
+    np.testing.assert_array_equal(paused.memory["inertia"], moving.memory["inertia"])
     ahead, on = after(fem, moving, 1, 0.01, force), after(fem, paused, 1, 0.01, force)
     np.testing.assert_allclose(on.displacement, ahead.displacement, atol=1e-12)
 
@@ -228,7 +228,7 @@ def asked(start: Deformation | None, time: float) -> Callable[[], object]:
 
 def strange() -> Deformation:
     start = guess(np.zeros((1, len(BLOCK.mesh.nodes), 3)))
-    object.__setattr__(start, "history", {"inertia": np.zeros((1, 5, 3))})
+    object.__setattr__(start, "memory", {"inertia": np.zeros((1, 5, 3))})
     return start
 
 
@@ -238,7 +238,7 @@ def strange() -> Deformation:
         (dynamic(density=0.0), r"Inertia\.density is 0\.0 kg/m\^3: give a positive"),
         (dynamic(damping=-1.0), r"Inertia\.damping is -1\.0 1/s"),
         (asked(None, -1.0), "load case 0 is at -1 s, before its start at 0 s: .* earlier deformation"),
-        (asked(strange(), 1.0), r"history of inertia has shape \(1, 5, 3\), not \(1, 27, 3\)"),
+        (asked(strange(), 1.0), r"memory of inertia has shape \(1, 5, 3\), not \(1, 27, 3\)"),
     ],
 )
 def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: str) -> None:
@@ -275,12 +275,12 @@ def test_where_no_time_passes_tools_stay_where_they_are() -> None:
     touched = fem.deform(pressed(0.095, 0.5), first)
     stays = fem.deform(pressed(0.080, 0.5), touched)
     assert touched.reaction[0, 0, 2] < 0.0 and stays.outcome[0].good
-    np.testing.assert_array_equal(stays.history["tool contact"], touched.history["tool contact"])
+    np.testing.assert_array_equal(stays.memory["tool contact"], touched.memory["tool contact"])
     np.testing.assert_allclose(stays.reaction, touched.reaction)
     moved = fem.deform(pressed(0.080, 1.0), stays)
     nodes = BLOCK.mesh.nodes + moved.displacement[0]
-    assert moved.outcome[0].good and distances_to(ball, moved.history["tool contact"][0, 0], nodes).min() > 0.0
-    np.testing.assert_array_equal(moved.history["tool contact"][0, 0, :3, 3], [0.04, 0.06, 0.080])
+    assert moved.outcome[0].good and distances_to(ball, moved.memory["tool contact"][0, 0], nodes).min() > 0.0
+    np.testing.assert_array_equal(moved.memory["tool contact"][0, 0, :3, 3], [0.04, 0.06, 0.080])
 
 
 def test_a_step_in_time_is_not_held_against_an_equilibrium() -> None:

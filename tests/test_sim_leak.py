@@ -88,7 +88,7 @@ def test_mid_edge_nodes_count(egg):
     answer = pressed(egg, "p2")
     space = discretise(egg.mesh, "p2")
     u = space.interpolated(answer.displacement[0])
-    u[len(egg.mesh.nodes) :] += answer.history[MIDDLES][0]
+    u[len(egg.mesh.nodes) :] += answer.memory[MIDDLES][0]
     device = find_device("cpu", "float64")
     assert Leak(egg, space, device).share(device.array(u.reshape(-1, 1)))[0] == pytest.approx(
         answer.leaked[0], rel=1e-3

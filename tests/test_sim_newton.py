@@ -36,7 +36,7 @@ TIGHT = Accuracy(tolerance=1e-10)
 
 
 def problem_of(device: Device, law: str = "stable-neo-hookean") -> Problem:
-    """Elasticity, nodal forces, a spring with history, and a wall 2 mm above the body."""
+    """Elasticity, nodal forces, a spring with memory, and a wall 2 mm above the body."""
     material = tissue(law)
     plain = compile_problem([Elasticity(material), Held(), NodalForce()], ANATOMY, device)
     extra = Spring(device, ROWS, 0.5), Wall(device, MESH.nodes, CEILING, 1.5e-3, 1e4)
@@ -51,14 +51,14 @@ TOTAL = np.array(
 
 def cases_of(total: np.ndarray = TOTAL, time: float = 0.7) -> Cases:
     count = len(total)
-    history = 2e-4 * np.random.default_rng(3).normal(size=(len(TOTAL), COUNT, 3))[:count]
+    memory = 2e-4 * np.random.default_rng(3).normal(size=(len(TOTAL), COUNT, 3))[:count]
     loads = Loads((Nodal(top_forces(MESH, total)),), np.full(count, time))
-    return Cases(loads, np.zeros(count), {"spring": history})
+    return Cases(loads, np.zeros(count), {"spring": memory})
 
 
 def rows_of(cases: Cases, index: np.ndarray) -> Cases:
-    history = {name: value[index] for name, value in cases.history.items()}
-    return Cases(cases.loads.rows(index), cases.start_time[index], history)
+    memory = {name: value[index] for name, value in cases.memory.items()}
+    return Cases(cases.loads.rows(index), cases.start_time[index], memory)
 
 
 def solve(problem: Problem, cases: Cases, accuracy: Accuracy = TIGHT, start: np.ndarray | None = None) -> Found:
@@ -105,10 +105,10 @@ def test_rows_do_not_depend_on_their_order(problem: Problem, batch: Found) -> No
 def test_history_arrives_in_its_rows(problem: Problem, batch: Found, device: Device) -> None:
     cases = cases_of()
     problem.begin(cases)
-    history = problem.end(device.array(batch.u))
-    assert list(history) == ["spring"]
-    before, u = cases.history["spring"], batch.u.T.reshape(len(TOTAL), COUNT, 3)
-    np.testing.assert_allclose(history["spring"], before + (1.0 - np.exp(-0.7)) * (u - before), atol=1e-14)
+    memory = problem.end(device.array(batch.u))
+    assert list(memory) == ["spring"]
+    before, u = cases.memory["spring"], batch.u.T.reshape(len(TOTAL), COUNT, 3)
+    np.testing.assert_allclose(memory["spring"], before + (1.0 - np.exp(-0.7)) * (u - before), atol=1e-14)
 
 
 def test_history_travels_through_the_deformer() -> None:
@@ -124,7 +124,7 @@ def test_history_travels_through_the_deformer() -> None:
             loads = Loads((Nodal(top_forces(MESH, total[rows])),), np.full(len(rows), time))
             state = fem.deform(loads, state)
             anchor += (1.0 - np.exp(begun - time)) * (state.displacement - anchor)
-            np.testing.assert_allclose(state.history["spring"], anchor, atol=1e-14)
+            np.testing.assert_allclose(state.memory["spring"], anchor, atol=1e-14)
             begun = time
             path.append(state.displacement)
         return path

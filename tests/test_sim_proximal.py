@@ -190,7 +190,7 @@ def test_a_batch_of_which_one_case_is_slow_goes_on() -> None:
     """What that one case learns, when it alone is left, is not the batch's."""
     fem, far = solver(Accuracy(1e-6)), touching(DOWN, at(0.045, 0.04, HEIGHT - 3e-3))
     second = fem.deform(far, fem.deform(touching(DOWN, DOWN)))
-    assert {len(value) for value in second.history.values()} == {2}
+    assert {len(value) for value in second.memory.values()} == {2}
     third = fem.deform(far, second)
     assert all(outcome.good for outcome in third.outcome)
     np.testing.assert_allclose(third.displacement, second.displacement, atol=1e-5)
@@ -210,8 +210,8 @@ def test_what_was_asked_before_changes_no_bit() -> None:
     again = fem.deform(touching(ASIDE), begun)
     np.testing.assert_array_equal(first.displacement, again.displacement)
     np.testing.assert_array_equal(first.reaction, again.reaction)
-    for name, array in first.history.items():
-        np.testing.assert_array_equal(array, again.history[name])
+    for name, array in first.memory.items():
+        np.testing.assert_array_equal(array, again.memory[name])
 
 
 def test_a_way_is_as_long_as_it_is_clear() -> None:
@@ -229,6 +229,6 @@ def test_a_tool_flies_in_few_strides() -> None:
     term = fem.problem.barriers[0]
     poses = at(-0.09, 0.03, HEIGHT + 5e-3), at(-0.33, 0.03, HEIGHT + 5e-3)
     there = fem.deform(touching(poses[0]))
-    cases = Cases(touching(poses[1]), np.zeros(1), there.history, np.zeros((1, len(BODY.mesh.nodes), 3)), np.zeros(1))
+    cases = Cases(touching(poses[1]), np.zeros(1), there.memory, np.zeros((1, len(BODY.mesh.nodes), 3)), np.zeros(1))
     stride = term.stride(cases, fem.problem.device.zeros(fem.problem.rows, 1))
     assert stride[0] > 0.07 / 0.24 > 10.0 * STRIDE * RADIUS / 0.24

@@ -152,14 +152,14 @@ class TestAcrossCuts:
         made = finite_elements(BODY, effects, Accuracy(tolerance=1e-9), "cpu", element=element)
         first = made.deform(replace(lying([0]), time=np.array([0.01])))
         second = made.deform(replace(lying([1]), time=np.array([0.0101])), first)
-        still = made.deform(replace(lying([1]), time=np.array([0.0101])), replace(first, history={}))
+        still = made.deform(replace(lying([1]), time=np.array([0.0101])), replace(first, memory={}))
         stays = ~made.remains(1).anatomy.orphaned  # type: ignore
         one, other, dead = (answer.displacement[0, stays] for answer in (first, second, still))
-        flown = 1e-4 * np.linalg.norm(first.history["inertia"][0, : len(MESH.nodes)][stays], axis=1)
+        flown = 1e-4 * np.linalg.norm(first.memory["inertia"][0, : len(MESH.nodes)][stays], axis=1)
         moved = np.linalg.norm(other - one, axis=1)
         assert moved.max() > 5.0 * np.abs(dead - one).max()
         np.testing.assert_allclose(moved, flown, atol=0.1 * flown.max())
-        assert second.history["inertia"].shape == first.history["inertia"].shape
+        assert second.memory["inertia"].shape == first.memory["inertia"].shape
 
 
 class TestWhatComesLoose:
@@ -281,7 +281,7 @@ class TestHardCases:
             operated.deform(lying([1, 3]))
 
     def test_a_plain_solver_says_whose_work_it_is(self) -> None:
-        with pytest.raises(InputError, match=r"operated\.finite_elements"):
+        with pytest.raises(InputError, match=r"sim\.finite_elements"):
             compile_problem((*EFFECTS, STEPS), BODY, find_device("cpu", "float64"))
         with pytest.raises(InputError, match="asked for 2 times"):
             finite_elements(BODY, (*EFFECTS, STEPS, STEPS))

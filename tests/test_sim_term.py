@@ -166,8 +166,8 @@ def test_keeping_columns_is_starting_with_them(
     def answers() -> list[np.ndarray]:
         linearise(term, device, u)
         found = [energy(term, device, u), gradient(term, device, u), curvature(term, device, p)]
-        history = term.end(device.array(u))
-        return found if history is None else [*found, history]
+        memory = term.end(device.array(u))
+        return found if memory is None else [*found, memory]
 
     term.keep(index)
     kept = answers()
@@ -265,6 +265,6 @@ def test_history_creeps_and_travels_rows_first(device: Device) -> None:
     example = EXAMPLES["spring"]
     spring = example.build(device)
     spring.begin(example.cases)
-    before, u = example.cases.history["spring"], example.u.T.reshape(3, -1, 3)
+    before, u = example.cases.memory["spring"], example.u.T.reshape(3, -1, 3)
     share = 1.0 - np.exp(-np.array([0.5, 2.0, 0.1]))[:, None, None]
     np.testing.assert_allclose(spring.end(device.array(example.u)), before + share * (u - before), atol=1e-15)

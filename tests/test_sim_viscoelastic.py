@@ -47,12 +47,12 @@ def posed(made_of: Tissue, element: str = "p1", mesh: TetMesh = MESH) -> tuple[P
 
 def stresses(problem: Problem, nodes: np.ndarray, path: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Mean first Piola-Kirchhoff stress (n, 3, 3) [Pa] along displacement gradients (n, 3, 3), the same everywhere."""
-    found, history, before = [], {}, 0.0
+    found, memory, before = [], {}, 0.0
     for H, time in zip(path, times, strict=True):
         u = problem.device.array((nodes @ H.T).reshape(-1, 1))
-        problem.begin(Cases(Loads((), np.array([time])), np.array([before]), history))
+        problem.begin(Cases(Loads((), np.array([time])), np.array([before]), memory))
         found.append(problem.gradient(u).numpy().reshape(-1, 3).T @ nodes / MESH.volumes.sum())
-        history, before = problem.end(u), time
+        memory, before = problem.end(u), time
     return np.array(found)
 
 
@@ -170,7 +170,7 @@ def test_one_step_may_be_as_long_as_a_day(precision: str) -> None:
 
 
 def test_a_run_may_be_cut_and_tissues_mixed() -> None:
-    """Another solver goes on as if it had been there from the start; regions that do not relax have no history."""
+    """Another solver goes on as if it had been there from the start; regions that do not relax have no memory."""
     halves = TetMesh(MESH.nodes, MESH.tets, np.arange(len(MESH.tets)) % 2)
     anatomy, force = base_held(halves), Nodal(top_forces(halves, np.array([[0.5, 0.0, 0.2], [0.0, 0.3, -0.2]])))
     law = Ogden(((900.0, -4.7),), 2e4)
@@ -188,8 +188,8 @@ def test_a_run_may_be_cut_and_tissues_mixed() -> None:
     cut = run(other, begun, (0.4, 2.0))
     np.testing.assert_array_equal(cut.displacement, straight.displacement)  # pyright: ignore
     name = "viscoelasticity ogden"
-    assert straight.history[name].shape == (2, 3, 18)  # pyright: ignore
-    np.testing.assert_array_equal(cut.history[name], straight.history[name])  # pyright: ignore
+    assert straight.memory[name].shape == (2, 3, 18)  # pyright: ignore
+    np.testing.assert_array_equal(cut.memory[name], straight.memory[name])  # pyright: ignore
     assert [term.name for term in one.problem.terms] == ["elasticity ogden", name, "nodal force"]
 
 
@@ -199,7 +199,7 @@ def test_held_all_round_it_needs_no_solver() -> None:
     fem = Fem(anatomy, [Elasticity(relaxing("ogden", SERIES[:1])), Held()], TIGHT, "cpu", element="p1")
     answer = fem.deform(Loads((), np.array([3.0])))
     assert not answer.displacement.any()
-    assert not answer.history["viscoelasticity ogden"].any()
+    assert not answer.memory["viscoelasticity ogden"].any()
 
 
 @pytest.mark.parametrize("law", HYPERELASTIC)

@@ -40,7 +40,7 @@ def predicted(truth, box):
     """The tumour alone, three to seven per cent too far."""
     known = truth.at(box.tumour_nodes)
     share = np.linspace(1.03, 1.07, len(truth))[:, None, None]
-    return replace(known, displacement=share * known.displacement, history={})
+    return replace(known, displacement=share * known.displacement, memory={})
 
 
 def largest(motion, tumour):
@@ -49,7 +49,7 @@ def largest(motion, tumour):
 
 def test_a_small_known_field_is_the_estimate(fem, truth, loads, box):
     field = 1e-3 * np.roll(truth.displacement, 1, axis=0)
-    state = replace(truth, displacement=truth.displacement + field, history={})
+    state = replace(truth, displacement=truth.displacement + field, memory={})
     found = certify(fem, loads, state)
     assert np.allclose(found.estimate, largest(field, box.tumour_nodes), rtol=0.02)
     assert np.allclose(found.correction, -field, atol=0.05 * np.abs(field).max())
@@ -82,7 +82,7 @@ def test_loads_that_two_steps_do_not_settle_are_not_sound(fem, loads, box):
     hard = loads.rows(np.arange(12)).scaled(6.0)
     known = fem.deform(hard).at(box.tumour_nodes)
     error = 0.02 * np.linalg.norm(known.displacement, axis=2).max(axis=1)
-    found = certify(fem, hard, replace(known, displacement=1.02 * known.displacement, history={}))
+    found = certify(fem, hard, replace(known, displacement=1.02 * known.displacement, memory={}))
     effectivity = found.estimate / error
     assert 4 < found.sound.sum() < 12 and (found.corrected.iterations == 2).any()
     assert (abs(effectivity - 1.0) < 0.2)[found.sound].all() and effectivity[~found.sound].max() > 2.0

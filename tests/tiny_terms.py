@@ -1,4 +1,4 @@
-"""Two tiny terms in NumPy that ask of the solver what later effects will: a history, and a domain to stay in."""
+"""Two tiny terms in NumPy that ask of the solver what later effects will: a memory, and a domain to stay in."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Spring:
 
     def begin(self, cases: Cases) -> None:
         count = len(cases.loads)
-        anchor = np.asarray(cases.history.get(self.name, np.zeros((count, self._rows // 3, 3))))
+        anchor = np.asarray(cases.memory.get(self.name, np.zeros((count, self._rows // 3, 3))))
         self._anchor = self._device.array(anchor.reshape(count, -1).T)
         self._creep = 1.0 - np.exp(-(cases.loads.times - cases.start_time) / self._tau)
 

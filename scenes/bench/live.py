@@ -97,7 +97,7 @@ def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:
         wp.synchronize()
         seconds = clock.perf_counter() - begun
         if number >= WARM_UP:
-            yield Frame(load, replace(last, history={}), seconds)
+            yield Frame(load, replace(last, memory={}, warm={}), seconds)
 
 
 def live_fem(scene: Scene, site: Site, device: str, element: str) -> Fem:

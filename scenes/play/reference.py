@@ -35,4 +35,4 @@ def truth_of(
         some = stacked(loads[first : first + size])
         answers.append(fem.deform(some, start=None if apart or not answers else answers[-1]))
         progress(len(some))
-    return joined([replace(answer, history={}) for answer in answers])
+    return joined([replace(answer, memory={}, warm={}) for answer in answers])

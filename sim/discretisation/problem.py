@@ -85,9 +85,9 @@ class Problem:
             term.keep(columns)
 
     def end(self, u: wp.array) -> Mapping[str, Any]:
-        """The history of every term that has one, by name."""
+        """The memory of every term that has one, by name."""
         kept = {term.name: term.end(u) for term in self.terms}
-        return {name: history for name, history in kept.items() if history is not None}
+        return {name: memory for name, memory in kept.items() if memory is not None}
 
     def energy(self, u: wp.array) -> np.ndarray:
         """Total potential (b,) [J]; +inf outside the domain."""

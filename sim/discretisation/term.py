@@ -18,18 +18,19 @@ from ..loads import Loads
 class Cases:
     """The load cases of a batch: what acts, since when, and what each term remembers of the past.
 
-    loads, B rows; start_time (B,) [s]; history, by term name: arrays with B rows, as `Term.end` returned them;
+    loads, B rows; start_time (B,) [s]; memory, by term name: arrays with B rows, as `Term.end` returned them;
     displacement (B, N, 3) [m] of the element's nodes at the start, or None: at rest; share (B,) of the way from where
     they were that tools have gone, 1 if None; anew (B,) bool, whose descent begins at rest, where nothing is touched
-    yet, none if None.
+    yet, none if None; warm, what an earlier answer left to make this one faster, rows (B, ...).
     """
 
     loads: Loads
     start_time: np.ndarray
-    history: Mapping[str, Any] = field(default_factory=dict)
+    memory: Mapping[str, Any] = field(default_factory=dict)
     displacement: np.ndarray | None = None
     share: np.ndarray | None = None
     anew: np.ndarray | None = None
+    warm: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def gone(self) -> np.ndarray:
@@ -56,11 +57,12 @@ class Cases:
 
     def rows(self, index: slice | np.ndarray) -> Cases:
         """Some of the cases."""
-        history = {name: value[index] for name, value in self.history.items()}
+        memory = {name: value[index] for name, value in self.memory.items()}
         displacement = None if self.displacement is None else self.displacement[index]
         share = None if self.share is None else self.share[index]
         anew = None if self.anew is None else self.anew[index]
-        return Cases(self.loads.rows(index), self.start_time[index], history, displacement, share, anew)
+        warm = {name: value[index] for name, value in self.warm.items()}
+        return Cases(self.loads.rows(index), self.start_time[index], memory, displacement, share, anew, warm)
 
     def past(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """What the term `name` remembers, (B, *shape) float64; zeros if nothing.
@@ -68,13 +70,13 @@ class Cases:
         Raises
         ------
         InputError
-            A history of another body or discretisation, or of other tools.
+            A memory of another body or discretisation, or of other tools.
         """
         whole = (len(self.loads), *shape)
-        found = self.history.get(name)
+        found = self.memory.get(name)
         if found is not None and found.shape != whole:
             raise InputError(
-                f"the start's history of {name} has shape {found.shape}, not {whole}: start from an answer of the same "
+                f"the start's memory of {name} has shape {found.shape}, not {whole}: start from an answer of the same "
                 "mesh, element and tools, or from rest."
             )
         return np.zeros(whole) if found is None else np.asarray(found, np.float64)
@@ -90,7 +92,7 @@ class Term(Protocol):
 
     @property
     def name(self) -> str:
-        """Unique in a problem; the key of its history."""
+        """Unique in a problem; the key of its memory."""
         ...
 
     @property
@@ -109,7 +111,7 @@ class Term(Protocol):
         ...
 
     def begin(self, cases: Cases) -> None:
-        """Take the loads, times and history of every column."""
+        """Take the loads, times and memory of every column."""
         ...
 
     def keep(self, columns: np.ndarray) -> None:
@@ -167,7 +169,7 @@ class Paced(Term, Protocol):
 
 @runtime_checkable
 class Remembering(Term, Protocol):
-    """A Term whose history, if it has any, is of elements or nodes: rows (B, n, width), one for each."""
+    """A Term whose memory, if it has any, is of elements or nodes: rows (B, n, width), one for each."""
 
     @property
     def marks(self) -> np.ndarray:

@@ -14,7 +14,6 @@ import numpy as np
 import warp as wp
 
 from ..arguments import all_finite
-from ..deformation import LEARNT_KEY
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
 from ..linalg.pcg import Preconditioner
@@ -144,13 +143,13 @@ def rows_first(array: wp.array) -> np.ndarray:
 
 
 def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
-    """What an earlier descent on as many rows = 3N left in the history; nothing if that does not fit these cases.
+    """What an earlier descent on as many rows = 3N left warm; nothing if that does not fit these cases.
 
     It only shortens the way: what holds numbers that are not finite is forgotten.
     """
-    if any(LEARNT_KEY + name not in cases.history for name in LEARNT):
+    if any(name not in cases.warm for name in LEARNT):
         return {}
-    found = {name: np.asarray(cases.history[LEARNT_KEY + name]) for name in LEARNT}
+    found = {name: np.asarray(cases.warm[name]) for name in LEARNT}
     shape = {"s": (PAIRS, rows), "w": (PAIRS, rows), "sy": (PAIRS, PAIRS), "yw": (PAIRS, PAIRS)}
     if any(array.shape != (len(cases.loads), *shape.get(name, ())) for name, array in found.items()):
         return {}

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import all_finite
 from ..loads import Loads, Pushed
 
-# The history's keys: the answer's own loads (B, 2, 7), last those before them; displacements (B, 3N) [m] before it.
+# Keys of what is warm: the answer's own loads (B, 2, 7), last those before them; displacements (B, 3N) [m] before it.
 PUSHES, BEFORE = "pushes", "before"
 # A way is followed back to where it began, and on for at most as long again twice.
 BACK, ON = -1.0, 2.0
@@ -45,26 +46,27 @@ def shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
     return np.where(known, share.clip(BACK, ON), 0.0)
 
 
-def knows(history: Mapping[str, Any], last: np.ndarray) -> bool:
-    """Whether a history says how answers (3N, B) came about."""
-    if BEFORE not in history or PUSHES not in history:
+def knows(warm: Mapping[str, Any], last: np.ndarray) -> bool:
+    """Whether what is warm says how answers (3N, B) came about."""
+    if BEFORE not in warm or PUSHES not in warm:
         return False
-    return history[BEFORE].shape == last.T.shape and history[PUSHES].shape == (last.shape[1], 2, 7)
+    fits = warm[BEFORE].shape == last.T.shape and warm[PUSHES].shape == (last.shape[1], 2, 7)
+    return fits and all_finite(warm[BEFORE]) and all_finite(warm[PUSHES])
 
 
-def moved_on(loads: Loads, last: np.ndarray, history: Mapping[str, Any]) -> np.ndarray:
-    """Starts (3N, B) [m] for loads whose last answers (3N, B) have this history; those answers if it tells no way."""
+def moved_on(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -> np.ndarray:
+    """Starts (3N, B) [m] for loads whose last answers (3N, B) were left with it; those answers if it tells no way."""
     now = pushes_of(loads)
-    if now is None or not knows(history, last):
+    if now is None or not knows(warm, last):
         return last
-    came, before = history[PUSHES][:, 0], history[PUSHES][:, 1]
-    return last + shares(now, came, before) * (last - history[BEFORE].T)
+    came, before = warm[PUSHES][:, 0], warm[PUSHES][:, 1]
+    return last + shares(now, came, before) * (last - warm[BEFORE].T)
 
 
-def way_of(now: np.ndarray | None, last: np.ndarray | None, history: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """What the answers to pushes (B, 7) hand on, whose last answers (3N, B) had this history, if there were any."""
+def way_of(now: np.ndarray | None, last: np.ndarray | None, warm: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """What the answers to pushes (B, 7) hand on, whose last answers (3N, B) were left with it, if there were any."""
     if now is None:
         return {}
-    if last is None or PUSHES not in history or history[PUSHES].shape != (len(now), 2, 7):
+    if last is None or PUSHES not in warm or warm[PUSHES].shape != (len(now), 2, 7):
         return {PUSHES: np.stack([now, now], axis=1)}
-    return {PUSHES: np.stack([now, history[PUSHES][:, 0]], axis=1), BEFORE: last.T}
+    return {PUSHES: np.stack([now, warm[PUSHES][:, 0]], axis=1), BEFORE: last.T}

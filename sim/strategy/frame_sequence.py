@@ -14,7 +14,7 @@ from weakref import ref
 
 import numpy as np
 
-from ..deformation import LEARNT_KEY, Cost, Deformation, Outcome
+from ..deformation import Cost, Deformation, Outcome
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
@@ -30,7 +30,7 @@ TURNED, BACK = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 class Kept(Mapping[str, Any]):
-    """A history of which the learnt pairs stay on the device until they are read, or about to be written over.
+    """What is warm in an answer: curvature pairs stay on the device until they are read, or about to be written over.
 
     `lock` is that of who answers: another thread may read while the next frame is about to be made.
     """
@@ -44,7 +44,7 @@ class Kept(Mapping[str, Any]):
         """Bring to the host what is still on the device."""
         with self._lock:
             if self.state is not None:
-                self._own |= {LEARNT_KEY + name: rows_first(self.state.columns[name]) for name in LEARNT}
+                self._own |= {name: rows_first(self.state.columns[name]) for name in LEARNT}
                 self.state = None
 
     def __getitem__(self, key: str) -> Any:
@@ -81,7 +81,7 @@ class Following:
         self._source = source
         self._nodes = np.arange(problem.rows // 3)
         self._last: Callable[[], Deformation | None] = _gone
-        # Histories whose pairs stand where the frame ended, and where it began.
+        # Those whose pairs stand where the frame ended, and where it began.
         self._here: Callable[[], Kept | None] = _gone
         self._there: Callable[[], Kept | None] = _gone
 
@@ -102,14 +102,14 @@ class Following:
             if not self._take(loads, start, last):
                 return None
         self._make_way()
-        way = way_of(now, last, start.history)
-        share = shares(now, way[PUSHES][:, 1], start.history[PUSHES][:, 1])[0] if knows(start.history, last) else 0.0
+        way = way_of(now, last, start.warm)
+        share = shares(now, way[PUSHES][:, 1], start.warm[PUSHES][:, 1])[0] if knows(start.warm, last) else 0.0
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
         self._last = self._here = _gone
         found = self._frame.push(point, radius, force, share)
         if found[STATUS] != DONE or found[INVERTED]:
             return None
-        history = Kept(way, self._frame.state, self._lock)
+        warm = Kept(way, self._frame.state, self._lock)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
         displacement = found[HEAD:].reshape(1, -1, 3).copy()
         displacement.setflags(write=False)  # as a start, the device's own stands in for it
@@ -121,18 +121,18 @@ class Following:
             residual=found[RESIDUAL : RESIDUAL + 1].copy(),
             time=loads.times,
             reaction=np.concatenate([force, arm[TURNED] * force[BACK] - arm[BACK] * force[TURNED]]).reshape(1, 1, 6),
-            history=history,
+            warm=warm,
             cost=Cost({"equilibrium": time.perf_counter() - clock}),
             reached=np.ones(1),
             inverted=np.zeros(1, int),
             source=self._source,
         )
-        self._last, self._here = ref(answer), ref(history)
+        self._last, self._here = ref(answer), ref(warm)
         return answer
 
     def _take(self, loads: Loads, start: Deformation, last: np.ndarray) -> bool:
         """Bring a start to the device, if it is fit for that."""
-        cases = Cases(loads, start.time, start.history)
+        cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
         u = self._problem.device.array(last)
         if self._problem.gap(u)[1].any() or self._inversion.count(u).any():
@@ -141,7 +141,7 @@ class Following:
         if here is not None:
             here.settle()
         self._last = self._here = _gone
-        past = start.history[BEFORE].T if knows(start.history, last) else None
+        past = start.warm[BEFORE].T if knows(start.warm, last) else None
         self._frame.take(last, past, learnt_from(cases, len(last)))
         return True
 

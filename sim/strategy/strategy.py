@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from ..accuracy import Accuracy
-from ..deformation import LEARNT_KEY, Outcome
+from ..deformation import Outcome
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases, Local
@@ -50,7 +50,7 @@ PATIENCE = 4
 class Answer:
     """u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, shares of the load reached, inverted tets.
 
-    The linear iterations of the batch; what of the curvature the next frame may know, as history; where tools move,
+    The linear iterations of the batch; what of the curvature the next frame may know; where tools move,
     shares (B,) of their way at which they are, and (B,) bool whose way began at rest.
     """
 
@@ -223,7 +223,7 @@ class Ladder:
         ]
         near = self.local(count)
         if near is not None:
-            patch = {NODES: cases.history[LEARNT_KEY + NODES]} if LEARNT_KEY + NODES in cases.history else {}
+            patch = {NODES: cases.warm[NODES]} if NODES in cases.warm else {}
             descents = [(near, patch), (self._lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
         answer = Answer(
@@ -235,7 +235,7 @@ class Ladder:
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
             answer.put(index, self._answer(found.u, outcome, found.steps, found.residual, 0), device)
-            taught = {LEARNT_KEY + name: array for name, array in found.learnt.items()}
+            taught = found.learnt
             index = index[found.left]
             if len(index) == 0:
                 break
@@ -391,5 +391,4 @@ class Ladder:
         if len(short):
             problem.begin(cases.rows(short))
             residual[short] = shortfall(problem, gathered(device, u, short))
-        taught = {LEARNT_KEY + name: array for name, array in (learnt or NOTHING).items()}
-        return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent, taught)
+        return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent, learnt or NOTHING)

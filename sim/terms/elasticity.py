@@ -49,7 +49,7 @@ class Elasticity:
         Where its arrays live.
     sources
         What the law takes at every point in every case beside its coefficients, from the inside of the law outwards. At
-        most one has a history.
+        most one has a memory.
     """
 
     constant, steep = False, False
@@ -193,7 +193,7 @@ class Elasticity:
         outputs = [strains[part.first : part.first + part.count] for part in self._parts]
         self._each(self._kernels.measure, lambda part: [u, *part.shape], outputs, u.shape[1])
         kept = [source.end(self._cases, strains) for source in reversed(self._sources)]
-        return next((history for history in kept if history is not None), None)
+        return next((memory for memory in kept if memory is not None), None)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:
         """Add to `out` whatever a kernel adds."""

@@ -132,7 +132,7 @@ class Inertia:
         Raises
         ------
         InputError
-            Loads that lie before their start; a history of another body.
+            Loads that lie before their start; a memory of another body.
         """
         steps, count = cases.steps, len(cases.loads)
         self._cases = cases

@@ -162,7 +162,7 @@ class Prony:
     Parameters
     ----------
     name
-        Key of its history.
+        Key of its memory.
     law
         The law itself, of `coefficients` (T, k).
     pairs

@@ -241,7 +241,7 @@ def contact_of(
         return np.reshape(begin, pose.shape)
 
     def way(cases: Cases) -> Way | None:
-        last = cases.past(name, (len(tools), 4, 4)) if name in cases.history else None
+        last = cases.past(name, (len(tools), 4, 4)) if name in cases.memory else None
         if contact:
             cause = cases.loads.of(Touching)
             if cause is None:
