@@ -22,6 +22,7 @@ from ..effects import Effect
 from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
+from ..minimisers.line_search import goes_too_far, kept_of
 from ..minimisers.residual import State, constants_of
 from ..runtime.columns import combined, dots
 from .clamped_part import Rimmed
@@ -35,9 +36,8 @@ LEFT, ADDED = 0.8, 60
 CYCLES, PAIRS, CUTS = 30, 8, 6
 # A load whose free force was not halved in so many cycles goes elsewhere.
 PATIENCE = 8
-# The vicinity is settled to a share of the whole residual, or of the tolerance; the slope ahead may rise to a share of
-# the promise.
-FORCING, ENOUGH, OVERSHOOT = 0.1, 0.5, 0.5
+# The vicinity is settled to a share of the whole residual, or of the tolerance.
+FORCING, ENOUGH = 0.1, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +106,9 @@ class Vicinity:
             v = combined(device, now.u, length, d, wp.empty_like(d))
             new = self._at(part.settled(v, force))
             slope = float(dots(device, new.g, d)[0])
-            if new.finite and slope <= OVERSHOOT * promised:
+            if new.finite and not goes_too_far(slope, promised):
                 return new
-            length *= float(np.clip(promised / (promised + slope), 0.1, 0.7)) if np.isfinite(slope) else 0.25
+            length *= kept_of(slope, promised)
         return None
 
     def _at(self, u: wp.array) -> State:

@@ -26,7 +26,8 @@ from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
 from ..minimisers.compact_lbfgs import Pairs, pairs_of
 from ..minimisers.lbfgs import Descended
-from ..minimisers.lbfgs_kernels import BROKEN, DONE, KEPT, LEAST_KEPT, LIVE, MOST_KEPT, OVERSHOOT
+from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
+from ..minimisers.line_search import goes_too_far, kept_of
 from ..minimisers.residual import Measured
 from ..runtime.threads import one_thread
 from .contact_forces import Softness, settled
@@ -162,10 +163,9 @@ class Proximal:
         new = self._judged(now.u + t * x)
         for _ in range(CUTS):
             ahead = float(new.whole @ x) if new.finite else np.inf
-            if ahead <= OVERSHOOT * abs(promised):
+            if not goes_too_far(ahead, promised):
                 break
-            kept = promised / (promised + ahead) if promised > 0.0 and np.isfinite(ahead) else KEPT
-            t *= float(np.clip(kept, LEAST_KEPT, MOST_KEPT))
+            t *= kept_of(ahead, promised)
             new = self._judged(now.u + t * x)
         return t, new
 

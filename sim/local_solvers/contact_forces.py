@@ -20,7 +20,7 @@ from scipy.linalg import LinAlgError, cholesky
 from ..discretisation.term import Reduction
 from ..linalg.compliance import Compliance
 from ..minimisers.compact_lbfgs import Pairs
-from ..minimisers.lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
+from ..minimisers.line_search import goes_too_far, kept_of
 
 STEPS, CUTS = 60, 20
 # More touched nodes than these are no few.
@@ -91,10 +91,9 @@ def settled(
         slope = pushed(w + t * way)
         for _ in range(CUTS):
             ahead = float((slope - force - t * change) @ way)
-            if ahead <= OVERSHOOT * abs(promised):
+            if not goes_too_far(ahead, promised):
                 break
-            kept = promised / (promised + ahead) if promised > 0.0 else KEPT
-            t *= float(np.clip(kept, LEAST_KEPT, MOST_KEPT))
+            t *= kept_of(ahead, promised)
             slope = pushed(w + t * way)
         force, w = force + t * change, w + t * way
     return force if convex else None

@@ -22,7 +22,8 @@ from ..compile import compile_part
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
-from ..minimisers.lbfgs_kernels import KEPT, LEAST_CURVATURE, LEAST_KEPT, MOST_KEPT, OVERSHOOT, PAIRS
+from ..minimisers.lbfgs_kernels import LEAST_CURVATURE, PAIRS
+from ..minimisers.line_search import goes_too_far, kept_of
 
 TURNS, CUTS = 150, 12
 
@@ -85,10 +86,9 @@ class Patch:
                 moved = x + t * d
                 new = self._free(beside + t * pull + self._excess(u, moved) - start)
                 slope = float(new @ d)
-                if slope <= OVERSHOOT * promised:
+                if not goes_too_far(slope, promised):
                     break
-                kept = promised / (promised + slope) if np.isfinite(slope) else KEPT
-                t *= float(np.clip(kept, LEAST_KEPT, MOST_KEPT))
+                t *= kept_of(slope, promised)
             else:
                 break
             work = t * (promised + slope)

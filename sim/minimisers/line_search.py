@@ -10,16 +10,26 @@ import warp as wp
 
 from ..discretisation.problem import Problem
 from ..runtime.columns import combined, dots
+from .lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
 from .newton_cg import Direction
 
-# The slope ahead may rise to this share of the promised decrease: a step that overshoots more is cut.
-OVERSHOOT = 0.5
 # A step that was cut and still descends more steeply than this share is lengthened again, so many times at most.
 UNDERSHOOT = 0.5
 REFINEMENTS = 4
 TRIALS = 16
 # A shorter step leads nowhere.
 SHORTEST = 1e-8
+
+
+def goes_too_far(ahead: float, promised: float) -> bool:
+    """Whether the slope `ahead` of a step, which promised so much decrease, has risen too far; or is no number."""
+    return not ahead <= OVERSHOOT * abs(promised)
+
+
+def kept_of(ahead: float, promised: float) -> float:
+    """The share of a step that went too far to be tried next: where the line through both slopes is zero."""
+    kept = promised / (promised + ahead) if promised > 0.0 and np.isfinite(ahead) else KEPT
+    return float(np.clip(kept, LEAST_KEPT, MOST_KEPT))
 
 
 def search(problem: Problem, u: wp.array, direction: Direction) -> np.ndarray:
@@ -50,6 +60,6 @@ def search(problem: Problem, u: wp.array, direction: Direction) -> np.ndarray:
         if found.all():
             break
         with np.errstate(invalid="ignore"):
-            share = np.clip(slope_low / (slope_low - slope_high), 0.1, 0.7)
+            share = np.clip(slope_low / (slope_low - slope_high), LEAST_KEPT, MOST_KEPT)
             t = np.where(found, low, low + share * (high - low))
     return np.where(low >= SHORTEST, low, 0.0)

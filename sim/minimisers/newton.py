@@ -16,6 +16,7 @@ from ..discretisation.problem import Problem
 from ..runtime.columns import combined, gathered, norms, scattered
 from .line_search import search
 from .newton_cg import Descent
+from .residual import relative
 
 # Inexact Newton: the linear residual is never larger than this share.
 LARGEST_FORCING = 0.25
@@ -58,12 +59,11 @@ def find_equilibrium(problem: Problem, descent: Descent, start: wp.array, accura
         if step and open_gap.any():  # what is closed stays closed: directions are projected
             gap, open_gap = problem.gap(u)
         vanished = scale <= last_digit**2 * first[live]
-        with np.errstate(invalid="ignore"):
-            relative = np.divide(free, scale, out=np.zeros_like(free), where=~vanished)
-        bad = ~np.isfinite(relative)
-        done = ~bad & ~open_gap & (relative <= accuracy.tolerance)
-        idle[live] = np.where(relative <= 0.9 * best[live], 0, idle[live] + 1)
-        best[live] = np.fmin(best[live], relative)
+        share = relative(free, np.where(vanished, 0.0, scale))
+        bad = ~np.isfinite(share)
+        done = ~bad & ~open_gap & (share <= accuracy.tolerance)
+        idle[live] = np.where(share <= 0.9 * best[live], 0, idle[live] + 1)
+        best[live] = np.fmin(best[live], share)
         stuck = ~done & ~bad & (failed | (idle[live] >= PATIENCE))
         if stuck.any():
             drowned = stuck & ~open_gap & (free <= ROUND_OFF * round_off(problem, u, g))
@@ -72,7 +72,7 @@ def find_equilibrium(problem: Problem, descent: Descent, start: wp.array, accura
             failed |= drowned
         outcome[live[done]] = Outcome.CONVERGED
         outcome[live[bad]] = Outcome.NOT_FINITE
-        iterations[live], residual[live] = step, np.where(bad, np.inf, relative)
+        iterations[live], residual[live] = step, np.where(bad, np.inf, share)
         leave = done | bad | failed
         last = leave.all() or step == accuracy.outer
         for state, columns in ((u, ~bad & (leave | last)), (before, bad)):
@@ -84,9 +84,9 @@ def find_equilibrium(problem: Problem, descent: Descent, start: wp.array, accura
             problem.keep(stay)
             descent.keep(device, stay)
             u, g, gap = (gathered(device, array, stay) for array in (u, g, gap))
-            live, taken, open_gap, relative = live[stay], taken[stay], open_gap[stay], relative[stay]
+            live, taken, open_gap, share = live[stay], taken[stay], open_gap[stay], share[stay]
         # Superlinear, and never finer than the tolerance needs.
-        forcing = np.clip(np.sqrt(relative), 0.3 * accuracy.tolerance / np.maximum(relative, 1e-300), LARGEST_FORCING)
+        forcing = np.clip(np.sqrt(share), 0.3 * accuracy.tolerance / np.maximum(share, 1e-300), LARGEST_FORCING)
         found = descent.find(problem, u, g, gap if open_gap.any() else None, forcing, taken)
         linear_iterations += found.iterations
         length = search(problem, u, found)

@@ -105,12 +105,16 @@ class State(Measured):
     scale: float
 
 
+def relative(free: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Free gradients (b,) [N] over the norms that they are measured against (b,); zero where nothing acts."""
+    with np.errstate(invalid="ignore"):  # forces that overflowed
+        return np.divide(free, scale, out=np.zeros_like(free), where=scale != 0.0)
+
+
 def shortfall(problem: Problem, u: wp.array) -> np.ndarray:
     """The relative residual (b,) of u (3N, b) under the whole load, or the share of imposed motion that is missing."""
     _, free, scale = problem.residual(u)
     gap, size = problem.constraint.close_gap(u)
     largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)
-    with np.errstate(invalid="ignore"):  # forces that overflowed
-        share = [np.divide(a, b, out=np.zeros(len(b)), where=b > 0.0) for a, b in ((free, scale), (size, largest))]
-    worse = np.maximum(*share)
+    worse = np.maximum(relative(free, scale), relative(size, largest))
     return np.where(np.isnan(worse), np.inf, worse)

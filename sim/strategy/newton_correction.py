@@ -19,6 +19,7 @@ from ..discretisation.term import Cases
 from ..linalg.pcg import LinearSolution, conjugate_gradients
 from ..minimisers.line_search import search
 from ..minimisers.newton_cg import Direction
+from ..minimisers.residual import relative
 from ..runtime.columns import combined, dots
 from .strategy import Answer, Ladder
 
@@ -56,7 +57,7 @@ def step_from(ladder: Ladder, cases: Cases, guess: np.ndarray) -> Step:
     start = device.array(np.where(ladder.inversion.count(start) > 0, 0.0, guess))
     u = combined(device, start, 1.0, problem.gap(start)[0], start)
     _, free, scale = problem.residual(u)
-    before = _relative(free, scale)
+    before = relative(free, scale)
     near = ladder.local(count) or ladder.near()
     if near is not None and not problem.constraint.imposes:
         u = near.descend(u, np.full(count, ladder.accuracy.tolerance), 1).u
@@ -69,7 +70,7 @@ def step_from(ladder: Ladder, cases: Cases, guess: np.ndarray) -> Step:
     length = search(problem, u, Direction(found.x, dots(device, rhs, found.x), found.iterations))
     u = combined(device, u, length, found.x, wp.empty_like(u))
     g, free, scale = problem.residual(u)
-    after, left = _relative(free, scale), wp.zeros_like(g)
+    after, left = relative(free, scale), wp.zeros_like(g)
     ladder.preconditioner.apply(g, np.ones(count, bool), left)
     problem.constraint.project(left)
     combined(device, wp.zeros_like(left), -1.0, left, left)
@@ -96,7 +97,3 @@ def _solved(problem: Problem, ladder: Ladder, u: wp.array, rhs: wp.array, tolera
         ladder.preconditioner.prepare(problem, rhs.shape[1])
         found = conjugate_gradients(problem, ladder.preconditioner, wp.clone(rhs), tolerance, ITERATIONS)
     return found
-
-
-def _relative(free: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    return np.divide(free, scale, out=np.zeros_like(free), where=scale > 0.0)
