@@ -363,6 +363,7 @@ class TestAdapting:
         assert row.adapted.mm.mean == pytest.approx(wanted, rel=1e-6)
         assert row.adapt > simulating_seconds(study) > 0.0
         assert found[0].adapt > 0.0 and found[0].adapted is None
+        assert any("L-BFGS" in line for line in found[0].plan) and not row.plan
         assert found[2].adapt is None  # no data of the debulked body yet
 
     def test_a_run_that_was_stopped_has_no_time(self, study, monkeypatch):

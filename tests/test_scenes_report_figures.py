@@ -12,7 +12,7 @@ from scenes.cli import main
 from scenes.commands import report as command
 from scenes.report.page import Section, write_report
 from scenes.report.plots import against_time, front
-from scenes.report.row import Row, figures_of, of_times
+from scenes.report.row import Row, figures_of, of_times, row_from_json, row_to_json
 from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset
 
@@ -61,7 +61,14 @@ def test_every_figure_stands_under_its_head(tmp_path):
     row = Row("svr", "learnt", reference=one, teacher=sets, **shares, median=1.5, p99=2.5, set_up=3.5, memory=0.25)
     row = replace(row, taught=600, units=60, series=9000, inside=12, solving=180.0, learning=120.0, timed=1000)
     row = replace(row, bare=0.0125, reference=replace(one, worst=replace(one.worst, mean=7.5)))
+    solved = replace(row, name="FEM", plan=("First this.", "Then <that>."))
+    write_report(tmp_path, "a machine", [Section("data", (), (solved,))])
+    assert (
+        "<summary>FEM</summary><ul><li>First this.<li>Then &lt;that&gt;.</ul>" in (tmp_path / "index.html").read_text()
+    )
+    assert row_from_json(row_to_json(solved)).plan == solved.plan
     write_report(tmp_path, "a machine", [Section("data", (), (row,))])
+    assert "Which solvers" not in (tmp_path / "index.html").read_text()
     tables = [
         [re.findall("<t[hd]>(.*?)</t[hd]>", line) for line in table.split("</tr>")]
         for table in re.findall("<table>(.*?)</table>", (tmp_path / "index.html").read_text(), re.S)

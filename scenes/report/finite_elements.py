@@ -82,6 +82,7 @@ def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
         reference=against_reference(study, field, np.array(good), own.tumour_nodes),
         failed=good.count(False),
         set_up=set_up,
+        plan=fem.plan.explain(),
         adapt=_adapt(study, spec, loads.rows(np.array([0]))),
         **of_times(seconds),
     )

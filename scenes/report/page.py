@@ -112,8 +112,18 @@ def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
         + f"<h3>By tenths of the force</h3>{_by_force(measured, learnt)}"
         "<h3>Worst cases</h3><p>The tumour as the row has it, and dashed in yellow where the reference has it; a pixel "
         "is about 0.1 mm.</p>"
-        f"{''.join(pictures)}"
+        f"{''.join(pictures)}{_plans(measured)}"
     )
+
+
+def _plans(rows: Sequence[Row]) -> str:
+    """How the rows of finite elements go about a load."""
+    plans = [
+        f"<details><summary>{escape(row.name)}</summary><ul>{''.join(f'<li>{escape(line)}' for line in row.plan)}</ul></details>"
+        for row in rows
+        if row.plan
+    ]
+    return f"<h3>Which solvers finite elements try</h3>{''.join(plans)}" if plans else ""
 
 
 def _against_reference(section: Section) -> str:

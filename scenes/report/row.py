@@ -151,6 +151,8 @@ class Row:
         Distances from the teacher of the debulked body then, on discs left out; None of finite elements.
     curve
         Distances from the teacher on the discs, by number of loads taught.
+    plan
+        Which solvers finite elements try for a load, in sentences.
     picture
         PNG in the report's folder: the played load of the largest distance from the reference.
     """
@@ -180,6 +182,7 @@ class Row:
     adapt: float | None = None
     adapted: Figures | None = None
     curve: tuple[tuple[int, Figures], ...] = ()
+    plan: tuple[str, ...] = ()
     picture: str | None = None
 
 
@@ -194,6 +197,7 @@ def row_from_json(text: str) -> Row:
     for name in ("reference", "adapted"):
         stored[name] = _figures(stored[name])
     stored["teacher"] = {name: _figures(each) for name, each in stored["teacher"].items()}
+    stored["plan"] = tuple(stored.get("plan", ()))
     stored["curve"] = tuple((taught, _figures(each)) for taught, each in stored["curve"])
     return Row(**stored)
 
