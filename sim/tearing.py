@@ -68,6 +68,16 @@ def torn(
     loads
         One load.
 
+    Returns
+    -------
+    Torn
+        The answer after the tear, which vertices let go, and whether nothing changes any more.
+
+    Examples
+    --------
+    >>> found = torn(anatomy, pushed_effects(anatomy, BRAIN), push(point, force, footprint=6e-3))  # doctest: +SKIP
+    >>> found.rested, len(found.sliding) + len(found.free)  # doctest: +SKIP
+
     Raises
     ------
     InputError
