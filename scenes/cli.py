@@ -22,7 +22,7 @@ COMMANDS = {
     "simulate": "draw loads of a tool and answer them by finite elements, into a data set",
     "train": "fit surrogate models to a data set, and compare their errors on cortex that was left out",
     "judge": "test models on loads that they have never seen: errors, and whether their bounds hold",
-    "export": "write a learnt model as an ONNX file, for programs in other languages",
+    "export": "write a trained model as an ONNX file, for programs in other languages",
     "patient": "from a label volume to a brain ready for the scenes: anatomy, simulate, train",
     "scenes": "list the built-in scenes: effects, who can play them, pictures and cost",
     "effects": "measure what each effect of a scene costs, and what it changes",

@@ -29,8 +29,8 @@ class Outcome(Enum):
     PIERCED = "stopped because a tool came to be inside the tissue, where it has no surface to press on"
     NOT_FINITE = "stopped because a number overflowed"
     GUESSED = "a first guess: nothing was solved"
-    PREDICTED = "predicted by a learnt model inside the range that it was taught"
-    EXTRAPOLATED = "predicted by a learnt model outside the range that it was taught: do not rely on it"
+    PREDICTED = "predicted by a trained model inside its training range"
+    EXTRAPOLATED = "predicted by a trained model outside its training range: do not rely on it"
 
     @property
     def good(self) -> bool:

@@ -110,7 +110,7 @@ ALL = [
     (["--anatomy", "text.vtu"], "cannot be read"),
     (["--anatomy", "mesh.vtu"], "not an anatomy"),
     (["--anatomy", "closed.vtu"], "no open cortex"),
-    (["--anatomy", "other.vtu"], "was taught on"),
+    (["--anatomy", "other.vtu"], "was trained on"),
     (["--anatomy", "box.vtu", "--model", "none.npz"], "no such file"),
     (["--anatomy", "box.vtu", "--model", "text.npz"], "cannot be read as a model"),
     (["--anatomy", "box.vtu", "--device", "abacus"], "no device 'abacus'"),

@@ -84,7 +84,7 @@ def test_every_figure_stands_under_its_head(tmp_path):
     assert [[line[others.index(head)] for head in asked] for line in taught] == [
         ["whole discs of cortex left out", "7", "0.1", "1 %", "94 %"],
         ["whole sectors of direction left out", "8", "0.2", "2 %", ""],
-        ["beyond the taught range", "9", "0.3", "100 %", "53 %"],
+        ["beyond the training range", "9", "0.3", "100 %", "53 %"],
     ]
 
 

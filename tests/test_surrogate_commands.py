@@ -171,4 +171,4 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, box, capsy
     assert main(["judge", model, other]) == 2
     assert "difference of two bodies" in capsys.readouterr().err
     assert main(["judge", model, data]) == 2
-    assert "was taught: simulate others" in capsys.readouterr().err
+    assert "was trained: simulate others" in capsys.readouterr().err

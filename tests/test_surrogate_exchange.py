@@ -62,7 +62,7 @@ def models(block, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def loads(block, models):
-    """Five as they were taught, at corners and edges of triangles, of no force and outside what was taught."""
+    """Five as they were taught, at corners and edges of triangles, of no force and outside the training range."""
     taught, patch = models["linear"].envelope, open_patch(block)
     corner = patch.points[np.argsort(np.linalg.norm(patch.points, axis=1))[:2]]
     at, down = taught.points[0], np.array([0.0, 0.0, -0.2])

@@ -289,9 +289,11 @@ def test_what_has_no_answer_is_refused_alone_and_among_others(trained, box, name
             asked(here + way)
         with pytest.raises(InputError, match=r"load 1 .*does not touch the open cortex"):
             asked(here, here + way)
-    with pytest.raises(InputError, match=r"load 0 has a force of 10 N, but this model was taught 0\..* N at most"):
+    with pytest.raises(InputError, match=r"load 0 has a force of 10 N, but this model was trained on 0\..* N at most"):
         asked(here, force=50.0 * down)
-    with pytest.raises(InputError, match=r"load 0 has a footprint of 50 mm, but this model was taught .* mm at most"):
+    with pytest.raises(InputError, match=r"footprint of 50 mm, but this model was trained on .* mm at most"):
+        InputError, match=r"load 0 has a footprint of 50 mm, but this model was trained on .* mm at most"
+    ):
         model.deform(push(here, down, 0.05), at=box.tumour_nodes)
     assert asked(here + [0.0, 0.0, 5.9e-3]).outcome[0] is not None
     assert asked(here, force=2.9 * strongest * down / 0.2).outcome == (Outcome.EXTRAPOLATED,)
@@ -340,7 +342,7 @@ def test_other_loads_and_other_vertices_are_refused(model, box):
     point = np.zeros((1, 3))
     lying = Posture(np.ones((1, 3)), np.zeros(1), np.ones(1))
     for cause in (Displaced(point, point, np.full(1, 6e-3)), Nodal(np.zeros((1, len(box.mesh.nodes), 3))), lying):
-        with pytest.raises(InputError, match=f"{type(cause).__name__}.*taught pushing forces only"):
+        with pytest.raises(InputError, match=f"{type(cause).__name__}.*trained on pushing forces only"):
             model.deform(Loads((cause,)))
     tumour = np.isin(np.arange(len(box.mesh.nodes)), box.tumour_nodes)
     wrong = ((tumour, "at is a mask"), ([1.5], "type float64"), ([[1]], "shape"), ([-1], "not vertex -1"), ("x", "<U1"))

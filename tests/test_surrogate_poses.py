@@ -186,7 +186,7 @@ def test_a_stored_model_knows_its_ball(tmp_path: Path, trained: Trained, box: An
 
 def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(trained: Trained, box: Anatomy) -> None:
     model = trained.models["gp"]
-    with pytest.raises(InputError, match="causes Pushed, but this model was taught the poses of one ball"):
+    with pytest.raises(InputError, match="causes Pushed, but this model was trained on the poses of one ball"):
         model.deform(draw("palpation", box, 2, 0))
     two = Touching(np.tile(np.eye(4), (1, 2, 1, 1)))
     with pytest.raises(InputError, match="poses of one ball"):
@@ -194,7 +194,7 @@ def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(train
     forces = Learned(box, model.parts, model.envelope)
     with pytest.raises(InputError, match="loads is None: give Loads"):
         forces.deform(None)
-    with pytest.raises(InputError, match="taught pushing forces only"):
+    with pytest.raises(InputError, match="trained on pushing forces only"):
         forces.deform(draw_poses("palpation", box, 2, 0))
     assert refusal(model, EFFECTS) is None
     for tools in ((Ball(5e-3),), (BALL, BALL), (Capsule(BALL.radius, 0.01),)):

@@ -56,5 +56,5 @@ def run(args: argparse.Namespace) -> int:
         return 0
     print(f"{len(loads)} loads, each answered without its position, at {len(nodes)} vertices of the tumour:")
     print(table(scores, motion))
-    print("taught in [s]: " + ", ".join(f"{row.name} {spent:.0f}" for row, spent in zip(scores, seconds, strict=True)))
+    print("training [s]: " + ", ".join(f"{row.name} {spent:.0f}" for row, spent in zip(scores, seconds, strict=True)))
     return 0

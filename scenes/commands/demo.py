@@ -25,7 +25,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
         "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
     )
     parser.add_argument(
-        "--deformer", help="linear, ann, svr, ... or fem; auto: by budget (default: the learnt one of least error)"
+        "--deformer", help="linear, ann, svr, ... or fem; auto: by budget (default: the trained one of least error)"
     )
     budget = parser.add_argument_group("a budget, in place of a deformer; the error is what each states")
     budget.add_argument(

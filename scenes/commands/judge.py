@@ -42,14 +42,14 @@ def run(args: argparse.Namespace) -> int:
             taught, here = model.training.get(what), data.provenance.get(what)
             if taught != here:
                 raise InputError(
-                    f"{args.data}: its {what} is {here}, but {name} was taught {taught}: that would judge the "
+                    f"{args.data}: its {what} is {here}, but {name} was trained on {taught}: that would judge the "
                     "difference of two bodies. Simulate with the model's own."
                 )
     for name, model in models.items():
         point = model.asked(loads).point.astype(np.float32)
         if (model.envelope.points[:, None] == point[: len(point) : max(1, len(point) // 100)]).all(axis=2).any():
             raise InputError(
-                f"{args.data}: holds loads at places where {name} was taught: simulate others, with another --seed."
+                f"{args.data}: holds loads at places where {name} was trained: simulate others, with another --seed."
             )
     scores = [score(name, model, loads, truth, nodes) for name, model in models.items()]
     promised = {name: coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None}

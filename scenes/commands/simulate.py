@@ -155,4 +155,4 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Solved) -
     if not args.poses and refused_words(args.preset):
         print(refused_words(args.preset))
     if failed:
-        print(f"{failed} cases did not converge; they stay in the file, marked, and are not learnt from.")
+        print(f"{failed} cases did not converge; they stay in the file, marked, and are not trained on.")

@@ -31,9 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--learners",
         help=f"which of {', '.join(LEARNERS)}, or of poses {', '.join(OF_POSES)}, separated by commas (default: "
-        "all that the data can teach)",
+        "all that the data can train)",
     )
-    parser.add_argument("--most", type=int, metavar="LOADS", help="teach at most so many of the loads (default: all)")
+    parser.add_argument("--most", type=int, metavar="LOADS", help="train on at most so many loads (default: all)")
     parser.add_argument(
         "--device",
         default="auto",
@@ -111,7 +111,7 @@ def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
                 f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"
                 for name, found in trained.distance_left_out.items()
             ),
-            f"the models written were taught {trained.taught} loads; {_calibration(trained)}",
+            f"the models written were trained on {trained.taught} loads; {_calibration(trained)}",
             f"written: {out}",
         ]
     )

@@ -91,7 +91,7 @@ class Theatre:
         allowed = ", ".join(self.names(scene))
         if name not in self.models:
             raise InputError(
-                f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the learnt ones."
+                f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the trained ones."
             )
         why = self.refusals(scene)[name]
         if why is not None:

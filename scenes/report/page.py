@@ -22,7 +22,7 @@ PLOTS = {"time": against_time, "learners": learners_against_time, "solves": agai
 SETS = {
     "discs": "whole discs of cortex left out",
     "sectors": "whole sectors of direction left out",
-    "beyond": "beyond the taught range",
+    "beyond": "beyond the training range",
 }
 SPREAD_HEADS = (
     "mean mm", "p95", "p99.9", "largest", "worst vertex mm: mean", "p95", "p99.9", "mean %", "p95", "p99.9", "largest",
@@ -43,7 +43,7 @@ NOTES = (
     "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
     "of those vertices. A row in bold, or full colour, is one that no other equals or beats in time and mean error.",
     "Worst vertex: of each load the vertex with the largest distance; mean, p95 and p99.9 are over the loads. "
-    f"No p99.9 is told of fewer than {FEWEST_FOR_P999:,} loads.",
+    f"No p99.9 is given for fewer than {FEWEST_FOR_P999:,} loads.",
     "Solves: all answers of finite elements that a row was told: loads, linear answers to unit forces at nodes of the "
     "cortex, and terms of the power series. In discs: those that tell of the tumour from inside the discs left out. "
     "The linear answers of the cortex beside the tumour are told everywhere; the cortex is not compared. Minutes: of "
@@ -53,7 +53,7 @@ NOTES = (
     "in NumPy compares learners: it is one kind of code for all. "
     "Set-up, compiling and warm-up are not in it. Memory: the largest resident size of the process that made and "
     "played the row alone; card: what it took of the graphics card.",
-    "Bounds are promised for loads like those that were taught; how often they hold in discs of cortex and beyond the "
+    "Bounds are promised for loads like those of the training; how often they hold in discs of cortex and beyond the "
     "range that were not is shown, but no model promises it. In discs it is that of a model, and loads, apart from the "
     "figures beside it: some loads calibrate, and others stand in the discs.",
     "Adapting: wall time until the row answers again after a fifth of the tumour is taken out of its middle: for "

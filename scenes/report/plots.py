@@ -50,7 +50,7 @@ def against_solves(rows: Sequence[Row]) -> np.ndarray | None:
         Curve(row.name, tuple((float(count), each.mm.mean) for count, each in row.curve)) for row in rows if row.curve
     )
     y = "mean distance from the teacher on left-out discs [mm]"
-    return drawn([Panel("Error against solves", "loads taught", y, curves, size=SIZE)]) if curves else None
+    return drawn([Panel("Error against solves", "training loads", y, curves, size=SIZE)]) if curves else None
 
 
 def _places(found: Iterable[tuple[Row, Figures | None]]) -> dict[str, Place]:

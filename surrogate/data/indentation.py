@@ -32,8 +32,8 @@ def indented(loads: Loads, radius: float, patch: Patch) -> Pushed:
     if touching is None or touching.pose.shape[1] != 1:
         names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
         raise InputError(
-            f"the loads have the causes {names}, but this model was taught the poses of one ball: give `Touching` of "
-            "one tool alone, or ask the finite elements."
+            f"the loads have the causes {names}, but this model was trained on the poses of one ball: give `Touching` "
+            "of one tool alone, or ask the finite elements."
         )
     pose = touching.pose[:, 0]
     middle = pose[:, :3, 3] + radius * pose[:, :3, 2]

@@ -121,7 +121,7 @@ def refused_words(preset: str) -> str:
     share = refused_share(preset)
     return (
         f"{100.0 * share:.0f} % of the nominal loads of {preset} (its forces on its radii) have a pressure or depth "
-        "that surgery has not: they are not drawn, and lie outside the taught range."
+        "that surgery has not: they are not drawn, and lie outside the training range."
         if share > 0.0
         else ""
     )

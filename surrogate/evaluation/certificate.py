@@ -125,5 +125,5 @@ def _check(vertices: int, tumour: np.ndarray, loads: Loads, prediction: Deformat
     if prediction.nodes.max(initial=-1) >= vertices or not np.isin(tumour, prediction.nodes).all():
         raise InputError(
             f"the prediction, of {len(prediction.nodes)} vertices, is of another mesh than the finite elements, which "
-            f"have {vertices}, {len(tumour)} of them a tumour's: take the anatomy that the model was taught on."
+            f"have {vertices}, {len(tumour)} of them a tumour's: take the anatomy that the model was trained on."
         )

@@ -50,7 +50,7 @@ class Coverage:
         tenths = " ".join(f"{100 * share:.0f}" for share in self.tenths)
         return (
             f"{held}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median error "
-            f"{self.error_mm:.4f} mm; {self.extrapolated} loads outside what was taught"
+            f"{self.error_mm:.4f} mm; {self.extrapolated} loads outside the training range"
         )
 
 

@@ -157,7 +157,7 @@ def _told(scores: Sequence[Score]) -> list[str]:
         for name, told in known
     ]
     return [
-        "finite-element solves told to the learners above, their wall time, and how many tell of the tumour from "
+        "finite-element solves given to the learners above, their wall time, and how many tell of the tumour from "
         "inside the discs:",
         "learner     loads    unit   series      all    inside   seconds",
         *rows,

@@ -1,4 +1,4 @@
-"""Which scenes a learnt model may answer: those of the effects that it was taught under."""
+"""Which scenes a learnt model may answer: those of the effects that it was trained under."""
 
 from __future__ import annotations
 
@@ -59,17 +59,17 @@ def refusal(model: Learned, effects: Iterable[Effect], element: str | None = Non
         here = next((effect.tools for effect in effects if isinstance(effect, ToolContact)), ())
         if here != (Ball(model.ball),):
             tools = ", ".join(map(repr, here)) or "none"
-            return f"it was taught the poses of one ball of {1e3 * model.ball:g} mm, and the tools here are {tools}"
+            return f"it was trained on the poses of one ball of {1e3 * model.ball:g} mm, and the tools here are {tools}"
     elif ToolForce.__name__ not in asked:
         others = ", ".join(sorted(asked - taught))
-        return f"it was taught what a tool's force does, and here is none{f', but {others}' if others else ''}"
+        return f"it was trained on what a tool's force does, and here is none{f', but {others}' if others else ''}"
     idle = set() if model.anatomy.slide_normal.any() else {"Bonded", "Slide"}
     strange, missing = asked - taught - idle, taught - asked - ON_CALL - idle
     if not strange and not missing:
         return _other_body(model, effects, element)
     differences = [f"not under {', '.join(sorted(strange))}"] * bool(strange)
     differences += [f"never without {', '.join(sorted(missing))}"] * bool(missing)
-    return f"it was taught under {', '.join(sorted(taught))}, {' and '.join(differences)}"
+    return f"it was trained under {', '.join(sorted(taught))}, {' and '.join(differences)}"
 
 
 def _other_body(model: Learned, effects: tuple[Effect, ...], element: str | None) -> str | None:

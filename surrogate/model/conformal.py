@@ -28,7 +28,7 @@ LOAD = 4
 BENDS = 150
 # Standard deviations beyond which a feature counts no further; and the share of the mean below which no error counts.
 FARTHEST, LEAST = 4.0, 1e-3
-# How much a bound grows outside what was taught, for each unit of `Envelope.excess`.
+# How much a bound grows outside the training range, for each unit of `Envelope.excess`.
 GROWTH = 4.0
 
 

@@ -73,7 +73,7 @@ class Learned:
     Parameters
     ----------
     anatomy
-        The body that it was taught on.
+        The body that it was trained on.
     parts
         Added where they overlap.
     envelope
@@ -167,7 +167,7 @@ class Learned:
             far = np.flatnonzero(size > FARTHEST * most)
             if len(far):
                 raise InputError(
-                    f"load {far[0]} has {name} of {unit * size[far[0]]:.3g} {symbol}, but this model was taught "
+                    f"load {far[0]} has {name} of {unit * size[far[0]]:.3g} {symbol}, but this model was trained on "
                     f"{unit * most:.3g} {symbol} at most: give up to {FARTHEST:g} times that, or ask the finite "
                     "elements."
                 )
@@ -368,7 +368,7 @@ def only_pushed(loads: Loads) -> Pushed:
     if pushed is None:
         names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
         raise InputError(
-            f"the loads have the causes {names}, but this model was taught pushing forces only: give `Pushed` alone, "
-            "or ask the finite elements."
+            f"the loads have the causes {names}, but this model was trained on pushing forces only: give `Pushed` "
+            "alone, or ask the finite elements."
         )
     return pushed

@@ -1,4 +1,4 @@
-"""How far outside of what was taught one load lies, and what is promised of its answer: functions of a kernel."""
+"""How far outside of what was trained one load lies, and what is promised of its answer: functions of a kernel."""
 
 import warp as wp
 

@@ -86,7 +86,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
     Raises
     ------
     InputError
-        A file that is missing or not a model file of this project, that was taught on another anatomy, or that holds
+        A file that is missing or not a model file of this project, that was trained on another anatomy, or that holds
         a model which cannot be.
     """
     path = path_of(path)
@@ -99,7 +99,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
             raise InputError(f"{path}: has the format {str(header['format'])[:40]!r}, not {FORMAT!r}: train it anew.")
         if header["anatomy"] != anatomy.digest:
             raise InputError(
-                f"{path}: was taught on the anatomy {str(header['anatomy'])[:40]}, but this one is {anatomy.digest}: "
+                f"{path}: was trained on the anatomy {str(header['anatomy'])[:40]}, but this one is {anatomy.digest}: "
                 "use the mesh that it was made for, or run `sulcus simulate` and `sulcus train` for this one."
             )
         arrays = archive.arrays(_keys(header["models"].values()))

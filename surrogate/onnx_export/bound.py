@@ -1,4 +1,4 @@
-"""How far a load lies outside what was taught, and the bound of its error, as wires."""
+"""How far a load lies outside the training range, and the bound of its error, as wires."""
 
 from __future__ import annotations
 

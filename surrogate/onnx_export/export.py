@@ -71,7 +71,7 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     rest = model.anatomy.mesh.nodes[nodes]
     sheet.output(displacement, Port("displacement", np.float32, ("B", len(nodes), 3), "of the vertices `nodes` [m]"))
     sheet.output(bound, Port("bound", np.float32, ("B", len(LEVELS)), "no tumour vertex is farther off [m]"))
-    sheet.output(excess.shaped(-1), Port("excess", np.float32, ("B",), "how far outside what was taught; 0 inside"))
+    sheet.output(excess.shaped(-1), Port("excess", np.float32, ("B",), "how far outside the training range; 0 inside"))
     sheet.output((excess > 0.0).shaped(-1), Port("extrapolated", np.bool_, ("B",), "outside: do not rely on it"))
     sheet.output(sheet.constant(nodes), Port("nodes", np.int64, nodes.shape, "of the mesh"))
     sheet.output(sheet.constant(rest), Port("rest", np.float32, rest.shape, "where the vertices `nodes` lie [m], RAS"))

@@ -43,7 +43,7 @@ class Published:
     Parameters
     ----------
     anatomy
-        The body that it was taught on.
+        The body that it was trained on.
     nodes
         (k,) the vertices that it knows.
     machines

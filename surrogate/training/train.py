@@ -101,7 +101,7 @@ def train(
     most: int | None = None,
     expansion: Expansion | None = None,
 ) -> Trained:
-    """Fit `learners`, by default all that the data can teach: first to be scored, then to be used.
+    """Fit `learners`, by default all that the data can train: first to be scored, then to be used.
 
     Scored is what was taught outside discs of the cortex, on the loads inside them. What is returned was taught all
     those loads, and its bounds were calibrated on others, which no fit has seen. Another `split`, with a row for each
