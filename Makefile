@@ -5,13 +5,20 @@ STAMP := $(VENV)/.installed
 # Pages answer visitors in time: these tests have the machine to themselves.
 PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py
 
-.PHONY: demo test lint template clean
+# The most telling tests: a minute on two cores.
+QUICK := house sim_reference sim_material sim_physics sim_plan sim_warm sim_loads sim_term sim_given sim_meshfile sim_solve \
+	sim_readme surrogate_bound surrogate_store ar_camera ar_raster ar_overlay scenes_tissue scenes_output
+
+.PHONY: demo quick test lint template clean
 
 demo: $(STAMP)
 	$(VENV)/bin/sulcus demo
 
+quick: $(STAMP)
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile $(QUICK:%=tests/test_%.py)
+
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile $(PAGES:%=--ignore=%)
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile --durations 15 $(PAGES:%=--ignore=%)
 	$(VENV)/bin/python -m pytest $(PAGES)
 
 lint: $(STAMP)

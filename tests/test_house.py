@@ -272,6 +272,15 @@ def test_no_path_of_one_machine():
         assert not machine.search(path.read_text()), name_of(path)
 
 
+def test_the_tests_that_the_makefile_names_are_there():
+    text = (HOUSE / "Makefile").read_text()
+    quick = re.search(r"^QUICK := ((?:.*\\\n)*.*)", text, re.MULTILINE)[1].replace("\\", " ").split()
+    pages = re.search(r"^PAGES := (.*)", text, re.MULTILINE)[1].split()
+    assert len(quick) > 10 and pages
+    assert not [name for name in quick if not (HOUSE / f"tests/test_{name}.py").exists()]
+    assert not [name for name in pages if not (HOUSE / name).exists()]
+
+
 def test_files_that_are_named_are_there():
     """In documents and docstrings; a name in a folder that was just named stands alone."""
     named = re.compile(r"(?<![\w/.-])(?:sim|surrogate|ar|scenes|tests|examples|benchmarks)/[\w/]+\.py\b")
