@@ -50,29 +50,11 @@ POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0 (done), 1 (ran, but did not reach what was asked) or 2 (bad input)."""
     arguments = _with_points(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="sulcus",
-        description=__doc__,
-        epilog="First steps: `sulcus demo`, then `sulcus patient --help`. Research only; not a medical device.",
-    )
-    parser.add_argument("--version", action="version", version=f"sulcus {version('sulcus')}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     asked = arguments[0] if arguments else None
     inner = INNER.get(asked or "", ())
     if inner and (len(arguments) == 1 or arguments[1] not in (*inner, "-h", "--help")):
         arguments.insert(1, inner[0])
-    for name, text in COMMANDS.items():
-        command = commands.add_parser(
-            name,
-            help=text,
-            description=text[0].upper() + text[1:] + ".",
-            epilog=guidance(name),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        if name == asked:
-            importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
-            if name in MAKING + READING:
-                add_plugin(command)
+    parser, _ = make_parsers(asked)
     args = parser.parse_args(arguments)
     warnings.formatwarning = lambda message, *rest: f"sulcus {args.command}: {message}\n"
     try:
@@ -82,6 +64,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"sulcus {args.command}: {error}", file=sys.stderr)
         return 2
+
+
+def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The parser of `sulcus`, and that of each command by its name; only those asked for know their arguments."""
+    parser = argparse.ArgumentParser(
+        prog="sulcus",
+        description=__doc__,
+        epilog="First steps: `sulcus demo`, then `sulcus patient --help`. Research only; not a medical device.",
+    )
+    parser.add_argument("--version", action="version", version=f"sulcus {version('sulcus')}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, text in COMMANDS.items():
+        command = commands.add_parser(
+            name,
+            help=text,
+            description=text[0].upper() + text[1:] + ".",
+            epilog=guidance(name),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if name in asked:
+            importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
+            if name in MAKING + READING:
+                add_plugin(command)
+    return parser, dict(commands.choices)
 
 
 def add_plugin(parser: argparse.ArgumentParser) -> None:
