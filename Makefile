@@ -9,7 +9,7 @@ PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py
 QUICK := house sim_reference sim_material sim_physics sim_plan sim_warm sim_loads sim_term sim_given sim_meshfile sim_solve \
 	sim_readme surrogate_bound surrogate_store ar_camera ar_raster ar_overlay scenes_tissue scenes_output
 
-.PHONY: demo quick test lint template clean
+.PHONY: demo quick test docs lint template clean
 
 demo: $(STAMP)
 	$(VENV)/bin/sulcus demo
@@ -20,6 +20,10 @@ quick: $(STAMP)
 test: $(STAMP)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile --durations 15 $(PAGES:%=--ignore=%)
 	$(VENV)/bin/python -m pytest $(PAGES)
+
+# The pages for the browser, from docs/: open build/docs/index.html. Warnings are errors.
+docs: $(STAMP)
+	$(VENV)/bin/python -m sphinx -W --keep-going docs build/docs
 
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
@@ -38,4 +42,4 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 clean:
-	rm -rf $(VENV) build out *.egg-info
+	rm -rf $(VENV) build out docs/generated *.egg-info

@@ -1,0 +1,52 @@
+"""What is made before the pages are read: it lies in generated/, and is not edited."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from array_tables import dataset_table, episode_table
+from command_pages import command_page
+from example_scripts import copy_scripts
+from public_names import PACKAGES, package_page
+from sphinx.application import Sphinx
+
+HEADER = """Examples
+========
+
+Scripts from the folder ``examples/``. Each is short, and runs by ``python examples/NAME.py`` or as its page says.
+"""
+# Links that hold beside the repository's files, and what they become among the pages.
+IN_PAGES = (
+    (re.compile(r"\]\(\.\./examples/(\w+)\.py\)"), r"](generated/examples/\1.rst)"),
+    (re.compile(r"\]\(\.\./examples/?\)"), r"](generated/examples/index.rst)"),
+)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Make the pages before the gallery looks for its scripts."""
+    app.connect("builder-inited", _make, priority=100)
+    app.connect("source-read", _relinked)
+    return {"parallel_read_safe": True}
+
+
+def _make(app: Sphinx) -> None:
+    source, made = Path(app.srcdir), Path(app.srcdir) / "generated"
+    made.mkdir(exist_ok=True)
+    pages = {
+        "command-line.md": command_page(),
+        "dataset-arrays.txt": dataset_table(),
+        "episode-arrays.txt": episode_table(),
+        "changes.md": (source.parent / "CHANGELOG.md").read_text().replace("](docs/", "](../"),
+        **{f"{name}.rst": package_page(name) for name in PACKAGES},
+    }
+    for name, text in pages.items():
+        path = made / name
+        if not path.exists() or path.read_text() != text:  # an unchanged page is not built again
+            path.write_text(text)
+    copy_scripts(source.parent / "examples", made / "scripts", HEADER)
+
+
+def _relinked(app: Sphinx, name: str, text: list[str]) -> None:
+    for link, page in IN_PAGES:
+        text[0] = link.sub(page, text[0])

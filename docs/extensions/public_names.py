@@ -1,0 +1,61 @@
+"""The reference of the public names: one page for each package, from its `__all__`."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+from pathlib import Path
+
+from plain_docstrings import structured
+from sphinx.pycode import ModuleAnalyzer
+
+PACKAGES = ("sim", "surrogate", "ar", "scenes")
+LONGEST = 200
+"""Characters of a constant's value that is shown."""
+
+
+def package_page(package: str) -> str:
+    """A page in reStructuredText: what the package is, a table of its names, and each name's docstring."""
+    names = importlib.import_module(package).__all__
+    return "\n".join(
+        [
+            package,
+            "=" * len(package),
+            "",
+            f".. py:module:: {package}",
+            f".. currentmodule:: {package}",
+            "",
+            inspect.getdoc(importlib.import_module(package)) or "",
+            "",
+            ".. autosummary::",
+            "   :nosignatures:",
+            "",
+            *(f"   {name}" for name in names),
+            "",
+            *(line for name in names for line in _entry(package, name)),
+        ]
+    )
+
+
+def _entry(package: str, name: str) -> list[str]:
+    found = getattr(importlib.import_module(package), name)
+    if inspect.isclass(found):
+        return [f".. autoclass:: {name}", "   :members:", ""]
+    if inspect.isfunction(found):
+        return [f".. autofunction:: {name}", ""]
+    value = [f"   :value: {found!r}"] if len(repr(found)) < LONGEST else []
+    return [f".. py:data:: {name}", *value, "", *(f"   {line}" for line in _told(package, name)), ""]
+
+
+def _told(package: str, name: str) -> list[str]:
+    """The words below a constant, in the module that the package's stub has it from."""
+    stub = ast.parse(Path(str(importlib.import_module(package).__file__)).with_suffix(".pyi").read_text())
+    (home,) = (
+        node.module
+        for node in stub.body
+        if isinstance(node, ast.ImportFrom) and name in {alias.name for alias in node.names}
+    )
+    analyzer = ModuleAnalyzer.for_module(f"{package}.{home}")
+    analyzer.analyze()
+    return structured(analyzer.attr_docs.get(("", name), []))

@@ -1,0 +1,135 @@
+"""The pages for the browser: they build without a warning, hold what the code has, and fetch nothing from elsewhere."""
+
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from scenes.cli import COMMANDS
+from scenes.play.episode import MEANINGS as EPISODE
+from scenes.script.scene import SCENES, find_scene
+from surrogate.data.array_meanings import MEANINGS as DATASET
+
+HOUSE = Path(__file__).parents[1]
+LINKS = {"a": "href"}
+LOADED = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src"}
+
+
+def build(source, target, *more):
+    """Run Sphinx as `make docs` does."""
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", *more, source, target]
+    return subprocess.run(command, cwd=HOUSE, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The built pages, of a copy: what is generated lies beside the sources."""
+    folder = tmp_path_factory.mktemp("pages")
+    for name in ("docs", "examples"):
+        shutil.copytree(HOUSE / name, folder / name, ignore=shutil.ignore_patterns("generated", "__pycache__"))
+    shutil.copy(HOUSE / "CHANGELOG.md", folder)
+    done = build(folder / "docs", folder / "site", "-D", "plot_gallery=0")  # examples are shown, not run
+    assert done.returncode == 0, done.stderr
+    return folder / "site"
+
+
+class Tags(HTMLParser):
+    """What a page holds: addresses that it loads, places that it links to, and its own anchors."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.loaded, self.links, self.anchors, self.names = set(), set(), set(), set()
+        self.feed(page.read_text())
+
+    def handle_starttag(self, tag, attrs):
+        told = dict(attrs)
+        self.names.add(tag)
+        self.anchors.add(told.get("id"))
+        for kinds, found in ((LOADED, self.loaded), (LINKS, self.links)):
+            if told.get(kinds.get(tag, "")):
+                found.add(told[kinds[tag]])
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    """Every page by its name."""
+    return {path.relative_to(site).with_suffix("").as_posix(): Tags(path) for path in site.rglob("*.html")}
+
+
+def test_every_source_is_a_page_and_every_example_too(pages):
+    wanted = {path.stem for path in (HOUSE / "docs").glob("*.md")}
+    wanted |= {f"generated/examples/{path.stem}" for path in (HOUSE / "examples").glob("*.py")}
+    assert len(wanted) > 20 and wanted <= set(pages)
+
+
+def test_no_page_loads_anything_from_elsewhere(site, pages):
+    """No script, style, font or picture: the pages are read where there is no network."""
+    outside = {name: [it for it in page.loaded if "//" in it] for name, page in pages.items()}
+    assert not {name: found for name, found in outside.items() if found}
+    assert any(page.loaded for page in pages.values())
+    styles = [path.read_text() for path in site.rglob("*.css")]
+    assert styles and not [text for text in styles if re.search(r"(url\(|@import )['\"]?(https?:)?//", text)]
+
+
+def test_every_link_inside_the_pages_arrives(site, pages):
+    checked = 0
+    for name, page in pages.items():
+        for link in page.links:
+            place, _, anchor = link.partition("#")
+            if re.match(r"[a-z]+:", link) or link == "#":
+                continue
+            target = (site / name).parent / place if place else site / f"{name}.html"
+            assert target.exists(), f"{name} links to {link}"
+            if anchor and target.suffix == ".html":
+                assert anchor in pages[target.resolve().relative_to(site).with_suffix("").as_posix()].anchors, link
+                checked += 1
+    assert checked > 100
+
+
+def test_every_command_and_public_name_is_in_the_reference(site, pages):
+    assert set(COMMANDS) <= pages["generated/command-line"].anchors
+    text = (site / "generated/command-line.html").read_text()
+    assert "--opening-over" in text and "FILE.py" in text and "bench throughput" in text
+    for package in ("sim", "surrogate", "ar", "scenes"):
+        names = importlib.import_module(package).__all__
+        assert {f"{package}.{name}" for name in names} <= pages[f"generated/{package}"].anchors
+
+
+def test_formulas_are_drawn_by_the_browser_itself(site, pages):
+    assert "math" in pages["physics"].names
+    assert "MathJax" not in (site / "physics.html").read_text()
+
+
+def test_files_are_described_array_by_array(site):
+    text = re.sub(r"<[^>]+>", "", (site / "formats.html").read_text())
+    assert not [name for name in (*DATASET, *EPISODE) if name not in text]
+
+
+def test_each_scene_has_a_picture_and_its_own_words():
+    text = (HOUSE / "docs/scenes.md").read_text()
+    assert re.findall(r"^## (\w+)\n\n!\[[^]]*\]\(scenes/(\w+)\.webp\)$", text, re.M) == [
+        (name, name) for name in SCENES
+    ]
+    assert not [name for name in SCENES if find_scene(name).title not in text]
+    pictures = list((HOUSE / "docs/scenes").iterdir())
+    assert len(pictures) == len(SCENES) and sum(path.stat().st_size for path in pictures) < 400_000
+
+
+def test_a_page_with_a_link_that_leads_nowhere_is_refused(tmp_path):
+    """Warnings are errors: here of one page, with the settings of all."""
+    shutil.copytree(HOUSE / "docs/extensions", tmp_path / "extensions")
+    settings = (HOUSE / "docs/conf.py").read_text()
+    for gone in ('    "generated_pages",\n', '    "sphinx_gallery.gen_gallery",\n'):
+        assert gone in settings
+        settings = settings.replace(gone, "")
+    (tmp_path / "conf.py").write_text(settings)
+    (tmp_path / "static").mkdir()
+    (tmp_path / "static/pages.css").write_text("")
+    for text, code in (("# A page\n\n$E^2$\n", 0), ("# A page\n\n[x](nowhere.md)\n", 1), ("# A page\n\n$\\no$\n", 1)):
+        (tmp_path / "index.md").write_text(text)
+        assert build(tmp_path, tmp_path / "site").returncode == code, text
