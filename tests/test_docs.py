@@ -120,6 +120,22 @@ def test_each_scene_has_a_picture_and_its_own_words():
     assert len(pictures) == len(SCENES) and sum(path.stat().st_size for path in pictures) < 400_000
 
 
+@pytest.mark.parametrize(
+    ("words", "title", "rest"),
+    [
+        ("Push on the brain.\n\nThen read.", "Push on the brain", "Then read."),
+        ("Push on the brain\n\nThen: read. It.", "Push on the brain", "Then: read. It."),
+        ("A law: Yeoh's, which\nstiffens.", "A law", "A law: Yeoh's, which\nstiffens."),
+        ("Push\nhard. It |moves|.", "Push hard", "It \\|moves\\|."),
+        ("Push at 0.3 N.", "Push at 0.3 N", ""),
+    ],
+)
+def test_what_an_example_begins_with_is_its_title(words, title, rest, monkeypatch):
+    monkeypatch.syspath_prepend(HOUSE / "docs/extensions")
+    made = importlib.import_module("example_scripts").gallery_script(f'"""{words}"""\nx = 1\n')
+    assert made == f'r"""\n{title}\n{"=" * len(title)}\n\n{rest}\n"""\nx = 1\n'
+
+
 def test_a_page_with_a_link_that_leads_nowhere_is_refused(tmp_path):
     """Warnings are errors: here of one page, with the settings of all."""
     shutil.copytree(HOUSE / "docs/extensions", tmp_path / "extensions")

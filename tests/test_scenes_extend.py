@@ -1,5 +1,6 @@
 """The page docs/extend.md: its code runs in a folder outside the packages, and it names only what there is."""
 
+import argparse
 import importlib
 import os
 import re
@@ -8,9 +9,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from scenes.script.scene import find_scene
+from scenes.script.shipped_files import template_path
 
 HOUSE = Path(__file__).parents[1]
 PAGE = (HOUSE / "docs/extend.md").read_text()
@@ -43,10 +46,20 @@ def test_the_blocks_run_one_after_the_other(folder):
     assert 5e-4 < held < 0.9 * free
 
 
+def test_the_command_says_how_large_the_tumour_is(capsys):
+    (block,) = (block for block in BLOCKS if "def add_arguments" in block)
+    names = {}
+    exec(block, names)
+    parser = argparse.ArgumentParser()
+    names["add_arguments"](parser)
+    assert names["run"](parser.parse_args([str(template_path())])) == 0
+    assert float(capsys.readouterr().out.removesuffix(" ml\n")) == pytest.approx(4 / 3 * np.pi * 1.2**3, rel=0.05)
+
+
 def test_every_example_says_how_it_is_used_and_every_name_on_the_page_exists():
     for path in (HOUSE / "examples").glob("*.py"):
         assert f"examples/{path.name}" in PAGE and path.read_text().startswith('"""')
-    names = set(re.findall(r"`((?:sim|scenes|surrogate)(?:\.[a-z_]+)+)\.([A-Z]\w+)`", PAGE))
+    names = set(re.findall(r"`((?:sim|scenes|surrogate)(?:\.[a-z_]+)*)\.([A-Z]\w+)`", PAGE))
     assert len(names) >= 8
     for module, name in names:
         assert hasattr(importlib.import_module(module), name), f"{module}.{name}"

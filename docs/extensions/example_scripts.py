@@ -1,4 +1,4 @@
-"""The scripts in examples/ as sphinx-gallery wants them: the docstring's first sentence, underlined, is the title."""
+"""The scripts in examples/ as sphinx-gallery wants them: what their docstrings begin with is the title, underlined."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ from plain_docstrings import structured
 
 
 def gallery_script(text: str) -> str:
-    """The same script, whose docstring has a title: its first line up to a colon or to its full stop."""
-    (head, *_) = ast.parse(text).body
-    assert isinstance(head, ast.Expr) and isinstance(head.value, ast.Constant) and isinstance(head.value.value, str)
-    words = head.value.value.strip()
-    title = re.split(r":\s|\.(?:\s|$)", words, maxsplit=1)[0].replace("\n", " ")
-    rest = words if words.startswith(f"{title}:") else words[len(title) :].lstrip(". \n")
+    """The same script, whose docstring has a title: its first paragraph up to a colon, or to a full stop.
+
+    What a colon ends is said again below the title, where it begins a sentence.
+    """
+    head = ast.parse(text).body[0]
+    words = ast.get_docstring(ast.Module([head], []))
+    if not words:
+        raise ValueError("an example begins with a docstring, whose first line is its title")
+    first, _, _ = words.partition("\n\n")
+    title, ended, _ = re.split(r"(:(?=\s)|\.(?=\s|$)|$)", first, maxsplit=1)[:3]
+    rest = words if ended == ":" else words[len(title) + len(ended) :].lstrip()
+    title = " ".join(title.split())
     body = "\n".join(structured(rest.splitlines()))
     code = "\n".join(text.splitlines()[head.end_lineno :])
     return f'r"""\n{title}\n{"=" * len(title)}\n\n{body}\n"""\n{code}\n'
