@@ -21,10 +21,6 @@ test: $(STAMP)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile --durations 15 $(PAGES:%=--ignore=%)
 	$(VENV)/bin/python -m pytest $(PAGES)
 
-# The pages for the browser, from docs/: open build/docs/index.html. Warnings are errors.
-docs: $(STAMP)
-	$(VENV)/bin/python -m sphinx -W --keep-going docs build/docs
-
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
@@ -35,6 +31,10 @@ template: $(STAMP)
 	$(VENV)/bin/sulcus anatomy --out scenes/data/template.vtu
 	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --count 5000 --out build/template.h5
 	$(VENV)/bin/sulcus train build/template.h5 --learners linear,ann,svr,series,series-gp --most 2000 --out scenes/data/template.model.npz
+
+# The pages for the browser, from docs/: open build/docs/index.html. Warnings are errors.
+docs: $(STAMP)
+	$(VENV)/bin/python -m sphinx -W --keep-going docs build/docs
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+from enum import Enum
 from pathlib import Path
 
 from plain_docstrings import structured
@@ -40,6 +41,8 @@ def package_page(package: str) -> str:
 
 def _entry(package: str, name: str) -> list[str]:
     found = getattr(importlib.import_module(package), name)
+    if inspect.isclass(found) and issubclass(found, Enum):
+        return [f".. autoclass:: {name}", "   :members:", "   :undoc-members:", ""]
     if inspect.isclass(found):
         return [f".. autoclass:: {name}", "   :members:", ""]
     if inspect.isfunction(found):
