@@ -33,6 +33,9 @@ def site(tmp_path_factory):
     for name in ("docs", "examples"):
         shutil.copytree(HOUSE / name, folder / name, ignore=shutil.ignore_patterns("generated", "__pycache__"))
     shutil.copy(HOUSE / "CHANGELOG.md", folder)
+    left = folder / "docs/generated/examples/gone.rst"  # by an earlier build, of a script that is there no more
+    left.parent.mkdir(parents=True)
+    left.write_text("Gone\n====\n")
     done = build(folder / "docs", folder / "site", "-D", "plot_gallery=0")  # examples are shown, not run
     assert done.returncode == 0, done.stderr
     return folder / "site"
@@ -65,6 +68,7 @@ def test_every_source_is_a_page_and_every_example_too(pages):
     wanted = {path.stem for path in (HOUSE / "docs").glob("*.md")}
     wanted |= {f"generated/examples/{path.stem}" for path in (HOUSE / "examples").glob("*.py")}
     assert len(wanted) > 20 and wanted <= set(pages)
+    assert "generated/examples/gone" not in pages
 
 
 def test_no_page_loads_anything_from_elsewhere(site, pages):

@@ -45,6 +45,15 @@ def _make(app: Sphinx) -> None:
         if not path.exists() or path.read_text() != text:  # an unchanged page is not built again
             path.write_text(text)
     copy_scripts(source.parent / "examples", made / "scripts", HEADER)
+    _keep(made, {path.partition(".")[0] for path in pages})
+    _keep(made / "examples", {"index", *(script.stem for script in (made / "scripts").glob("*.py"))})
+
+
+def _keep(folder: Path, names: set[str]) -> None:
+    """Take away files of other names, which earlier builds left: they would be pages that nothing leads to."""
+    for path in folder.glob("*"):
+        if path.is_file() and path.name.partition(".")[0] not in names:
+            path.unlink()
 
 
 def _relinked(app: Sphinx, name: str, text: list[str]) -> None:
