@@ -1,6 +1,7 @@
 """The pages for the browser: they build without a warning, hold what the code has, and fetch nothing from elsewhere."""
 
 import importlib
+import json
 import re
 import shutil
 import subprocess
@@ -8,14 +9,21 @@ import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 
 from scenes.cli import COMMANDS
+from scenes.play.deformers import model_path
 from scenes.play.episode import MEANINGS as EPISODE
 from scenes.script.scene import SCENES, find_scene
+from scenes.script.shipped_files import template_path
 from surrogate.data.array_meanings import MEANINGS as DATASET
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_loads import draw
 
 HOUSE = Path(__file__).parents[1]
+FORMATS = (HOUSE / "docs/formats.md").read_text()
 LINKS = {"a": "href"}
 LOADED = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src"}
 
@@ -112,6 +120,32 @@ def test_formulas_are_drawn_by_the_browser_itself(site, pages):
 def test_files_are_described_array_by_array(site):
     text = re.sub(r"<[^>]+>", "", (site / "formats.html").read_text())
     assert not [name for name in (*DATASET, *EPISODE) if name not in text]
+
+
+def test_the_code_on_the_page_of_formats_reads_the_files(tmp_path, monkeypatch, box, pretender):
+    data, episode = re.findall(r"```python\n(.*?)```", FORMATS, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    simulate(Path("patient.h5"), pretender, draw("palpation", box, 6, 0), {"preset": "palpation"})
+    names = {}
+    exec(data, names)
+    assert names["motion"].shape == (6, len(box.mesh.nodes), 3)
+    held = set()
+    with h5py.File("patient.h5") as file:
+        file.visititems(lambda name, item: held.add(name) if isinstance(item, h5py.Dataset) else None)
+    assert "loads/Pushed/force" in held and held <= set(DATASET)
+    read = re.findall(r'file\["([\w/]+)"\]', episode)
+    assert len(read) == 3 and set(read) <= set(EPISODE)
+
+
+def test_the_page_of_formats_lists_what_a_model_holds():
+    with np.load(model_path(template_path())) as archive:
+        header = json.loads(str(archive["header"]))
+    rows = re.findall(r"^\| (`\w+`) \| .*$", FORMATS.partition("\n## Model")[2].partition("\n## ")[0], re.M)
+    assert {row.strip("`") for row in rows} == {"header", *header["models"]["series-gp"]}
+    (told,) = re.findall(r"^\| `header` \| JSON: (.*)\|$", FORMATS, re.M)
+    assert set(re.findall(r"`(\w+)`", told)) == set(header)
+    (told,) = re.findall(r"^\| `envelope` \| (.*)\|$", FORMATS, re.M)
+    assert set(re.findall(r"`(\w+)`", told)) == set(header["models"]["series-gp"]["envelope"])
 
 
 def test_each_scene_has_a_picture_and_its_own_words():
