@@ -272,6 +272,13 @@ def test_no_path_of_one_machine():
         assert not machine.search(path.read_text()), name_of(path)
 
 
+def test_the_linter_reads_every_file():
+    """What .gitignore names, ruff passes over: a folder of artefacts there must not be one of ours too."""
+    shown = [sys.executable, "-m", "ruff", "check", "--show-files", "."]
+    read = subprocess.run(shown, cwd=HOUSE, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert {str(path) for path in FILES} <= set(read)
+
+
 def test_the_tests_that_the_makefile_names_are_there():
     text = (HOUSE / "Makefile").read_text()
     quick = re.search(r"^QUICK := ((?:.*\\\n)*.*)", text, re.MULTILINE)[1].replace("\\", " ").split()

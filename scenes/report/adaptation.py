@@ -16,8 +16,8 @@ from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from surrogate.data.simulate import simulate
 
-from .study import Study
 from .artefact_time import note_seconds, noted_seconds
+from .study import Study
 
 # Of the tumour's volume.
 SHARE = 0.2

@@ -1,13 +1,17 @@
 """What steps of a report took, kept beside the files that they made, for runs that go on."""
 
 from __future__ import annotations
+
 import json
-from pathlib import Path
-from sim.runtime.atomic_files import written_whole
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+
+from sim.runtime.atomic_files import written_whole
 from surrogate.training.shared_inputs import EXPANDED
+
 from .study import Study
+
 
 def note_seconds(made: Path, seconds: float) -> None:
     """Keep the seconds that a file took to make, in a JSON file of its name."""

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from sim.loads import Loads, Pushed
-from surrogate.data.encode import directions
 from surrogate.data.cortex_patch import Patch
+from surrogate.data.encode import directions
 
 # Times the greatest force; degrees more than the greatest angle; of the radius, how near to the rim a centre comes.
 STRONGER, MORE_OBLIQUE, NEARER = (1.2, 1.6), (5.0, 15.0), (0.5, 0.9)

@@ -9,20 +9,20 @@ import numpy as np
 
 from sim.accuracy import FLOOR, Accuracy, Precision
 from sim.anatomy import Anatomy
-from sim.effects import pushed_effects
-from sim.errors import InputError
-from sim.fem import Fem
-from sim.discretisation.footprint import nearest_on
-from sim.loads import Loads, Pushed
-from sim.geometry.locate import locate
-from sim.material import Material, Tissue
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.refine import refined
 from sim.bodies.subject import Plan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
+from sim.discretisation.footprint import nearest_on
+from sim.effects import pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.geometry.locate import locate
+from sim.loads import Loads, Pushed
+from sim.material import Material, Tissue
 
 from .adaptation import debulked
-from .row import (DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, of_times)
+from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, of_times
 from .study import Study
 
 OWN, HALVED = "own", "halved"

@@ -10,18 +10,18 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
-from surrogate.evaluation.coverage import TENTHS, coverage
-from surrogate.training.published_models import MACHINES, published_nodes, taught
-from surrogate.evaluation.score import bare_microseconds, single_seconds
 from surrogate.data.direction_split import leave_sectors_out
 from surrogate.data.disc_split import Split
+from surrogate.evaluation.coverage import TENTHS, coverage
+from surrogate.evaluation.score import bare_microseconds, single_seconds
 from surrogate.evaluation.solve_counts import Told
+from surrogate.training.published_models import MACHINES, published_nodes, taught
 from surrogate.training.train import train
 
 from .adaptation import debulked_study, simulating_seconds
+from .artefact_time import series_seconds
 from .reference import beyond_of
 from .row import Figures, Row, against_reference, figures_between, of_times
-from .artefact_time import series_seconds
 from .study import Study
 
 FEWEST_TAUGHT = 64
@@ -29,7 +29,7 @@ FEWEST_TAUGHT = 64
 
 @dataclass(frozen=True)
 class Learner:
-    """One of `surrogate.training.train.LEARNERS`, or of `surrogate.training.published_models.MACHINES`, which know every tenth vertex."""
+    """One of `train.LEARNERS`, or of `published_models.MACHINES`, which know every tenth vertex."""
 
     name: str
 

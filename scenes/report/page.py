@@ -118,11 +118,11 @@ def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
 
 def _plans(rows: Sequence[Row]) -> str:
     """How the rows of finite elements go about a load."""
-    plans = [
-        f"<details><summary>{escape(row.name)}</summary><ul>{''.join(f'<li>{escape(line)}' for line in row.plan)}</ul></details>"
-        for row in rows
-        if row.plan
-    ]
+    plans = []
+    for row in rows:
+        lines = "".join(f"<li>{escape(line)}" for line in row.plan)
+        if lines:
+            plans.append(f"<details><summary>{escape(row.name)}</summary><ul>{lines}</ul></details>")
     return f"<h3>Which solvers finite elements try</h3>{''.join(plans)}" if plans else ""
 
 

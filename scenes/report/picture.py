@@ -11,16 +11,16 @@ from ar.hud import panel
 from ar.overlay import DASHED, composite, dash, outlines, silhouette
 from ar.renderer import render
 from sim.bodies.intensity import read_intensity, sidecar
-from sim.loads import Pushed
 from sim.geometry.ball_at_rest import resting_tip
+from sim.loads import Pushed
 
-from .reference import reference_of
-from .study import Study
+from ..play.stage import TOOL, Stage
 from ..script.scene import Viewpoint, find_scene
 from ..script.shipped_files import template_path
 from ..script.site import Site, site_of
-from ..play.stage import TOOL, Stage
 from ..script.tool import Probe
+from .reference import reference_of
+from .study import Study
 
 # So narrow that a pixel is a tenth of a millimetre.
 VIEW = Viewpoint(fov=np.radians(9.0), width=400, height=300)

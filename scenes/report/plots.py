@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from ..bench.loglog_chart import Curve, Dot, Panel, drawn
-
 from surrogate.evaluation.choose import unbeaten
+
+from ..bench.loglog_chart import Curve, Dot, Panel, drawn
 from .row import ERROR, TOLERANCE_ALONE, Figures, Row
 
 SIZE = (880, 560)

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import REFERENCE, TRAIN
+from sim.bodies.refine import refined
 from sim.effects import pushed_effects
 from sim.fem import Fem
-from sim.runtime.atomic_files import written_whole
-from sim.loads import Loads
 from sim.geometry.locate import Located, locate
+from sim.loads import Loads
+from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
-from sim.bodies.refine import refined
 
 from .study import Study
 

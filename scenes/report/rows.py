@@ -14,16 +14,16 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import FLOOR, Precision
-from sim.runtime.atomic_files import written_whole
-from sim.material import LAWS
 from sim.geometry.tetmesh import digest_of
+from sim.material import LAWS
+from sim.runtime.atomic_files import written_whole
 from surrogate.training.published_models import MACHINES
 from surrogate.training.train import LEARNERS
 
 from .finite_elements import HALVED, OWN, STANDARD, Elements
 from .learner import Learner
-from .row import Row, row_from_json, row_to_json
 from .measure import FAMILY, Spec, measured
+from .row import Row, row_from_json, row_to_json
 from .study import Study
 
 # The state of rows that nothing is wrong with.

@@ -10,19 +10,19 @@ from pathlib import Path
 import numpy as np
 
 from sim.anatomy import Anatomy
+from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
+from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Pushed
 from sim.material import BRAIN, Tissue, tissue_from_json
-from sim.geometry.tetmesh import digest_of
-from sim.bodies.meshfile import read_anatomy
+from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.disc_split import Split, leave_discs_out
 from surrogate.data.encode import directions
 from surrogate.training.shared_inputs import Expansion
-from surrogate.data.cortex_patch import Patch, open_patch
-from surrogate.data.disc_split import Split, leave_discs_out
 
-from .extrapolated_loads import loads_beyond
 from ..script.shipped_files import template_path
+from .extrapolated_loads import loads_beyond
 
 
 @dataclass(frozen=True)

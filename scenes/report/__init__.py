@@ -1,0 +1,1 @@
+"""The report: what accuracy costs in time."""
