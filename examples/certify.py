@@ -17,7 +17,7 @@ tumour = theatre.anatomy.tumour_nodes
 loads = draw("palpation", theatre.anatomy, count=1, seed=0)
 predicted = model.deform(loads, at=tumour)
 
-fem = Fem(theatre.anatomy, scene.effects, TRAIN, "cpu", element="smoothed")
+fem = Fem(theatre.anatomy, scene.effects, TRAIN, "cpu", element="smoothed", live=True)  # loads come one at a time
 found = certify(fem, loads, predicted)
 solved = fem.deform(loads, at=tumour)
 
