@@ -86,7 +86,7 @@ class Deformation:
         (B,) whole numbers: tetrahedra that lie inside out, or collapsed; -1 from a deformer that does not know.
     leaked
         (B,): the volume that passes out through the closed skull, as a share of what the opening takes in and gives
-        out. NaN from a deformer that does not know, as a live frame on a card or a learnt model.
+        out. NaN from a deformer that does not know, as a live frame on a card or a trained model.
     bond
         (B,): the largest traction of a `Bonded` skull, as a share of what the bond bears: above 1 it would tear, and
         the answer is no longer one of its law. NaN where nothing is bonded, or from a deformer as above.
@@ -214,10 +214,12 @@ def check_start(start: Deformation, count: int, vertices: int) -> None:
             f"the start has displacements of shape {np.shape(start.displacement)}: give every vertex of {count} load "
             f"cases, ({count}, {vertices}, 3)."
         )
-    for name, values in {"time": start.time, **start.memory, **start.warm}.items():
+    # A term may be called as something warm is: each is checked as what it is.
+    needed = [(name, values, True) for name, values in {"time": start.time, **start.memory}.items()]
+    for name, values, finite in [*needed, *((name, values, False) for name, values in start.warm.items())]:
         array = as_array(f"the start's {name!r}", values)
         good = array.dtype.kind in "fiu" and array.shape[:1] == (count,)
-        if not good or not (name in start.warm or all_finite(array)):
+        if not good or (finite and not all_finite(array)):
             raise InputError(
                 f"the start's {name!r} are no {count} rows of finite numbers: start from an answer to {count} loads as "
                 "it came, or from rest."

@@ -215,6 +215,7 @@ def test_starts_that_are_none(fem: Fem, cut: Any) -> None:
             (replace(good, time=np.array([np.nan])), "the start's 'time' are no 1 rows of finite numbers"),
             (replace(good, time=np.zeros(3)), "the start's 'time'"),
             (spoilt(good, inertia=np.full((1, 64, 3), np.nan)), "the start's 'inertia'"),
+            (spoilt(good, pushes=np.full((1, 2, 7), np.nan)), "the start's 'pushes'"),  # a term of that name
             (warmed(good, pushes=np.array("x")), "the start's 'pushes'"),
             (warmed(good, pushes=np.zeros((4, 2, 7))), "the start's 'pushes'"),
             (warmed(good, pushes=good.warm["pushes"] * 1j), "the start's 'pushes'"),
