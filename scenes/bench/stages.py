@@ -14,6 +14,8 @@ import numpy as np
 import warp as wp
 
 from sim.accuracy import LIVE, TRAIN
+from sim.fem import Fem
+from sim.resected_fem import Operated
 from sim.runtime.device import find_device
 from surrogate.data.tool_loads import draw
 
@@ -48,8 +50,18 @@ def timed(name: str, unit: str, scale: float, runs: int, note: str, work: Callab
     return Row(name, scale * float(np.median(seconds)), scale * float(np.percentile(seconds, 95)), unit, runs, note)
 
 
-def rows(theatre: Theatre, player: Player, deformer: str, solves: int, batch: int) -> Iterator[Row]:
-    """The figures of a theatre, one by one: finite elements, learners, and the pictures of a player of `deformer`."""
+def rows(
+    theatre: Theatre,
+    player: Player,
+    deformer: str,
+    solves: int,
+    batch: int,
+    made: Callable[[Fem | Operated], object] = lambda fem: None,
+) -> Iterator[Row]:
+    """The figures of a theatre, one by one: finite elements, learners, and the pictures of a player of `deformer`.
+
+    `made` hears of the finite elements that solve the batch.
+    """
     scene = player.scene
     nodes = theatre.anatomy.tumour_nodes
     size = f"{len(theatre.anatomy.mesh.nodes)} nodes, {len(theatre.anatomy.mesh.tets)} tetrahedra"
@@ -59,8 +71,9 @@ def rows(theatre: Theatre, player: Player, deformer: str, solves: int, batch: in
     begun = clock.perf_counter()
     fem = theatre.fem(scene, TRAIN, batch)
     fem.deform(single[0])
-    made = clock.perf_counter() - begun
-    yield Row("FEM set-up", made, None, "s", 1, f"compile or load kernels, factorise; {size}")
+    seconds = clock.perf_counter() - begun
+    made(fem)
+    yield Row("FEM set-up", seconds, None, "s", 1, f"compile or load kernels, factorise; {size}")
     begun = clock.perf_counter()
     answers = fem.deform(loads)
     each = 1e3 * (clock.perf_counter() - begun) / len(loads)

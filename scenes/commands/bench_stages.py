@@ -26,7 +26,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
-    from sim.accuracy import TRAIN
     from sim.effects import ToolForce
     from sim.fem import Fem
 
@@ -46,16 +45,15 @@ def run(args: argparse.Namespace) -> int:
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
-    found = []
+    found, solvers = [], []
     where = machine(args.device)
     table = sys.stderr if args.json else sys.stdout
     print(f"{where}\n\n| stage | median | p95 | | what |\n|---|---|---|---|---|", file=table)
-    for row in rows(theatre, player, name, args.solves, args.batch):
+    for row in rows(theatre, player, name, args.solves, args.batch, solvers.append):
         found.append(row)
         p95 = "" if row.p95 is None else f"{row.p95:.3g}"
         print(f"| {row.name} | {row.median:.3g} | {p95} | {row.unit} | {row.note} |", file=table, flush=True)
-    fem = theatre.fem(scene, TRAIN, args.batch)
-    plan = fem.plan.explain() if isinstance(fem, Fem) else ()
+    plan = tuple(line for fem in solvers if isinstance(fem, Fem) for line in fem.plan.explain())
     if plan:
         print("\nHow the finite elements go about a load:\n", *(f"- {line}" for line in plan), sep="\n", file=table)
     if args.json:
