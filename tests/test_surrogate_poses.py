@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
+from scenes.script.shipped_files import template_path
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Deformation, Deformer, Outcome
@@ -27,6 +28,7 @@ from surrogate.evaluation.score import errors
 from surrogate.model.applicability import refusal
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
+from surrogate.model.training_range import envelope_of
 from surrogate.training.learners import POSED
 from surrogate.training.train import Trained, learners_for, train
 
@@ -182,6 +184,19 @@ def test_a_stored_model_knows_its_ball(tmp_path: Path, trained: Trained, box: An
     again, fresh = load(tmp_path / "model.npz", box)["gp"], draw_poses("palpation", box, 5, 1)
     assert again.ball == BALL.radius
     np.testing.assert_array_equal(again.deform(fresh).displacement, trained.models["gp"].deform(fresh).displacement)
+
+
+def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses() -> None:
+    """A data set to judge by is told from the training's own by what is not a vertex of the cortex."""
+    template = read_anatomy(template_path())
+    patch, corners = open_patch(template), template.mesh.nodes
+    first, same, other = (
+        indented(draw_poses("palpation", template, 900, seed), ball_of("palpation").radius, patch) for seed in (0, 0, 1)
+    )
+    known = envelope_of(patch, first)
+    shared = (known.points[:, None] == other.point.astype(np.float32)).all(axis=2).any(axis=1)
+    assert shared.sum() > 3 and not known.repeats(other.point, corners)
+    assert known.repeats(same.point, corners)
 
 
 def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(trained: Trained, box: Anatomy) -> None:

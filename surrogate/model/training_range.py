@@ -59,6 +59,14 @@ class Envelope:
         """(B,) bool: whether each load lies inside."""
         return self.excess(pushed, measured(patch, pushed)) == 0.0
 
+    def repeats(self, point: np.ndarray, corners: np.ndarray) -> bool:
+        """Whether some of the points (B, 3) [m] are points of the training, to the last bit.
+
+        The surface's corners (n, 3) [m] do not count: many different poses have the same corner nearest to them.
+        """
+        asked, known, free = (set(map(tuple, place.astype(np.float32))) for place in (point, self.points, corners))
+        return bool((asked & known) - free)
+
     def excess(self, pushed: Pushed, known: Measured) -> np.ndarray:
         """How far outside each load lies (B,), in shares of what was taught; zero inside.
 
