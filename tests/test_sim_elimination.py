@@ -19,7 +19,8 @@ from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
 from sim.linalg.preconditioner import rest_solver
 from sim.linalg.schur import condensed
-from sim.local_solvers.batch_elimination import PATIENCE, Elimination, eliminating, near_tetrahedra
+from sim.local_solvers.batch_elimination import Elimination, eliminating, near_tetrahedra
+from sim.local_solvers.outer_loop import Limits
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from sim.runtime.device import find_device
 from sim.strategy.plan import Step
@@ -120,7 +121,7 @@ def test_what_gets_no_nearer_is_left_to_others() -> None:
     elimination = descent_of(eliminating, problem, space, law)
     found = elimination.descend(problem.device.zeros(problem.rows, 1), np.zeros(1), 100)
     assert found.status[0] == LIVE and found.residual[0] < 1e-12
-    assert found.steps[0] < 20 + PATIENCE
+    assert found.steps[0] < 20 + Limits().patience
 
 
 def test_the_condensed_surroundings_are_the_schur_complement() -> None:
@@ -144,7 +145,7 @@ def test_the_condensed_surroundings_are_the_schur_complement() -> None:
     np.testing.assert_allclose(around.follow, moved[:, around.rows], atol=1e-5)
 
 
-def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves() -> None:
     anatomy, space = body()
     effects = (Elasticity(tissue("stable-neo-hookean")), *EFFECTS)
     fem = Fem(anatomy, effects, Accuracy(tolerance=FINE), "cpu", element="p1")
@@ -152,9 +153,10 @@ def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves(monkeypatc
     fem._ladder = replace(fem._ladder, plan=replace(fem.plan, many=None))
     plain = fem.deform(loads_of(many))
     near = eliminating(fem.problem, rest_solver(fem.problem), effects, space)
-    fem._ladder = replace(fem._ladder, plan=replace(fem.plan, many=Step.NEAR), near=lambda: near)
+    assert near is not None
     for cycles in (12, 3):
-        monkeypatch.setattr("sim.local_solvers.batch_elimination.CYCLES", cycles)
+        some = replace(near, limits=Limits(cycles=cycles))
+        fem._ladder = replace(fem._ladder, plan=replace(fem.plan, many=Step.NEAR), near=lambda some=some: some)
         found = fem.deform(loads_of(many))
         assert all(outcome.good for outcome in found.outcome)
         assert (found.iterations != plain.iterations).any()

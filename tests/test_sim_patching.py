@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from openings import FINE, LAWS_AND_ELEMENTS, TOTAL, begun, descent_of, equilibria, loads_of
@@ -13,8 +15,9 @@ from sim.deformation import Outcome
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
+from sim.local_solvers.outer_loop import Limits
 from sim.local_solvers.patch import Patch
-from sim.local_solvers.patch_elimination import CYCLES, NODES, PATIENCE, patching
+from sim.local_solvers.patch_elimination import NODES, patching
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from surrogate.data.tool_loads import draw
 
@@ -94,7 +97,7 @@ def test_what_gets_no_nearer_is_left_to_others() -> None:
     problem, space = begun(law, total=TOTAL[:1])
     found = descent_of(patching, problem, space, law).descend(problem.device.zeros(problem.rows, 1), np.zeros(1), 100)
     assert found.status[0] == LIVE and found.residual[0] < 1e-12
-    assert found.steps[0] <= CYCLES and found.steps[0] < 12 + PATIENCE
+    assert found.steps[0] <= Limits().cycles and found.steps[0] < 12 + Limits().patience
 
 
 def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
@@ -113,12 +116,11 @@ def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
     np.testing.assert_allclose(patch._free(force), patch._free(taken), atol=1e-6 * np.abs(force).max())
 
 
-def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[1:2])
     whole = descent_of(patching, problem, space, law)
-    monkeypatch.setattr("sim.local_solvers.patch_elimination.LARGEST_NEAR", 60)
-    part = descent_of(patching, problem, space, law)
+    part = descent_of(partial(patching, largest=60), problem, space, law)
     assert len(part._nodes) < 0.8 * len(whole._nodes) and np.isin(part._nodes, whole._nodes).all()
     found = part.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)
     assert found.status[0] == DONE and found.residual[0] <= FINE

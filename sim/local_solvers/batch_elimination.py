@@ -1,11 +1,10 @@
 """Nonlinear elimination: a part that is strained most is solved by itself, again and again, and the rest follows it.
 
 Close to the tools tissue is far from its rest stiffness, elsewhere it is nearly linear. A descent from the rest
-stiffness spends most of its turns on the first, at the price of the whole body. Here each cycle corrects the whole with
-the rest stiffness, then solves the near part in its surroundings, as stiff as at rest, and lets the far part follow:
+stiffness spends most of its iterations on the first, at the price of the whole body. Here each cycle corrects the whole
+with the rest stiffness, then solves the near part in its surroundings, as stiff as at rest. The far part follows:
 Gendre, Allix, Gosselet, Comte 2009, "Non-intrusive and exact global/local techniques for structural problems with local
-plasticity", Comput. Mech. 44:233-245; nonlinear elimination is that of Cai, Keyes 2002, "Nonlinearly preconditioned
-inexact Newton algorithms", SIAM J. Sci. Comput. 24:183-200.
+plasticity", Comput. Mech. 44:233-245. The outer loop is that of nonlinear elimination (`outer_loop.py`).
 
 With C the inverse of the rest stiffness, r the gradient at u, and e = -C r the linear correction, the near part finds x
 of n(u + x) - n(u) + F x = (n' + F) e there: n are its internal forces, n' and F the stiffness of its own and that of
@@ -31,21 +30,15 @@ from ..linalg.pcg import Preconditioner
 from ..linalg.preconditioner import rest_solver
 from ..linalg.schur import condensed
 from ..minimisers.lbfgs import Descended, Lbfgs
-from ..minimisers.lbfgs_kernels import BROKEN, DONE, FREE, LIVE, WHOLE
-from ..minimisers.residual import balance, constants_of
-from ..runtime.columns import combined, gathered, put_rows, rows_taken, scattered
+from ..minimisers.residual import Judge, State
+from ..runtime.columns import combined, put_rows, rows_taken
 from ..runtime.dense_product import product_with
+from .outer_loop import USUAL, Limits, eliminated
 
 # The near part: such a share of the tetrahedra, where the free surface is at most such a share of all of it.
 NEAR, LARGEST_OPENING = 0.2, 0.25
-CYCLES = 20
-# The near part is solved to a share of the whole residual, or of the tolerance, in so many turns or until few columns
-# are left.
-FORCING, ENOUGH, TURNS, STRAGGLERS = 0.03, 0.3, 100, 0.05
-# A column whose free force was not halved in so many cycles goes elsewhere.
-PATIENCE = 5
-# Hard loads pass through states whose free force is so many times the start's; beyond that they have exploded.
-RISE = 30.0
+# The near part is solved in so many iterations or until few columns are left.
+ITERATIONS, STRAGGLERS = 100, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +53,8 @@ class Elimination:
         The near part in its surroundings, and the descent that solves it.
     shared, follow
         (m,) rows of the near part that the far part touches, on the device; (x (m, b), out (3N, b)): how it follows.
+    limits
+        When cycles end.
     """
 
     problem: Problem
@@ -69,51 +64,17 @@ class Elimination:
     lbfgs: Lbfgs
     shared: wp.array
     follow: Callable[[wp.array, wp.array], None]
+    limits: Limits = USUAL
 
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
-        """As `Lbfgs.descend`, in at most `most` cycles; nothing is learnt.
+        """As `Lbfgs.descend`, in at most `most` cycles; nothing is learnt."""
 
-        A column that has not got below the free force of its start ends there: it has not become better.
-        """
-        problem, device, count = self.problem, self.problem.device, start.shape[1]
-        result, u, live = wp.clone(start), wp.clone(start), np.arange(count)
-        status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
-        first, mark, idle = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count, int)
-        constant, loud = constants_of(problem, u)
-        square = loud.numpy().max(axis=0, initial=0.0)
-        last = min(CYCLES, most)
-        for cycle in range(last + 1):
-            found = balance(problem, u, constant)
-            sums, own = found.sums.numpy(), found.own.numpy()
-            largest = np.maximum(square[live], own.max(axis=0))
-            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-                free, largest = np.sqrt(sums[FREE]), np.sqrt(np.maximum(largest, sums[WHOLE] - sums[FREE]))
-                relative = np.where(free == 0.0, 0.0, free / largest)
-            finite = np.isfinite(relative) & np.isfinite(largest)
-            if cycle == 0:
-                first, status[~finite] = free, BROKEN
-            sane, better = finite & (free <= RISE * first[live]), finite & (free <= first[live])
-            residual[live[better]], steps[live[sane]] = relative[better], cycle
-            done = better & (relative <= tolerance[live])  # forces that explode lower the relative residual
-            status[live[done]] = DONE
-            halved = free <= 0.5 * mark[live]
-            mark[live[halved]] = free[halved]
-            idle[live] = np.where(halved, 0, idle[live] + 1)
-            leave = done | ~sane | (idle[live] >= PATIENCE) | (cycle == last)
-            better &= leave
-            scattered(device, gathered(device, u, np.flatnonzero(better)), live[better], result)
-            if leave.all():
-                break
-            g, force = found.g, np.fmax(FORCING * free, ENOUGH * tolerance[live] * largest)
-            if leave.any():
-                stay = np.flatnonzero(~leave)
-                problem.keep(stay)
-                u, g, constant = (gathered(device, array, stay) for array in (u, g, constant))
-                live, force = live[stay], force[stay]
-            u = self._corrected(u, g, force)
-        return Descended(result, status, steps, residual, {})
+        def cycle(judge: Judge, now: State, force: np.ndarray) -> State:
+            return judge(self._corrected(now.u, now.g, force))
+
+        return eliminated(self.problem, start, tolerance, most, self.limits, cycle)
 
     def _corrected(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
         """The next state (3N, b), from the free gradient g (3N, b) at u (3N, b); force (b,) [N] may be left near."""
@@ -132,7 +93,7 @@ class Elimination:
         load = part.gradient(near)
         self.part.put(combined(device, load, -1.0, g, load))
         part.constraint.project_nodes(g)
-        found = self.lbfgs.descend(near, np.zeros(count), TURNS, None, force, STRAGGLERS, (g, back))
+        found = self.lbfgs.descend(near, np.zeros(count), ITERATIONS, None, force, STRAGGLERS, (g, back))
         missed = combined(device, found.u, -1.0, aim, aim)
         followed = wp.empty_like(out)
         self.follow(rows_taken(device, missed, self.shared), followed)

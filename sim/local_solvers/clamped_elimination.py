@@ -2,14 +2,13 @@
 
 Where the rest stiffness is known only nearly (levels), the surroundings of a part cannot be condensed. So the part of
 the body near a load, held at its rim (`clamped_part.py`), is brought to equilibrium by itself, and L-BFGS minimises
-what is left, a function of the body around it, whose curvature the rest stiffness knows well. Cai, Keyes 2002,
-"Nonlinearly preconditioned inexact Newton algorithms", SIAM J. Sci. Comput. 24:183-200.
+what is left, a function of the body around it, whose curvature the rest stiffness knows well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,12 +19,13 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
 from ..linalg.pcg import Preconditioner
+from ..minimisers.compact_lbfgs import no_pairs
 from ..minimisers.lbfgs import Descended
-from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from ..minimisers.line_search import goes_too_far, kept_of
-from ..minimisers.residual import State, constants_of
-from ..runtime.columns import combined, dots
+from ..minimisers.residual import Judge, State
+from ..runtime.columns import combined
 from .clamped_part import Rimmed
+from .outer_loop import Limits, eliminated
 
 # The vicinity is what the linear answer strains more than this, the most strained tetrahedra first, of at most such a
 # share of all nodes; and all tetrahedra that touch these.
@@ -33,11 +33,8 @@ STRAINED, LARGEST = 0.15, 0.03
 # Where a cycle leaves more than this share of the free force, and so many nodes have most of what is beyond the
 # vicinity, these and what touches them are added to it.
 LEFT, ADDED = 0.8, 60
-CYCLES, PAIRS, CUTS = 30, 8, 6
-# A load whose free force was not halved in so many cycles goes elsewhere.
-PATIENCE = 8
-# The vicinity is settled to a share of the whole residual, or of the tolerance.
-FORCING, ENOUGH = 0.1, 0.5
+CUTS = 6
+DEAR = Limits(cycles=30, patience=8, rise=np.inf, forcing=0.1, enough=0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,90 +45,89 @@ class Vicinity:
         The whole body's.
     effects, space
         What the problem was compiled from.
+    limits
+        When cycles end: one is dear here, and the line search cuts what explodes.
     """
 
     problem: Problem
     preconditioner: Preconditioner
     effects: Iterable[Effect]
     space: Discretisation
+    limits: Limits = DEAR
 
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
-        """As `Lbfgs.descend`, of one column, in at most `most` cycles; nothing is learnt.
+        """As `Lbfgs.descend`, of one column, in at most `most` cycles; nothing is learnt."""
+        chosen, part, pairs = (
+            np.zeros(len(self.space.table), bool),
+            None,
+            no_pairs(self.problem.rows, self.problem.device.precision),
+        )
+        z = np.zeros(0)
 
-        What is not brought to its end is left where its free force was least.
-        """
-        constant, _ = constants_of(self.problem, start)
-        first = best = now = self._at(start)
-        aim, status, cycle, idle, mark = float(tolerance[0]), LIVE if first.finite else BROKEN, 0, 0, np.inf
-        chosen, pairs = np.zeros(len(self.space.table), bool), Pairs(self.problem)
-        if first.finite:
-            linear = combined(self.problem.device, start, -1.0, self._solved(now.g), wp.empty_like(start))
-            chosen = self._touching(self._strained(linear))
-        if not chosen.any():
-            return _ended(best, status, cycle)
-        part = Rimmed(self.problem, self.effects, self.space, chosen, constant, start)
-        now = self._at(part.settled(now.u, FORCING * now.free))
-        while now.finite:
-            best = now if now.free <= best.free else best
-            status = DONE if best.relative <= aim else LIVE
-            halved = now.free <= 0.5 * mark
-            mark, idle = (now.free, 0) if halved else (mark, idle + 1)
-            if status == DONE or idle >= PATIENCE or cycle >= min(CYCLES, most):
-                break
-            cycle += 1
-            new = self._lower(now, part, pairs, max(FORCING * now.free, ENOUGH * aim * now.scale))
-            if new is None:
-                break
-            pairs.learn(now, new)
-            if new.free > LEFT * now.free:
-                more = self._left(new.g, part.nodes)
+        def cycle(judge: Judge, now: State, force: np.ndarray) -> State:
+            nonlocal chosen, part, pairs, z
+            if part is None:
+                z = self._solved(now.g)
+                chosen = self._touching(self._strained(now.u.numpy()[:, 0] - z))
+                if not chosen.any():
+                    return replace(now, free=np.full(1, np.inf))
+                part = Rimmed(self.problem, self.effects, self.space, chosen, judge.constant, now.u)
+                new = judge(part.settled(now.u, force[0]))
+                z = self._solved(new.g)
+                return new
+            new = self._lower(judge, now, part, -z - pairs.motion(pairs.weights(_host(now.g))), force[0])
+            if not new.finite[0]:
+                return new
+            after = self._solved(new.g)
+            s, y = _host(new.u) - _host(now.u), _host(new.g) - _host(now.g)
+            if s @ y > 0.0:
+                pairs = pairs.and_one(s, y, after - z)
+            if new.free[0] > LEFT * now.free[0]:
+                more = self._left(_host(new.g), part.nodes)
                 if len(more):
                     chosen |= self._touching(more)
-                    part = Rimmed(self.problem, self.effects, self.space, chosen, constant, new.u)
-            now = new
-        return _ended(best, status, cycle)
+                    part = Rimmed(self.problem, self.effects, self.space, chosen, judge.constant, new.u)
+            z = after
+            return new
 
-    def _lower(self, now: State, part: Rimmed, pairs: Pairs, force: float) -> State | None:
-        """A step along the direction of L-BFGS that does not go too far, and the part settled to `force` [N] there.
+        return eliminated(self.problem, start, tolerance, most, self.limits, cycle)
 
-        None where no step that was tried leads on.
+    def _lower(self, judge: Judge, now: State, part: Rimmed, d: np.ndarray, force: float) -> State:
+        """A step along d (3N,) that does not go too far, and the part settled to `force` [N] there.
+
+        Its free force is not finite where no step that was tried leads on.
         """
-        d, promised = pairs.direction(now.g, self._solved)
-        if not promised > 0.0:
-            return None
-        device, length = self.problem.device, float(self.problem.longest_step(now.u, d)[0])
-        for _ in range(CUTS):
-            v = combined(device, now.u, length, d, wp.empty_like(d))
-            new = self._at(part.settled(v, force))
-            slope = float(dots(device, new.g, d)[0])
-            if new.finite and not goes_too_far(slope, promised):
+        promised, device = -float(_host(now.g) @ d), self.problem.device
+        way = device.array(d[:, None])
+        length = float(self.problem.longest_step(now.u, way)[0])
+        for _ in range(CUTS if promised > 0.0 else 0):
+            new = judge(part.settled(combined(device, now.u, length, way, wp.empty_like(way)), force))
+            slope = float(_host(new.g) @ d)
+            if new.finite[0] and not goes_too_far(slope, promised):
                 return new
             length *= kept_of(slope, promised)
-        return None
+        return replace(now, free=np.full(1, np.inf))
 
-    def _at(self, u: wp.array) -> State:
-        g, free, scale = self.problem.residual(u)
-        return State(u, g, float(free[0]), float(scale[0]))
-
-    def _solved(self, g: wp.array) -> wp.array:
+    def _solved(self, g: wp.array) -> np.ndarray:
+        """How the body at rest answers a force g (3N, 1) [N]: (3N,) [m]."""
         z = wp.zeros_like(g)
         self.preconditioner.apply(g, np.ones(1, bool), z)
         self.problem.constraint.project_nodes(z)
-        return z
+        return _host(z)
 
-    def _strained(self, u: wp.array) -> np.ndarray:
-        """The nodes (k,) of the tetrahedra that a displacement u (3N, 1) strains most."""
+    def _strained(self, u: np.ndarray) -> np.ndarray:
+        """The nodes (k,) of the tetrahedra that a displacement u (3N,) [m] strains most."""
         table = self.space.table
-        slope = np.einsum("tai,taj->tij", u.numpy().reshape(-1, 3)[table[:, :4]], self._slopes)
+        slope = np.einsum("tai,taj->tij", u.reshape(-1, 3)[table[:, :4]], self._slopes)
         strain = np.sqrt(np.einsum("tij,tij->t", slope, slope))
         most = min(int(LARGEST * len(strain)), int((strain > STRAINED).sum()))
         return table[np.argsort(-strain)[:most]].ravel()
 
-    def _left(self, g: wp.array, nodes: np.ndarray) -> np.ndarray:
-        """The few nodes (k,) beyond these that have most of the free gradient g (3N, 1) there; none if no few have."""
-        square = (g.numpy().reshape(-1, 3).astype(np.float64) ** 2).sum(axis=1)
+    def _left(self, g: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """The few nodes (k,) beyond these that have most of the free gradient g (3N,) there; none if no few have."""
+        square = (g.reshape(-1, 3).astype(np.float64) ** 2).sum(axis=1)
         square[nodes] = 0.0
         most = np.argsort(-square)[:ADDED]
         return most if 2.0 * square[most].sum() > square.sum() else most[:0]
@@ -148,34 +144,6 @@ class Vicinity:
         return linear_elements(self.space.mesh, every).gradient[:, 0].astype(np.float32)
 
 
-def _ended(best: State, status: int, cycle: int) -> Descended:
-    return Descended(best.u, np.array([status]), np.array([cycle]), np.array([best.relative]), {})
-
-
-@dataclass(eq=False)
-class Pairs:
-    """The last pairs of L-BFGS: steps s and changes y of the gradient (3N, 1)."""
-
-    problem: Problem
-    known: list[tuple[wp.array, wp.array]] = field(default_factory=list)
-
-    def learn(self, before: State, after: State) -> None:
-        """What the step between two states says of the curvature."""
-        device = self.problem.device
-        s = combined(device, after.u, -1.0, before.u, wp.empty_like(after.u))
-        y = combined(device, after.g, -1.0, before.g, wp.empty_like(after.g))
-        if after.finite and float(dots(device, s, y)[0]) > 0.0:
-            self.known = [*self.known, (s, y)][-PAIRS:]
-
-    def direction(self, g: wp.array, solved: Callable[[wp.array], wp.array]) -> tuple[wp.array, float]:
-        """The direction (3N, 1), and the decrease that it promises. Nocedal, Wright 2006, algorithm 7.4."""
-        device, q, along = self.problem.device, wp.clone(g), []
-        for s, y in reversed(self.known):
-            share = float(dots(device, s, q)[0] / dots(device, s, y)[0])
-            combined(device, q, -share, y, q)
-            along.append(share)
-        z = solved(q)
-        for (s, y), share in zip(self.known, reversed(along), strict=True):
-            combined(device, z, share - float(dots(device, y, z)[0] / dots(device, s, y)[0]), s, z)
-        promised = float(dots(device, g, z)[0])
-        return combined(device, wp.zeros_like(z), -1.0, z, z), promised
+def _host(column: wp.array) -> np.ndarray:
+    """(3N,) of a column (3N, 1) on the CPU."""
+    return column.numpy()[:, 0]

@@ -28,7 +28,7 @@ from ..minimisers.compact_lbfgs import Pairs, pairs_of
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from ..minimisers.line_search import goes_too_far, kept_of
-from ..minimisers.residual import Measured
+from ..minimisers.residual import relative
 from ..runtime.threads import one_thread
 from .contact_forces import Softness, settled
 
@@ -43,7 +43,7 @@ DRAG, GROWTH, TIMES = 0.3, 3.0, 5
 
 
 @dataclass(frozen=True, eq=False)
-class State(Measured):
+class State:
     """u (3N,) [m]; the free gradients (3N,) [N] of all that is smooth, and of all; its 2-norm, and its scale."""
 
     u: np.ndarray
@@ -51,6 +51,16 @@ class State(Measured):
     whole: np.ndarray
     free: float
     scale: float
+
+    @property
+    def relative(self) -> float:
+        """The relative residual."""
+        return float(relative(np.asarray(self.free), np.asarray(self.scale)))
+
+    @property
+    def finite(self) -> bool:
+        """Whether it is a state at all: forces that overflow have no scale."""
+        return bool(np.isfinite(self.free) and np.isfinite(self.scale))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ step needs C^-1, for every direction is C times a force, plus steps whose forces
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import get_blas_funcs
@@ -22,20 +21,11 @@ from ..compile import compile_part
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
-from ..minimisers.lbfgs_kernels import LEAST_CURVATURE, PAIRS
+from ..minimisers.compact_lbfgs import no_pairs
+from ..minimisers.lbfgs_kernels import LEAST_CURVATURE
 from ..minimisers.line_search import goes_too_far, kept_of
 
-TURNS, CUTS = 150, 12
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """A step (m,) [m], the change (m,) [N] of the gradient along it, their product [J], and C^-1 times the step."""
-
-    step: np.ndarray
-    change: np.ndarray
-    work: float
-    force: np.ndarray
+ITERATIONS, CUTS = 150, 12
 
 
 class Patch:
@@ -70,19 +60,24 @@ class Patch:
         The share is as much of e as no element forbids. The forces are q but for the gradient, whose 2-norm is at most
         `force` [N]: C q would amplify what that leaves by how much stiffer than at rest the elements have become.
         """
-        pairs: list[Pair] = []
+        pairs = no_pairs(len(e), "float64")
+        forces = changes = np.zeros((0, len(e)), e.dtype)  # C^-1 s of the pairs' steps s, and C^-1 w of their w = C y
         share = self._longest(u, e)
-        x, beside, turns = share * e, np.zeros_like(e), 1  # beside: C^-1 (x - s e)
+        x, beside, tried = share * e, np.zeros_like(e), 1  # beside: C^-1 (x - s e)
         start = self._excess(u, beside)
         g = self._free(self._excess(u, x) - start)
-        while turns < TURNS and np.linalg.norm(g) > force:
-            d, pull = self._direction(g, pairs)
+        z = self._answered(g)
+        while tried < ITERATIONS and np.linalg.norm(g) > force:
+            weights = pairs.weights(g)
+            along_s, along_w = np.split(weights.astype(g.dtype), 2)
+            d = (-z - pairs.motion(weights)).astype(g.dtype)
+            pull = -g - along_s @ forces - along_w @ changes  # C^-1 d
             promised = -float(g @ d)
             if not promised > 0.0:  # round-off, or forces that are not finite
                 break
             t = 1.0  # a step that an element forbids has forces that are not finite, and is cut
             for _ in range(CUTS):
-                turns += 1
+                tried += 1
                 moved = x + t * d
                 new = self._free(beside + t * pull + self._excess(u, moved) - start)
                 slope = float(new @ d)
@@ -91,27 +86,19 @@ class Patch:
                 t *= kept_of(slope, promised)
             else:
                 break
-            work = t * (promised + slope)
-            if work > LEAST_CURVATURE * t * promised:
-                pairs = [*pairs[1 - PAIRS :], Pair(t * d, new - g, work, t * pull)]
-            x, beside, g = moved, beside + t * pull, new
+            after = self._answered(new)
+            if promised + slope > LEAST_CURVATURE * promised:
+                pairs = pairs.and_one(t * d, new - g, after - z)
+                forces, changes = (
+                    np.vstack([old[-len(pairs.s) + 1 :] if len(pairs.s) > 1 else old[:0], one])
+                    for old, one in ((forces, t * pull), (changes, new - g))
+                )
+            x, beside, g, z = moved, beside + t * pull, new, after
         return share, beside
 
-    def _direction(self, g: np.ndarray, pairs: list[Pair]) -> tuple[np.ndarray, np.ndarray]:
-        """A step (m,) against the gradient g (m,), and C^-1 times it.
-
-        Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4.
-        """
-        pull, along = -g, []
-        for pair in reversed(pairs):
-            along.append(pair.step @ pull / pair.work)
-            pull -= along[-1] * pair.change
-        d = self._product(1.0, self._compliance.T, pull).astype(g.dtype)
-        for pair, share in zip(pairs, reversed(along), strict=True):
-            more = share - pair.change @ d / pair.work
-            d += more * pair.step
-            pull += more * pair.force
-        return d, pull
+    def _answered(self, force: np.ndarray) -> np.ndarray:
+        """C force (m,) [m], of a force (m,) [N]."""
+        return self._product(1.0, self._compliance.T, force).astype(force.dtype)
 
     def _excess(self, u: np.ndarray, x: np.ndarray) -> np.ndarray:
         """n(u + x) - K x (m,)."""

@@ -7,8 +7,8 @@ it instead of five to twenty. `batch_elimination.py` does so for batches, with o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -18,22 +18,17 @@ from ..discretisation.space import Discretisation
 from ..effects import Effect
 from ..linalg.multifrontal import Factor
 from ..minimisers.lbfgs import Descended
-from ..minimisers.lbfgs_kernels import BROKEN, DONE, FREE, LIVE, WHOLE
-from ..minimisers.residual import State, balance, constants_of
+from ..minimisers.residual import Judge, State
 from ..runtime.columns import combined
 from ..runtime.threads import one_thread
 from .batch_elimination import NEAR, near_tetrahedra
+from .outer_loop import USUAL, Limits, eliminated
 from .patch import Patch, patch_of
 
 # A patch has at most so many nodes, and less where what lies beyond has such a share of the forces.
 LARGEST, NEGLIGIBLE = 550, 0.02
-CYCLES = 20
-# A patch is settled to a share of the whole residual, or of the tolerance.
-FORCING, ENOUGH = 0.03, 0.3
 # A patch stays while each cycle leaves at most such a share of the free force.
 LEFT = 0.3
-# A load whose free force was not halved in so many cycles goes elsewhere, and so does one that it rises so far with.
-PATIENCE, RISE = 5, 30.0
 # The near part has about so many nodes at most: its compliance is a matrix of three times as many rows. (Of the default
 # brain's 1,244 it takes a second and 55 MB.)
 LARGEST_NEAR = 2000
@@ -52,12 +47,21 @@ class Patching:
         What the problem was compiled from.
     near
         (T,) bool: the tetrahedra that a patch may be made of.
+    limits
+        When cycles end.
     """
 
     def __init__(
-        self, problem: Problem, factor: Factor, effects: Iterable[Effect], space: Discretisation, near: np.ndarray
+        self,
+        problem: Problem,
+        factor: Factor,
+        effects: Iterable[Effect],
+        space: Discretisation,
+        near: np.ndarray,
+        limits: Limits = USUAL,
     ):
         self._problem, self._factor, self._effects, self._space = problem, factor, tuple(effects), space
+        self._limits = limits
         self._near, self._table = np.flatnonzero(near), space.table[near]
         self._nodes = np.unique(self._table)
         self._rows = (3 * self._nodes[:, None] + np.arange(3)).ravel()
@@ -70,38 +74,23 @@ class Patching:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
-        """As `Lbfgs.descend`, of one column, in at most `most` cycles.
-
-        What is learnt is the patch. A load that has not got below the free force of its start ends there.
-        """
-        u = wp.clone(start)
-        constant, loud = constants_of(self._problem, u)
-        judged = partial(self._judged, constant, float(loud.numpy().max(initial=0.0)))
-        first = best = now = judged(u)
+        """As `Lbfgs.descend`, of one column, in at most `most` cycles; what is learnt is the patch."""
         nodes, forces = self._known(learnt), np.zeros(len(start) // 3)
-        status, mark, idle, cycle = LIVE if first.finite else BROKEN, np.inf, 0, 0
-        while status == LIVE:
-            # Forces that explode lower the relative residual.
-            if now.free <= first.free and now.relative <= tolerance[0]:
-                status = DONE
-            best = now if status == DONE or now.free <= best.free else best
-            mark, idle = (now.free, 0) if now.free <= 0.5 * mark else (mark, idle + 1)
-            if status == DONE or idle >= PATIENCE or cycle >= min(CYCLES, most):
-                break
-            force = max(FORCING * now.free, ENOUGH * float(tolerance[0]) * now.scale)
-            new, nodes, here = self._cycle(judged, now, nodes, force)
-            cycle += 1
-            if not (new.finite and new.free <= RISE * first.free):
-                break
-            forces = np.maximum(forces, here / np.linalg.norm(here))
-            if nodes is not None and new.free > LEFT * now.free:
-                nodes = self._strained(forces)
-            now = new
-        taught = {NODES: nodes[None]} if learnt is not None and nodes is not None else {}
-        return Descended(best.u, np.array([status]), np.array([cycle]), np.array([best.relative]), taught)
+
+        def cycle(judge: Judge, now: State, force: np.ndarray) -> State:
+            nonlocal nodes, forces
+            new, nodes, here = self._cycle(judge, now, nodes, float(force[0]))
+            if new.finite[0]:
+                forces = np.maximum(forces, here / np.linalg.norm(here))
+                if nodes is not None and new.free[0] > LEFT * now.free[0]:
+                    nodes = self._strained(forces)
+            return new
+
+        found = eliminated(self._problem, start, tolerance, most, self._limits, cycle)
+        return found if learnt is None or nodes is None else replace(found, learnt={NODES: nodes[None]})
 
     def _cycle(
-        self, judged: Callable[[wp.array], State], now: State, nodes: np.ndarray | None, force: float
+        self, judge: Judge, now: State, nodes: np.ndarray | None, force: float
     ) -> tuple[State, np.ndarray | None, np.ndarray]:
         """The next state, the nodes of the patch, and forces (N,) [N]: what is out of balance then, or the patch took.
 
@@ -109,8 +98,8 @@ class Patching:
         """
         device = self._problem.device
         if nodes is None:
-            ahead = self._answered(judged, now.u, combined(device, now.g, -2.0, now.g, wp.empty_like(now.g)))
-            if ahead.free <= force:
+            ahead = self._answered(judge, now.u, combined(device, now.g, -2.0, now.g, wp.empty_like(now.g)))
+            if ahead.free[0] <= force:
                 return ahead, None, _norms(ahead.g)
             nodes = self._strained(_norms(ahead.g))
         patch, reach = self._patch(nodes)
@@ -120,27 +109,20 @@ class Patching:
             share, own = patch.settled(u[patch.rows], e, force)
         pull = device.array(-share * g[:, None])
         pull.numpy()[patch.rows, 0] += own
-        new = self._answered(judged, now.u, pull)
+        new = self._answered(judge, now.u, pull)
         forces = _norms(new.g)
         forces[patch.nodes] = np.linalg.norm(own.reshape(-1, 3), axis=1)
         return new, nodes, forces
 
-    def _judged(self, constant: wp.array, square: float, u: wp.array) -> State:
-        """The state u (3N, 1) under loads of this `constant` gradient (3N, 1), `square` of the loudest one's norm."""
-        found = balance(self._problem, u, constant)
-        sums, own = found.sums.numpy()[:, 0], float(found.own.numpy().max())
-        free, largest = sums[FREE], max(square, own, float(sums[WHOLE] - sums[FREE]))
-        return State(u, found.g, float(np.sqrt(free)), float(np.sqrt(largest)))
-
-    def _answered(self, judged: Callable[[wp.array], State], u: wp.array, force: wp.array) -> State:
+    def _answered(self, judge: Judge, u: wp.array, force: wp.array) -> State:
         """Where the body moves from u (3N, 1) [m] under a force (3N, 1) [N], at rest, or as far as terms allow."""
         problem, device, step = self._problem, self._problem.device, self._problem.device.zeros(*u.shape)
         self._factor.apply(force, np.ones(1, bool), step)
         problem.constraint.project_nodes(step)  # what is rounded row by row leaves the planes it slides on
-        new = judged(combined(device, u, 1.0, step, wp.empty_like(step)))
-        if new.finite:
+        new = judge(combined(device, u, 1.0, step, wp.empty_like(step)))
+        if new.finite[0]:
             return new
-        return judged(combined(device, u, float(problem.longest_step(u, step)[0]), step, step))
+        return judge(combined(device, u, float(problem.longest_step(u, step)[0]), step, step))
 
     def _strained(self, forces: np.ndarray) -> np.ndarray:
         """The nodes (k,), ascending, of those tetrahedra that have the largest `forces` (N,) at their nodes."""
@@ -176,9 +158,11 @@ class Patching:
         return self._last[1:]
 
 
-def patching(problem: Problem, factor: Factor, effects: Iterable[Effect], space: Discretisation) -> Patching:
-    """For single loads on the CPU, on a body with a small opening."""
-    near = near_tetrahedra(space, problem.constraint, min(NEAR, LARGEST_NEAR / space.count))
+def patching(
+    problem: Problem, factor: Factor, effects: Iterable[Effect], space: Discretisation, largest: int = LARGEST_NEAR
+) -> Patching:
+    """For single loads on the CPU, on a body with a small opening: about the `largest` number of nodes near it."""
+    near = near_tetrahedra(space, problem.constraint, min(NEAR, largest / space.count))
     return Patching(problem, factor, effects, space, near)
 
 

@@ -68,10 +68,15 @@ class Pairs:
         return {**found, "head": np.array([(known - 1) % PAIRS]), "known": np.array([known])}
 
 
+def no_pairs(rows: int, kind: str) -> Pairs:
+    """Nothing learnt yet of a column of `rows`, kept as numbers of a `kind`."""
+    return Pairs(*np.zeros((2, 0, rows), kind), *np.zeros((2, 0, 0)))
+
+
 def pairs_of(learnt: Mapping[str, np.ndarray], rows: int, kind: str) -> Pairs:
-    """What was learnt of one column of `rows`, kept as numbers of a `kind`; nothing if nothing was."""
+    """What was learnt of one column, as `no_pairs`; nothing if nothing was."""
     if not learnt:
-        return Pairs(*np.zeros((2, 0, rows), kind), *np.zeros((2, 0, 0)))
+        return no_pairs(rows, kind)
     order = (int(learnt["head"][0]) + 1 - np.arange(int(learnt["known"][0]), 0, -1)) % PAIRS
     square = np.ix_(order, order)
     s, w = (learnt[name][0][order].astype(kind) for name in ("s", "w"))

@@ -8,9 +8,10 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..runtime.columns import CHUNK, add_dots, combined
+from ..runtime.columns import CHUNK, add_dots, combined, gathered
+from ..runtime.device import Device
 from . import lbfgs_trial_kernels
-from .lbfgs_kernels import OWN, PAIRS, SUMS, kernels_of
+from .lbfgs_kernels import FREE, OWN, PAIRS, SUMS, WHOLE, kernels_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,31 +79,64 @@ def constants_of(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
     return total, square
 
 
-class Measured:
-    """The 2-norm [N] of a free gradient, and the norm [N] that it is measured against."""
-
-    free: float
-    scale: float
-
-    @property
-    def relative(self) -> float:
-        """The relative residual."""
-        return self.free / self.scale if self.free else 0.0
-
-    @property
-    def finite(self) -> bool:
-        """Whether it is a state at all: forces that overflow have no scale."""
-        return bool(np.isfinite(self.free) and np.isfinite(self.scale))
-
-
 @dataclass(frozen=True, eq=False)
-class State(Measured):
-    """u (3N, 1) [m], its free gradient g (3N, 1) [N] and that one's 2-norm, and the norm it is measured against."""
+class State:
+    """Where b columns are: u (3N, b) [m], free gradients g (3N, b) [N], their 2-norms `free` (b,), and `scale` (b,).
+
+    The scale [N] is what free gradients are measured against.
+    """
 
     u: wp.array
     g: wp.array
-    free: float
-    scale: float
+    free: np.ndarray
+    scale: np.ndarray
+
+    @property
+    def relative(self) -> np.ndarray:
+        """The relative residuals (b,)."""
+        return relative(self.free, self.scale)
+
+    @property
+    def finite(self) -> np.ndarray:
+        """(b,) bool: whether each is a state at all. Forces that overflow have no scale."""
+        return np.isfinite(self.free) & np.isfinite(self.scale)
+
+    def rows(self, device: Device, stay: np.ndarray) -> State:
+        """Some of the columns (k,)."""
+        u, g = (gathered(device, array, stay) for array in (self.u, self.g))
+        return State(u, g, self.free[stay], self.scale[stay])
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Measures states of the batch that a problem has begun.
+
+    The gradient (3N, b) [N] of its terms that are constant, and the largest square norm (b,) of one of these.
+    """
+
+    problem: Problem
+    constant: wp.array
+    square: np.ndarray
+
+    def __call__(self, u: wp.array) -> State:
+        """The states u (3N, b) [m]."""
+        found = balance(self.problem, u, self.constant)
+        sums = found.sums.numpy()
+        with np.errstate(invalid="ignore", over="ignore"):
+            largest = np.maximum(self.square, found.own.numpy().max(axis=0, initial=0.0))
+            largest = np.maximum(largest, sums[WHOLE] - sums[FREE])
+            return State(u, found.g, np.sqrt(sums[FREE]), np.sqrt(largest))
+
+    def rows(self, stay: np.ndarray) -> Judge:
+        """Of some of the columns (k,), which are all that the problem keeps from now on."""
+        self.problem.keep(stay)
+        return Judge(self.problem, gathered(self.problem.device, self.constant, stay), self.square[stay])
+
+
+def judge_of(problem: Problem, u: wp.array) -> Judge:
+    """Of the batch that the problem has begun, about to start at u (3N, b) [m]."""
+    constant, loud = constants_of(problem, u)
+    return Judge(problem, constant, loud.numpy().max(axis=0, initial=0.0))
 
 
 def relative(free: np.ndarray, scale: np.ndarray) -> np.ndarray:
