@@ -24,13 +24,16 @@ class Accuracy:
         Converged: free gradient <= tolerance x the largest 2-norm among the terms' own gradients and the
         reaction at constrained nodes.
     outer
-        Most Newton steps for one load. L-BFGS, which goes first unless they are very few, has a budget of its own.
+        Most Newton steps for one load, and for each of its load steps.
     inner
         Most conjugate-gradient iterations in one Newton step.
     precision
         Scalar type of the solver.
     steps
         Most load steps that are tried when a load has no equilibrium within `outer`; zero gives up there.
+    evaluations
+        Most evaluations of the whole body's forces before Newton, which local solvers and L-BFGS share; 0: Newton
+        alone. None: as many as are worth it on the device. Few `outer` steps are Newton's alone, whatever this says.
 
     Raises
     ------
@@ -43,6 +46,7 @@ class Accuracy:
     inner: int = 400
     precision: Precision = "float64"
     steps: int = 24
+    evaluations: int | None = None
 
     def __post_init__(self) -> None:
         if self.precision not in tuple(FLOOR):  # which need not be hashable
@@ -57,6 +61,8 @@ class Accuracy:
             )
         for name, least in (("outer", 1), ("inner", 1), ("steps", 0)):
             at_least(name, getattr(self, name), least)
+        if self.evaluations is not None:
+            at_least("evaluations", self.evaluations, 0)
 
 
 DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32", steps=0)

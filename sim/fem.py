@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from threading import RLock
@@ -41,7 +41,7 @@ from .strategy.captured_frame import Frame
 from .strategy.extrapolation import moved_on, pushes_of, way_of
 from .strategy.frame_sequence import Following
 from .strategy.newton_correction import step_from
-from .strategy.plan import local_solvers, plan_for
+from .strategy.plan import Step, local_solvers, plan_for
 from .strategy.strategy import Answer, Ladder
 from .strategy.time_steps import KEPT, Still, alike
 
@@ -72,6 +72,8 @@ class Fem:
         One of `space.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
     live
         Loads will be asked for one at a time: on the CPU it takes a second more to set up, and each load half as long.
+    avoid
+        Solvers that are not tried, as where one is measured or doubted. Newton-CG always is.
 
     Raises
     ------
@@ -88,6 +90,7 @@ class Fem:
         batch: int | None = None,
         element: str | None = None,
         live: bool = False,
+        avoid: Collection[Step] = (),
     ):
         if not isinstance(anatomy, Anatomy):
             raise InputError(f"anatomy is {anatomy!r:.80}: give an Anatomy, such as read_anatomy(FILE.vtu) returns.")
@@ -104,7 +107,7 @@ class Fem:
         problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
         preconditioner = choose_preconditioner(problem, self.space, self._unsmoothed)
         fitting = fitting_batch(problem.rows, problem.device) if batch is None else at_least("batch", batch, 1)
-        self.plan = plan_for(problem, preconditioner, self.space, accuracy, fitting, live)
+        self.plan = plan_for(problem, preconditioner, self.space, accuracy, fitting, live, avoid)
         parts = local_solvers(self.plan, problem, preconditioner, self.effects, self.space)
         if problem.device.on_cuda:
             parts[0]()  # a card is there for batches; a frame on the CPU need not wait for what it does not use

@@ -148,15 +148,14 @@ def test_the_condensed_surroundings_are_the_schur_complement() -> None:
 def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves() -> None:
     anatomy, space = body()
     effects = (Elasticity(tissue("stable-neo-hookean")), *EFFECTS)
-    fem = Fem(anatomy, effects, Accuracy(tolerance=FINE), "cpu", element="p1")
+    fem, without = (Fem(anatomy, effects, Accuracy(FINE), "cpu", None, "p1", False, out) for out in ((), (Step.NEAR,)))
     many = np.repeat(TOTAL, 4, axis=0)
-    fem._ladder = replace(fem._ladder, plan=replace(fem.plan, many=None))
-    plain = fem.deform(loads_of(many))
+    plain = without.deform(loads_of(many))
     near = eliminating(fem.problem, rest_solver(fem.problem), effects, space)
     assert near is not None
     for cycles in (12, 3):
         some = replace(near, limits=Limits(cycles=cycles))
-        fem._ladder = replace(fem._ladder, plan=replace(fem.plan, many=Step.NEAR), near=lambda some=some: some)
+        fem._ladder = replace(fem._ladder, near=lambda some=some: some)
         found = fem.deform(loads_of(many))
         assert all(outcome.good for outcome in found.outcome)
         assert (found.iterations != plain.iterations).any()

@@ -12,13 +12,15 @@ from openings import EFFECTS, TOTAL, body, loads_of
 
 from sim.accuracy import TRAIN, Accuracy
 from sim.effects import Effect, Elasticity, Held, Inertia, Retraction, ToolContact, ToolForce
+from sim.errors import InputError
 from sim.fem import Fem
 from sim.local_solvers.batch_elimination import Elimination
 from sim.local_solvers.clamped_elimination import Vicinity
 from sim.local_solvers.patch_elimination import Patching
 from sim.minimisers.lbfgs import Lbfgs
 from sim.strategy import strategy
-from sim.strategy.plan import FEWEST, TURNS, WORTH, Plan, Step
+from sim.strategy.plan import EVALUATIONS, FEWEST, WORTH, Plan, Step
+from sim.terms.elasticity import Elasticity as ElasticityTerm
 from sim.tools import Ball, Spatula
 
 BODY, PUSHED = body()[0], (Elasticity(), *EFFECTS)
@@ -58,6 +60,52 @@ def test_contact_is_settled_apart_where_one_kind_of_tool_is_all_that_touches():
     assert planned(**{**POSED, "effects": both}).contact is Step.NEWTON
 
 
+@pytest.mark.parametrize(
+    ("avoid", "steps"),
+    [
+        (Step.NEAR, {WORTH: LAST}),
+        (Step.PATCH, {1: LAST}),
+        (Step.LBFGS, {1: (Step.NEWTON,), WORTH: (Step.NEWTON,)}),
+        (Step.NEWTON, {1: (Step.PATCH, *LAST), WORTH: (Step.NEAR, *LAST)}),
+    ],
+)
+def test_what_is_avoided_is_not_tried(avoid, steps):
+    plan = planned(live=True, avoid=(avoid,))
+    assert {count: plan.steps(count) for count in steps} == steps
+    assert planned(**POSED, avoid=(Step.CONTACT,)).contact is Step.NEWTON
+    assert planned(element="p2", avoid=(Step.CLAMPED,)).single is None
+
+
+@pytest.mark.parametrize("evaluations", [0, 1, 7])
+@pytest.mark.parametrize(("count", "more"), [(1, {"live": True}), (WORTH, {}), (1, {"element": "p2"})])
+def test_a_budget_of_evaluations_bounds_all_that_comes_before_newton(count, more, evaluations, monkeypatch):
+    """Counted at the element's kernels, of the whole body: a local solver's part is another problem."""
+    accuracy, looks = replace(TRAIN, evaluations=evaluations, outer=FEWEST, steps=0), []
+    fem = Fem(BODY, PUSHED, accuracy, "cpu", **{"element": "p1", **more})
+    (whole,) = (term for term in fem.problem.terms if isinstance(term, ElasticityTerm))
+    inside, found = ElasticityTerm.add_gradient, strategy.find_equilibrium
+
+    def looking(term, u, out):
+        if term is whole:
+            looks.append(u)
+        inside(term, u, out)
+
+    def newton(*given):
+        before.append(len(looks))
+        return found(*given)
+
+    before = []
+    monkeypatch.setattr(ElasticityTerm, "add_gradient", looking)
+    monkeypatch.setattr(strategy, "find_equilibrium", newton)
+    fem.deform(loads_of(np.tile(TOTAL[3], (count, 1))))
+    spent = before[0] if before else len(looks)
+    # A solver that goes on judges its start, and a cycle may try twice.
+    assert bool(spent) == bool(evaluations) and spent <= 2 * evaluations + 3
+    assert before or evaluations > 1
+    with pytest.raises(InputError, match="evaluations"):
+        replace(TRAIN, evaluations=-1)
+
+
 def test_quadratic_loads_go_one_by_one():
     assert planned(element="p2", batch=8).batch == 1 and planned(batch=8).batch == 8
 
@@ -67,7 +115,7 @@ def test_quadratic_loads_go_one_by_one():
 )
 def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     """Each step that is asked passes every load on, so that all are heard."""
-    tried = []
+    tried, left = [], [EVALUATIONS]
     kinds = {Elimination: Step.NEAR, Patching: Step.PATCH, Vicinity: Step.CLAMPED, Lbfgs: Step.LBFGS}
 
     def deaf(kind):
@@ -76,9 +124,11 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
         def descend(self, start, tolerance, most, *rest, **named):
             if kind is Lbfgs and self is not fem._ladder._lbfgs:  # that of a part
                 return original(self, start, tolerance, most, *rest, **named)
+            assert most == left[-1]
             tried.append(kinds[kind])
-            assert most == TURNS
-            return original(self, start, np.full(start.shape[1], 1e-30), 1, *rest, **named)
+            found = original(self, start, np.full(start.shape[1], 1e-30), 1, *rest, **named)
+            left.append(most - found.steps.max())
+            return found
 
         return descend
 
@@ -100,7 +150,7 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     [
         (
             {},
-            (f"Batches of {WORTH} loads and more", "L-BFGS", f"at most {TURNS} evaluations", "sparse factor"),
+            (f"Batches of {WORTH} loads and more", "L-BFGS", f"at most {EVALUATIONS} evaluations", "sparse factor"),
             ("A single load",),
         ),
         (

@@ -1,4 +1,4 @@
-"""One frame of a live tool on the device: a push, its footprint, and turns of L-BFGS from where the last frame ended.
+"""One frame of a live tool on the device: a push, its footprint, and L-BFGS from where the last frame ended.
 
 Everything stands in fixed arrays, so that CUDA replays the frame as one captured graph: a few numbers go up, the answer
 comes down, and what lies between, the state that it starts from included, stays.
@@ -20,8 +20,8 @@ from ..minimisers.lbfgs_state import Room, State, ground_of, standing
 from ..runtime.columns import lanes_of, summed
 from ..runtime.device import Device, forward_kernel
 
-# A frame that takes more turns is not one of a tool that moves smoothly.
-MOST = 60
+# A frame that takes more evaluations is not one of a tool that moves smoothly.
+FRAME_EVALUATIONS = 60
 # What goes up: point and radius, force, and how far to move on.
 GIVEN = 8
 # What comes down before the displacements; the sums are those of the footprint.
@@ -31,7 +31,7 @@ HEAD = 8
 
 @dataclass(frozen=True)
 class Kernels:
-    """What stands around the turns of a frame, in one scalar type."""
+    """What stands around the iterations of a frame, in one scalar type."""
 
     pull: wp.Kernel
     move_on: wp.Kernel
@@ -43,7 +43,7 @@ class Kernels:
 @cache
 def kernels_of(device: Device) -> Kernels:
     """Kernels of a device's scalar type, for one column."""
-    scalar, most, m, head, lanes = device.scalar, MOST, PAIRS, HEAD, lanes_of(device)
+    scalar, most, m, head, lanes = device.scalar, FRAME_EVALUATIONS, PAIRS, HEAD, lanes_of(device)
 
     @forward_kernel(module="unique")
     def pull(
@@ -99,7 +99,7 @@ def kernels_of(device: Device) -> Kernels:
         steps: wp.array(dtype=wp.int32),
         cut: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
-        turns: wp.array(dtype=wp.int32),
+        tried: wp.array(dtype=wp.int32),
         going: wp.array(dtype=wp.int32),
         inverted: wp.array(dtype=wp.int32),
     ):
@@ -114,7 +114,7 @@ def kernels_of(device: Device) -> Kernels:
         steps[0] = 0
         cut[0] = 0
         status[0] = LIVE
-        turns[0] = 0
+        tried[0] = 0
         going[0] = 1
         inverted[0] = 0
 
@@ -122,12 +122,12 @@ def kernels_of(device: Device) -> Kernels:
     def look(
         status: wp.array(dtype=wp.int32),
         # outputs
-        turns: wp.array(dtype=wp.int32),
+        tried: wp.array(dtype=wp.int32),
         going: wp.array(dtype=wp.int32),
     ):
-        """Whether to turn again."""
-        turns[0] = turns[0] + 1
-        going[0] = wp.where(status[0] == LIVE and turns[0] < most, 1, 0)
+        """Whether to go on."""
+        tried[0] = tried[0] + 1
+        going[0] = wp.where(status[0] == LIVE and tried[0] < most, 1, 0)
 
     @forward_kernel(module="unique")
     def report(
@@ -179,7 +179,7 @@ class Frame:
         self._before = standing(problem, 1, ground_of(problem, 1))
         self._past = problem.device.zeros(problem.rows, 1)
         name = problem.device.name
-        self._turns, self._going, self._inverted = (wp.zeros(1, dtype=wp.int32, device=name) for _ in range(3))
+        self._tried, self._going, self._inverted = (wp.zeros(1, dtype=wp.int32, device=name) for _ in range(3))
         self._given, self._up = self._both_sides(GIVEN)
         self._out, self._down = self._both_sides(HEAD + problem.rows)
         self._imprint = skin.imprint(wp.array(ptr=self._given.ptr, dtype=wp.vec4d, shape=(1,), device=name))
@@ -234,23 +234,23 @@ class Frame:
             wp.copy(array, self._room.state.moved[kind])
         self._skin.put(imprint)
         names = ("t", "promised", "residual", "loud", "sg", "wg", "steps", "cut", "status")
-        outputs = [*(a[name] for name in names), self._turns, self._going, self._inverted]
+        outputs = [*(a[name] for name in names), self._tried, self._going, self._inverted]
         device.launch(k.renew, (1,), [], outputs)
         vectors = [self._past, *(a[name] for name in ("u", "d", "g", "z"))]
         device.launch(k.move_on, (len(self._past),), [self._given], vectors)
         inputs = [self._given, self._skin.numbers, imprint.weight, imprint.sums]
         lanes = lanes_of(device)
         device.launch(k.pull, (-(-len(self._skin.numbers) // lanes) * lanes,), inputs, [a["constant"], a["loud"]])
-        wp.capture_while(self._going, self._turn)
+        wp.capture_while(self._going, self._iterate)
         self._inversion.add_count(a["u"], self._inverted)
         inputs = [a["status"], a["steps"], a["residual"], self._inverted, imprint.sums, a["u"]]
         device.launch(k.report, (len(self._past),), inputs, [self._out])
         wp.copy(self._down, self._out)
 
-    def _turn(self) -> None:
+    def _iterate(self) -> None:
         self._room.once()
         inputs = [self._room.columns["status"]]
-        self._device.launch(kernels_of(self._device).look, (1,), inputs, [self._turns, self._going])
+        self._device.launch(kernels_of(self._device).look, (1,), inputs, [self._tried, self._going])
 
     def _both_sides(self, count: int) -> tuple[wp.array, wp.array]:
         """So many numbers on the device, and as many on the host, from where a card reads without asking."""

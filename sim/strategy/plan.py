@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache, partial
@@ -21,11 +21,12 @@ from ..linalg.preconditioner import is_exact, name_of
 from ..local_solvers.batch_elimination import Elimination, eliminating, has_small_opening
 from ..local_solvers.clamped_elimination import Vicinity
 from ..local_solvers.patch_elimination import Patching, patching
+from .captured_frame import FRAME_EVALUATIONS
 
 # So many load cases are worth the set-up of a local problem that they share.
 WORTH = 16
-# Of L-BFGS, evaluations of the whole body. On CUDA, where few columns cost hardly less than one, Newton comes last.
-TURNS, TURNS_ON_CUDA = 60, 800
+# Evaluations of the whole body before Newton. On CUDA, where few columns cost hardly less than one, it comes last.
+EVALUATIONS, EVALUATIONS_ON_CUDA = 60, 800
 # A budget of fewer outer iterations is Newton's alone: its steps lead farther.
 FEWEST = 10
 
@@ -37,6 +38,7 @@ class Step(Enum):
     PATCH = "nonlinear elimination: the few hundred nodes that the load strains most are solved by themselves"
     CLAMPED = "nonlinear elimination: the tissue near the load, clamped at its rim, is solved by itself"
     CONTACT = "proximal quasi-Newton: the nodes that tools touch are solved apart from the tissue"
+    FRAME = "a live frame: one graph that was captured on the card"
     LBFGS = "L-BFGS from the stiffness at rest"
     NEWTON = "Newton-CG in a trust region"
 
@@ -57,8 +59,8 @@ class Plan:
         Whether L-BFGS is tried before Newton-CG.
     frames
         Whether loads that follow another are answered by a captured graph on the card.
-    turns, outer, load_steps
-        Most evaluations of L-BFGS, outer iterations of Newton-CG, and load steps.
+    evaluations, outer, load_steps
+        Most evaluations of the body's forces before Newton-CG, iterations of that, and load steps.
     batch
         Most loads that are solved together.
     """
@@ -69,7 +71,7 @@ class Plan:
     contact: Step | None
     quick: bool
     frames: bool
-    turns: int
+    evaluations: int
     outer: int
     load_steps: int
     batch: int
@@ -89,7 +91,7 @@ class Plan:
         """The same in sentences."""
         lines = [f"The stiffness at rest is prepared once ({self.preconditioner}); every solver starts from it."]
         if self.frames:
-            lines.append("A load that follows another is a live frame: one graph that was captured on the card.")
+            lines.append(f"A load that follows another is {Step.FRAME.value}.")
         if self.contact:
             lines.append(f"Tools are moved by pose. A single load begins with {self.contact.value}.")
             lines.append(f"{Step.NEWTON.value} takes what that leaves, and all batches.")
@@ -100,7 +102,7 @@ class Plan:
                 lines.append(f"Batches of {WORTH} loads and more begin with {self.many.value}.")
             if self.single:
                 lines.append(f"A single load begins with {self.single.value}.")
-            lines.append(f"{Step.LBFGS.value} takes what is left, in at most {self.turns} evaluations.")
+            lines.append(f"{Step.LBFGS.value} takes what is left, in at most {self.evaluations} evaluations.")
             lines.append(f"{Step.NEWTON.value} takes what that leaves, in at most {self.outer} iterations.")
             lines.append(f"Loads that prescribe motion go to {Step.NEWTON.value} at once.")
         if self.load_steps:
@@ -120,10 +122,12 @@ def plan_for(
     accuracy: Accuracy,
     batch: int,
     live: bool = False,
+    avoid: Collection[Step] = (),
 ) -> Plan:
     """Choose the solvers of a problem: the one place where this is decided.
 
-    `batch` loads are solved together where nothing solves them one by one; `live` ones come one at a time.
+    `batch` loads are solved together where nothing solves them one by one; `live` ones come one at a time. What is to
+    be avoided is not tried; Newton-CG always is.
     """
     cuda, exact = problem.device.on_cuda, is_exact(preconditioner)
     elastic = problem.plain  # what is solved by itself is elastic, and nothing else
@@ -140,14 +144,19 @@ def plan_for(
         alike = not isinstance(preconditioner, BlockJacobi)
         one = len(problem.barriers) == 1 and isinstance(problem.barriers[0], Local)
         contact = Step.CONTACT if one and alike else Step.NEWTON
+    following = cuda and exact and elastic and can_follow(space, accuracy) and wp.is_conditional_graph_supported()
+    quick = not problem.steep and not problem.barriers and accuracy.outer >= FEWEST
+    single, contact = None if single in avoid else single, Step.NEWTON if contact in avoid else contact
+    most = EVALUATIONS_ON_CUDA if cuda else EVALUATIONS
+    most = most if accuracy.evaluations is None else min(most, accuracy.evaluations)
     return Plan(
         preconditioner=name_of(preconditioner),
-        many=Step.NEAR if small and exact else None,
+        many=Step.NEAR if small and exact and Step.NEAR not in avoid else None,
         single=single,
         contact=contact,
-        quick=not problem.steep and not problem.barriers and accuracy.outer >= FEWEST,
-        frames=cuda and exact and elastic and can_follow(space, accuracy) and wp.is_conditional_graph_supported(),
-        turns=TURNS_ON_CUDA if cuda else TURNS,
+        quick=quick and most > 0 and Step.LBFGS not in avoid,
+        frames=following and most >= FRAME_EVALUATIONS and Step.FRAME not in avoid,
+        evaluations=most,
         outer=accuracy.outer,
         load_steps=accuracy.steps,
         batch=1 if single is Step.CLAMPED else batch,  # each load has a part of its own

@@ -230,8 +230,10 @@ class Ladder:
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
         )
         taught: Mapping[str, np.ndarray] = {}
+        left = self.plan.evaluations
         for descent, known in descents:
-            found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), self.plan.turns, known)
+            found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), left, known)
+            left -= int(found.steps.max(initial=0))
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
             answer.put(index, self._answer(found.u, outcome, found.steps, found.residual, 0), device)
