@@ -13,6 +13,7 @@ from importlib.metadata import version
 from sim.errors import InputError
 from sim.runtime.user_script import run_script
 
+from .commands.bench import BENCHES
 from .commands.guidance import guidance
 
 # A command's module is imported only when it is asked for: `sulcus solve` does not wait for torch.
@@ -40,7 +41,7 @@ MAKING = ("train", "patient")
 READING = ("judge", "export", "scenes", "effects", "demo", "render", "collect", "sensitivity", "check")
 
 # Commands with commands of their own; the first is meant where none is named.
-INNER = {"bench": ("stages", "elements", "skull", "robust", "live", "growth", "throughput", "published", "solver")}
+INNER = {"bench": tuple(BENCHES)}
 
 
 POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+")

@@ -19,7 +19,7 @@ from sim.loads import Loads, Touching
 from sim.local_solvers.contact_descent import Proximal
 from sim.local_solvers.contact_preconditioner import Touched
 from sim.material import Material
-from sim.minimisers.compact_lbfgs import Pairs, pairs_of
+from sim.minimisers.compact_lbfgs import Pairs, no_pairs
 from sim.minimisers.lbfgs_kernels import PAIRS
 from sim.terms.contact.tool_path import STRIDE, Way
 from sim.tools import Ball
@@ -74,7 +74,7 @@ def learnt_pairs(count: int) -> tuple[Pairs, np.ndarray, np.ndarray]:
     begun = np.linalg.inv(stiffness + size * np.eye(size))
     steps = rng.normal(size=(count, size))
     changes = steps @ (stiffness + change)
-    pairs = pairs_of({}, size, "float64")
+    pairs = no_pairs(size, "float64")
     for s, y in zip(steps, changes, strict=True):
         pairs = pairs.and_one(s, y, begun @ y)
     return pairs, begun, bfgs(begun, steps[-PAIRS:], changes[-PAIRS:])
@@ -88,20 +88,6 @@ def test_pairs_are_those_of_bfgs(count: int) -> None:
     some = np.array([3, 7, 8])
     learnt = pairs.at(some).T @ pairs.middle @ pairs.at(some)
     np.testing.assert_allclose(begun[np.ix_(some, some)] + learnt, expected[np.ix_(some, some)], atol=1e-10)
-
-
-@pytest.mark.parametrize("count", [0, 3, PAIRS + 3])
-def test_pairs_travel_as_history(count: int) -> None:
-    """In the places that L-BFGS on the device keeps them in, whichever of these is the newest."""
-    pairs, begun, _ = learnt_pairs(count)
-    learnt = pairs.learnt()
-    turned = {name: np.roll(array, 3, axis=1) if name in "sw" else array for name, array in learnt.items()}
-    turned |= {name: np.roll(learnt[name], (3, 3), axis=(1, 2)) for name in ("sy", "yw")}
-    turned["head"] = (learnt["head"] + 3) % PAIRS
-    for told in (learnt, turned):
-        back = pairs_of(told, len(begun), "float64")
-        for name in ("s", "w", "sy", "yw"):
-            np.testing.assert_array_equal(getattr(back, name), getattr(pairs, name))
 
 
 def test_columns_are_what_the_preconditioner_does() -> None:

@@ -14,6 +14,7 @@ BENCHES = {
     "growth": "what a load takes in seconds and memory, the finer the mesh the more, and what preconditions it",
     "throughput": "how many loads a second the finite elements solve: one mesh, thousands of loads",
     "published": "how far the published learners are off, one force position left out at a time",
+    "shortcuts": "what each shortcut of the solver is worth, on work that users do",
     "solver": "the first load on a mesh and a further one, beside other packages",
 }
 

@@ -12,7 +12,6 @@ x = -H (s'(u) + f), with the tools' forces f on them as `contact_forces` finds t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,7 +23,7 @@ from ..discretisation.problem import Problem
 from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
-from ..minimisers.compact_lbfgs import Pairs, pairs_of
+from ..minimisers.compact_lbfgs import Pairs, no_pairs
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from ..minimisers.line_search import goes_too_far, kept_of
@@ -84,12 +83,9 @@ class Proximal:
         """At the nodes that can be touched."""
         return Compliance(self.problem, self.preconditioner, self.barrier.touchable)
 
-    def descend(
-        self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
-    ) -> Descended:
-        """As `Lbfgs.descend`, of one column, in at most `most` steps."""
-        rows, kind = self.problem.rows, self.problem.device.precision
-        pairs = pairs_of(learnt or {}, rows, kind)
+    def descend(self, start: wp.array, tolerance: np.ndarray, most: int) -> Descended:
+        """As `Lbfgs.descend`, of one column, in at most `most` steps; nothing is learnt."""
+        pairs = no_pairs(self.problem.rows, self.problem.device.precision)
         now = self._judged(start.numpy()[:, 0].astype(np.float64))
         status, step, drag, slow = LIVE if now.finite else BROKEN, 0, 0.0, 0
         # Threads of BLAS wait for one another, ages where something else runs on their cores.
@@ -125,8 +121,7 @@ class Proximal:
                         pairs = pairs.and_one(moved, change, way)
                 now = new
         u = self.problem.device.array(now.u[:, None])
-        taught = {} if learnt is None else pairs.learnt()
-        return Descended(u, np.array([status]), np.array([step]), np.array([now.relative]), taught)
+        return Descended(u, np.array([status]), np.array([step]), np.array([now.relative]), {})
 
     def _aimed(
         self, now: State, force: np.ndarray, rest: np.ndarray, pairs: Pairs, tolerance: float, drag: float

@@ -9,7 +9,6 @@ Schnabel 1994, "Representations of quasi-Newton matrices and their use in limite
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -59,25 +58,7 @@ class Pairs:
         yw[-1] = yw[:, -1]
         return Pairs(steps, ways, sy, yw)
 
-    def learnt(self) -> dict[str, np.ndarray]:
-        """As `lbfgs.LEARNT` names them, of one row."""
-        known = len(self.s)
-        wide = ((0, PAIRS - known), (0, 0)), ((0, PAIRS - known),) * 2
-        arrays = {"s": (self.s, 0), "w": (self.w, 0), "sy": (self.sy, 1), "yw": (self.yw, 1)}
-        found = {name: np.pad(array, wide[square])[None] for name, (array, square) in arrays.items()}
-        return {**found, "head": np.array([(known - 1) % PAIRS]), "known": np.array([known])}
-
 
 def no_pairs(rows: int, kind: str) -> Pairs:
     """Nothing learnt yet of a column of `rows`, kept as numbers of a `kind`."""
     return Pairs(*np.zeros((2, 0, rows), kind), *np.zeros((2, 0, 0)))
-
-
-def pairs_of(learnt: Mapping[str, np.ndarray], rows: int, kind: str) -> Pairs:
-    """What was learnt of one column, as `no_pairs`; nothing if nothing was."""
-    if not learnt:
-        return no_pairs(rows, kind)
-    order = (int(learnt["head"][0]) + 1 - np.arange(int(learnt["known"][0]), 0, -1)) % PAIRS
-    square = np.ix_(order, order)
-    s, w = (learnt[name][0][order].astype(kind) for name in ("s", "w"))
-    return Pairs(s, w, learnt["sy"][0][square], learnt["yw"][0][square])

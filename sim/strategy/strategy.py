@@ -212,10 +212,10 @@ class Ladder:
         # Rest satisfies whatever the batch does not move.
         imposed = problem.constraint.imposes or (start is not None and bool(problem.gap(start)[1].any()))
         start = device.zeros(problem.rows, count) if start is None else start
-        if problem.paced or (problem.barriers and count > 1):  # it would teach the next frame nothing
-            learnt = None
         if problem.barriers:
-            return self._moved(cases, start, learnt)
+            return self._moved(cases, start)
+        if problem.paced:  # it would teach the next frame nothing
+            learnt = None
         if Step.LBFGS not in self.plan.steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
         descents: list[tuple[Elimination | Patching | Vicinity | Lbfgs, Mapping[str, np.ndarray] | None]] = [
@@ -247,25 +247,23 @@ class Ladder:
             answer.put(index, self._thorough(start, self.accuracy.outer), device)
         return replace(answer, learnt=taught)
 
-    def _touching(
-        self, cases: Cases, start: wp.array, outer: int, gaps: float, learnt: Mapping[str, np.ndarray] | None
-    ) -> Answer:
+    def _touching(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
         """Of cases whose tools have gone so many times their gap: what touches and what gives apart, then Newton."""
         problem, touch = self.problem, self._proximal
         problem.begin(cases)
         if touch is None or len(cases.loads) > 1 or problem.constraint.imposes or problem.gap(start)[1].any():
             return self._closed(cases, start, outer, gaps)
         start = self._rested(start)
-        found = touch.descend(start, np.array([self.accuracy.tolerance]), min(SETTLING, outer), learnt)
+        found = touch.descend(start, np.array([self.accuracy.tolerance]), min(SETTLING, outer))
         if found.status[0] == DONE:
             outcome = np.full(1, Outcome.CONVERGED, object)
-            return replace(self._answer(found.u, outcome, found.steps, found.residual, 0), learnt=found.learnt)
+            return self._answer(found.u, outcome, found.steps, found.residual, 0)
         spent = found.steps
         if found.residual[0] <= NEARLY:
             answer = self._thorough(found.u, min(SETTLING, outer))
             spent = spent + answer.iterations
             if answer.good.all():
-                return replace(answer, iterations=spent, learnt=found.learnt)
+                return replace(answer, iterations=spent)
         closed = self._closed(cases, start, outer, gaps)
         return replace(closed, iterations=closed.iterations + spent)
 
@@ -320,7 +318,7 @@ class Ladder:
         found.residual[none], found.reached[none] = failed.residual[index[none]], failed.reached[index[none]]
         return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
-    def _moved(self, cases: Cases, start: wp.array, learnt: Mapping[str, np.ndarray] | None) -> Answer:
+    def _moved(self, cases: Cases, start: wp.array) -> Answer:
         """From start (3N, b), where the tools were, as far as they may go at once again and again.
 
         A body at rest on which nothing acts where they end is there, whatever they met on their way.
@@ -332,7 +330,7 @@ class Ladder:
         device, count, most = self.problem.device, len(cases.loads), self.accuracy.steps
         acting = np.flatnonzero(self._acts(count))
         if len(acting) == count:
-            return self._by_steps(cases, start, moved, 1.0, most, learnt)
+            return self._by_steps(cases, start, moved, 1.0, most)
         at_rest, none = device.zeros(*start.shape), np.zeros(count, int)
         every = np.full(count, Outcome.CONVERGED, object)
         answer = Answer(at_rest, every, none, np.zeros(count), np.ones(count), none.copy(), 0)
@@ -348,7 +346,6 @@ class Ladder:
         aimed: Callable[[Cases, np.ndarray], Cases],
         first: float,
         most: int,
-        learnt: Mapping[str, np.ndarray] | None = None,
     ) -> Answer:
         """From start (3N, b), cases at growing shares: the equilibrium at the largest share found.
 
@@ -374,8 +371,8 @@ class Ladder:
             aim = np.minimum(reached[live] + step[live], 1.0)
             gone = float(((aim - reached[live]) * gaps[live]).max())
             left -= int((step < longest)[live].any())
-            found = self._touching(aimed(cases.rows(live), aim), gathered(device, u, live), outer, gone, learnt)
-            learnt, spent = found.learnt or learnt, spent + found.linear_iterations
+            found = self._touching(aimed(cases.rows(live), aim), gathered(device, u, live), outer, gone)
+            spent += found.linear_iterations
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
             iterations[live] += found.iterations
@@ -393,4 +390,4 @@ class Ladder:
         if len(short):
             problem.begin(cases.rows(short))
             residual[short] = shortfall(problem, gathered(device, u, short))
-        return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent, learnt or NOTHING)
+        return Answer(u, outcome, iterations, residual, reached, self.inversion.count(u), spent)

@@ -1,0 +1,90 @@
+"""`sulcus bench shortcuts`: both solvers answer the same loads, and only what a solver has is measured."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes.bench import shortcuts
+from scenes.bench.shortcuts import Row, Work, measure, works
+from scenes.cli import main
+from scenes.script.site import Site, site_of
+from sim.accuracy import LIVE, TRAIN
+from sim.anatomy import Anatomy
+from sim.effects import pushed_effects
+from sim.fem import Fem
+from sim.material import BRAIN
+from sim.strategy.plan import Step
+from surrogate.data.tool_loads import draw
+
+
+@pytest.fixture(scope="module")
+def site(box: Anatomy) -> Site:
+    return site_of(box)
+
+
+def some(site: Site, **more) -> Work:
+    loads = draw("palpation", site.anatomy, 3, 0)
+    single = [loads.rows(np.array([row])) for row in range(3)]
+    effects = pushed_effects(site.anatomy, BRAIN)
+    return replace(Work("a", "b", Step.LBFGS, single, effects, TRAIN, "p1"), **more)
+
+
+def test_with_and_without_are_timed_in_turn(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, solve = [], Fem.deform
+
+    def heard(fem: Fem, loads, start=None):
+        asked.append((fem.plan.quick, loads, start))
+        return solve(fem, loads, start)
+
+    monkeypatch.setattr(Fem, "deform", heard)
+    row = measure(some(site), site, "cpu")
+    assert row is not None and row.runs == 2  # the first only warms up
+    assert [quick for quick, _, _ in asked] == 3 * [True, False]
+    assert all(one is other for (_, one, _), (_, other, _) in zip(asked[::2], asked[1::2], strict=True))
+    assert not any(start for _, _, start in asked)
+    assert row.ratio == pytest.approx(row.median_without / row.median) and row.total >= row.median > 0.0
+
+
+def test_frames_follow_and_what_is_warm_is_dropped(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    starts, solve = [], Fem.deform
+
+    def heard(fem: Fem, loads, start=None):
+        starts.append(start)
+        return solve(fem, loads, start)
+
+    monkeypatch.setattr(Fem, "deform", heard)
+    assert measure(some(site, step=None, accuracy=LIVE, live=True, follows=True), site, "cpu") is not None
+    assert starts[:2] == [None, None]
+    assert all(len(start.warm) > 0 for start in starts[2::2]) and not any(start.warm for start in starts[3::2])
+
+
+@pytest.mark.parametrize("step", [Step.FRAME, Step.CONTACT, Step.CLAMPED, Step.PATCH])
+def test_a_shortcut_that_is_not_taken_has_no_row(site: Site, step: Step) -> None:
+    assert measure(some(site, step=step), site, "cpu") is None
+
+
+def test_every_step_but_newton_is_some_work(site: Site) -> None:
+    found = list(works(site, 2, False))
+    assert {work.step for work in found} == {None, *Step} - {Step.NEWTON}
+    assert all(len(work.loads) == 3 for work in found)
+    assert {len(work.loads[0]) for work in found} == {1, shortcuts.BATCH}
+
+
+def test_the_command_prints_what_was_measured(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = Row("short", "work", 4, 2.0, 3.0, 5.0, 6.0, 10.0, 15.0)
+    found = iter([row, None])
+    monkeypatch.setattr(shortcuts, "works", lambda *known: [1, 2])
+    monkeypatch.setattr(shortcuts, "measure", lambda *known: next(found))
+    assert main(["bench", "shortcuts", "--device", "cpu", "--json"]) == 0
+    captured = capsys.readouterr()
+    (said,) = json.loads(captured.out)["rows"]
+    assert (said["ratio"], said["ratio_of_totals"]) == (2.5, 1.5)
+    assert "| short | work | 4 | 2, 3 | 5, 6 | 2.50 | 1.50 |" in captured.err
+    assert main(["bench", "shortcuts", "--runs", "0"]) == 2
+    assert "--runs" in capsys.readouterr().err
