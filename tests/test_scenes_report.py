@@ -24,7 +24,7 @@ from scenes.report.measure import measured
 from scenes.report.page import Section, write_report
 from scenes.report.reference import Truth, beyond_of, reference_of, solve_reference
 from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, row_from_json, row_to_json
-from scenes.report.rows import UNBUILT, every, learners, rows, star
+from scenes.report.rows import every, learners, rows, star
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import pushed_effects
 from sim.errors import InputError
@@ -77,7 +77,7 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
     with open(page / "data.csv") as file:
         lines = list(csv.DictReader(file))
     assert [line["name"] for line in lines] == [row["name"] for row in stored]
-    assert [row["name"] for row in stored] == [spec.name for spec in SPECS] + list(UNBUILT)
+    assert [row["name"] for row in stored] == [spec.name for spec in SPECS]
     effects = pushed_effects(box, TISSUE)
     truth = Fem(box, effects, REFERENCE, "cpu", element="p2").deform(study.played).at(box.tumour_nodes).displacement
     answer = Fem(box, effects, TRAIN, "cpu", element="p1").deform(study.played).at(box.tumour_nodes).displacement
@@ -157,7 +157,7 @@ def test_what_is_played_lies_in_the_discs_alone(study):
 
 
 def test_rows_say_what_they_are(found, box):
-    fem, law, learner, published, *empty = found
+    fem, law, learner, published = found
     assert (fem.against, law.against, learner.against) == ("error", "model difference", "error")
     assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.teacher
     assert set(learner.teacher) == {"discs", "sectors", "beyond"} and learner.flagged["beyond"] == 1.0
@@ -167,7 +167,6 @@ def test_rows_say_what_they_are(found, box):
     assert learner.teacher["beyond"].percent.mean > learner.teacher["discs"].percent.mean
     assert (fem.timed, fem.p99, learner.timed) == (2, None, 30) and fem.median > learner.median > 0.0
     assert published.reference.values == 2 * len(published_nodes(box)) and published.picture is None
-    assert {row.state for row in empty} == {"not built yet"} and all(row.reference is None for row in empty)
     assert learner.adapt is None and fem.adapt > 0.0 and learner.curve[-1] == (learner.taught, learner.teacher["discs"])
     assert row_from_json(row_to_json(learner)) == learner
     assert 0.05 < peak_memory() < 50.0
@@ -264,7 +263,7 @@ def test_the_page_needs_nothing_but_itself(page, found):
     assert not re.search(r"https?:|<script|<link|@import|url\(", text)
     sources = re.findall(r'src="([^"]{0,30})', text)
     assert len(sources) == 3 + 3 and all(source.startswith("data:image/png;base64,") for source in sources)
-    for words in ("not built yet", "not measured", "model difference", "About &lt;this&gt;.", *UNBUILT):
+    for words in ("model difference", "About &lt;this&gt;."):
         assert words in text
     assert text.index("<img") < text.index("<table"), "error against time comes first"
     for row in found[:3]:

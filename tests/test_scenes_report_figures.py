@@ -39,7 +39,7 @@ def test_the_front_is_what_nobody_beats():
 
     rows = [row("fast", 1.0, 9.0), row("near", 9.0, 1.0), row("between", 3.0, 3.0), row("beaten", 4.0, 3.0)]
     rows += [row("slow", 10.0, 10.0), row("other law", 0.5, 0.5, "model difference")]
-    rows += [Row("none", "f", state="not built yet")]
+    rows += [Row("none", "f", state="it has no bound")]
     assert front(rows) == {"fast", "near", "between"}
     assert against_time(rows).std() > 5.0 and against_time(rows[-1:]) is None
 

@@ -58,15 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a row could not be measured."""
-    from ..report.rows import LATER
-
     try:
         sections = _measured(args)
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on from {args.out}", file=sys.stderr)
         return INTERRUPTED
     _say(args, sections)
-    return 0 if all(row.state in ("measured", LATER) for part in sections for row in part.rows) else 1
+    return 0 if all(row.state == "measured" for part in sections for row in part.rows) else 1
 
 
 def _measured(args: argparse.Namespace) -> list[Section]:
@@ -77,7 +75,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     from ..report.adaptation import debulked_study, simulate_debulked
     from ..report.page import Section, write_report
     from ..report.reference import solve_beyond, solve_reference
-    from ..report.rows import UNBUILT, every, learners, rows, star
+    from ..report.rows import every, learners, rows, star
     from ..report.study import Study
 
     find_device(args.device, "float32")
@@ -98,7 +96,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     for study in studies:
         specs = (*(every(study) if args.full else star(study, not args.quick)), *learners())
         after = 0 if args.quick else len(study.dataset.loads) + len(study.dataset.unit_good)
-        total = len(study.played) + len(study.outside) + after + len(specs) + len(UNBUILT)
+        total = len(study.played) + len(study.outside) + after + len(specs)
         found = []
         with tqdm(total=total, desc=study.data.stem, unit="step", file=sys.stderr) as bar:
             solve_reference(study, bar.update)

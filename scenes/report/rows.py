@@ -26,9 +26,6 @@ from .measure import FAMILY, Spec, measured
 from .row import Row, row_from_json, row_to_json
 from .study import Study
 
-# The state of rows that nothing is wrong with.
-LATER = "not built yet"
-UNBUILT = ("mass-spring", "meshless", "boundary element", "geometry-based")
 ELEMENTS = ("p1", "smoothed", "p2")
 MESHES = {"2.5k": "2500", "17k": "17000"}
 TOLERANCES = (1e-2, 1e-3, STANDARD, 1e-5, 1e-6)
@@ -77,7 +74,7 @@ def apart(study: Study, spec: Spec, picture: Path) -> Row:
 
 
 def rows(study: Study, specs: Sequence[Spec], run: Run = apart) -> Iterator[Row]:
-    """A row for each of the `specs`, then the empty ones; those whose inputs are the same as before are read.
+    """A row for each of the `specs`; those whose inputs are the same as before are read.
 
     A row is kept as soon as it is measured, unless it could not be.
     """
@@ -92,7 +89,6 @@ def rows(study: Study, specs: Sequence[Spec], run: Run = apart) -> Iterator[Row]
                 with written_whole(path, ".json") as partial:
                     partial.write_text(json.dumps({"digest": digest, "row": json.loads(row_to_json(kept))}))
         yield kept
-    yield from (Row(name, name, state=LATER) for name in UNBUILT)
 
 
 def _power(tolerance: float) -> str:
