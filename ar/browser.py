@@ -17,9 +17,9 @@ import numpy as np
 import viser
 
 from .guard import bracketed, open_server
-from .page_parts import Body, Choice, Control, Deed, Fold, Playback, Sign, Slider, Toggle, Viewpoint
+from .page_parts import Body, Choice, Control, Deed, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
 from .page_sight import PICTURE, SAID, coded, sight
-from .page_style import PAGE, STATUS, style
+from .page_style import NOTE, PAGE, STATUS, style
 
 PICTURES_PER_SECOND = 15.0
 # Behind all that is added later.
@@ -46,7 +46,7 @@ class Browser:
         bodies: Sequence[Body],
         viewpoint: Viewpoint,
         playback: Playback,
-        controls: Sequence[Control | Fold] = (),
+        controls: Sequence[Control | Fold | Note] = (),
         title: str = "sulcus",
         words: str = "",
         host: str = "127.0.0.1",
@@ -90,6 +90,7 @@ class Browser:
         self.newest: dict[str, Callable[[], object]] = {}
         self.lock, self.sending = threading.Lock(), threading.Lock()
         self.meshes: dict[str, viser.MeshHandle] = {}
+        self.notes: dict[str, tuple[viser.GuiFolderHandle, viser.GuiHtmlHandle]] = {}
         self.folder: viser.GuiFolderHandle | None = None
         self.fill(bodies, playback, controls, title, words)
         self.closed = threading.Event()
@@ -100,7 +101,7 @@ class Browser:
         self,
         bodies: Sequence[Body],
         playback: Playback,
-        controls: Sequence[Control | Fold] = (),
+        controls: Sequence[Control | Fold | Note] = (),
         title: str = "sulcus",
         words: str = "",
     ) -> None:
@@ -121,6 +122,7 @@ class Browser:
             self.wanted, self.shown = (0, self.shown[1], ""), (0, self.shown[1], self.shown[2])
             self.report("")
             self.inputs: dict[str, viser.GuiInputHandle] = {}
+            self.notes = {}
             self.folder = self.server.gui.add_folder(None)
             with self.folder:
                 self.add_playback(playback)
@@ -225,6 +227,15 @@ class Browser:
         control = self.inputs[label]
         self.note(f"control {label}", lambda: self.assign(control, value))
 
+    def write(self, label: str, words: str) -> None:
+        """Put other words, HTML, into a note; without any it is not shown."""
+        folder, text = self.notes[label]
+
+        def send() -> None:
+            text.content, folder.visible = noted(words), bool(words)
+
+        self.note(f"note {label}", send)
+
     def close(self) -> None:
         """Stop the page."""
         self.closed.set()
@@ -302,9 +313,13 @@ class Browser:
                 written = cv2.imencode(".png", np.ascontiguousarray(colour[..., ::-1]))[1]
                 event.client.send_file_download(name, written.tobytes(), save_immediately=True)
 
-    def add_control(self, control: Control | Fold) -> None:
-        """A slider, a list, a box to tick, or a folder of them."""
+    def add_control(self, control: Control | Fold | Note) -> None:
+        """A slider, a list, a box to tick, a folder of them, or a folder of words."""
         gui = self.server.gui
+        if isinstance(control, Note):
+            with gui.add_folder(control.label, expand_by_default=False, visible=bool(control.words)) as folder:
+                self.notes[control.label] = folder, gui.add_html(noted(control.words))
+            return
         if isinstance(control, Fold):
             with gui.add_folder(control.label, expand_by_default=False):
                 for inner in control.controls:
@@ -347,6 +362,11 @@ class Browser:
 def held(name: str, words: str) -> str:
     """An element of the page that the rules find by its name."""
     return f'<div id="{name}">{words}</div>'
+
+
+def noted(words: str) -> str:
+    """The words of a note, which the rules find by their class."""
+    return f'<div class="{NOTE}">{words}</div>'
 
 
 def check_address(host: str, port: int) -> None:

@@ -79,6 +79,14 @@ class Fold:
     controls: tuple[Slider | Choice | Toggle, ...]
 
 
+@dataclass(frozen=True)
+class Note:
+    """Words, HTML, that a visitor opens to read them, for `Browser.write`; there is no note while there are none."""
+
+    label: str
+    words: str = ""
+
+
 Control = Slider | Choice | Toggle
 
 

@@ -11,6 +11,8 @@ from .page_sight import PICTURE, SAID
 
 PAGE, STATUS = "sulcus", "sulcus-status"
 """Names of the elements that hold the words under the picture, and the line over it."""
+NOTE = "sulcus-note"
+"""Class of the words of a note."""
 PANEL = f"div:has(canvas) ~ div:has(#{PAGE})"
 VIEW = f"div:has(canvas):has(~ div #{PAGE})"
 PARTS = f"div:has(> div > #{SAID})"
@@ -31,6 +33,8 @@ RULES = """
 #SAID table { border-collapse: collapse; font-size: 0.8rem; margin-bottom: 0.3rem }
 #SAID .best { font-weight: 700 }
 #SAID td, #SAID th { padding: 0 0.9rem 0 0; text-align: left; font-weight: inherit }
+.NOTE { font-size: 0.8rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
+.NOTE ul { margin: 0; padding-left: 1.1rem }
 #STATUS { position: fixed; top: 0.6rem; left: 0.6rem; z-index: 7; pointer-events: none }
 #STATUS span { background: #e8590c; color: #fff; border-radius: 0.3rem; padding: 0.2rem 0.6rem; font-size: 0.9rem }
 PANEL #PICTURE { position: fixed; left: 0; top: 0; width: var(--w); aspect-ratio: var(--aspect); background: #181818;
@@ -84,6 +88,7 @@ def style(aspect: float) -> str:
         ("#PAGE", f"#{PAGE}"),
         ("#STATUS", f"#{STATUS}"),
         ("#SAID", f"#{SAID}"),
+        (".NOTE", f".{NOTE}"),
     ):
         rules = rules.replace(name, value)
     return f"<style>:root {{ --aspect: {aspect:.4f} }}{rules}</style>"

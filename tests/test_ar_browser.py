@@ -10,9 +10,9 @@ import pytest
 from visitor import Visitor, free_port, wait_for
 
 from ar.browser import Browser
-from ar.page_parts import Body, Choice, Fold, Playback, Sign, Slider, Toggle, Viewpoint
+from ar.page_parts import Body, Choice, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
 from ar.page_sight import PICTURE, SAID, coded
-from ar.page_style import PAGE, STATUS, style
+from ar.page_style import NOTE, PAGE, STATUS, style
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 
@@ -254,6 +254,17 @@ def test_the_line_over_the_picture_comes_and_goes(page):
     assert wait_for(lambda: page.line.content == "")
 
 
+def test_a_note_is_there_while_it_has_words(page):
+    page.fill([], Playback(30, print, print), [Note("how"), Note("why", "<p>known</p>")])
+    folder, text = page.notes["how"]
+    assert not folder.visible and page.notes["why"][0].visible and "<p>known</p>" in page.notes["why"][1].content
+    assert not folder.expand_by_default
+    page.write("how", "<ul><li>first</ul>")
+    assert wait_for(lambda: folder.visible and "<ul><li>first</ul>" in text.content)
+    page.write("how", "")
+    assert wait_for(lambda: not folder.visible)
+
+
 def test_the_button_says_whether_it_plays(page):
     page.plays(False)
     assert wait_for(lambda: page.button.label == "Play")
@@ -269,6 +280,7 @@ def test_a_body_changes_its_colour(page):
 def test_the_rules_know_the_picture_s_shape_and_the_page_s_elements(page):
     sheet = style(4 / 3)
     assert "--aspect: 1.3333" in sheet and sheet.startswith("<style>") and sheet.count("{") == sheet.count("}")
+    assert f".{NOTE}" in sheet
     for name in (PAGE, PICTURE, SAID, STATUS):
         assert f"#{name}" in sheet
     assert PAGE in page.words.content and SAID in page.text.content

@@ -13,8 +13,10 @@ from ar.browser import Browser
 from ar.hud import FINE
 from ar.refind import stands
 from scenes.play.page import FEM_COLOUR, STALE_COLOUR, Demo, Moment
+from scenes.play.page_controls import PLAN
 from scenes.play.page_referee import Referee
 from scenes.play.page_requests import HAND, SCRIPT, Wish
+from scenes.play.page_text import plan_words
 from scenes.script.tool_paths import Touch, press
 from sim.fem import Fem
 from surrogate.model.learned import Learned
@@ -97,6 +99,21 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
     assert f"mean {1e3 * np.linalg.norm(off, axis=1).mean():.3f}" in text
     assert demo.browser.shown[1].shape == (240, 320, 3)
     assert len(np.unique(demo.browser.shown[1])) > 50
+
+
+def test_how_the_finite_elements_solve_a_load_can_be_read(demo, monkeypatch):
+    """Of the referee while a model answers, of those that answer where they do, and nothing where none have a plan."""
+    folder, text = demo.browser.notes[PLAN]
+    assert not folder.visible
+    demo.wish.set(plays=False)
+    assert wait_for(lambda: demo.run(0.3) and folder.visible)
+    assert demo.referee.plan and plan_words(demo.referee.plan) in text.content
+    assert "Newton-CG" in text.content and text.content.count("<li>") == len(demo.referee.plan)
+    monkeypatch.setattr(demo.referee, "plan", ())
+    demo.wish.set(deformer="fem")
+    assert wait_for(lambda: demo.run(0.3) and demo.wish.deformer == "fem" and "Newton-CG" in text.content)
+    monkeypatch.setattr("scenes.play.page.plan_of", lambda deformer: ())
+    assert wait_for(lambda: demo.run(0.3) and not folder.visible)
 
 
 def test_the_words_beside_a_picture_are_of_its_frame(demo, monkeypatch):

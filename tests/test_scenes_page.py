@@ -8,11 +8,12 @@ import pytest
 from theatres import short, sinking, small, theatre_of
 
 from ar.page_parts import Choice, Fold, Slider
+from scenes.play.deformers import plan_of
 from scenes.play.load_stamp import stamp
 from scenes.play.page_controls import clocked, controls
 from scenes.play.page_referee import Truth
 from scenes.play.page_requests import Wish
-from scenes.play.page_text import RESEARCH, about, fem_words, report, side, trust, words
+from scenes.play.page_text import RESEARCH, about, fem_words, plan_words, report, side, trust, words
 from scenes.play.page_verdict import Judged, judge, verdict_words
 from scenes.play.player import Player
 from scenes.play.stage import Stage
@@ -111,6 +112,13 @@ class TestWords:
         )
         assert fem_words(plain, find_scene("retract")).endswith("relaxes under a held load")
         assert "brain.vtu, opened" in about(theatre, short(), "brain.vtu")
+
+    def test_a_plan_is_a_list_and_only_finite_elements_have_one(self, theatre):
+        assert plan_words(("First <this>.", "Then that.")) == "<ul><li>First &lt;this&gt;.</li><li>Then that.</li></ul>"
+        assert plan_words(()) == "" == plan_words(plan_of(theatre.models["linear"]))
+        scene = small("resection")
+        assert plan_of(theatre.fem(scene, scene.accuracy)) == ()
+        assert plan_of(theatre.fem(short(), LIVE)) == theatre.fem(short(), LIVE).plan.explain()
 
     def test_the_side_is_the_patient_s(self, theatre):
         site = theatre.site

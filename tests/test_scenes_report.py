@@ -263,7 +263,7 @@ def test_the_page_needs_nothing_but_itself(page, found):
     assert not re.search(r"https?:|<script|<link|@import|url\(", text)
     sources = re.findall(r'src="([^"]{0,30})', text)
     assert len(sources) == 3 + 3 and all(source.startswith("data:image/png;base64,") for source in sources)
-    for words in ("model difference", "About &lt;this&gt;."):
+    for words in ("not measured", "model difference", "About &lt;this&gt;."):
         assert words in text
     assert text.index("<img") < text.index("<table"), "error against time comes first"
     for row in found[:3]:

@@ -27,10 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
     from sim.effects import ToolForce
-    from sim.fem import Fem
 
     from ..bench.stages import machine, rows
-    from ..play.deformers import open_theatre
+    from ..play.deformers import open_theatre, plan_of
     from ..script.scene import SCENES, find_scene
 
     if args.batch < 1:
@@ -53,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         found.append(row)
         p95 = "" if row.p95 is None else f"{row.p95:.3g}"
         print(f"| {row.name} | {row.median:.3g} | {p95} | {row.unit} | {row.note} |", file=table, flush=True)
-    plan = tuple(line for fem in solvers if isinstance(fem, Fem) for line in fem.plan.explain())
+    plan = tuple(line for fem in solvers for line in plan_of(fem))
     if plan:
         print("\nHow the finite elements go about a load:\n", *(f"- {line}" for line in plan), sep="\n", file=table)
     if args.json:

@@ -109,6 +109,11 @@ class Theatre:
         return Player(Stage(scene, self.site, self.intensity), self.deformer(name, scene))
 
 
+def plan_of(deformer: Deformer) -> tuple[str, ...]:
+    """Which solvers a deformer tries for a load, in sentences; none of a model, or of a body that is operated on."""
+    return deformer.plan.explain() if isinstance(deformer, Fem) else ()
+
+
 def model_path(anatomy: Path) -> Path:
     """Where the models of an anatomy file are looked for: MESH.model.npz beside MESH.vtu."""
     return anatomy.with_suffix(".model.npz")

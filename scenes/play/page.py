@@ -20,14 +20,14 @@ from sim.loads import Loads
 
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
-from .deformers import Theatre
+from .deformers import Theatre, plan_of
 from .effect_ablation import without
 from .load_stamp import stamp
-from .page_controls import clocked, controls
+from .page_controls import PLAN, clocked, controls
 from .page_referee import Referee, Truth
 from .page_requests import HAND, SCRIPT, Wish
 from .page_tally import Tally
-from .page_text import deformer_words, effect_words, report, words
+from .page_text import deformer_words, effect_words, plan_words, report, words
 from .page_verdict import Judged, changed, judge, verdict_words
 from .player import Frame, Player
 from .replay import Session
@@ -61,6 +61,7 @@ class Moment:
     by: tuple | None = None
     judged: Judged | None = None
     stale: bool | None = None
+    plan: tuple[str, ...] | None = None
 
 
 class Demo:
@@ -258,6 +259,10 @@ class Demo:
             verdict = changed(truth, whole, answer, gone) if fresh else verdict_words(None, True, WAITS)
         else:
             verdict = verdict_words(now.judged if truth is not None else None, not fresh, WAITS)
+        plan = plan_of(self._session(name, off).player.deformer) or self.referee.plan
+        if plan != now.plan:
+            now.plan = plan
+            self.browser.write(PLAN, plan_words(plan))
         scene = self.stage.scene
         said = report(now.frame, self.stage, name, verdict, self.tally.rows, len(scene.times), gone)
         assert now.picture is not None

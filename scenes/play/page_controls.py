@@ -10,7 +10,7 @@ import numpy as np
 
 from ar.hud import bearings
 from ar.overlay import Style
-from ar.page_parts import Choice, Fold, Slider, Toggle
+from ar.page_parts import Choice, Fold, Note, Slider, Toggle
 from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
 
 from ..script.scene import SCENES, Scene
@@ -23,6 +23,8 @@ STYLES = {"window": "outline and window", "contour": "outline", "fill": "outline
 """What a visitor calls the overlay's styles."""
 MOST_FORCE, MOST_DEPTH, MOST_TILT = 0.4, 8.0, 40.0
 """Ends of the sliders [N], [mm], [deg]."""
+PLAN = "how the finite elements solve a load"
+"""Label of the note that says which solvers they try."""
 HANDS = "A slider takes the tool in your hand; 'script' gives it back."
 
 
@@ -33,7 +35,7 @@ def controls(
     wish: Wish,
     give: Callable[[str], None],
     take: Callable[..., None],
-) -> list[Slider | Choice | Toggle | Fold]:
+) -> list[Slider | Choice | Toggle | Fold | Note]:
     """All that a visitor can set in a scene that deformers of these names answer.
 
     `give` takes who gets the tool, `take` numbers of its touch, as `Wish.hand` does.
@@ -58,6 +60,7 @@ def controls(
         Choice("overlay", tuple(styles), shown, lambda words: wish.set(style=styles[words]), hint="how it is drawn"),
         *([] if scene.tool is None else hand(scene, site, wish, give, take)),
         *([Fold("more: switch parts of the physics off", switches)] if switches else []),
+        Note(PLAN),
     ]
 
 

@@ -12,7 +12,7 @@ from sim.loads import Loads
 
 from ..script.scene import Scene
 from ..script.tool_paths import Touch
-from .deformers import Theatre
+from .deformers import Theatre, plan_of
 from .replay import Session
 
 
@@ -31,12 +31,14 @@ class Referee:
 
     Frames on the way to it that what went before is known from are answered too. Where the finite elements fail,
     `failure` says why, and no further frames are answered; where they refuse loads, that frame is left out alone.
+    `plan` says in sentences which solvers they try, as soon as they are set up.
     """
 
     def __init__(self, theatre: Theatre, scene: Scene) -> None:
         self.newest: tuple[int, Touch | None] | None = None
         self.truth: Truth | None = None
         self.failure: Exception | None = None
+        self.plan: tuple[str, ...] = ()
         self.closed = threading.Event()
         self.wake = threading.Condition()
         self.thread = threading.Thread(target=self._serve, args=(theatre, scene), name="fem", daemon=True)
@@ -68,6 +70,7 @@ class Referee:
 
     def _judge(self, theatre: Theatre, scene: Scene) -> None:
         session = Session(theatre.player("fem", scene))
+        self.plan = plan_of(session.player.deformer)
         while True:
             with self.wake:
                 self.wake.wait_for(lambda: self.closed.is_set() or self.newest is not None)

@@ -112,6 +112,11 @@ def deformer_words(name: str) -> str:
     return "finite elements" if name == "fem" else f"trained model {name}"
 
 
+def plan_words(lines: Sequence[str]) -> str:
+    """Which solvers the finite elements try, as a list; nothing of none."""
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>" if lines else ""
+
+
 def trust(answer: Deformation, name: str) -> str:
     """How an answer came about, and how far off it may be; in another colour, with the reason, where it is not good."""
     outcome, who = answer.outcome[0], f"<b>{escape(deformer_words(name))}</b>"
