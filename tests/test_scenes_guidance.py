@@ -1,5 +1,6 @@
 """What the command line says before, while and after it works."""
 
+import argparse
 import json
 from types import SimpleNamespace
 
@@ -8,10 +9,11 @@ import numpy as np
 import pytest
 import warp as wp
 from balls import ball
+from plain_english import too_long
 from theatres import put, theatre_of
 
 from ar.screen import read_png, signature
-from scenes.cli import COMMANDS, _with_points, main
+from scenes.cli import COMMANDS, _with_points, main, make_parsers
 from scenes.commands.guidance import EXAMPLES, NAMES, PLAYING
 from scenes.commands.placement_options import opened
 from scenes.commands.train import _warnings
@@ -32,6 +34,25 @@ def helped(words, capsys):
 
 def test_the_version_is_told(capsys):
     assert helped(["--version"], capsys).startswith("sulcus 0.")
+
+
+def arguments_of(name, parser):
+    """Each argument of a command and of the commands in it: its name, and the help for it."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for inner, command in action.choices.items():
+                yield from arguments_of(f"{name} {inner}", command)
+        else:
+            yield f"{name} {(*action.option_strings, action.dest)[0]}", action.help
+
+
+def test_every_argument_of_every_command_has_help_in_short_sentences():
+    known = dict(each for name, parser in make_parsers(*COMMANDS)[1].items() for each in arguments_of(name, parser))
+    assert len(known) > 200 and "solve --precision" in known and "bench live --frames" in known
+    assert not [name for name, text in known.items() if not (text or "").strip()]
+    # A default alone does not say what it is of.
+    assert not [name for name, text in known.items() if text.startswith("(")]
+    assert not {name: long for name, text in known.items() if (long := too_long(text))}
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -151,7 +151,7 @@ def told_of_tissue(capsys: pytest.CaptureFixture, *command: str) -> str:
 def test_the_help_of_solve_names_every_tissue_with_its_source(capsys: pytest.CaptureFixture) -> None:
     said = "".join(told_of_tissue(capsys, "solve").split())
     for name, known in MATERIALS.items():
-        assert "".join(f"{name} (holds for {known.time_scale}; {known.source})".split()) in said
+        assert "".join(f"{name} holds for {known.time_scale}. Source: {known.source}".split()) in said
     assert all(law in said for law in LAWS)
 
 

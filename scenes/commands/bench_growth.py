@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES), metavar="N", help="nodes (default: six)")
     parser.add_argument("--batch", nargs="+", type=int, default=[1, 8], metavar="B", help="loads together (1 8)")
-    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="(default %(default)s)")
+    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument(
         "--out", type=Path, default=Path("growth.png"), metavar="PLOT.png",

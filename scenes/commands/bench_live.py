@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--checked", type=int, default=20, help="frames held against the converged solution (default %(default)s)"
     )
     add_tissue_arguments(parser)
-    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="(default %(default)s)")
+    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 

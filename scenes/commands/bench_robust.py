@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, default=10_000, help="loads, half of them brutal (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
     add_tissue_arguments(parser)
-    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="(default %(default)s)")
+    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--out", type=Path, metavar="LOADS.csv", help="a line for each load; an unfinished run goes on")

@@ -53,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--element", choices=ELEMENTS,
-        help="(default smoothed: linear tetrahedra lock as nu nears 0.5; p2 where the mesh brings mid-edge nodes)",
+        help="element of the mesh (default smoothed: linear tetrahedra lock as nu nears 0.5; p2 where the mesh brings "
+        "mid-edge nodes)",
     )  # fmt: skip
     parser.add_argument(
         "--beside", nargs="+", choices=ELEMENTS, default=[], metavar="ELEMENT",
@@ -66,7 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--factorial", action="store_true",
         help="every combination of skull, Poisson's ratio, opening, depth and stiffness of the template's tumour, in "
-        "place of one change at a time; an hour on two cores; --out gets the table, and a plot beside it (.png)",
+        "place of one change at a time. It takes an hour on two cores. --out gets the table, and a plot beside it "
+        "(.png)",
     )  # fmt: skip
     parser.add_argument("--nodes", type=int, default=5300, help="of the meshes of --factorial (default %(default)s)")
     parser.add_argument("--out", type=Path, metavar="TABLE.csv", help="the table, unrounded")

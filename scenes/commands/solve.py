@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from sim.accuracy import Accuracy
+from sim.accuracy import FLOOR, Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 from sim.deformation import Deformation, guess
@@ -26,10 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
         "mesh",
-        help="mesh of linear or quadratic (`tetra10`) tetrahedra with point data `fixed` (V,) or (V, 3), and `force` "
-        "(V, 3) [N] or `prescribed` (V, 3) in the file's unit of length; optional `slide_normal` (V, 3), `start` "
-        "(V, 3), a first guess in the file's unit, and cell data `region`. Mid-edge nodes that the file brings are "
-        "nodes as any other: held only where `fixed` says so",
+        help="mesh of linear or quadratic (`tetra10`) tetrahedra. It needs point data `fixed` (V,) or (V, 3), and "
+        "`force` (V, 3) [N] or `prescribed` (V, 3) in the file's unit of length. Optional are `slide_normal` (V, 3), "
+        "`start` (V, 3), a first guess in the file's unit, and cell data `region`. Mid-edge nodes that the file brings "
+        "are nodes as any other: held only where `fixed` says so",
     )
     add_tissue_arguments(parser, whole=True)
     add_element_argument(parser, "p1, the file's linear tetrahedra as every other program takes them")
@@ -40,10 +40,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="LABEL:YOUNG,POISSON",
         help="other constants for one region, LABEL:C1,M1;C2,M2;K for ogden; may be repeated",
     )
-    parser.add_argument("--tolerance", type=float, default=1e-6, help="relative residual")
-    parser.add_argument("--precision", default="float64", choices=("float32", "float64"))
-    parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
+    parser.add_argument("--tolerance", type=float, default=1e-6, help="relative residual (default %(default)g)")
+    parser.add_argument(
+        "--precision",
+        default="float64",
+        choices=("float32", "float64"),
+        help="scalar type of the solver: float32 is faster and reaches no tolerance below "
+        f"{FLOOR['float32']:g} (default %(default)s)",
+    )
+    parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument(
         "--out", required=True, help=".vtu in metres with point data `displacement` [m]; not the mesh itself"
     )

@@ -12,17 +12,18 @@ from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
 
 
 def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False) -> None:
-    """Declare --material and the constants of its laws; the help tells the `whole` of each tissue, or its name."""
-    sets = ", ".join(MATERIALS) + "; `sulcus solve --help` tells their time scales and sources"
+    """Declare --material and the constants of its laws; the help describes each tissue if `whole`, else names it."""
+    sets = f"{', '.join(MATERIALS)} (`sulcus solve --help` gives their time scales and sources)"
     if whole:
-        sets = "; ".join(f"{name} (holds for {known.time_scale}; {known.source})" for name, known in MATERIALS.items())
+        each = (f"{name} holds for {known.time_scale}. Source: {known.source}" for name, known in MATERIALS.items())
+        sets = ". ".join(each)
     parser.add_argument(
         "--material",
         default="default",
         choices=(*MATERIALS, *LAWS, Ogden.law),
         metavar="TISSUE",
-        help=f"tissue law ({', '.join((*LAWS, Ogden.law))}), or a named tissue, which is a law with its constants: "
-        f"{sets} (default %(default)s)",
+        help=f"tissue law ({', '.join((*LAWS, Ogden.law))}), or a named tissue, which is a law with its constants. "
+        f"Named tissues: {sets}. Default: %(default)s",
     )
     parser.add_argument(
         "--young", type=float, metavar="PA", help=f"Young's modulus [Pa] (default the material's, or {BRAIN.young:g})"
@@ -33,8 +34,8 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False) -
     parser.add_argument(
         "--ogden",
         metavar="C1,M1;C2,M2",
-        help="terms of --material ogden: psi = sum of C/M^2 (l1^M + l2^M + l3^M - 3) [Pa] + K/2 (ln J)^2, as FEBio's; "
-        "where mu and alpha are given with 2 mu/alpha^2, C is 2 mu",
+        help="terms of --material ogden, in FEBio's form: psi = sum of C/M^2 (l1^M + l2^M + l3^M - 3) [Pa] + "
+        "K/2 (ln J)^2. Where mu and alpha are given with 2 mu/alpha^2, C is 2 mu",
     )
     parser.add_argument("--bulk", type=float, metavar="K", help="bulk modulus of --material ogden [Pa]")
 
@@ -46,9 +47,12 @@ def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] =
         "slide": "it slides without friction and never comes off",
         "contact": "it slides without friction, and comes off",
     }
-    said = "; ".join(f"{name}, {words[name]}" for name in choices)
+    said = ". ".join(f"{name}: {words[name]}" for name in choices)
     parser.add_argument(
-        "--skull", choices=choices, default=choices[0], help=f"how the skull holds the brain: {said} (%(default)s)"
+        "--skull",
+        choices=choices,
+        default=choices[0],
+        help=f"how the skull holds the brain. {said}. Default: %(default)s",
     )
 
 
@@ -57,8 +61,8 @@ def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMEND
     parser.add_argument(
         "--element",
         choices=ELEMENTS,
-        help="; ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
-        + f" (default {meant}; p2 where the mesh brings mid-edge nodes of its own)",
+        help=". ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
+        + f". Default: {meant}; p2 where the mesh brings mid-edge nodes of its own",
     )
 
 
