@@ -1,8 +1,8 @@
 """The page: the camera picture, a 3-D view beside it, playback, controls and a report, made with viser.
 
-The overlay is composited into the picture before it comes here, and the picture is shown whole, as an image of its own:
-no window shape and no client can bring the two out of register. The 3-D view follows by sending vertices alone.
-Where things are is the business of `ar.page_style`.
+The overlay is composited into the picture before it comes here (`ar.overlay`), and the picture is shown whole, as an
+image of its own. So no window shape and no client can bring the two out of register. The 3-D view follows by sending
+vertices alone. `ar.page_style` says where things are.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ Sight = tuple[int, np.ndarray, str]
 class Browser:
     """A screen in the browser, for any number of visitors, who share picture and controls.
 
-    `show`, `move`, `report` and `put` only note what is newest and may be called from any thread at any rate; a
-    thread of the page sends it on, 15 times a second at most.
+    `show`, `move`, `report`, `write` and `put` only note what is newest. They may be called from any thread at any
+    rate. A thread of the page sends it on, 15 times a second at most.
     """
 
     def __init__(

@@ -53,7 +53,7 @@ def lay(
 ) -> None:
     """Write lines of ASCII text at the free place nearest to a wish, and take that place; both arrays change in place.
 
-    Lay the most important words first: where there is no room nothing is written, unless it is `needed`.
+    Lay the most important words first: where there is no space nothing is written, unless it is `needed`.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def lay(
         Column and row where the upper left corner of the lines is wanted, as `free_place` takes it.
     sights
         (H, W) uint8: above 0 where words hide what should stay in sight, as a tool; they do where there is no other
-        room.
+        space.
     """
     if not lines:
         return
@@ -115,7 +115,7 @@ def millimetres(length: float, error: float | None = None) -> str:
 
 
 def rounded_up(value: float, digits: int) -> float:
-    """The least number of so many decimals that is no smaller, for bounds: they may not be told too small."""
+    """The least number of so many decimals that is no smaller, for bounds: a bound must not be rounded down."""
     return math.ceil(round(value * 10**digits, 6)) / 10**digits
 
 

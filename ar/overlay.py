@@ -97,11 +97,11 @@ def composite(
         Draws the line from the tip to the hidden surface, and its length in millimetres.
     before
         Where the hidden surface was before, as in the scan: a dotted grey outline, with an arrow from there to here and
-        the mean motion in millimetres; what that may be off by is the largest margin.
+        the mean motion in millimetres. The error of that motion is the largest margin.
     doubt
         Why the surface's place may not be relied on. It is written at the picture's foot, see `doubt_lines`, whatever
-        the style; the outline is amber and broken, and nothing is promised: no margin is drawn, and the number beside
-        the line has no error.
+        the style. The outline is amber and broken. Nothing is promised: no margin is drawn, and the number beside the
+        line has no error.
 
     Raises
     ------
@@ -252,7 +252,7 @@ def write_gauge(drawn: Picture, camera: Camera, gauge: Gauge, covered: np.ndarra
 
 
 def write_doubt(drawn: Picture, doubt: str) -> None:
-    """Write why an answer may not be relied on at the left of the foot, in place, room or no room."""
+    """Write why an answer may not be relied on at the left of the foot, in place, even over other words."""
     height, width = drawn.taken.shape
     lay(drawn.colour, drawn.taken, doubt_lines(doubt, width), (0, height), FINE, ink_of(WARNING), needed=True)
 

@@ -1,7 +1,7 @@
 """The picture and the words beside it as one message, which the visitor's browser shows at one moment.
 
-A browser loads pictures later than it sets words, and drops one that is replaced before it is loaded: a slow one would
-show new words beside an old picture. So both wait, out of sight, until the picture is loaded, and change places then.
+A browser loads pictures later than it sets words, and drops a picture that is replaced before it is loaded. A slow
+browser would show new words beside an old picture. So both wait, out of sight, until the picture is loaded.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ ASIDE = 2
 
 
 def free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) -> tuple[int, int] | None:
-    """Find where a box can stand, as near as can be to where it is wanted; None where there is no room.
+    """Find where a box can stand, as near as can be to where it is wanted; None where there is no space.
 
     Parameters
     ----------

@@ -1,9 +1,12 @@
 """Which triangle does each pixel see: a z-buffer rasteriser in Warp.
 
 Triangles are tested in homogeneous pixel coordinates q = K x_camera = (u w, v w, w), so nothing is ever clipped
-(Olano & Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates"): for p = (u, v, 1) the edge
-functions e_a = p . (q_b x q_c), e_b, e_c have one sign inside, their sum is p . n with n = (q_b - q_a) x (q_c - q_a),
-the depth is n . q_a / p . n, and e / sum e are the weights on the triangle itself, hence perspective-correct.
+(Olano & Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates"). With p = (u, v, 1):
+
+    e_a = p . (q_b x q_c), and e_b, e_c likewise    edge functions, of one sign inside
+    n = (q_b - q_a) x (q_c - q_a)                   p . n is the sum of the edge functions
+    n . q_a / p . n                                 depth
+    e / sum e                                       weights on the triangle itself, hence perspective-correct
 """
 
 from __future__ import annotations
@@ -49,8 +52,8 @@ def rasterise(
 ) -> Fragments:
     """The nearest triangle at every pixel centre.
 
-    Both sides of a triangle are seen. A pixel centre on an edge belongs to both neighbours (the z-buffer keeps one,
-    the lower index at equal depth), so shared edges leave no cracks; triangles without area leave no trace.
+    Both sides of a triangle are seen. A pixel centre on an edge belongs to both neighbours, so shared edges leave no
+    cracks: the z-buffer keeps one, the lower index at equal depth. Triangles without area leave no trace.
 
     Parameters
     ----------

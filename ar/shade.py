@@ -18,8 +18,9 @@ BRIGHTEST = wp.constant(4.0)
 class Light:
     """The lamp as the kernel sees it.
 
-    position [m], unit axis, cosine of the lit cone's angle, how fast its rim fades in, strength, ambient share;
-    `P` takes a world point to (u w, v w, w) in the shadow map, which is asked `offset` [m] above the surface.
+    It has a position [m], a unit axis, the cosine of the lit cone's angle, how fast its rim fades in, a strength and an
+    ambient share. `P` takes a world point to (u w, v w, w) in the shadow map, which is read `offset` [m] above the
+    surface.
     """
 
     position: wp.vec3f

@@ -10,6 +10,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from plain_english import docstrings, paragraphs, prose, sentences, too_long, words
 
 HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
@@ -68,6 +69,10 @@ JOBS = {
     "numpy": {"sim/loads.py", "sim/deformation.py", "ar/camera.py", "surrogate/data/dataset.py"},  # the borders
 }
 """Libraries with several jobs: these files, at least, must import them."""
+PLAIN = ("ar", "scenes")
+"""Packages whose docstrings are held to plain English."""
+OURS = re.compile(r"\b(?:(?:un)?taught|teach(?:es|ing)?|told|vicinit(?:y|ies)|lanes?|rungs?)\b", re.IGNORECASE)
+"""Words of our own, for which the field has others: trained, given or stated, local problem, columns, steps."""
 IMPORT_NAMES = {
     "opencv-python-headless": "cv2",
     "scikit-learn": "sklearn",
@@ -252,6 +257,34 @@ def test_everything_public_has_a_docstring():
                 if public and not isinstance(node, ast.FunctionDef):
                     open_nodes.append((f"{name}:{child.name}", child))
     assert not missing
+
+
+@pytest.mark.parametrize("room", PLAIN)
+def test_docstrings_are_in_plain_english(room):
+    """Sentences of less than 30 words, and none of the words that we once had for the field's own."""
+    long, ours = {}, {}
+    for path in FILES:
+        if name_of(path).startswith(f"{room}/"):
+            for place, text in docstrings(path):
+                said = prose(text)
+                long |= {f"{room} {place}": found for found in [too_long(said)] if found}
+                ours |= {f"{room} {place}": found for found in [OURS.findall(said)] if found}
+    assert not long and not ours
+
+
+def test_a_sentence_ends_where_it_ends():
+    """What the test above and those of pages and help texts stand on."""
+    text = "Of `a b c`, e.g. x = 2. It (see there.) ends\nhere! And v. 1.5 does not."
+    assert sentences(text) == ["Of `a b c`, e.g x = 2.", "It (see there.", "ends here!", "And v.", "1.5 does not."]
+    assert words("The force `tool force` is F = k x, or [so](there.md).") == 8
+    assert too_long("so " * 30) and not too_long("so " * 29) and not too_long("so " * 20 + "\n\n" + "so " * 20)
+    docstring = (
+        "Do it.\n\n    x = y + z\n\nParameters\n----------\nsize, taught\n    Of it.\n\nExamples\n--------\n>>> 1"
+    )
+    assert " ".join(prose(docstring).split()) == "Do it. Of it."
+    page = "# A\nOne.\n```sh\ntwo\n```\n| three |\n- four\n- five"
+    assert paragraphs(page).split() == ["One.", "-", "four", "-", "five"] and "four\n\n" in paragraphs(page)
+    assert next(text for _, text in docstrings(Path(__file__))).startswith("The house rules")
 
 
 def test_names_say_what_things_are():

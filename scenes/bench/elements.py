@@ -67,7 +67,7 @@ def rows(
 def limits(found: Sequence[Row]) -> dict[float, float]:
     """The tumour's motion [mm] on an infinitely fine mesh, for each Poisson's ratio.
 
-    Richardson's extrapolation of the quadratic element on the two finest meshes, its error taken as second order in
+    Richardson's extrapolation of the quadratic element on the two finest meshes. Its error is taken as second order in
     h = vertices^(-1/3): at the rim of the opening the solution is not smooth enough for more.
     """
     out = {}

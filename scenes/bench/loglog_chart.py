@@ -139,7 +139,7 @@ def _scatter(
 ) -> None:
     """Dots and their names, each where it covers least; the groups above the lower left corner of the axes.
 
-    A pale dot without room for its name has none.
+    A pale dot without space for its name has none.
     """
     groups = {group: COLOURS[number % len(COLOURS)] for number, group in enumerate({dot.group: 0 for dot in dots})}
     taken = [_around(place, (-DOT, -DOT), (2 * DOT, 2 * DOT)) for place in places]

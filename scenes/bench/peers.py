@@ -181,8 +181,8 @@ def compare(
 ) -> list[Row]:
     """A row for each engine, ours first; `done` is called after every answer.
 
-    Every engine is started once for nothing, which compiles what it compiles and reads its files, and then `starts`
-    times for the first answer; the last of these goes on with the further loads.
+    Every engine is started once to warm up, so that it compiles its code and reads its files. It is then started
+    `starts` times for the first answer. The last of these processes goes on with the further loads.
     """
     rows = [Row(engine.label, engine.setting, case.tolerance, missing=engine.missing) for engine in engines]
     here = [number for number, row in enumerate(rows) if not row.missing]

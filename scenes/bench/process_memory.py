@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def peak_memory() -> float | None:
-    """The largest resident size of this process so far [GiB], as Linux tells it."""
+    """The largest resident size of this process so far [GiB], as Linux reports it."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:

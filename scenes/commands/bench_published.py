@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Teach each learner once for every position left out, and score them on the loads there."""
+    """Train each learner once for every position left out, and score them on the loads there."""
     data = read_dataset(args.data)
     good = np.flatnonzero(data.good)[: args.count]
     loads, nodes = data.loads.rows(good), published_nodes(data.anatomy)

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenes", nargs="*", help="which, MY_SCENE.py too (default: all built-in scenes)")
     parser.add_argument("--every", type=int, default=10, help="check every so many frames (default %(default)s)")
     parser.add_argument(
-        "--certify", action="store_true", help="tell each frame's error without solving to the end, and correct it"
+        "--certify", action="store_true", help="give each frame's error without solving to the end, and correct it"
     )
     add_theatre(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON line")

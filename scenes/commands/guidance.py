@@ -5,7 +5,7 @@ from __future__ import annotations
 # Named here too, so that a command's help waits for no scene to be imported.
 NAMES = "press, slide, draw, palpate, retract, brain_shift, resection, pulsation"
 PLAYING = ("demo", "render", "collect", "check", "effects")
-"""Commands that are told which scene to play."""
+"""Commands that take the scene to play."""
 
 EXAMPLES = {
     "anatomy": """examples:

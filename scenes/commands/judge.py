@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        Loads at places that the models were taught, or of another tissue or element.
+        Loads at places that the models were trained on, or of another tissue or element.
     """
     data = read_dataset(args.data)
     models = load(args.model, data.anatomy)

@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _physics(args: argparse.Namespace) -> str:
-    """What a scene must be told so that it is played with the tissue and the element of these data."""
+    """The options with which a scene is played with the tissue and the element of these data."""
     tissue = "" if args.material == BRAIN.law else f" --material {args.material}"
     return tissue + ("" if args.element in (None, RECOMMENDED) else f" --element {args.element}")
 

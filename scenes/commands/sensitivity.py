@@ -202,7 +202,7 @@ def _remarks(study: Study, beside: Sequence[str], model: Learned | None, failed:
         stated = _stated(model)
         said.append(
             f"The surrogate's error is its stated bound on held-out {stated['preset']} loads against its own teacher, "
-            f"finite elements of the kind {stated['element']}; how far off those are, --beside tells."
+            f"finite elements of the kind {stated['element']}; how far off those are, --beside says."
         )
     else:
         said.append("No surrogate's error stands beside: no model with a bound lies beside this anatomy (--model).")

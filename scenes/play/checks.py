@@ -42,7 +42,7 @@ class Figures:
         Distance between the drawn camera's projection of the tumour and OpenCV's for the scene's camera [pixel].
     drawn
         Distance between the outline in the picture itself, found again by its colour, and that of the finite elements'
-        tumour by another renderer [pixel]: 95 in 100 of the outline's pixels are nearer.
+        tumour by another renderer [pixel]. 95 in 100 of the outline's pixels are nearer.
     printed
         Whether the picture says the frame's number and the distance from tip to tumour, as they are computed here.
     finite, answered
@@ -53,10 +53,10 @@ class Figures:
         Whether every picture shows the answer to its own moment.
     leaked
         The volume that passes the closed skull in the finite elements' answers, as a share of what the opening takes
-        in and gives out. Told, and held to nothing: see docs/verification.md.
+        in and gives out. It is reported and has no limit: see docs/verification.md.
     bond
         The largest traction between brain and skull, as a share of what their bond bears: above 1 it would tear. NaN
-        where nothing is bonded. Told, and held to nothing.
+        where nothing is bonded. It is reported and has no limit.
     """
 
     overlap: float

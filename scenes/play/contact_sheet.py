@@ -1,4 +1,4 @@
-"""A sheet of all scenes: of each its most telling picture, with what a frame costs."""
+"""A sheet of all scenes: of each its clearest picture, with what a frame costs."""
 
 from __future__ import annotations
 

@@ -40,8 +40,9 @@ class Run:
 class Row:
     """One effect: the scene with all of them, less the scene without it; `ALL` is the scene itself, less nothing.
 
-    milliseconds a frame; megabytes that are kept on the device; how far the means over the tumour's and the open
-    cortex's vertices move at most [mm]; `refused` says why the scene cannot be without it: then there are no figures.
+    Its figures: milliseconds a frame; megabytes that are kept on the device; and how far the means over the tumour's
+    and the open cortex's vertices move at most [mm]. `refused` says why the scene cannot be without the effect: then
+    there are no figures.
     """
 
     effect: str

@@ -86,7 +86,7 @@ def collect(
     Raises
     ------
     InputError
-        A file that cannot be written, or a disk with less room than it needs.
+        A file that cannot be written, or a disk with less space than it needs.
     """
     total = len(player.scene.times)
     demand_space(path, int(total * PIXEL_BYTES * player.camera.width * player.camera.height))

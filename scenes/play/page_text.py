@@ -183,7 +183,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def _off(millimetres: float) -> str:
-    """No error is told as none."""
+    """The error in millimetres; a small one is not rounded to none."""
     return f"{millimetres:.3f}" if millimetres >= 1e-3 else "under 0.001"
 
 

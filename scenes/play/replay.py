@@ -49,8 +49,8 @@ class Reel(Generic[T]):
 class Session:
     """What one player answers visitors, who scrub through its script or take its tool over.
 
-    Where answers depend on those before them, a frame of the script is that of the straight run; a hand goes on from
-    what was answered last, and each of its frames is one frame's time later than that, whichever number it has.
+    Where answers depend on those before them, a frame of the script is that of the straight run. A hand goes on from
+    the last answer: each of its frames is one frame's time later than that, whichever number it has.
     """
 
     def __init__(self, player: Player) -> None:

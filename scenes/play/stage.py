@@ -97,7 +97,7 @@ class Stage:
     def visible(self, positions: np.ndarray) -> Layer:
         """The open cortex, and what lies just under the edge of the bone: it comes to light where the brain shifts.
 
-        Where the brain comes off the skull, what is beyond the drape's hole is drawn below it: the drape lies on the
+        Where the brain comes off the skull, what is beyond the drape's hole is drawn below it. The drape lies on the
         scan, and a bump that slides by millimetres would come through where there was none.
         """
         layer = self._visible.at(positions)

@@ -40,7 +40,7 @@ def reading(
 ) -> Reading | None:
     """Read the distance in the first load case of a deformer's answer; None where no single ball pushes or is moved.
 
-    Of finite elements it is their own and has no bound. A learnt model promises nothing outside what it was taught.
+    That of finite elements is their own and has no bound. A trained model has no bound outside of its training range.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Who of the visitors to a page has the tool, as each of them is told."""
+"""Who of the visitors to a page has the tool, in the words that each of them reads."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ NOTICED, LOOK = 0.3, 0.1
 
 
 class Busy:
-    """A thread that tells `say` what is being solved and for how long, and an empty line when it is done."""
+    """A thread that gives `say` what is being solved and for how long, and an empty line when it is done."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say

@@ -45,7 +45,7 @@ def debulked_study(study: Study) -> Study:
 
 
 def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
-    """Answer the data's own loads on the debulked body; `progress` is told how many rows more are done."""
+    """Answer the data's own loads on the debulked body; `progress` is given how many rows more are done."""
     path = _path(study)
     if path.exists():
         progress(len(study.dataset.loads) + len(study.dataset.unit_good))

@@ -1,4 +1,4 @@
-"""Loads beyond those that were taught: what extrapolation costs is measured on them."""
+"""Loads beyond the training range: what extrapolation costs is measured on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A row of a learner: taught without the discs, without the sectors, and with ever fewer loads."""
+"""A row of a learner: trained without the discs, without the sectors, and with ever fewer loads."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]
 
 
 def _taught(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> tuple[Deformer, Told]:
-    """Fitted to the loads that a split teaches, and what it was told; truth (B, k, 3) [m] of all that converged."""
+    """A model of the split's training loads, and the solves that it took; truth (B, k, 3) [m] of all that converged."""
     if spec.name not in MACHINES:
         trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
         told = trained.scores[0].told

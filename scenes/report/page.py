@@ -37,28 +37,29 @@ figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption
 .wide { overflow-x: auto; }
 """
 NOTES = (
-    "Two errors, never mixed: from the reference, which says what a row is worth; and from its own teacher, which says "
-    "what learning lost. What obeys another law than the reference has a model difference instead of an error; the "
-    "reference's own elements, less exactly solved, show their tolerance alone and are not drawn.",
+    "There are two errors, never mixed. The error against the reference says what a row is worth. The error against "
+    "its own teacher, the finite elements that it was trained on, says what learning lost. A row of another law than "
+    "the reference's has a model difference instead of an error. The reference's own elements, less exactly solved, "
+    "show their tolerance alone and are not drawn.",
     "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
     "of those vertices. A row in bold, or full colour, is one that no other equals or beats in time and mean error.",
     "Worst vertex: of each load the vertex with the largest distance; mean, p95 and p99.9 are over the loads. "
     f"No p99.9 is given for fewer than {FEWEST_FOR_P999:,} loads.",
-    "Solves: all answers of finite elements that a row was told: loads, linear answers to unit forces at nodes of the "
-    "cortex, and terms of the power series. In discs: those that tell of the tumour from inside the discs left out. "
-    "The linear answers of the cortex beside the tumour are told everywhere; the cortex is not compared. Minutes: of "
+    "Solves: all answers of finite elements that a row was given: loads, linear answers to unit forces at nodes of the "
+    "cortex, and terms of the power series. In discs: those of the tumour under loads inside the discs left out. "
+    "The linear answers of the cortex beside the tumour are given everywhere; the cortex is not compared. Minutes: of "
     "these solves, on the machine that made them, and of fitting.",
     "Time: one load at a time, from rest, learners on one core; median, and p99 where at least 1,000 were timed. It is "
     "of the whole answer, its bound and limits included, for which series have a kernel of their own. The model alone "
     "in NumPy compares learners: it is one kind of code for all. "
     "Set-up, compiling and warm-up are not in it. Memory: the largest resident size of the process that made and "
     "played the row alone; card: what it took of the graphics card.",
-    "Bounds are promised for loads like those of the training; how often they hold in discs of cortex and beyond the "
-    "range that were not is shown, but no model promises it. In discs it is that of a model, and loads, apart from the "
-    "figures beside it: some loads calibrate, and others stand in the discs.",
-    "Adapting: wall time until the row answers again after a fifth of the tumour is taken out of its middle: for "
-    "finite elements set-up and the first load, for what is learnt its solves and fitting, all anew; in brackets the "
-    "mean error then [mm], on discs left out, from the debulked body's own teacher.",
+    "Bounds are promised for loads like those of the training. How often they hold in left-out discs of cortex, and "
+    "beyond the training range, is shown, but no model promises it. The share in discs is that of another model than "
+    "the figures beside it, because some of the loads calibrate its bounds.",
+    "Adapting: wall time until the row answers again after a fifth of the tumour is taken out of its middle. For "
+    "finite elements it is set-up and the first load; for a learner its solves and its fitting, all anew. In brackets "
+    "stands the mean error then [mm], on discs left out, against the debulked body's own finite elements.",
 )
 
 
@@ -155,7 +156,7 @@ def _adapting(row: Row) -> str:
 
 
 def _solves(row: Row) -> str:
-    """What a row was told by finite elements, by kind."""
+    """How many solves of finite elements a row was given, by kind."""
     kinds = ((row.taught, ""), (row.units, " unit"), (row.series, " series"))
     return " + ".join(f"{count}{kind}" for count, kind in kinds if count)
 

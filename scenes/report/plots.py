@@ -45,7 +45,7 @@ def learners_against_time(rows: Sequence[Row]) -> np.ndarray | None:
 
 
 def against_solves(rows: Sequence[Row]) -> np.ndarray | None:
-    """Error against the number of loads taught, (H, W, 3) uint8; None without learners."""
+    """Error against the number of training loads, (H, W, 3) uint8; None without learners."""
     curves = tuple(
         Curve(row.name, tuple((float(count), each.mm.mean) for count, each in row.curve)) for row in rows if row.curve
     )

@@ -35,7 +35,7 @@ class Truth:
 def solve_reference(study: Study, progress: Callable[[int], object]) -> None:
     """Solve the played loads with quadratic tetrahedra to 1e-8 in double precision, and keep each at `study.drawn`.
 
-    `progress` is told how many more are done. What is kept already is not solved again.
+    `progress` is given how many more are done. What is kept already is not solved again.
     """
 
     def made() -> tuple[Fem, Located]:
@@ -47,7 +47,7 @@ def solve_reference(study: Study, progress: Callable[[int], object]) -> None:
 
 
 def solve_beyond(study: Study, progress: Callable[[int], object]) -> None:
-    """Answer the loads beyond the taught ones as the data's own loads were answered, and keep each at the tumour."""
+    """Answer the loads beyond the training range as the data's own loads were answered, and keep each at the tumour."""
 
     def made() -> tuple[Fem, Located]:
         body = study.anatomy

@@ -138,9 +138,9 @@ class Row:
     memory, card
         Of its process, and of the graphics card, at the peak [GiB].
     taught, units, series
-        Solves of finite elements that it was told: loads, unit responses of the open cortex, terms of the series.
+        Solves of finite elements that it was given: loads, unit responses of the open cortex, terms of the series.
     inside
-        Those of them inside the discs left out that tell of the tumour.
+        Those of them inside the discs left out that are about the tumour.
     solving
         Seconds of all these solves, if the data say.
     learning
@@ -150,7 +150,7 @@ class Row:
     adapted
         Distances from the teacher of the debulked body then, on discs left out; None of finite elements.
     curve
-        Distances from the teacher on the discs, by number of loads taught.
+        Distances from the teacher on the discs, by number of training loads.
     plan
         Which solvers finite elements try for a load, in sentences.
     picture

@@ -1,4 +1,4 @@
-"""What a report plays: loads of the discs of cortex that no learner saw, and loads beyond all that were taught."""
+"""What a report plays: loads of the discs of cortex that no learner saw, and loads beyond the training range."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ class Study:
     device
         "auto", "cpu" or "cuda".
     loads, beyond, timed
-        Held-out loads that are held against the reference; loads beyond the taught ones; single loads that are timed.
+        Held-out loads that are compared with the reference; loads beyond the training range; single loads that are
+        timed.
     fine
         Whether the reference's mesh has every edge halved.
     """
@@ -131,7 +132,7 @@ class Study:
 
     @cached_property
     def outside(self) -> Loads:
-        """Loads beyond those taught: stronger, more oblique, nearer to the rim, in equal parts."""
+        """Loads beyond the training range: stronger, more oblique, nearer to the rim, in equal parts."""
         pushed = self.converged.rows(np.flatnonzero(self.discs.test)).of(Pushed)
         taught = self.converged.rows(np.flatnonzero(self.discs.taught)).of(Pushed)
         assert pushed is not None and taught is not None

@@ -48,8 +48,8 @@ MOST_FRAMES = 108_000
 class Viewpoint:
     """A camera by its place relative to the open cortex: from the side, for a tool moves a tumour mostly downwards.
 
-    distance [m] from the site; tilt [rad] of the way to the camera, from the outward normal towards the site's `up`;
-    vertical field of view [rad]; size of the picture [pixel].
+    It has a distance [m] from the site, a vertical field of view [rad] and a size of the picture [pixel]. Its tilt
+    [rad] is that of the way to the camera, from the outward normal towards the site's `up`.
     """
 
     distance: float = 0.20
@@ -214,7 +214,7 @@ class Scene:
         return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
 
     def _cause(self, effect: Effect, site: Site, touch: Touch, time: float) -> Cause | None:
-        """What an effect of the scene is told at a moment."""
+        """The cause that an effect of the scene answers at a moment."""
         match effect:
             case ToolForce():
                 return self._pushed(site, touch)
@@ -244,7 +244,7 @@ def _resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
 
 
 SCENES = ("press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation")
-"""The built-in scenes, each a module of this room that exports SCENE."""
+"""The built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
 
 
 def find_scene(name: str) -> Scene:
@@ -255,8 +255,8 @@ def find_scene(name: str) -> Scene:
     Raises
     ------
     InputError
-        No scene of that name; a file that is missing, does not run, has no SCENE, one whose path gives no Touch, or one
-        of a tissue that fails `sim.check_tissue`.
+        There is no scene of that name. Or the file is missing, does not run or has no SCENE. Or the scene's path gives
+        no Touch, or its tissue fails `sim.check_tissue`.
     """
     if name.endswith(".py"):
         return _own_scene(name)

@@ -20,7 +20,7 @@ class Instrument(Protocol):
 
     @property
     def radius(self) -> float:
-        """Of its footprint where it pushes, and of the room round its tip that it needs in an opening [m]."""
+        """Of its footprint where it pushes, and of the space round its tip that it needs in an opening [m]."""
         ...
 
     @cached_property
@@ -110,7 +110,7 @@ class Blade:
 
     @property
     def radius(self) -> float:
-        """Of the circle round its tip end to end: the room that it needs in an opening [m]."""
+        """Of the circle round its tip end to end: the space that it needs in an opening [m]."""
         return 0.5 * float(np.hypot(self.width, self.length))
 
     @property

@@ -21,8 +21,8 @@ class Touch:
     tilt
         Direction of the force against the inward normal, towards x and y [rad].
     depth
-        Of a tool that is moved, not pushed: how far it is beyond where it would just touch the tissue at rest, along
-        that direction [m]; negative in the air.
+        Of a tool that is moved, not pushed: how far it is beyond where it would just touch the tissue at rest [m]. It
+        is measured along that direction, and is negative in the air.
     """
 
     x: float = 0.0
