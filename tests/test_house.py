@@ -69,6 +69,7 @@ JOBS = {
     "numpy": {"sim/loads.py", "sim/deformation.py", "ar/camera.py", "surrogate/data/dataset.py"},  # the borders
 }
 """Libraries with several jobs: these files, at least, must import them."""
+PAGES = sorted(name.relative_to(HOUSE).as_posix() for name in (*HOUSE.glob("*.md"), *HOUSE.glob("docs/*.md")))
 PLAIN = ("ar", "scenes")
 """Packages whose docstrings are held to plain English."""
 OURS = re.compile(r"\b(?:(?:un)?taught|teach(?:es|ing)?|told|vicinit(?:y|ies)|lanes?|rungs?)\b", re.IGNORECASE)
@@ -270,6 +271,12 @@ def test_docstrings_are_in_plain_english(room):
                 long |= {f"{room} {place}": found for found in [too_long(said)] if found}
                 ours |= {f"{room} {place}": found for found in [OURS.findall(said)] if found}
     assert not long and not ours
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_are_in_plain_english(page):
+    text = paragraphs((HOUSE / page).read_text())
+    assert not too_long(text) and not OURS.findall(text)
 
 
 def test_a_sentence_ends_where_it_ends():
