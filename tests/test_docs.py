@@ -40,10 +40,12 @@ def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pages")
     for name in ("docs", "examples"):
         shutil.copytree(HOUSE / name, folder / name, ignore=shutil.ignore_patterns("generated", "__pycache__"))
-    shutil.copy(HOUSE / "CHANGELOG.md", folder)
-    left = folder / "docs/generated/examples/gone.rst"  # by an earlier build, of a script that is there no more
-    left.parent.mkdir(parents=True)
-    left.write_text("Gone\n====\n")
+    for name in ("CHANGELOG.md", "CONTRIBUTING.md"):
+        shutil.copy(HOUSE / name, folder)
+    for gone in ("examples", "sim"):  # by an earlier build, of a script or a name that is there no more
+        left = folder / f"docs/generated/{gone}/gone.rst"
+        left.parent.mkdir(parents=True)
+        left.write_text("Gone\n====\n")
     done = build(folder / "docs", folder / "site", "-D", "plot_gallery=0")  # examples are shown, not run
     assert done.returncode == 0, done.stderr
     return folder / "site"
@@ -76,7 +78,12 @@ def test_every_source_is_a_page_and_every_example_too(pages):
     wanted = {path.stem for path in (HOUSE / "docs").glob("*.md")}
     wanted |= {f"generated/examples/{path.stem}" for path in (HOUSE / "examples").glob("*.py")}
     assert len(wanted) > 20 and wanted <= set(pages)
-    assert "generated/examples/gone" not in pages
+    assert not {"generated/examples/gone", "generated/sim/gone"} & set(pages)
+
+
+def test_who_wants_to_contribute_finds_how(site, pages):
+    assert "generated/contributing.html" in pages["extending"].links
+    assert "Where things go" in (site / "generated/contributing.html").read_text()
 
 
 def test_no_page_loads_anything_from_elsewhere(site, pages):
@@ -109,7 +116,9 @@ def test_every_command_and_public_name_is_in_the_reference(site, pages):
     assert "--opening-over" in text and "FILE.py" in text and "bench throughput" in text
     for package in ("sim", "surrogate", "ar", "scenes"):
         names = importlib.import_module(package).__all__
-        assert {f"{package}.{name}" for name in names} <= pages[f"generated/{package}"].anchors
+        for name in names:
+            assert f"{package}.{name}" in pages[f"generated/{package}/{name}"].anchors
+            assert f"{package}/{name}.html#{package}.{name}" in pages[f"generated/{package}"].links
 
 
 def test_formulas_are_drawn_by_the_browser_itself(site, pages):

@@ -8,7 +8,7 @@ from pathlib import Path
 from array_tables import dataset_table, episode_table
 from command_pages import command_page
 from example_scripts import copy_scripts
-from public_names import PACKAGES, package_page
+from public_names import reference_pages
 from sphinx.application import Sphinx
 
 HEADER = """Examples
@@ -20,6 +20,7 @@ Scripts from the folder ``examples/``. Each is short, and runs by ``python examp
 IN_PAGES = (
     (re.compile(r"\]\(\.\./examples/(\w+)\.py\)"), r"](generated/examples/\1.rst)"),
     (re.compile(r"\]\(\.\./examples/?\)"), r"](generated/examples/index.rst)"),
+    (re.compile(r"\]\(\.\./CONTRIBUTING\.md\)"), r"](generated/contributing.md)"),
 )
 
 
@@ -38,14 +39,17 @@ def _make(app: Sphinx) -> None:
         "dataset-arrays.txt": dataset_table(),
         "episode-arrays.txt": episode_table(),
         "changes.md": (source.parent / "CHANGELOG.md").read_text().replace("](docs/", "](../"),
-        **{f"{name}.rst": package_page(name) for name in PACKAGES},
+        "contributing.md": (source.parent / "CONTRIBUTING.md").read_text().replace("](docs/", "](../"),
+        **reference_pages(),
     }
     for name, text in pages.items():
         path = made / name
+        path.parent.mkdir(exist_ok=True)
         if not path.exists() or path.read_text() != text:  # an unchanged page is not built again
             path.write_text(text)
     copy_scripts(source.parent / "examples", made / "scripts", HEADER)
-    _keep(made, {path.partition(".")[0] for path in pages})
+    for folder in {(made / name).parent for name in pages}:
+        _keep(folder, {name.rpartition("/")[2].partition(".")[0] for name in pages if (made / name).parent == folder})
     _keep(made / "examples", {"index", *(script.stem for script in (made / "scripts").glob("*.py"))})
 
 

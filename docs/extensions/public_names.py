@@ -1,4 +1,4 @@
-"""The reference of the public names: one page for each package, from its `__all__`."""
+"""The reference of the public names: a page for each package, and one for each name in its `__all__`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,21 @@ LONGEST = 200
 """Characters of a constant's value that is shown."""
 
 
+def reference_pages() -> dict[str, str]:
+    """Pages in reStructuredText by the place of their files."""
+    packages = {package: importlib.import_module(package).__all__ for package in PACKAGES}
+    names = {f"{package}/{name}.rst": name_page(package, name) for package, known in packages.items() for name in known}
+    return {f"{package}.rst": package_page(package) for package in packages} | names
+
+
+def name_page(package: str, name: str) -> str:
+    """What a name is, from its docstring."""
+    title = f"{package}.{name}"
+    return "\n".join([title, "=" * len(title), "", f".. currentmodule:: {package}", "", *_entry(package, name)])
+
+
 def package_page(package: str) -> str:
-    """A page in reStructuredText: what the package is, a table of its names, and each name's docstring."""
+    """What the package is, and a table of its names."""
     names = importlib.import_module(package).__all__
     return "\n".join(
         [
@@ -34,7 +47,11 @@ def package_page(package: str) -> str:
             "",
             *(f"   {name}" for name in names),
             "",
-            *(line for name in names for line in _entry(package, name)),
+            ".. toctree::",
+            "   :hidden:",
+            "",
+            *(f"   {name} <{package}/{name}>" for name in names),
+            "",
         ]
     )
 
