@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """The parser of `sulcus`, and that of each command by its name; only those asked for know their arguments."""
+    """The parser of `sulcus`, and that of each command by its name; only those asked for know their arguments and examples."""
     parser = argparse.ArgumentParser(
         prog="sulcus",
         description=__doc__,
@@ -81,10 +81,10 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
             name,
             help=text,
             description=text[0].upper() + text[1:] + ".",
-            epilog=guidance(name),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if name in asked:
+            command.epilog = guidance(name)
             importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
             if name in MAKING + READING:
                 add_plugin(command)
