@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """The parser of `sulcus`, and that of each command by its name; only those asked for know their arguments and examples."""
+    """The parser of `sulcus`, and that of each command by name; those asked for know their arguments and examples."""
     parser = argparse.ArgumentParser(
         prog="sulcus",
         description=__doc__,

@@ -18,6 +18,7 @@ from scenes.play.deformers import model_path
 from scenes.play.episode import MEANINGS as EPISODE
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.shipped_files import template_path
+from sim.bodies.meshfile import read_anatomy
 from surrogate.data.array_meanings import MEANINGS as DATASET
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
@@ -163,8 +164,21 @@ def test_each_scene_has_a_picture_and_its_own_words():
         (name, name) for name in SCENES
     ]
     assert not [name for name in SCENES if find_scene(name).title not in text]
-    pictures = list((HOUSE / "docs/scenes").iterdir())
+    pictures = list((HOUSE / "docs/scenes").glob("*.webp"))
     assert len(pictures) == len(SCENES) and sum(path.stat().st_size for path in pictures) < 400_000
+
+
+def test_the_motions_of_the_scenes_are_those_that_were_measured():
+    """And are measured again when a scene gets other effects."""
+    text, measured = ((HOUSE / "docs" / name).read_text() for name in ("scenes.md", "scenes/measured.json"))
+    known = json.loads(measured)
+    assert f"`{known['command']}` measured" in text and known["date"] in text
+    assert [row["scene"] for row in known["scenes"]] == list(SCENES)
+    anatomy = read_anatomy(template_path())
+    for row in known["scenes"]:
+        told = re.search(rf"^## {row['scene']}\n.*?\| ([\d.]+) mm \|$", text, re.MULTILINE | re.DOTALL)[1]
+        assert float(told) == round(row["moved_mm"], len(told.partition(".")[2]))
+        assert row["effects"] == [type(effect).__name__ for effect in find_scene(row["scene"]).effects_on(anatomy)]
 
 
 @pytest.mark.parametrize(

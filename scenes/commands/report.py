@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..report.page import Section
     from ..report.study import Study
 
-# Loads of the data that is made where none is given; loads held against the reference; loads beyond the taught ones.
+# Loads of the data that is made where none is given; loads held against the reference; loads beyond the training range.
 QUICK, WHOLE = (256, 8, 24), (3000, 64, 120)
 INTERRUPTED = 130
 
