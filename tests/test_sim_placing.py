@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sim.bodies.mesher
-from sim.bodies.placement import BASE, HULL_DEPTH, opening_at, opening_over, side_of, site_over
+from sim.bodies.placement import Placement, opening_at, opening_over, side_of, site_over
 from sim.errors import InputError
 
 LOW, HIGH = np.array([-0.07, -0.09, -0.06]), np.array([0.07, 0.09, 0.08])
@@ -29,7 +29,7 @@ def test_an_opening_is_centred_on_the_nearest_cortex_that_can_be_reached(cortex)
     assert np.linalg.norm(site - asked) == pytest.approx(np.linalg.norm(cortex - asked, axis=1).min())
     # From a point in the fissure the skull is reached over it, not in it.
     site = opening_over(cortex, np.array([0.005, 0.0, 0.035]), 0.01)
-    assert abs(np.linalg.norm(site / [0.07, 0.09, 0.07]) - 1.0) < HULL_DEPTH / 0.07 and site[2] > 0.06
+    assert abs(np.linalg.norm(site / [0.07, 0.09, 0.07]) - 1.0) < Placement().hull_depth / 0.07 and site[2] > 0.06
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_over_a_point_outside_nothing_is_opened(cortex):
     with pytest.raises(InputError, match="over the brainstem"):
         opening_over(cortex, np.array([0.0, 0.0, -0.069]), 0.0)
     deep = site_over(cortex, np.array([0.0, 0.0, 0.0]))
-    assert deep[2] >= -0.07 + BASE * 0.14 - 1e-3
+    assert deep[2] >= -0.07 + Placement().base * 0.14 - 1e-3
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_places_are_called_as_clinicians_call_them(place, words):
 def test_too_few_nodes_are_told_how_many_would_do(monkeypatch):
     asked = []
 
-    def meshed(solids, count):
+    def meshed(solids, count, settings):
         asked.append(count)
         return "mesh" if count >= 4000 else None
 

@@ -31,11 +31,12 @@ from sim.bodies.vtu_size import demand_small
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, tissue_from_json, tissue_to_json
-from sim.runtime import file_limits
 from sim.runtime.atomic_files import check_output, demand_space, written_stream, written_whole
+from sim.runtime.file_limits import MeshBytes
 from sim.runtime.outside_files import read_as
 
 BODY = base_held(box((2, 2, 2), 0.02))
+FEW = MeshBytes(largest=2**22)
 
 
 def volume(path: Path, shape: tuple[int, ...] = (6, 6, 6), edge: float = 1.0) -> Path:
@@ -146,14 +147,13 @@ class TestMeshes:
         meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(tmp_path / name)
         assert np.array_equal(read_mesh(tmp_path / name).mesh.tets, BODY.mesh.tets)
 
-    def test_raw_bytes_behind_the_xml_are_counted(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("sim.bodies.meshfile.LARGEST_MESH", 2**22)
+    def test_raw_bytes_behind_the_xml_are_counted(self, tmp_path: Path) -> None:
         block = zlib.compress(bytes(2**23))
         path = with_raw_bytes(tmp_path / "a.vtu", struct.pack("<4Q", 1, 2**23, 0, len(block)) + block)
         tracemalloc.start()
         try:
             with pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
-                read_mesh(path)
+                read_mesh(path, limits=FEW)
             assert tracemalloc.get_traced_memory()[1] < 2**22
         finally:
             tracemalloc.stop()
@@ -163,19 +163,18 @@ class TestMeshes:
         with pytest.raises(InputError):
             demand_small(small, 23)
 
-    def test_a_small_file_does_not_fill_the_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_small_file_does_not_fill_the_memory(self, tmp_path: Path) -> None:
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
-        monkeypatch.setattr("sim.bodies.meshfile.LARGEST_MESH", 2**22)
-        assert read_mesh(tmp_path / "a.vtu").mesh.digest == BODY.mesh.digest
+        assert read_mesh(tmp_path / "a.vtu", limits=FEW).mesh.digest == BODY.mesh.digest
         fattened(tmp_path / "a.vtu", 64)
         tracemalloc.start()
         try:
             with pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
-                read_mesh(tmp_path / "a.vtu")
+                read_mesh(tmp_path / "a.vtu", limits=FEW)
             assert tracemalloc.get_traced_memory()[1] < 2**24
         finally:
             tracemalloc.stop()
-        assert file_limits.LARGEST_MESH > 2**31
+        assert MeshBytes().largest > 2**31
 
     def test_a_file_is_no_larger_than_the_limit(self, tmp_path: Path) -> None:
         for name in ("a.vtu", "a.inp"):
@@ -183,7 +182,7 @@ class TestMeshes:
             os.truncate(tmp_path / name, 60 * 10**9)  # of which the disk holds nothing
             with pytest.raises(InputError, match=r"is of 60 GB, and 4\.29 GB are the most\. Mesh coarser"):
                 read_mesh(tmp_path / name)
-        assert file_limits.mesh_bytes(10, 2**32) == 2**28 and file_limits.mesh_bytes(2**23, 2**32) == 100 * 2**23
+        assert MeshBytes().of(10) == 2**28 and MeshBytes().of(2**23) == 100 * 2**23
 
     @pytest.mark.parametrize("packing", ["zlib", "lzma"])
     def test_a_bomb_is_refused_before_it_is_inflated(self, tmp_path: Path, packing: str) -> None:
@@ -206,13 +205,12 @@ class TestMeshes:
         with pytest.raises(InputError, match="inflates to more than its header says"):
             demand_small(path, 2**30)
 
-    def test_what_looks_raw_in_a_comment_hides_no_array(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("sim.bodies.meshfile.LARGEST_MESH", 2**22)
+    def test_what_looks_raw_in_a_comment_hides_no_array(self, tmp_path: Path) -> None:
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
         text = fattened(tmp_path / "a.vtu", 64).read_text().replace("</VTKFile>", "<!-- </AppendedData> --></VTKFile>")
         (tmp_path / "a.vtu").write_text(text.replace("<Unstr", '<!-- <AppendedData encoding="raw"> --><Unstr', 1))
         with pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
-            read_mesh(tmp_path / "a.vtu")
+            read_mesh(tmp_path / "a.vtu", limits=FEW)
 
     @pytest.mark.parametrize("kind", ["Int64", "Float64"])
     def test_a_header_counts_upwards(self, tmp_path: Path, kind: str) -> None:

@@ -12,6 +12,7 @@ from boxes import base_held, box
 
 from sim.bodies.meshfile import read_mesh
 from sim.errors import InputError
+from sim.runtime.file_limits import MeshBytes
 
 BODY = base_held(box((2, 2, 2), 0.02))
 
@@ -84,16 +85,14 @@ def test_hdf5_of_a_mesh_holds_its_arrays_itself(tmp_path: Path, name: str, way: 
         read_mesh(path)
 
 
-def test_hdf5_is_as_large_as_its_own_file_allows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.xdmf"
+def test_hdf5_is_as_large_as_its_own_file_allows(tmp_path: Path) -> None:
+    path, few = tmp_path / "a.xdmf", MeshBytes(inflation=2, small=2**10)
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(path)
-    monkeypatch.setattr("sim.runtime.file_limits.SMALL_MESH", 2**10)
-    monkeypatch.setattr("sim.runtime.file_limits.MESH_INFLATION", 2)
     with h5py.File(path.with_suffix(".h5"), "r+") as file:
         file["more"] = np.random.default_rng(0).random(400_000)  # 3.2 MB, far more than the XML
-    assert read_mesh(path).mesh.digest == BODY.mesh.digest
+    assert read_mesh(path, limits=few).mesh.digest == BODY.mesh.digest
     with h5py.File(path.with_suffix(".h5"), "r+") as file:
         for number in range(3):
             file.create_dataset(f"zeros{number}", (400_000,), "f8", compression="gzip")[:] = 0.0
     with pytest.raises(InputError, match="take more than"):
-        read_mesh(path)
+        read_mesh(path, limits=few)

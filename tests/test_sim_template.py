@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.subject import Plan, make_anatomy
-from sim.bodies.template import VOLUME, Tumour, template_subject
+from sim.bodies.template import Head, Tumour, template_subject
 from sim.errors import InputError
 from sim.geometry.geodesic import distances
 from sim.geometry.tetmesh import dihedral_angles
@@ -64,7 +64,7 @@ def test_at_17k_nodes_angles_surface_and_volume_are_as_promised(shape):
 
 
 def test_it_has_the_volume_of_a_person(anatomy):
-    assert anatomy.mesh.volumes.sum() == pytest.approx(VOLUME, rel=0.005)
+    assert anatomy.mesh.volumes.sum() == pytest.approx(Head().volume, rel=0.005)
     assert abs(len(anatomy.mesh.nodes) - 5300) <= 530
 
 

@@ -9,15 +9,13 @@ from ..errors import InputError
 from ..geometry.geodesic import distances
 from ..geometry.surface import vertex_normals
 from ..geometry.tetmesh import TetMesh
-from .placement import STEM
-
-FEWEST_OPEN = 6  # nodes; fewer do not carry a tool
+from .placement import Placement
 
 
-def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float) -> Anatomy:
+def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, settings: Placement) -> Anatomy:
     """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
 
-    Stem: surface nodes within 0.15 of the brain's height from the lowest one (least superior); held. Craniotomy:
+    Stem: surface nodes within a share of the brain's height from the lowest one (least superior); held. Craniotomy:
     surface nodes within half of the diameter `craniotomy` [m] along the surface from the point nearest to `site`;
     free. Skull: the rest of the surface, each node with its unit normal n_i, along the integral of grad N_i: a body of
     linear tetrahedra whose nodes do not move along theirs passes no volume through the skull (Engelman, Sani, Gresho
@@ -26,19 +24,19 @@ def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float) -> Anatomy:
     Raises
     ------
     InputError
-        An opening with fewer than 6 nodes, or one that leaves no skull.
+        An opening with too few nodes, or one that leaves no skull.
     """
     surface = mesh.surface
     outer = np.unique(surface)
     lowest = outer[mesh.nodes[outer, 2].argmin()]
     height = np.ptp(mesh.nodes[outer, 2])
     stem = np.zeros(len(mesh.nodes), bool)
-    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= STEM * height
+    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= settings.stem * height
     opened = (distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy) & ~stem
-    if opened.sum() < FEWEST_OPEN:
+    if opened.sum() < settings.fewest_open:
         raise InputError(
-            f"a craniotomy of {craniotomy * 1e3:g} mm holds {opened.sum()} mesh nodes, and {FEWEST_OPEN} are needed: "
-            "ask for a larger one, or for more nodes."
+            f"a craniotomy of {craniotomy * 1e3:g} mm holds {opened.sum()} mesh nodes, and {settings.fewest_open} are "
+            "needed: ask for a larger one, or for more nodes."
         )
     rest = np.zeros(len(mesh.nodes), bool)
     rest[outer] = True

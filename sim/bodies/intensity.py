@@ -13,11 +13,25 @@ from ..errors import InputError
 from ..runtime.atomic_files import written_whole
 from .nifti import read_volume
 
-BRIGHTEST = 99.5  # per cent of the voxels in the crop are at most white
-MARGIN = 0.015  # [m] round what is looked at
 HEADER = 348  # bytes of NIfTI
 SIGNED = b"sulcus: intensities beside a mesh"
 """By which what was written here is told from a user's own scan."""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """What of a scan is kept beside a mesh.
+
+    Parameters
+    ----------
+    margin
+        [m] round what is looked at: a camera sees beyond the craniotomy's rim.
+    brightest
+        Per cent of the voxels in the crop are at most white: the few brightest are vessels, and would darken the rest.
+    """
+
+    margin: float = 0.015
+    brightest: float = 99.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +47,8 @@ class Intensity:
         index = inverse[:3, :3] @ points.T + inverse[:3, 3:]
         return ndimage.map_coordinates(self.values, index, order=1, mode="constant", output=np.float64) / 255.0
 
-    def around(self, points: np.ndarray) -> Intensity:
-        """The part within 15 mm of the box round points (n, 3) [m], as 8-bit grey: black is 0, white the brightest.
+    def around(self, points: np.ndarray, crop: Crop = Crop()) -> Intensity:
+        """The part round the box of points (n, 3) [m], as 8-bit grey: black is 0, white the brightest.
 
         Raises
         ------
@@ -43,13 +57,13 @@ class Intensity:
         """
         inverse = np.linalg.inv(self.affine)
         index = points @ inverse[:3, :3].T + inverse[:3, 3]
-        reach = MARGIN / np.linalg.norm(self.affine[:3, :3], axis=0)
+        reach = crop.margin / np.linalg.norm(self.affine[:3, :3], axis=0)
         low = np.maximum(np.floor(index.min(axis=0) - reach), 0).astype(int)
         high = np.minimum(np.ceil(index.max(axis=0) + reach) + 1, self.values.shape).astype(int)
         if (high <= low).any():
             raise InputError("the T1 volume does not cover the craniotomy: give one in the labels' own space.")
         part = self.values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].astype(np.float64)
-        white = float(np.percentile(part, BRIGHTEST))
+        white = float(np.percentile(part, crop.brightest))
         if white <= 0.0:
             raise InputError("the T1 volume is black at the craniotomy: give one in the labels' own space.")
         affine = self.affine.copy()

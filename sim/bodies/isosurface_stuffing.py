@@ -15,13 +15,7 @@ from ..geometry.tetmesh import EDGES
 from .bcc_lattice import Lattice
 from .signed_distance import Field
 
-# A crossing nearer to a node than this share of the edge pulls the node onto the surface (section 4 of the paper,
-# the pair that bounds every dihedral angle by 10.7 degrees on an ungraded lattice).
-SNAP_LONG, SNAP_SHORT = 0.24999, 0.41189
-SNAP_SHORTEST = 0.4
-SNAP_OTHER = 0.35  # edges that end at a node of an earlier cut
 CENTRE, CORNER, CUT = 0, 1, 2
-BISECTIONS = 24
 
 LONE_FIRST = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
 PAIR_FIRST = {3: [0, 1, 2, 3], 5: [0, 2, 3, 1], 9: [0, 3, 1, 2], 6: [1, 2, 0, 3], 10: [1, 3, 2, 0], 12: [2, 3, 0, 1]}
@@ -39,6 +33,31 @@ TURN = np.array(
 )
 SPLIT_15 = np.array([[0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3]])
 SPLIT_24 = np.array([[0, 1, 2, 4], [0, 4, 2, 5], [0, 4, 5, 3]])
+
+
+@dataclass(frozen=True)
+class Stuffing:
+    """How far a cut pulls nodes onto its surface, and how exactly it finds where an edge crosses that.
+
+    Parameters
+    ----------
+    snap_long, snap_short
+        Shares of a long and of a short edge of the lattice: a crossing nearer to a node pulls the node onto the
+        surface. Section 4 of the paper: this pair bounds every dihedral angle by 10.7 degrees on an ungraded lattice.
+    snap_other
+        The share of an edge that ends at a node of an earlier cut, for which the paper has none.
+    snap_shortest
+        Farthest pull, as a share of the node's shortest edge. Where the lattice changes size, the shares of a long
+        edge would turn the small tetrahedra beside it inside out.
+    bisections
+        Halvings of an edge in search of the crossing: 24 leave 6e-8 of it.
+    """
+
+    snap_long: float = 0.24999
+    snap_short: float = 0.41189
+    snap_other: float = 0.35
+    snap_shortest: float = 0.4
+    bisections: int = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +89,7 @@ def whole(lattice: Lattice) -> Pieces:
     return Pieces(lattice.nodes, kind, lattice.tets, everywhere, np.zeros(len(kind), bool))
 
 
-def cut(pieces: Pieces, field: Field, pinned: np.ndarray | None = None) -> Pieces:
+def cut(pieces: Pieces, field: Field, pinned: np.ndarray | None = None, settings: Stuffing = Stuffing()) -> Pieces:
     """Split `pieces` along the zero surface of `field`.
 
     Nodes near the surface are pulled onto it, but for those `pinned` (V,), which count as lying on it where they are.
@@ -78,8 +97,8 @@ def cut(pieces: Pieces, field: Field, pinned: np.ndarray | None = None) -> Piece
     nodes = pieces.nodes.copy()
     values = field(nodes)
     edges = _crossed_edges(pieces.tets, values)
-    at = _crossings(field, nodes, edges, values)
-    snapped, onto = _snapped(edges, at, _snapping_reach(pieces, edges))
+    at = _crossings(field, nodes, edges, values, settings.bisections)
+    snapped, onto = _snapped(edges, at, _snapping_reach(pieces, edges, settings))
     values[snapped] = 0.0
     loose = snapped if pinned is None else snapped[~pinned[snapped]]
     onto = onto if pinned is None else onto[~pinned[snapped]]
@@ -107,31 +126,28 @@ def _crossed_edges(tets: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.stack([keys // len(values), keys % len(values)], axis=1)
 
 
-def _crossings(field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _crossings(field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.ndarray, bisections: int) -> np.ndarray:
     """Where (E,) along each edge, in (0, 1), the field vanishes; by bisection, since it need only be continuous."""
     start, along = nodes[edges[:, 0]], nodes[edges[:, 1]] - nodes[edges[:, 0]]
     sign = np.sign(values[edges[:, 0]])
     low, high = np.zeros(len(edges)), np.ones(len(edges))
-    for _ in range(BISECTIONS):
+    for _ in range(bisections):
         middle = 0.5 * (low + high)
         same = sign * field(start + middle[:, None] * along) > 0.0
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     return 0.5 * (low + high)
 
 
-def _snapping_reach(pieces: Pieces, edges: np.ndarray) -> np.ndarray:
-    """The share (E, 2) of each edge within which a crossing pulls either end.
-
-    No node is pulled farther than 0.4 of its shortest edge: where the lattice changes size, the paper's shares of a
-    long edge would turn the small tetrahedra beside it inside out.
-    """
+def _snapping_reach(pieces: Pieces, edges: np.ndarray, settings: Stuffing) -> np.ndarray:
+    """The share (E, 2) of each edge within which a crossing pulls either end."""
     kinds = pieces.kind[edges]
-    share = np.where(kinds[:, 0] == kinds[:, 1], SNAP_LONG, SNAP_SHORT)
-    share = np.where((kinds == CUT).any(axis=1), SNAP_OTHER, share)
+    share = np.where(kinds[:, 0] == kinds[:, 1], settings.snap_long, settings.snap_short)
+    share = np.where((kinds == CUT).any(axis=1), settings.snap_other, share)
     ends = pieces.tets[:, EDGES].reshape(-1, 2)
     shortest = np.full(len(pieces.nodes), np.inf)
     np.minimum.at(shortest, ends.ravel(), np.repeat(_lengths(pieces.nodes, ends), 2))
-    return np.minimum(share[:, None], SNAP_SHORTEST * shortest[edges] / _lengths(pieces.nodes, edges)[:, None])
+    farthest = settings.snap_shortest * shortest[edges]
+    return np.minimum(share[:, None], farthest / _lengths(pieces.nodes, edges)[:, None])
 
 
 def _lengths(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
@@ -13,17 +14,42 @@ from ..errors import InputError
 from .intensity import Intensity
 from .nifti import read_volume
 from .placement import Piece, site_over
-from .signed_distance import mask_field
+from .signed_distance import Blur, mask_field
 from .subject import Subject, rim
 
-SMALLEST_BRAIN, LARGEST_BRAIN = 20e-6, 5000e-6  # [m^3]
-FEWEST_VOXELS = 27  # of a tumour; fewer have no shape
-SPECK = 1e-3  # of the tumour's volume; smaller components are noise
-EXTENSION = 8  # voxels
+
+@dataclass(frozen=True)
+class Labelling:
+    """What labels are taken for a brain and a tumour.
+
+    Parameters
+    ----------
+    smallest_brain, largest_brain
+        [m^3] Bounds that hold every mammal's that is operated on, and that a wrong label or unit falls out of.
+    fewest_voxels
+        Of a tumour; fewer have no shape.
+    speck
+        Share of the tumour's volume; smaller components are noise.
+    extension
+        Voxels by which a tumour at the cortex goes on beyond it: farther than `blur` reaches.
+    blur
+        Of both masks.
+    """
+
+    smallest_brain: float = 20e-6
+    largest_brain: float = 5000e-6
+    fewest_voxels: int = 27
+    speck: float = 1e-3
+    extension: int = 8
+    blur: Blur = field(default_factory=Blur)
 
 
 def volume_subject(
-    path: str | Path, brain: Sequence[int], tumour: Sequence[int], t1: str | Path | None = None
+    path: str | Path,
+    brain: Sequence[int],
+    tumour: Sequence[int],
+    t1: str | Path | None = None,
+    settings: Labelling = Labelling(),
 ) -> Subject:
     """The subject in a NIfTI file of whole-number labels, of which some are `brain` and some `tumour`.
 
@@ -35,7 +61,7 @@ def volume_subject(
     ------
     InputError
         What `read_volume` refuses; labels that are not whole, not there, or named twice; a brain of less than 20 ml or
-        more than 5,000 ml; a tumour outside the brain or of fewer than 27 voxels.
+        more than 5,000 ml; a tumour outside the brain or of fewer than 27 voxels (or what else `settings` say).
     """
     volume = read_volume(path)
     _check_labels(path, volume.values, brain, tumour)
@@ -43,10 +69,11 @@ def volume_subject(
     notes = list(volume.notes)
     marked = np.isin(volume.values, tumour)
     solid = _whole(np.isin(volume.values, brain), marked, voxel, notes)
-    if not SMALLEST_BRAIN <= solid.sum() * voxel <= LARGEST_BRAIN:
+    smallest, largest = settings.smallest_brain, settings.largest_brain
+    if not smallest <= solid.sum() * voxel <= largest:
         raise InputError(
             f"{path}: the labels {_listed(brain)} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
-            f"{SMALLEST_BRAIN * 1e6:g} to {LARGEST_BRAIN * 1e6:g} ml. Check the labels and the voxel size."
+            f"{smallest * 1e6:g} to {largest * 1e6:g} ml. Check the labels and the voxel size."
         )
     edge = int(solid.sum() - solid[1:-1, 1:-1, 1:-1].sum())
     if edge:
@@ -54,7 +81,7 @@ def volume_subject(
             f"{edge} voxels of the brain lie on the volume's border: where it is cut there is no cortex, so see that "
             "the craniotomy lies elsewhere"
         )
-    inside = _inside(path, solid, marked, voxel, notes)
+    inside = _inside(path, solid, marked, voxel, notes, settings)
     cortex, interface = rim(solid, volume.affine), rim(inside, volume.affine)
     pieces = _pieces(inside, volume.affine)
     intensity = None
@@ -62,8 +89,8 @@ def volume_subject(
         grey = read_volume(t1)
         intensity = Intensity(grey.values, grey.affine)
     return Subject(
-        brain=mask_field(solid, volume.affine),
-        tumour=mask_field(_extended(inside, solid), volume.affine),
+        brain=mask_field(solid, volume.affine, settings.blur),
+        tumour=mask_field(_extended(inside, solid, settings.extension), volume.affine, settings.blur),
         cortex=cortex,
         interface=interface,
         tumour_volume=float(inside.sum() * voxel),
@@ -110,18 +137,26 @@ def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]
     return filled
 
 
-def _inside(path: str | Path, solid: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
+def _inside(
+    path: str | Path,
+    solid: np.ndarray,
+    tumour: np.ndarray,
+    voxel: float,
+    notes: list[str],
+    settings: Labelling,
+) -> np.ndarray:
     """The tumour's components that lie in the solid, but for specks."""
     inside = tumour & solid
     if not inside.any():
         raise InputError(f"{path}: the tumour lies outside the brain. Check the labels given as brain and as tumour.")
     component, count = cast(tuple[np.ndarray, int], ndimage.label(inside, np.ones((3, 3, 3))))
     size = np.bincount(component.ravel(), minlength=count + 1)
-    kept = size >= max(SPECK * inside.sum(), FEWEST_VOXELS)
+    fewest = settings.fewest_voxels
+    kept = size >= max(settings.speck * inside.sum(), fewest)
     kept[0] = False
     if not kept.any():
         raise InputError(
-            f"{path}: the tumour's largest component has {size[1:].max()} voxels, and {FEWEST_VOXELS} are needed to "
+            f"{path}: the tumour's largest component has {size[1:].max()} voxels, and {fewest} are needed to "
             "show its shape. Resample the volume more finely, or check the labels."
         )
     result = kept[component]
@@ -131,13 +166,13 @@ def _inside(path: str | Path, solid: np.ndarray, tumour: np.ndarray, voxel: floa
     return result
 
 
-def _extended(tumour: np.ndarray, solid: np.ndarray) -> np.ndarray:
-    """The tumour, and beside the brain all voxels whose nearest one in the solid is tumour.
+def _extended(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
+    """The tumour, and up to `by` voxels beside the brain those whose nearest one in the solid is tumour.
 
     A tumour that reaches the cortex then goes on beyond it, and its field crosses the cortex instead of touching it.
     """
     (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(tumour.astype(np.uint8)))
-    wide = tuple(slice(max(part.start - EXTENSION, 0), part.stop + EXTENSION) for part in box)
+    wide = tuple(slice(max(part.start - by, 0), part.stop + by) for part in box)
     if solid[wide].all():
         return tumour
     nearest = ndimage.distance_transform_edt(~solid[wide], return_distances=False, return_indices=True)

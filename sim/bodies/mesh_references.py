@@ -6,7 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from ..errors import InputError
-from ..runtime.file_limits import INFLATION, mesh_bytes, too_large
+from ..runtime.file_limits import INFLATION, MeshBytes, too_large
 
 # Of meshio's formats those whose readers end where a file is cut short (of .mdpa, .tec and .node they never do), and
 # whose files say how much they hold (of .gz they do not).
@@ -16,8 +16,8 @@ ENDINGS = (
 )
 
 
-def demand_own(path: Path, most: int) -> None:
-    """Refuse other formats than `ENDINGS`, numbers that lie outside the file or its folder, HDF5 of over `most` bytes.
+def demand_own(path: Path, limits: MeshBytes) -> None:
+    """Refuse other formats than `ENDINGS`, numbers that lie outside the file or its folder, HDF5 beyond the limits.
 
     Raises
     ------
@@ -34,13 +34,13 @@ def demand_own(path: Path, most: int) -> None:
         _demand_no_include(path)
     elif suffix in (".xdmf", ".xmf"):
         for other in _named(path):
-            demand_stored(other, most)
+            demand_stored(other, limits)
     elif h5py.is_hdf5(path):
-        demand_stored(path, most)
+        demand_stored(path, limits)
 
 
-def demand_stored(path: Path, most: int) -> None:
-    """Refuse HDF5 that refers to other files, whose arrays take over `most` bytes, or more than was stored of them.
+def demand_stored(path: Path, limits: MeshBytes) -> None:
+    """Refuse HDF5 that refers to other files, or whose arrays take more bytes than may be or than were stored.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def demand_stored(path: Path, most: int) -> None:
     """
     import h5py
 
-    most = mesh_bytes(path.stat().st_size, most)
+    most = limits.of(path.stat().st_size)
     left, seen = most, set()
 
     def look(group: h5py.Group, within: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,14 +13,38 @@ from .signed_distance import Field, onto_level
 Projection = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Points (n, 3) [m] wished for and their nodes (n,) -> the nearest points (n, 3) where those nodes may lie."""
 
-GOOD_SINE = np.sin(np.radians(18.0))
-ROUNDS = 60
-LARGEST_SHIFT = 5e-4  # [m] off a surface to fit it better: half a voxel
 # The faces that meet at each edge of a tetrahedron (a face carries the number of the corner opposite to it).
 MEETING = np.array([[2, 3], [1, 3], [1, 2], [0, 3], [0, 2], [0, 1]])
 TRIALS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
 TRIALS /= np.linalg.norm(TRIALS, axis=1, keepdims=True)
-LARGEST_STEP, SMALLEST_STEP = 0.3, 0.02  # of the shortest edge at the node
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """How far nodes are moved for the sake of surfaces and angles, and how long this is tried.
+
+    Parameters
+    ----------
+    good_angle
+        [degrees] Tetrahedra with a dihedral angle below it, or above 180 less it, are bad: their nodes are moved.
+    rounds
+        Most rounds of moves.
+    largest_shift
+        [m] Farthest that a node leaves its surface to fit it better: half a voxel, since the image says no more.
+    largest_step, smallest_step
+        Shares of the shortest edge at a node: its first step, and the step below which it is left where it is.
+    """
+
+    good_angle: float = 18.0
+    rounds: int = 60
+    largest_shift: float = 5e-4
+    largest_step: float = 0.3
+    smallest_step: float = 0.02
+
+    @property
+    def good_sine(self) -> float:
+        """Sine of the good angle."""
+        return float(np.sin(np.radians(self.good_angle)))
 
 
 def smallest_sines(corners: np.ndarray) -> np.ndarray:
@@ -37,7 +62,12 @@ def smallest_sines(corners: np.ndarray) -> np.ndarray:
 
 
 def fitted(
-    nodes: np.ndarray, triangles: np.ndarray, field: Field, movable: np.ndarray, volume: float | None = None
+    nodes: np.ndarray,
+    triangles: np.ndarray,
+    field: Field,
+    movable: np.ndarray,
+    volume: float | None = None,
+    settings: Smoothing = Smoothing(),
 ) -> np.ndarray:
     """Nodes (V, 3) [m], of which those `movable` (V,) moved so that the closed surface of triangles (S, 3) fits best.
 
@@ -54,7 +84,8 @@ def fitted(
     for corner in triangles.T:
         np.add.at(weight, corner, area)
         np.add.at(total, corner, -0.75 * area * field(middle))
-    level = np.clip(total[on] / weight[on], -LARGEST_SHIFT, LARGEST_SHIFT)
+    most = settings.largest_shift
+    level = np.clip(total[on] / weight[on], -most, most)
     nodes = nodes.copy()
     nodes[on] = onto_level(field, nodes[on], level)
     if volume is not None:
@@ -62,7 +93,7 @@ def fitted(
         for _ in range(2):
             _, area = _middles_and_areas(nodes, triangles)
             missing = (volume - enclosed_volume(nodes, triangles)) / (area @ moving)
-            level = np.clip(level + missing, -LARGEST_SHIFT, LARGEST_SHIFT)
+            level = np.clip(level + missing, -most, most)
             nodes[on] = onto_level(field, nodes[on], level)
     return nodes
 
@@ -79,19 +110,19 @@ def _middles_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tuple[np.nda
     return corners.mean(axis=1), 0.5 * np.linalg.norm(normal, axis=1)
 
 
-def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection) -> np.ndarray:
-    """Nodes (V, 3) [m] moved until no dihedral angle is below 18 degrees, or none of them can be raised further.
+def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection, settings: Smoothing = Smoothing()) -> np.ndarray:
+    """Nodes (V, 3) [m] moved until every dihedral angle is good, or no bad one can be raised further.
 
     Each round a set of nodes of bad tetrahedra, no two in one tetrahedron, tries 26 steps each and takes the one that
     makes the angles round it fall least short of that.
     """
-    nodes = nodes.copy()
+    nodes, good = nodes.copy(), settings.good_sine
     order = np.argsort(tets, axis=None, kind="stable")
     incident, begin = order // 4, np.searchsorted(tets.ravel()[order], np.arange(len(nodes) + 1))
-    step = np.full(len(nodes), LARGEST_STEP)
+    step = np.full(len(nodes), settings.largest_step)
     sines = smallest_sines(nodes[tets])
-    for _ in range(ROUNDS):
-        movers = _independent(tets, sines, step)
+    for _ in range(settings.rounds):
+        movers = _independent(tets, sines, step, settings)
         if len(movers) == 0:
             break
         counts = begin[movers + 1] - begin[movers]
@@ -108,9 +139,9 @@ def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection) -> np.nda
         astray = np.linalg.norm(placed - trials, axis=2) > (step[movers] * length)[:, None]
         trials = np.where(astray[..., None], nodes[movers, None], placed)
         tried = np.where(own[:, None, :, None], trials[row][:, :, None], corners[:, None])
-        badness = np.add.reduceat(_badness(smallest_sines(tried)), first)
+        badness = np.add.reduceat(_badness(smallest_sines(tried), good), first)
         best = badness.argmin(axis=1)
-        better = badness.min(axis=1) < 0.99 * np.add.reduceat(_badness(sines[near]), first)
+        better = badness.min(axis=1) < 0.99 * np.add.reduceat(_badness(sines[near], good), first)
 
         step[movers[~better]] *= 0.4
         moved = movers[better]
@@ -118,16 +149,16 @@ def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection) -> np.nda
         touched = near[better[row]]
         sines[touched] = smallest_sines(nodes[tets[touched]])
         around = np.unique(tets[touched])
-        step[around] = np.maximum(step[around], 3.0 * SMALLEST_STEP)
+        step[around] = np.maximum(step[around], 3.0 * settings.smallest_step)
     return nodes
 
 
-def _independent(tets: np.ndarray, sines: np.ndarray, step: np.ndarray) -> np.ndarray:
+def _independent(tets: np.ndarray, sines: np.ndarray, step: np.ndarray, settings: Smoothing) -> np.ndarray:
     """Nodes of bad tetrahedra that may still move, the worst first, such that no two share a tetrahedron."""
-    bad = np.flatnonzero(sines < GOOD_SINE)
+    bad = np.flatnonzero(sines < settings.good_sine)
     worst = np.full(len(step), np.inf)
     np.minimum.at(worst, tets[bad].ravel(), np.repeat(sines[bad], 4))
-    worst[step < SMALLEST_STEP] = np.inf
+    worst[step < settings.smallest_step] = np.inf
     movers = np.flatnonzero(np.isfinite(worst))
     rank = np.full(len(step), len(step))
     rank[movers[np.argsort(worst[movers], kind="stable")]] = np.arange(len(movers))
@@ -137,6 +168,6 @@ def _independent(tets: np.ndarray, sines: np.ndarray, step: np.ndarray) -> np.nd
     return movers[~beaten[movers]]
 
 
-def _badness(sines: np.ndarray) -> np.ndarray:
+def _badness(sines: np.ndarray, good: float) -> np.ndarray:
     """What a node's steps make smaller: how far angles fall short, squared so that the worst count most."""
-    return np.maximum(GOOD_SINE - sines, 0.0) ** 2
+    return np.maximum(good - sines, 0.0) ** 2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -11,21 +11,54 @@ from ..anatomy import BRAIN_LABEL, TUMOUR_LABEL
 from ..errors import InputError
 from ..geometry.tetmesh import TetMesh, faces_once
 from .bcc_lattice import graded_lattice
-from .isosurface_stuffing import Pieces, cut, whole
+from .isosurface_stuffing import Pieces, Stuffing, cut, whole
 from .manifold_repair import clean, ears
-from .mesh_smoothing import GOOD_SINE, Projection, fitted, improved, smallest_sines
+from .mesh_smoothing import Projection, Smoothing, fitted, improved, smallest_sines
 from .signed_distance import Field, onto_level
 
-TOLERANCE = 0.03  # of the number of nodes asked for, at which the search for the lattice's size stops
-TRIALS = 8
-FINE = 0.5  # of the coarsest cell: the cells at the tumour and the craniotomy
-CELLS_PER_RADIUS = 2.5  # at least, across the tumour's radius
-GROWTH = 0.5  # of a cell's size per distance from the points of interest
-ROUNDING = 2.0**0.5  # a cell up to this much larger than wanted is not halved
-SLACKS = (0.0, 3e-4, 6e-4, 1.2e-3, 2.4e-3)  # [m] that nodes may leave their surface by, attempt by attempt
-DEEPEST = 4  # halvings of the coarsest cell
 TOO_COARSE = "so few nodes do not show the brain or the tumour: ask for more nodes, or check the labels."
-MORE = (1.25, 1.6, 2.0, 2.5)  # times the nodes asked for, tried only to say how many would do
+
+
+@dataclass(frozen=True)
+class Meshing:
+    """How the number of nodes is searched for, where the mesh is fine, and how hard bad angles are mended.
+
+    Parameters
+    ----------
+    tolerance, farthest
+        Shares of the number of nodes asked for: a mesh that near ends the search, and one farther off is refused.
+    trials
+        Most lattices that the search carves before it takes the nearest.
+    fine
+        The cells at the tumour and the craniotomy, as a share of the coarsest: what is looked at and pressed is there.
+    cells_per_radius
+        Fewest cells across the tumour's radius: fewer do not show its shape.
+    growth
+        By how much a cell's edge grows per distance from those places.
+    rounding
+        A cell up to so many times larger than wanted is not halved: then cells are as often too large as too small.
+    deepest
+        Most halvings of the coarsest cell: bounds the lattice round a very small tumour.
+    slacks
+        [m] How far nodes may leave their surface for better angles, attempt by attempt.
+    more
+        Times the nodes asked for, tried only to tell how many would do.
+    stuffing, smoothing
+        Of the cuts, and of the nodes' moves after them.
+    """
+
+    tolerance: float = 0.03
+    farthest: float = 0.1
+    trials: int = 8
+    fine: float = 0.5
+    cells_per_radius: float = 2.5
+    growth: float = 0.5
+    rounding: float = 2.0**0.5
+    deepest: int = 4
+    slacks: tuple[float, ...] = (0.0, 3e-4, 6e-4, 1.2e-3, 2.4e-3)
+    more: tuple[float, ...] = (1.25, 1.6, 2.0, 2.5)
+    stuffing: Stuffing = field(default_factory=Stuffing)
+    smoothing: Smoothing = field(default_factory=Smoothing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +86,8 @@ class Solids:
     opening: np.ndarray
 
 
-def mesh_solids(solids: Solids, count: int) -> TetMesh:
-    """The mesh of `solids` with `count` nodes, to within 10 % and mostly 3 %.
+def mesh_solids(solids: Solids, count: int, settings: Meshing = Meshing()) -> TetMesh:
+    """The mesh of `solids` with `count` nodes, to within 10 % and mostly 3 % by default.
 
     Raises
     ------
@@ -62,75 +95,78 @@ def mesh_solids(solids: Solids, count: int) -> TetMesh:
         A solid that so few nodes cannot show, with a number that can, if one of up to 2.5 times as many does; a count
         that the search for a lattice size does not reach.
     """
-    mesh = _meshed(solids, count)
+    mesh = _meshed(solids, count, settings)
     if mesh is not None:
         return mesh
-    more = (int(round(count * times, -2)) for times in MORE)
-    would_do = next((number for number in more if _would_do(solids, number)), None)
+    more = (int(round(count * times, -2)) for times in settings.more)
+    would_do = next((number for number in more if _would_do(solids, number, settings)), None)
     remedy = "smooth the labels" if would_do is None else f"ask for {would_do}, or smooth the labels"
     raise InputError(f"the surfaces are too intricate for {count} nodes: {remedy}.")
 
 
-def _would_do(solids: Solids, count: int) -> bool:
+def _would_do(solids: Solids, count: int, settings: Meshing) -> bool:
     try:
-        return _meshed(solids, count) is not None
+        return _meshed(solids, count, settings) is not None
     except InputError:
         return False
 
 
-def _meshed(solids: Solids, count: int) -> TetMesh | None:
+def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | None:
     """The mesh with `count` nodes; None where some of its tetrahedra are inside out. Raises as `mesh_solids`."""
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
-    for _ in range(TRIALS):
-        pieces = carve(solids, edge)
+    for _ in range(settings.trials):
+        pieces = carve(solids, edge, settings)
         reached = len(pieces.nodes)
         if best is None or abs(reached - count) < abs(len(best.nodes) - count):
             best = pieces
-        if abs(reached - count) <= TOLERANCE * count:
+        if abs(reached - count) <= settings.tolerance * count:
             break
         edge *= float(np.clip((reached / count) ** 0.4, 0.5, 2.0))
     assert best is not None
-    if abs(len(best.nodes) - count) > 0.1 * count:
+    if abs(len(best.nodes) - count) > settings.farthest * count:
         raise InputError(f"{count} nodes cannot be had for this anatomy ({len(best.nodes)} is next): ask for more.")
-    return _finished(solids, best)
+    return _finished(solids, best, settings)
 
 
-def carve(solids: Solids, edge: float) -> Pieces:
+def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
     """The solid on a lattice of coarsest cell `edge` [m], split along the tumour's surface."""
     radius = (0.75 / np.pi * solids.tumour_volume) ** (1.0 / 3.0)
+    fine, growth = settings.fine * edge, settings.growth
     wanted = (
-        (KDTree(solids.interface), min(FINE * edge, radius / CELLS_PER_RADIUS)),
-        (KDTree(solids.opening), FINE * edge),
+        (KDTree(solids.interface), min(fine, radius / settings.cells_per_radius)),
+        (KDTree(solids.opening), fine),
     )
-    levels = min(int(np.rint(np.log2(edge / wanted[0][1]))), DEEPEST)
+    levels = min(int(np.rint(np.log2(edge / wanted[0][1]))), settings.deepest)
 
     def size(points: np.ndarray) -> np.ndarray:
-        return ROUNDING * np.min([fine + GROWTH * tree.query(points)[0] for tree, fine in wanted], axis=0)
+        return settings.rounding * np.min([least + growth * tree.query(points)[0] for tree, least in wanted], axis=0)
 
     lattice = graded_lattice(solids.low - edge, solids.high + edge, edge, levels, size)
-    body = cut(whole(lattice), solids.brain)
+    body = cut(whole(lattice), solids.brain, settings=settings.stuffing)
     if not body.inside.any():
         raise InputError(TOO_COARSE)
     body = body.kept(body.inside)
     body = body.kept(clean(body.tets))
     surface = np.zeros(len(body.nodes), bool)
     surface[faces_once(body.tets)] = True
-    return cut(body, solids.tumour, pinned=surface)
+    return cut(body, solids.tumour, surface, settings.stuffing)
 
 
-def _finished(solids: Solids, pieces: Pieces) -> TetMesh | None:
+def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | None:
     """The surfaces fitted, what is flat on them trimmed, the bad angles improved; None: some remain inside out."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
-    surface, _ = _surfaces(pieces)
-    nodes = fitted(pieces.nodes, faces_once(pieces.tets), solids.brain, surface)
-    nodes = fitted(nodes, faces_once(pieces.tets[pieces.inside]), solids.tumour, ~surface, solids.tumour_volume)
+    (surface, _), smoothing = _surfaces(pieces), settings.smoothing
+    nodes = fitted(pieces.nodes, faces_once(pieces.tets), solids.brain, surface, settings=smoothing)
+    inner = faces_once(pieces.tets[pieces.inside])
+    nodes = fitted(nodes, inner, solids.tumour, ~surface, solids.tumour_volume, smoothing)
     pieces = replace(pieces, nodes=nodes)
-    for slack in SLACKS:
-        bad = smallest_sines(pieces.nodes[pieces.tets]) < GOOD_SINE
+    for slack in settings.slacks:
+        bad = smallest_sines(pieces.nodes[pieces.tets]) < smoothing.good_sine
         pieces = pieces.kept(~ears(pieces.tets, bad))
-        pieces = replace(pieces, nodes=improved(pieces.nodes, pieces.tets, _projection(solids, pieces, slack)))
+        projection = _projection(solids, pieces, slack)
+        pieces = replace(pieces, nodes=improved(pieces.nodes, pieces.tets, projection, smoothing))
     if (smallest_sines(pieces.nodes[pieces.tets]) <= 0.0).any():
         return None
     region = np.where(pieces.inside, TUMOUR_LABEL, BRAIN_LABEL)
@@ -153,10 +189,10 @@ def _projection(solids: Solids, pieces: Pieces, slack: float) -> Projection:
 
     def project(points: np.ndarray, of: np.ndarray) -> np.ndarray:
         placed = points.copy()
-        for field, level, on in ((solids.tumour, levels[1], interface), (solids.brain, levels[0], surface)):
+        for solid, level, on in ((solids.tumour, levels[1], interface), (solids.brain, levels[0], surface)):
             rows = on[of]
             aim = level[of[rows]]
-            placed[rows] = onto_level(field, placed[rows], np.clip(field(placed[rows]), aim - slack, aim + slack))
+            placed[rows] = onto_level(solid, placed[rows], np.clip(solid(placed[rows]), aim - slack, aim + slack))
         return placed
 
     return project

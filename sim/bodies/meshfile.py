@@ -16,7 +16,7 @@ from ..anatomy import Anatomy
 from ..errors import InputError
 from ..geometry.tetmesh import MeshWarning, TetMesh, oriented
 from ..runtime.atomic_files import written_whole
-from ..runtime.file_limits import LARGEST_MESH, at_most, mesh_bytes
+from ..runtime.file_limits import MESH_BYTES, MeshBytes, at_most
 from ..runtime.outside_files import path_of, read_as
 from .mesh_references import demand_own
 from .vtu_size import demand_small
@@ -41,11 +41,11 @@ class MeshFile:
     notes: tuple[str, ...]
 
 
-def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
+def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES) -> MeshFile:
     """Read tetrahedra with cell data `region` (absent: one region 0).
 
     Quadratic ones (`tetra10`) are taken as they are, curved edges too. Cells that are not tetrahedra are dropped and
-    tetrahedra of negative orientation are turned, each with a note.
+    tetrahedra of negative orientation are turned, each with a note. `limits` bound what a file may inflate to.
 
     Raises
     ------
@@ -62,11 +62,11 @@ def read_mesh(path: str | Path, unit: str = "m") -> MeshFile:
     remedy = "Convert it to .vtu or .msh."
     # meshio prints what it stumbles over, and warns of arrays that it skips.
     with read_as(path, "a mesh", remedy), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        most = mesh_bytes(path.stat().st_size, LARGEST_MESH)
+        most = limits.of(path.stat().st_size)
         counted = path.suffix.lower() == ".vtu" and demand_small(path, most)
-        with warnings.catch_warnings(), nullcontext() if counted else at_most(LARGEST_MESH):
+        with warnings.catch_warnings(), nullcontext() if counted else at_most(limits.largest):
             warnings.simplefilter("ignore")
-            demand_own(path, LARGEST_MESH)
+            demand_own(path, limits)
             raw = meshio.read(path)
     with read_as(path, "a mesh", remedy):
         return _taken(path, raw, UNITS[unit])

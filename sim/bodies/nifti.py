@@ -18,12 +18,26 @@ if TYPE_CHECKING:
     from nibabel.nifti1 import Nifti1Image
 
 METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
-SAME_PLACE = 1e-3  # [m]; sform and qform that differ by less differ by round-off
-COARSEST = 6e-3  # [m]; larger voxels do not show a brain's surface
-FINEST = 1e-5  # [m]; no scanner of a brain resolves less
 # Bytes read at once, and bytes behind the voxels that are read for the checksum after them.
 PIECE, SURPLUS = 2**20, 2**24
 REMEDY = "Give one three-dimensional NIfTI volume (.nii or .nii.gz)."
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """Which voxels a volume of a brain may have.
+
+    Parameters
+    ----------
+    finest, coarsest
+        [m] Edges: no scanner of a brain resolves less, and larger voxels do not show its surface.
+    same_place
+        [m] An sform and a qform that place a voxel less far apart differ by round-off.
+    """
+
+    finest: float = 1e-5
+    coarsest: float = 6e-3
+    same_place: float = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +49,14 @@ class Volume:
     notes: tuple[str, ...]
 
 
-def read_volume(path: str | Path) -> Volume:
+def read_volume(path: str | Path, voxels: Voxels = Voxels()) -> Volume:
     """Read one volume of finite numbers from a NIfTI file.
 
     Raises
     ------
     InputError
         A path that is no readable NIfTI file; several volumes, a slice, colours or complex numbers; values that are
-        not finite; an affine that is singular; voxels of more than 6 mm or less than 0.01 mm, or too many of them; a
+        not finite; an affine that is singular; voxels that are too coarse or too fine, or too many of them; a
         slope that is no number; a file that ends before its voxels do.
     """
     import nibabel
@@ -62,10 +76,10 @@ def read_volume(path: str | Path) -> Volume:
         affine = np.array(image.affine, np.float64)
         metre = METRES.get(unit, 1e-3)
         affine[:3] *= metre
-        _check(path, values, affine)
+        _check(path, values, affine, voxels)
         while values.ndim > 3:
             values = values[..., 0]
-        return Volume(values, affine, _assumed(image, metre))
+        return Volume(values, affine, _assumed(image, metre, voxels.same_place))
 
 
 def _demand_held(path: Path, image: Nifti1Image) -> None:
@@ -92,7 +106,7 @@ def _demand_held(path: Path, image: Nifti1Image) -> None:
         raise InputError(f"{path}: ends after {held:,} of {needed:,} bytes. Copy or export it again.")
 
 
-def _assumed(image: Nifti1Image, metre: float) -> tuple[str, ...]:
+def _assumed(image: Nifti1Image, metre: float, same: float) -> tuple[str, ...]:
     """What had to be assumed about the place of an image whose affine is in units of `metre` [m]."""
     sform = image.get_sform(coded=True)[0]
     try:
@@ -105,12 +119,12 @@ def _assumed(image: Nifti1Image, metre: float) -> tuple[str, ...]:
         return ()
     corners = np.stack([*np.ndindex(2, 2, 2)]) * (np.array(image.shape[:3]) - 1)
     apart = metre * np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1).max()
-    if apart <= SAME_PLACE:
+    if apart <= same:
         return ()
     return (f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken",)
 
 
-def _check(path: Path, values: np.ndarray, affine: np.ndarray) -> None:
+def _check(path: Path, values: np.ndarray, affine: np.ndarray, voxels: Voxels) -> None:
     shape = " x ".join(map(str, values.shape))
     if values.dtype.kind not in "biuf":
         raise InputError(f"{path}: holds colours or complex numbers ({values.dtype}), not plain ones. {REMEDY}")
@@ -121,13 +135,13 @@ def _check(path: Path, values: np.ndarray, affine: np.ndarray) -> None:
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) <= 1e-6 * spacing.prod():
         raise InputError(f"{path}: its affine is singular, so its voxels have no place. Set the sform or qform.")
-    if spacing.min() < FINEST:
+    if spacing.min() < voxels.finest:
         raise InputError(
-            f"{path}: its voxels measure {spacing.min() * 1e3:.3g} mm along an axis; {FINEST * 1e3:g} mm is the least. "
-            "Set the voxel size, or resample it."
+            f"{path}: its voxels measure {spacing.min() * 1e3:.3g} mm along an axis; {voxels.finest * 1e3:g} mm is the "
+            "least. Set the voxel size, or resample it."
         )
-    if spacing.max() > COARSEST:
+    if spacing.max() > voxels.coarsest:
         voxel = " x ".join(f"{edge * 1e3:.3g}" for edge in spacing)
         raise InputError(
-            f"{path}: its voxels measure {voxel} mm; {COARSEST * 1e3:g} mm is the most that shows a brain."
+            f"{path}: its voxels measure {voxel} mm; {voxels.coarsest * 1e3:g} mm is the most that shows a brain."
         )

@@ -9,13 +9,40 @@ from scipy.spatial import ConvexHull
 
 from ..errors import InputError
 
-STEM = 0.15  # of the brain's height: in the template 21 mm, the medulla and what touches it
-HULL_DEPTH = 6e-3  # [m] under the convex hull: deeper cortex lies in a fissure and cannot be reached through the skull
-BASE = 0.3  # of the brain's height, under which the skull is not opened unless the tumour lies there too
-NEAR = 20e-3  # [m]; a point farther from the surface than this does not say which cortex is meant
-MIDLINE = 0.03  # of the brain's width, to either side of its middle
 AXES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
 """Of RAS: what small and large coordinates are called."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a brain is held, where its skull can be opened, and what counts as its midline.
+
+    Parameters
+    ----------
+    stem
+        The brainstem's reach from the lowest point, as a share of the brain's height: in the template 21 mm, the
+        medulla and what touches it.
+    hull_depth
+        [m] under the convex hull: deeper cortex lies in a fissure and cannot be reached through the skull.
+    base
+        Share of the brain's height, under which the skull is not opened unless the tumour lies there too.
+    near
+        [m] A point farther from the surface does not say which cortex is meant.
+    outside
+        [m] A point that is to lie in the brain may be so far outside: coordinates are read off images.
+    midline
+        Share of the brain's width, to either side of its middle.
+    fewest_open
+        Nodes of a craniotomy; fewer do not carry a tool.
+    """
+
+    stem: float = 0.15
+    hull_depth: float = 6e-3
+    base: float = 0.3
+    near: float = 20e-3
+    outside: float = 5e-3
+    midline: float = 0.03
+    fewest_open: int = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +53,7 @@ class Piece:
     centre: np.ndarray
 
 
-def side_of(point: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
+def side_of(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings: Placement = Placement()) -> str:
     """Words for a place (3,) [m] in a brain's box `low` to `high` (3,), RAS: "left anterior superior" and the like.
 
     Left and right are told but for a midline strip; of the other axes, the outer thirds.
@@ -34,7 +61,7 @@ def side_of(point: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
     share = (np.asarray(point) - low) / (high - low)
     words = []
     for axis, names in enumerate(AXES):
-        middle = MIDLINE if axis == 0 else 1.0 / 6.0
+        middle = settings.midline if axis == 0 else 1.0 / 6.0
         if abs(share[axis] - 0.5) > middle:
             words.append(names[int(share[axis] > 0.5)])
         elif axis == 0:
@@ -42,54 +69,54 @@ def side_of(point: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
     return " ".join(words)
 
 
-def site_over(cortex: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def site_over(cortex: np.ndarray, centre: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
     """The point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that can be reached through the skull."""
-    floor = min(cortex[:, 2].min() + BASE * np.ptp(cortex[:, 2]), centre[2])
-    outer = _outermost(cortex)
+    floor = min(cortex[:, 2].min() + settings.base * np.ptp(cortex[:, 2]), centre[2])
+    outer = _outermost(cortex, settings)
     return _nearest(outer[outer[:, 2] >= floor], centre)
 
 
-def opening_at(cortex: np.ndarray, point: np.ndarray) -> np.ndarray:
+def opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
     """The reachable point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) at the surface.
 
     Raises
     ------
     InputError
-        A point that is not finite, or more than 20 mm from there; one over the brainstem.
+        A point that is not finite, or more than `near` from there; one over the brainstem.
     """
     _demand_finite(point, "--opening-at")
-    site = _nearest(_outermost(cortex), point)
+    site = _nearest(_outermost(cortex, settings), point)
     apart = float(np.linalg.norm(site - point))
-    if apart > NEAR:
+    if apart > settings.near:
         raise InputError(
             f"the opening at {_mm(point)} mm lies {apart * 1e3:.0f} mm from the nearest cortex that the skull covers; "
-            f"{NEAR * 1e3:g} mm is the most. {_box(cortex)} Over a deep point, give --opening-over."
+            f"{settings.near * 1e3:g} mm is the most. {_box(cortex)} Over a deep point, give --opening-over."
         )
-    return _not_over_stem(cortex, site)
+    return _not_over_stem(cortex, site, settings)
 
 
-def opening_over(cortex: np.ndarray, point: np.ndarray, depth: float) -> np.ndarray:
+def opening_over(cortex: np.ndarray, point: np.ndarray, depth: float, settings: Placement = Placement()) -> np.ndarray:
     """The reachable point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) `depth` [m] below the brain's surface.
 
     Raises
     ------
     InputError
-        A point that is not finite, or more than 5 mm outside the brain; one over the brainstem.
+        A point that is not finite, or farther `outside` the brain; one over the brainstem.
     """
     _demand_finite(point, "--opening-over")
-    if not depth > -NEAR / 4.0:
+    if not depth > -settings.outside:
         raise InputError(
             f"the point {_mm(point)} mm lies {-depth * 1e3:.0f} mm outside the brain: give a point inside. "
             f"{_box(cortex)}"
         )
-    return _not_over_stem(cortex, site_over(cortex, point))
+    return _not_over_stem(cortex, site_over(cortex, point, settings), settings)
 
 
-def _outermost(cortex: np.ndarray) -> np.ndarray:
+def _outermost(cortex: np.ndarray, settings: Placement) -> np.ndarray:
     """The cortex (k, 3) near its convex hull."""
     hull = ConvexHull(cortex).equations
     depth = np.concatenate([-(part @ hull[:, :3].T + hull[:, 3]).max(axis=1) for part in np.array_split(cortex, 50)])
-    return cortex[depth <= HULL_DEPTH]
+    return cortex[depth <= settings.hull_depth]
 
 
 def _nearest(points: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -101,9 +128,9 @@ def _demand_finite(point: np.ndarray, option: str) -> None:
         raise InputError(f"{option} {_mm(point)}: every coordinate must be a finite number [mm].")
 
 
-def _not_over_stem(cortex: np.ndarray, site: np.ndarray) -> np.ndarray:
+def _not_over_stem(cortex: np.ndarray, site: np.ndarray, settings: Placement) -> np.ndarray:
     lowest, height = cortex[cortex[:, 2].argmin()], np.ptp(cortex[:, 2])
-    if np.linalg.norm(site - lowest) <= STEM * height:
+    if np.linalg.norm(site - lowest) <= settings.stem * height:
         raise InputError(
             f"the opening at {_mm(site)} mm lies over the brainstem, which is held: choose a point farther from the "
             f"brain's lowest one, {_mm(lowest)} mm."

@@ -12,10 +12,24 @@ from scipy import ndimage, special
 Field = Callable[[np.ndarray], np.ndarray]
 """A solid: values (n,) at points (n, 3) [m], negative inside, continuous; near its surface the distance to it [m]."""
 
-PROBE = 2e-4  # [m] for differences of a field: below a voxel, above round-off
-BLUR = 0.7  # voxels; takes the staircase off a mask and leaves what is wider than two voxels where it is
-REACH = 3.5  # blurs; farther from the surface than this the blurred mask says no more than inside or outside
-MARGIN = 5  # voxels of surroundings that a field keeps round its mask
+
+@dataclass(frozen=True)
+class Blur:
+    """How the field of a mask of voxels is made smooth.
+
+    Parameters
+    ----------
+    voxels
+        Standard deviation: takes the staircase off a mask and leaves what is wider than two voxels where it is.
+    reach
+        Standard deviations from the surface beyond which a blurred mask tells no more than inside or outside.
+    margin
+        Voxels of surroundings that a field keeps round its mask: more than the blur reaches.
+    """
+
+    voxels: float = 0.7
+    reach: float = 3.5
+    margin: int = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,33 +48,36 @@ class LevelSet:
         return ndimage.map_coordinates(self.values, index, order=1, mode="nearest", output=np.float64)
 
 
-def mask_field(mask: np.ndarray, affine: np.ndarray) -> LevelSet:
+def mask_field(mask: np.ndarray, affine: np.ndarray, blur: Blur = Blur()) -> LevelSet:
     """The field of the voxels `mask` (I, J, K) bool whose indices `affine` (4, 4) takes to metres.
 
-    The mask is blurred by 0.7 voxels and the blur of a plane, P = Phi(-d / sigma), is solved for the distance d.
+    The mask is blurred and the blur of a plane, P = Phi(-d / sigma), is solved for the distance d.
     Where voxels are oblong the mean of the three blurs stands for sigma, so that distances are right to a factor.
     """
-    mask, affine = cropped(mask, affine)
-    sigma = BLUR * abs(np.linalg.det(affine[:3, :3])) ** (1.0 / 3.0)
-    share = ndimage.gaussian_filter(mask.astype(np.float32), BLUR, mode="nearest")
-    limit = special.ndtr(-REACH)
+    mask, affine = cropped(mask, affine, blur.margin)
+    sigma = blur.voxels * abs(np.linalg.det(affine[:3, :3])) ** (1.0 / 3.0)
+    share = ndimage.gaussian_filter(mask.astype(np.float32), blur.voxels, mode="nearest")
+    limit = special.ndtr(-blur.reach)
     distance = -sigma * special.ndtri(np.clip(share, limit, 1.0 - limit))
     return LevelSet(distance.astype(np.float32), np.linalg.inv(affine))
 
 
-def cropped(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of a mask within 5 voxels of what is marked, padded where the volume ends, and its affine (4, 4)."""
+def cropped(mask: np.ndarray, affine: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a mask within `margin` voxels of what is marked, padded with zeros, and its affine (4, 4)."""
     (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(mask.astype(np.uint8)))
-    low = np.array([part.start for part in box]) - MARGIN
+    low = np.array([part.start for part in box]) - margin
     shifted = affine.copy()
     shifted[:3, 3] += affine[:3, :3] @ low
-    return np.pad(mask[box], MARGIN), shifted
+    return np.pad(mask[box], margin), shifted
 
 
-def gradient(field: Field, points: np.ndarray) -> np.ndarray:
-    """Gradient (n, 3) of a field at points (n, 3) [m], by central differences over 0.4 mm."""
-    steps = PROBE * np.eye(3)
-    return np.stack([field(points + step) - field(points - step) for step in steps], axis=1) / (2.0 * PROBE)
+def gradient(field: Field, points: np.ndarray, probe: float = 2e-4) -> np.ndarray:
+    """Gradient (n, 3) of a field at points (n, 3) [m], by differences `probe` [m] to both sides.
+
+    The default is below a voxel and above round-off.
+    """
+    steps = probe * np.eye(3)
+    return np.stack([field(points + step) - field(points - step) for step in steps], axis=1) / (2.0 * probe)
 
 
 def onto_level(field: Field, points: np.ndarray, level: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
@@ -12,8 +12,8 @@ from ..anatomy import Anatomy
 from ..errors import InputError
 from .boundary_conditions import bounded
 from .intensity import Intensity
-from .mesher import Solids, mesh_solids
-from .placement import Piece
+from .mesher import Meshing, Solids, mesh_solids
+from .placement import Piece, Placement
 from .signed_distance import Field
 
 FEWEST_NODES, MOST_NODES = 2_000, 250_000
@@ -22,7 +22,18 @@ SMALLEST_CRANIOTOMY, LARGEST_CRANIOTOMY = 0.015, 0.120  # [m]
 
 @dataclass(frozen=True)
 class Plan:
-    """How a subject becomes an anatomy: nodes wanted, diameter of the opening along the cortex [m].
+    """How a subject becomes an anatomy.
+
+    Parameters
+    ----------
+    nodes
+        Wanted in the mesh.
+    craniotomy
+        [m] Diameter of the opening along the cortex.
+    meshing
+        How the mesh is searched for and smoothed.
+    placement
+        Where the brain is held, and how many nodes an opening needs.
 
     Raises
     ------
@@ -32,6 +43,8 @@ class Plan:
 
     nodes: int = 5300
     craniotomy: float = 0.050
+    meshing: Meshing = field(default_factory=Meshing)
+    placement: Placement = field(default_factory=Placement)
 
     def __post_init__(self) -> None:
         if not FEWEST_NODES <= self.nodes <= MOST_NODES:
@@ -87,7 +100,8 @@ def make_anatomy(subject: Subject, plan: Plan) -> Anatomy:
     opening = subject.cortex[np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * plan.craniotomy]
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     solids = Solids(subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening)
-    return bounded(mesh_solids(solids, plan.nodes), subject.site, plan.craniotomy)
+    mesh = mesh_solids(solids, plan.nodes, plan.meshing)
+    return bounded(mesh, subject.site, plan.craniotomy, plan.placement)
 
 
 def rim(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:

@@ -15,8 +15,6 @@ from .placement import Piece, site_over
 from .signed_distance import Field, mask_field
 from .subject import Subject, rim
 
-VOLUME = 1470e-6  # [m^3]; the mask itself has 1,883 ml, more than a person
-THRESHOLD = 0.2  # of the template's brightest voxel: nilearn's own mask
 SITES = {
     "frontal": (32.0, 42.0, 36.0),
     "central": (40.0, -14.0, 58.0),
@@ -27,18 +25,67 @@ SITES = {
 """Directions, from the brain's middle, of points on the right hemisphere's convexity: MNI152 coordinates [mm]."""
 
 Shape = Literal["sphere", "lobed"]
-LOBES, LOBE_HEIGHT, LOBE_SHARPNESS = 6, 0.5, 5.0
-SMOOTH = 5e-3  # [m] over which the cortex is levelled to find which way is in
 SMALLEST_RADIUS, LARGEST_RADIUS = 3e-3, 35e-3
 SMALLEST_COVER, LARGEST_COVER = 1e-3, 60e-3
-CLEARANCE = 5e-4  # [m] of brain that must lie round the tumour
+
+
+@dataclass(frozen=True)
+class Head:
+    """What is made of the template, and what room a tumour needs in it.
+
+    Parameters
+    ----------
+    volume
+        [m^3] of the scaled brain; the mask itself has 1,883 ml, more than a person.
+    threshold
+        Share of the template's brightest voxel above which a voxel is brain: nilearn's own mask.
+    smooth
+        [m] The cortex is levelled over this length to find which way is in.
+    clearance
+        [m] of brain that must lie round the tumour.
+    """
+
+    volume: float = 1470e-6
+    threshold: float = 0.2
+    smooth: float = 5e-3
+    clearance: float = 5e-4
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """What a lobed tumour looks like: how many lobes of which height, and how pointed they are.
+
+    Parameters
+    ----------
+    count
+        Lobes, in random directions.
+    height
+        Of the largest one, as a share of the radius; the smallest has 0.3 of that.
+    sharpness
+        Of all lobes: s in `Lobed`.
+    """
+
+    count: int = 6
+    height: float = 0.5
+    sharpness: float = 5.0
 
 
 @dataclass(frozen=True)
 class Tumour:
-    """A tumour to be placed: radius (of the ball of the same volume) and cover, its cap's depth under the cortex [m].
+    """A tumour to be placed.
 
-    `middle` (x, y, z) [m], RAS, places it in the head; without it, it lies `cover` under the cortex of a `site`.
+    Parameters
+    ----------
+    radius
+        [m] of the ball of the same volume.
+    cover
+        [m] Depth of its cap under the cortex of the `site`, one of the names in `SITES`.
+    shape, lobes
+        "sphere" or "lobed", and then how.
+    seed
+        Of the lobes' directions and heights.
+    middle
+        (x, y, z) [m], RAS, in place of `cover` and `site`.
 
     Raises
     ------
@@ -53,6 +100,7 @@ class Tumour:
     site: str = "central"
     seed: int = 0
     middle: tuple[float, float, float] | None = None
+    lobes: Lobes = Lobes()
 
     def __post_init__(self) -> None:
         for name, value, low, high in (
@@ -85,17 +133,18 @@ class Tumour:
 class Lobed:
     """A star-shaped solid: its radius in the unit direction n is scale * (1 + sum_k height_k exp(s (n . d_k - 1))).
 
-    middle (3,) [m]; directions (L, 3) of unit length; heights (L,); scale [m]. A ball has no lobes.
+    middle (3,) [m]; directions (L, 3) of unit length; heights (L,); scale [m]; sharpness s. A ball has no lobes.
     """
 
     middle: np.ndarray
     directions: np.ndarray
     heights: np.ndarray
     scale: float
+    sharpness: float = Lobes.sharpness
 
     def radius(self, directions: np.ndarray) -> np.ndarray:
         """Distance (n,) [m] from the middle to the surface in unit directions (n, 3)."""
-        lobes = np.exp(LOBE_SHARPNESS * (directions @ self.directions.T - 1.0))
+        lobes = np.exp(self.sharpness * (directions @ self.directions.T - 1.0))
         return self.scale * (1.0 + lobes @ self.heights)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
@@ -105,24 +154,24 @@ class Lobed:
         return length - self.radius(arm / np.maximum(length, 1e-12)[:, None])
 
 
-def template_subject(tumour: Tumour) -> Subject:
-    """The template with a tumour, in the template's own RAS frame, scaled to 1,470 ml about the brain's centroid.
+def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
+    """The template with a tumour, in the template's own RAS frame, scaled to a person's about the brain's centroid.
 
     Raises
     ------
     InputError
         A tumour that would reach out of the brain.
     """
-    grey, mask, affine = _scaled_template()
+    grey, mask, affine = _scaled_template(head)
     brain, cortex = mask_field(mask, affine), rim(mask, affine)
     if tumour.middle is None:
-        site, inward = _site(brain, cortex, tumour.site)
+        site, inward = _site(brain, cortex, tumour.site, head.smooth)
         shape = _placed(tumour, site, inward)
     else:
         shape = _round(tumour, lambda unit, scale: np.array(tumour.middle))
         site = site_over(cortex, shape.middle)
     interface = shape.middle + _sphere(400) * shape.radius(_sphere(400))[:, None]
-    if (brain(interface) > -CLEARANCE).any():
+    if (brain(interface) > -head.clearance).any():
         raise InputError(
             f"a {tumour.shape} tumour of {tumour.radius * 1e3:g} mm radius {tumour.place} reaches out of the brain: "
             "choose a smaller radius, or another place."
@@ -133,31 +182,31 @@ def template_subject(tumour: Tumour) -> Subject:
     )
 
 
-def _scaled_template() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _scaled_template(head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Grey values (I, J, K), the brain's mask, and their affine (4, 4) to metres."""
     from nilearn.datasets import load_mni152_template  # takes seconds; only where an anatomy is made
 
     image = load_mni152_template(resolution=1)
     grey = np.asarray(image.dataobj)
-    component, _ = cast(tuple[np.ndarray, int], ndimage.label(grey > THRESHOLD * grey.max()))
+    component, _ = cast(tuple[np.ndarray, int], ndimage.label(grey > head.threshold * grey.max()))
     mask = cast(np.ndarray, ndimage.binary_fill_holes(component == np.bincount(component.ravel())[1:].argmax() + 1))
     affine = np.array(image.affine, np.float64)
     centre = affine[:3, :3] @ np.argwhere(mask).mean(axis=0) + affine[:3, 3]
-    scale = (VOLUME / (mask.sum() * abs(np.linalg.det(affine[:3, :3])))) ** (1.0 / 3.0)
+    scale = (head.volume / (mask.sum() * abs(np.linalg.det(affine[:3, :3])))) ** (1.0 / 3.0)
     affine[:3, 3] -= centre
     affine[:3] *= scale
     affine[:3, 3] += 1e-3 * centre
     return grey, mask, affine
 
 
-def _site(brain: Field, cortex: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _site(brain: Field, cortex: np.ndarray, name: str, smooth: float) -> tuple[np.ndarray, np.ndarray]:
     """Where (3,) [m] the ray from the brain's middle leaves it at a named site, and the inward normal (3,) there."""
     middle = 0.5 * (cortex.min(axis=0) + cortex.max(axis=0))
     outward = 1e-3 * np.array(SITES[name]) - middle
     outward /= np.linalg.norm(outward)
     along = np.arange(0.02, 0.15, 1e-5)
     site = middle + along[np.flatnonzero(brain(middle + along[:, None] * outward) < 0.0)[-1]] * outward
-    near = cortex[np.linalg.norm(cortex - site, axis=1) <= 3.0 * SMOOTH]
+    near = cortex[np.linalg.norm(cortex - site, axis=1) <= 3.0 * smooth]
     normal = np.linalg.eigh(np.cov(near.T))[1][:, 0]
     return site, -normal * np.sign(normal @ outward)
 
@@ -169,13 +218,13 @@ def _placed(tumour: Tumour, site: np.ndarray, inward: np.ndarray) -> Lobed:
 
 def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:
     """The tumour round a `middle` (3,) [m], told its shape at unit scale and its scale [m]."""
-    rng = np.random.default_rng(tumour.seed)
-    directions = rng.normal(size=(LOBES if tumour.shape == "lobed" else 0, 3))
+    rng, lobes = np.random.default_rng(tumour.seed), tumour.lobes
+    directions = rng.normal(size=(lobes.count if tumour.shape == "lobed" else 0, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    heights = rng.uniform(0.3, 1.0, len(directions)) * LOBE_HEIGHT
-    unit = Lobed(np.zeros(3), directions, heights, 1.0)
+    heights = rng.uniform(0.3, 1.0, len(directions)) * lobes.height
+    unit = Lobed(np.zeros(3), directions, heights, 1.0, lobes.sharpness)
     scale = tumour.radius / (unit.radius(_sphere(20_000)) ** 3).mean() ** (1.0 / 3.0)
-    return Lobed(middle(unit, scale), directions, heights, scale)
+    return Lobed(middle(unit, scale), directions, heights, scale, lobes.sharpness)
 
 
 def _sphere(count: int) -> np.ndarray:

@@ -14,9 +14,6 @@ from ..geometry.closest_point import closest
 from ..loads import Loads, Pushed, Touching
 from .open_cortex import OpenCortex, open_cortex
 
-# Cases whose tumours are looked at together.
-TOGETHER = 64
-
 
 @dataclass(frozen=True, eq=False)
 class TipGauge:
@@ -30,6 +27,8 @@ class TipGauge:
     ----------
     anatomy
         The body.
+    together
+        Cases whose tumours are looked at together: bounds the memory that it takes.
 
     Raises
     ------
@@ -38,6 +37,7 @@ class TipGauge:
     """
 
     anatomy: Anatomy
+    together: int = 64
 
     @cached_property
     def cortex(self) -> OpenCortex:
@@ -98,8 +98,8 @@ class TipGauge:
             )
         tips = self._tips(loads, displacement, row[self._open[0]], ball, lift)
         found, at = np.empty(len(loads)), row[self._tumour[0]]
-        for first in range(0, len(loads), TOGETHER):
-            some = slice(first, first + TOGETHER)
+        for first in range(0, len(loads), self.together):
+            some = slice(first, first + self.together)
             tumour = self.anatomy.mesh.nodes[self._tumour[0]] + displacement[some][:, at]
             near = closest(tips[some], tumour[:, self._tumour[1]]).point
             found[some] = np.linalg.norm(near - tips[some], axis=1)
@@ -118,8 +118,8 @@ class TipGauge:
             raise InputError("there is no tip where no tool pushes, and no ball of known radius is moved.")
         nodes, triangles = self._open
         rest, tips = self.anatomy.mesh.nodes[nodes], np.empty((len(loads), 3))
-        for first in range(0, len(loads), TOGETHER):
-            some = slice(first, first + TOGETHER)
+        for first in range(0, len(loads), self.together):
+            some = slice(first, first + self.together)
             _, triangle, weights = closest(pushed.point[some], rest[triangles])
             for case, at, share in zip(range(first, len(loads)), triangle, weights, strict=False):
                 surface = rest + displacement[case, row]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
@@ -13,10 +14,6 @@ INFLATION = 1032
 # One array [bytes]: quadratic tetrahedra (10 numbers of 8 bytes) of the finest brain meshes in use, 10 million, take
 # 0.8 GB.
 LARGEST_ARRAY = 2 * 1024**3
-# All arrays of a mesh file, inflated [bytes]: nodes, cells, and a few fields beside them.
-LARGEST_MESH = 4 * 1024**3
-# What inflates a hundred times is no mesh: its coordinates hardly repeat. So much is taken of a small file [bytes].
-MESH_INFLATION, SMALL_MESH = 100, 2**28
 # All arrays of a model file, inflated [bytes]: the shipped one, of seven learners, has 0.04 GB.
 LARGEST_MODEL = 2 * 1024**3
 # Text that heads a model file [bytes]: the shipped one has 0.02 MB.
@@ -25,25 +22,49 @@ LARGEST_HEADER = 16 * 1024**2
 MOST_VOXELS = 2**29
 
 
+@dataclass(frozen=True)
+class MeshBytes:
+    """How many bytes the arrays of a mesh file may inflate to.
+
+    Parameters
+    ----------
+    largest
+        [bytes] Of all arrays together: nodes, cells, and a few fields beside them.
+    inflation
+        Times the file's size. What inflates further is no mesh: its coordinates hardly repeat.
+    small
+        [bytes] A small file may inflate to so many all the same.
+    """
+
+    largest: int = 4 * 1024**3
+    inflation: int = 100
+    small: int = 2**28
+
+    def of(self, size: int) -> int:
+        """Bytes to which the arrays of a file of `size` bytes may inflate.
+
+        Raises
+        ------
+        InputError
+            A file that is larger itself.
+        """
+        if size > self.largest:
+            raise InputError(
+                f"it is of {size / 1e9:,.3g} GB, and {self.largest / 1e9:.3g} GB are the most. Mesh coarser."
+            )
+        return min(self.largest, max(self.small, self.inflation * size))
+
+
+MESH_BYTES = MeshBytes()
+"""Four gigabytes, and a hundred times a file's size."""
+
+
 def too_large(most: int) -> InputError:
     """What is said of a mesh file that asks for more than `most` bytes."""
     return InputError(
         f"its arrays take more than {most / 1e9:.3g} GB: a file of its size holds no such mesh of a brain. "
         "Write it anew, or mesh coarser."
     )
-
-
-def mesh_bytes(size: int, most: int) -> int:
-    """Bytes to which the arrays of a mesh file of `size` bytes may inflate: `most` of a large one.
-
-    Raises
-    ------
-    InputError
-        A file that is larger itself.
-    """
-    if size > most:
-        raise InputError(f"it is of {size / 1e9:,.3g} GB, and {most / 1e9:.3g} GB are the most. Mesh coarser.")
-    return min(most, max(SMALL_MESH, MESH_INFLATION * size))
 
 
 @contextmanager
