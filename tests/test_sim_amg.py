@@ -10,39 +10,31 @@ from test_sim_multigrid import built, matrices, spread
 from sim.compile import compile_problem
 from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held
-from sim.linalg import amg
 from sim.linalg.amg import rigid_motions
 from sim.linalg.pcg import BlockJacobi, conjugate_gradients
-from sim.linalg.preconditioner import name_of
+from sim.linalg.preconditioner import Preconditioning, name_of
 from sim.material import Material
 from sim.runtime.device import find_device
 
-
-@pytest.fixture
-def too_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every mesh is too large for a factor, and ten nodes are enough for the last level."""
-    monkeypatch.setattr("sim.linalg.preconditioner.LARGEST_FACTOR", 0)
-    monkeypatch.setattr("sim.linalg.preconditioner.LARGEST_SMOOTHED_FACTOR", 0)
-    monkeypatch.setattr(amg, "LARGEST_LAST", 10)
+# Every mesh is too large for a factor, and ten nodes are enough for the last level.
+LEVELS = Preconditioning(largest_factor=0, largest_smoothed_factor=0, largest_last=10)
 
 
-@pytest.mark.usefixtures("too_large")
 @pytest.mark.parametrize("poisson", [0.3, 0.49])
 @pytest.mark.parametrize("kind", ["p1", "p2", "tetra10", "smoothed"])
 def test_symmetric_positive_and_close(kind: str, poisson: float) -> None:
-    problem, preconditioner = built(kind, poisson, (3, 3, 4))
+    problem, preconditioner = built(kind, poisson, (3, 3, 4), settings=LEVELS)
     K, M = matrices(problem, preconditioner)
     assert np.abs(M - M.T).max() < 1e-6 * np.abs(M).max()  # the coarsest factor is kept in single precision
     assert np.linalg.eigvalsh((M + M.T) / 2.0).min() > 0.0
     assert spread(K, M) < (12.0 if poisson == 0.3 else 150.0)
 
 
-@pytest.mark.usefixtures("too_large")
 def test_refining_costs_few_iterations() -> None:
     """Eight times as many unknowns and one level more; block Jacobi would take twice the iterations."""
     count = []
     for cells in (4, 8):
-        problem, preconditioner = built("p1", 0.45, (cells, cells, cells))
+        problem, preconditioner = built("p1", 0.45, (cells, cells, cells), settings=LEVELS)
         free, device = problem.constraint.basis(), problem.device
         r = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 2))
         problem.linearise(device.zeros(*r.shape), np.zeros(2, bool))
@@ -53,9 +45,8 @@ def test_refining_costs_few_iterations() -> None:
     assert count[1] <= count[0] + 8
 
 
-@pytest.mark.usefixtures("too_large")
 def test_the_same_mesh_gives_the_same_cycle() -> None:
-    first, second = (matrices(*built("p1", 0.45, (3, 3, 4)))[1] for _ in range(2))
+    first, second = (matrices(*built("p1", 0.45, (3, 3, 4), settings=LEVELS))[1] for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
@@ -69,12 +60,9 @@ def test_the_same_mesh_gives_the_same_cycle() -> None:
         ("smoothed", 10_000, "sparse factor"),
     ],
 )
-def test_the_choice_goes_by_size_and_element(
-    kind: str, largest: int, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sim.linalg.preconditioner.LARGEST_FACTOR", largest)
-    monkeypatch.setattr(amg, "LARGEST_LAST", 5)
-    problem, preconditioner = built(kind, 0.45, (5, 5, 5))
+def test_the_choice_goes_by_size_and_element(kind: str, largest: int, name: str) -> None:
+    settings = Preconditioning(largest_factor=largest, largest_last=5)
+    problem, preconditioner = built(kind, 0.45, (5, 5, 5), settings=settings)
     assert name_of(preconditioner) == name
     assert name_of(BlockJacobi(problem.device)) == "block Jacobi"
 

@@ -12,11 +12,12 @@ from boxes import base_held, box, hold
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.effects import Elasticity, Held, Slide
-from sim.linalg.multifrontal import FEW, STRIP, Factor, node_of
+from sim.linalg.multifrontal import Factor, Factorisation, node_of
 from sim.linalg.symbolic import dissection, fronts_of
 from sim.runtime.device import Precision, find_device
 
 CELLS = (6, 6, 6)
+FEW, STRIP = Factorisation().few, Factorisation().strip
 EXACT = {"float32": 2e-5, "float64": 1e-12}
 
 

@@ -14,9 +14,12 @@ from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, Slide
 from sim.linalg.multigrid import TwoLevel
 from sim.linalg.pcg import BlockJacobi, Preconditioner
-from sim.linalg.preconditioner import choose_preconditioner
+from sim.linalg.preconditioner import Preconditioning, choose_preconditioner
 from sim.material import Material
 from sim.runtime.device import Precision, find_device
+
+# Smoothed strains take two levels here, as on large meshes.
+SMALL = Preconditioning(largest_smoothed_factor=0)
 
 
 def body(kind: str, cells: tuple[int, int, int]) -> Anatomy:
@@ -29,7 +32,11 @@ def body(kind: str, cells: tuple[int, int, int]) -> Anatomy:
 
 
 def built(
-    kind: str, poisson: float, cells: tuple[int, int, int], precision: Precision = "float64"
+    kind: str,
+    poisson: float,
+    cells: tuple[int, int, int],
+    precision: Precision = "float64",
+    settings: Preconditioning = SMALL,
 ) -> tuple[Problem, Preconditioner]:
     anatomy, device = body(kind, cells), find_device("cpu", precision)
     effects = Elasticity(Material("linear", 3000.0, poisson)), Held(), Slide()
@@ -39,7 +46,7 @@ def built(
     def unsmoothed(step: float) -> sp.csc_array:
         return compile_problem(effects, anatomy, device, discretise(anatomy.mesh, "p1")).rest_curvature(step)
 
-    return problem, choose_preconditioner(problem, space, unsmoothed)
+    return problem, choose_preconditioner(problem, space, unsmoothed, settings=settings)
 
 
 def matrices(problem: Problem, preconditioner: Preconditioner) -> tuple[np.ndarray, np.ndarray]:
@@ -59,12 +66,6 @@ def spread(K: np.ndarray, M: np.ndarray) -> float:
     C = np.linalg.cholesky(K)
     values = np.linalg.eigvalsh(C.T @ M @ C)
     return float(values[-1] / values[0])
-
-
-@pytest.fixture(autouse=True)
-def smoothed_strains_take_two_levels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Here as on large meshes."""
-    monkeypatch.setattr("sim.linalg.preconditioner.LARGEST_SMOOTHED_FACTOR", 0)
 
 
 @pytest.mark.parametrize("poisson", [0.3, 0.49])

@@ -16,9 +16,8 @@ ACROSS = RANDOM.normal(size=(COUNT, BORDER))
 
 
 @pytest.mark.parametrize("block", [1, 5, 23, 100])
-def test_what_is_inverted_in_place_is_the_inverse(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(block_inverse, "BLOCK", block)
-    rows = block_inverse.halved(sp.csc_array(MATRIX), block_inverse.cuts_of(COUNT), "cpu")
+def test_what_is_inverted_in_place_is_the_inverse(block: int) -> None:
+    rows = block_inverse.halved(sp.csc_array(MATRIX), block_inverse.cuts_of(COUNT, block), "cpu")
     assert len(rows) == -(-COUNT // block)
     block_inverse.invert(rows)
     expected, first = -np.linalg.inv(MATRIX), 0
@@ -30,9 +29,8 @@ def test_what_is_inverted_in_place_is_the_inverse(block: int, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("block", [1, 5, 23, 100])
-def test_what_is_eliminated_is_the_solution_and_what_it_takes(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(block_inverse, "BLOCK", block)
-    solution, taken = block_inverse.eliminated(sp.csc_array(MATRIX), sp.csc_array(ACROSS), "cpu")
+def test_what_is_eliminated_is_the_solution_and_what_it_takes(block: int) -> None:
+    solution, taken = block_inverse.eliminated(sp.csc_array(MATRIX), sp.csc_array(ACROSS), "cpu", block)
     expected = np.linalg.solve(MATRIX, ACROSS)
     assert solution.dtype == np.float32
     np.testing.assert_allclose(solution, expected, atol=1e-6)
@@ -45,8 +43,5 @@ def test_what_is_not_positive_definite_is_refused() -> None:
         block_inverse.eliminated(matrix, sp.csc_array(ACROSS), "cpu")
 
 
-def test_a_device_is_asked_how_fast_it_multiplies(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(block_inverse, "TRIAL", 8)
-    block_inverse.rate.cache_clear()
-    assert block_inverse.rate("cpu") > 0.0
-    block_inverse.rate.cache_clear()
+def test_a_device_is_asked_how_fast_it_multiplies() -> None:
+    assert block_inverse.rate("cpu", trial=8) > 0.0

@@ -13,7 +13,7 @@ from sim.accuracy import TRAIN, Accuracy
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, ToolContact
 from sim.fem import Fem
-from sim.linalg.compliance import BLOCK, Compliance
+from sim.linalg.compliance import Columns, Compliance
 from sim.linalg.pcg import Preconditioner
 from sim.loads import Loads, Touching
 from sim.local_solvers.contact_descent import Proximal
@@ -110,7 +110,7 @@ def test_columns_are_what_the_preconditioner_does() -> None:
 def test_columns_are_the_same_bits_in_whatever_order_they_are_made() -> None:
     fem, descent = parts()
     nodes, preconditioner = descent.barrier.touchable, fem._ladder.preconditioner
-    assert len(nodes) > 3 * BLOCK
+    assert len(nodes) > 3 * Columns().block
     one, other = (Compliance(fem.problem, preconditioner, nodes) for _ in range(2))
     every, last = np.arange(len(nodes)), np.array([len(nodes) - 1])
     other.between(last)

@@ -13,13 +13,11 @@ import pyamg
 import scipy.sparse as sp
 
 from ..runtime.device import Device
-from .multigrid import Lifted, TwoLevel, regular
+from .multigrid import CHEBYSHEV, Chebyshev, Lifted, TwoLevel, regular
 from .pcg import Preconditioner
 
 Direct = Callable[[sp.csc_array, sp.csc_array, np.ndarray], Preconditioner]
 """Solves K over motions L (n, m) whose unknowns are numbered by node (m,), as `multifrontal.Factor` does."""
-# A level of so few nodes, of six unknowns each, is the last.
-LARGEST_LAST = 1_000
 # Every neighbour counts. Energy-minimising smoothing draws no random numbers: the same mesh gives the same levels.
 SETTING: dict[str, Any] = {
     "strength": ("symmetric", {"theta": 0.0}),
@@ -31,8 +29,17 @@ SETTING: dict[str, Any] = {
 }
 
 
-def algebraic(stiffness: sp.bsr_array, motions: np.ndarray, direct: Direct, device: Device) -> Preconditioner:
+def algebraic(
+    stiffness: sp.bsr_array,
+    motions: np.ndarray,
+    direct: Direct,
+    device: Device,
+    largest_last: int = 1_000,
+    smoother: Chebyshev = CHEBYSHEV,
+) -> Preconditioner:
     """One V-cycle on K (3N, 3N) [N/m], positive definite in blocks of nodes, with rigid motions (3N, 6).
+
+    A level of up to `largest_last` nodes, of six unknowns each, is the last.
 
     Raises
     ------
@@ -40,15 +47,15 @@ def algebraic(stiffness: sp.bsr_array, motions: np.ndarray, direct: Direct, devi
         K is singular over the last level's motions.
     """
     *fine, _ = pyamg.smoothed_aggregation_solver(
-        sp.bsr_matrix(stiffness), B=motions, max_coarse=LARGEST_LAST, **SETTING
+        sp.bsr_matrix(stiffness), B=motions, max_coarse=largest_last, **SETTING
     ).levels
     if not fine:
         return _direct(sp.csc_array(stiffness), sp.csc_array(sp.eye_array(len(motions))), 3, direct)
     *upper, lowest = fine
     coarse = _direct(sp.csc_array(lowest.A), sp.csc_array(lowest.P), lowest.P.blocksize[1], direct)
-    solver = TwoLevel(coarse, _blocks(lowest.A), device)
+    solver = TwoLevel(coarse, _blocks(lowest.A), device, smoother=smoother)
     for level in reversed(upper):
-        solver = TwoLevel(Lifted(sp.bsr_array(level.P), solver, device), _blocks(level.A), device)
+        solver = TwoLevel(Lifted(sp.bsr_array(level.P), solver, device), _blocks(level.A), device, smoother=smoother)
     solver.name = f"algebraic multigrid, {len(fine) + 1} levels"
     return solver
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -17,33 +18,53 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 
-# Unknowns of a block: rows of blocks stand beside the matrix while it is exchanged.
-BLOCK, BESIDE = 4096, 3
-# Side of the product that says how fast a device multiplies, after one that wakes it.
-TRIAL = 4096
-# An exchange may take this share of the free memory, and so many seconds.
-SHARE, LONGEST = 0.9, 40.0
+# Rows of blocks that stand beside the matrix while it is exchanged.
+BESIDE = 3
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """How large the blocks of an exchange are, and what it may take.
+
+    Parameters
+    ----------
+    block
+        Unknowns of a block: rows of blocks stand beside the matrix.
+    share
+        Of the free memory.
+    longest
+        [s] that it may take.
+    trial
+        Side of the product that tells how fast a device multiplies.
+    """
+
+    block: int = 4096
+    share: float = 0.9
+    longest: float = 40.0
+    trial: int = 4096
 
 
 @cache
-def rate(where: str) -> float:
-    """Multiplications and additions a second in double precision, measured."""
-    one = torch.ones((TRIAL, TRIAL), dtype=torch.float64, device=where)
+def rate(where: str, trial: int = Exchange.trial) -> float:
+    """Multiplications and additions a second in double precision, measured by a second product of side `trial`."""
+    one = torch.ones((trial, trial), dtype=torch.float64, device=where)
     spent = 0.0
     for _ in range(2):
         begun = time.perf_counter()
         float((one @ one)[0, 0])  # waits for it
         spent = time.perf_counter() - begun
-    return TRIAL**3 / spent
+    return trial**3 / spent
 
 
-def fits(count: int, where: str, besides: int = 0) -> bool:
+def fits(count: int, where: str, besides: int = 0, settings: Exchange = Exchange()) -> bool:
     """Whether a card can exchange so many unknowns, beside so many bytes, in its free memory and in time."""
     if not torch.cuda.is_available():
         return False
     free, _ = torch.cuda.mem_get_info(where)
-    taken = 8 * (count * (count + BLOCK) // 2 + BESIDE * min(count, BLOCK) * count)
-    return taken + besides < SHARE * free and count**3 / 2 < LONGEST * rate(where)
+    taken = 8 * (count * (count + settings.block) // 2 + BESIDE * min(count, settings.block) * count)
+    if taken + besides >= settings.share * free:
+        return False
+    return count**3 / 2 < settings.longest * rate(where, settings.trial)
 
 
 def halved(matrix: sp.csc_array, cuts: Sequence[int], where: str) -> list[torch.Tensor]:
@@ -83,12 +104,14 @@ def invert(rows: Sequence[torch.Tensor]) -> None:
         rows[k][:, own] = -inverse
 
 
-def cuts_of(count: int) -> list[int]:
+def cuts_of(count: int, block: int = Exchange.block) -> list[int]:
     """Where the blocks of so many unknowns begin and end."""
-    return [*range(0, count, BLOCK), count]
+    return [*range(0, count, block), count]
 
 
-def eliminated(matrix: sp.csc_array, border: sp.csc_array, where: str) -> tuple[np.ndarray, np.ndarray]:
+def eliminated(
+    matrix: sp.csc_array, border: sp.csc_array, where: str, block: int = Exchange.block
+) -> tuple[np.ndarray, np.ndarray]:
     """X = A^-1 B (n, m) in single precision and B^T X (m, m), of sparse A (n, n) and B (n, m).
 
     Raises
@@ -96,7 +119,7 @@ def eliminated(matrix: sp.csc_array, border: sp.csc_array, where: str) -> tuple[
     RuntimeError
         A is not positive definite.
     """
-    cuts = cuts_of(len(matrix.indptr) - 1)
+    cuts = cuts_of(len(matrix.indptr) - 1, block)
     stop = cuts[-1] + len(border.indptr) - 1
     whole = sp.csc_array(sp.block_array([[matrix, border], [border.T, None]]))
     *rows, last = halved(whole, [*cuts, stop], where)

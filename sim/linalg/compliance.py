@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -9,10 +10,23 @@ import numpy as np
 from ..discretisation.problem import Problem
 from .pcg import Preconditioner
 
-# Nodes whose columns are made together, always by the same arithmetic: what is kept decides on time, never on numbers.
-BLOCK = 16
-# Bytes of columns that are kept at most, or a few blocks.
-MOST_BYTES, FEWEST_BLOCKS = 2**28, 8
+
+@dataclass(frozen=True)
+class Columns:
+    """Which columns of a compliance are made together, and how many are kept.
+
+    Parameters
+    ----------
+    block
+        Nodes whose columns are made together, always by the same arithmetic: what is kept decides on time, never on
+        numbers.
+    most_bytes, fewest_blocks
+        Bytes of columns that are kept at most, or so many blocks where these take more.
+    """
+
+    block: int = 16
+    most_bytes: int = 2**28
+    fewest_blocks: int = 8
 
 
 class Compliance:
@@ -26,13 +40,18 @@ class Compliance:
         Of the problem, alike at every state.
     nodes
         (n,) node numbers.
+    columns
+        How they are made and kept.
     """
 
-    def __init__(self, problem: Problem, preconditioner: Preconditioner, nodes: np.ndarray):
+    def __init__(
+        self, problem: Problem, preconditioner: Preconditioner, nodes: np.ndarray, columns: Columns = Columns()
+    ):
         self._problem, self._preconditioner, self._nodes = problem, preconditioner, nodes
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
-        size = 3 * BLOCK * problem.rows * np.dtype(problem.device.precision).itemsize
-        self._block = lru_cache(max(FEWEST_BLOCKS, MOST_BYTES // size))(self._columns)
+        self._size = columns.block
+        size = 3 * self._size * problem.rows * np.dtype(problem.device.precision).itemsize
+        self._block = lru_cache(max(columns.fewest_blocks, columns.most_bytes // size))(self._columns)
 
     def answered(self, force: np.ndarray) -> np.ndarray:
         """H force: motions (3N, b) [m] under forces (3N, b) [N]."""
@@ -47,27 +66,28 @@ class Compliance:
         """Motion (3N,) [m] of all nodes under a force (3n,) [N] on these n."""
         out = np.zeros(self._problem.rows, self._problem.device.precision)
         for node, own in _acting(force):
-            out += own.astype(out.dtype) @ self._block(node // BLOCK)[0][node % BLOCK]
+            out += own.astype(out.dtype) @ self._block(node // self._size)[0][node % self._size]
         return out
 
     def moved(self, force: np.ndarray) -> np.ndarray:
         """Motion (3n,) [m] of these n nodes alone."""
         out = np.zeros(len(force))
         for node, own in _acting(force):
-            out += own @ self._block(node // BLOCK)[1][node % BLOCK]
+            out += own @ self._block(node // self._size)[1][node % self._size]
         return out
 
     def between(self, some: np.ndarray) -> np.ndarray:
         """H (3a, 3a) [m/N] between `some` (a,) of the n nodes."""
         rows = (3 * some[:, None] + np.arange(3)).ravel()
-        return np.concatenate([self._block(node // BLOCK)[1][node % BLOCK][:, rows] for node in some.tolist()])
+        places = (divmod(node, self._size) for node in some.tolist())
+        return np.concatenate([self._block(block)[1][place][:, rows] for block, place in places])
 
     def _columns(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of a block's nodes, (BLOCK, 3, 3N), and at the n nodes in double precision (BLOCK, 3, 3n)."""
-        rows = self.rows[3 * BLOCK * number : 3 * BLOCK * (number + 1)]
-        unit = np.zeros((self._problem.rows, 3 * BLOCK))
+        """Of a block's k nodes, (k, 3, 3N), and at the n nodes in double precision (k, 3, 3n)."""
+        rows = self.rows[3 * self._size * number : 3 * self._size * (number + 1)]
+        unit = np.zeros((self._problem.rows, 3 * self._size))
         unit[rows, np.arange(len(rows))] = 1.0
-        whole = np.ascontiguousarray(self.answered(unit).T).reshape(BLOCK, 3, -1)
+        whole = np.ascontiguousarray(self.answered(unit).T).reshape(self._size, 3, -1)
         return whole, whole[:, :, self.rows].astype(np.float64)
 
 

@@ -21,20 +21,36 @@ from ..accuracy import Precision
 from ..discretisation.problem import Problem
 from ..runtime.device import Device
 from ..runtime.threads import cores, one_thread, together
-from .symbolic import Front, fronts_of
+from .symbolic import FRONT_SIZES, Front, FrontSizes, fronts_of
 from .triangular_solve import Sweep, add_lower
 
 potrf, trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 syrk, trsm = get_blas_funcs(("syrk", "trsm"), dtype=np.float64)
 
-# Up to so many right-hand sides, sweeps one by one are faster than products of matrices.
-FEW = 3
-# Right-hand sides that stay in a core's cache while they are swept.
-STRIP = 128
 # Border unknowns and their lower half of a matrix (m, m), for each front that these wait for.
 Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
-# A pivot that has lost so many digits is zero: the last ones are round-off.
-SINGULAR = 1e-13
+
+
+@dataclass(frozen=True)
+class Factorisation:
+    """How a factor is made and swept.
+
+    Parameters
+    ----------
+    few
+        Right-hand sides up to which sweeps one by one are faster than products of matrices.
+    strip
+        Right-hand sides that stay in a core's cache while they are swept.
+    singular
+        A pivot that has shrunk to this share of its diagonal is zero: the last digits are round-off.
+    fronts
+        What is eliminated together.
+    """
+
+    few: int = 3
+    strip: int = 128
+    singular: float = 1e-13
+    fronts: FrontSizes = FRONT_SIZES
 
 
 class Factor:
@@ -51,6 +67,8 @@ class Factor:
     precision
         In which the factor is kept; what it does is symmetric and positive definite in both. Single precision has half
         the bytes to read.
+    settings
+        How it is made and swept.
 
     Raises
     ------
@@ -67,14 +85,15 @@ class Factor:
         node: np.ndarray,
         device: Device,
         precision: Precision = "float32",
+        settings: Factorisation = Factorisation(),
     ):
         free = sp.csc_array(motions.T @ stiffness @ motions)
-        order, fronts = fronts_of(free, node, cores(len(node)))
+        order, fronts = fronts_of(free, node, cores(len(node)), settings.fronts)
         motions = sp.csc_array(motions[:, order].astype(device.precision))
         self._motions, self._transposed = sp.csr_array(motions), sp.csr_array(motions.T)
-        self._precision = precision
+        self._precision, self._settings = precision, settings
         with one_thread():
-            values, self._panels = panels_of(sp.csc_array(free[order][:, order]), fronts, precision)
+            values, self._panels = panels_of(sp.csc_array(free[order][:, order]), fronts, precision, settings.singular)
         self._sweep = Sweep(fronts, values, precision)
 
     def prepare(self, problem: Problem, columns: int) -> None:
@@ -105,21 +124,21 @@ class Factor:
             if reached[panel.front.first : panel.front.stop].any():
                 reached[panel.front.border] = True
                 panels.append(panel)
-        out = np.empty((len(rows), len(rows)), self._precision)
+        out, size = np.empty((len(rows), len(rows)), self._precision), self._settings.strip
 
         def fill(firsts: range) -> None:
             for first in firsts:
-                strip = slice(first, first + STRIP)
+                strip = slice(first, first + size)
                 x = unit[:, strip].toarray(order="C").astype(self._precision)
                 out[:, strip] = chosen @ _swept(panels, x)
 
         share = cores(len(rows))
         with one_thread():
-            together([partial(fill, range(STRIP * k, len(rows), STRIP * share)) for k in range(share)])
+            together([partial(fill, range(size * k, len(rows), size * share)) for k in range(share)])
         return out
 
     def _solved(self, x: np.ndarray) -> np.ndarray:
-        if x.shape[1] <= FEW:
+        if x.shape[1] <= self._settings.few:
             return self._sweep.solved(x)
         # Threads of BLAS wait for one another at every front, ages where something else runs on their cores.
         with one_thread():
@@ -165,7 +184,7 @@ def _swept(panels: Sequence[Panel], x: np.ndarray) -> np.ndarray:
 
 
 def panels_of(
-    matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision
+    matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision, singular: float
 ) -> tuple[np.ndarray, list[Panel]]:
     """The values of all panels, one after the other in one array; and the panels.
 
@@ -184,7 +203,7 @@ def panels_of(
         for front, shape, (first, stop) in zip(every, shapes, pairwise(cuts), strict=True)
     ]
     ends = np.cumsum([0, *(len(part) for part in fronts)]).tolist()
-    work = _Fronts(matrix, panels)
+    work = _Fronts(matrix, panels, singular)
     lower = [partial(work.eliminate, range(first, stop)) for first, stop in pairwise(ends[:-1])]
     left: list[Updates] = [{} for _ in lower]
     together([partial(task, updates) for task, updates in zip(lower, left, strict=True)])
@@ -199,8 +218,9 @@ def panels_of(
 class _Fronts:
     """Fronts of a sparse matrix, one after the other; those of different parts may be eliminated at the same time."""
 
-    def __init__(self, matrix: sp.csc_array, panels: Sequence[Panel]):
-        self._matrix, self._diagonal, self._panels = matrix, matrix.diagonal(), panels
+    def __init__(self, matrix: sp.csc_array, panels: Sequence[Panel], singular: float):
+        self._matrix, self._panels = matrix, panels
+        self._least = singular * matrix.diagonal()
         sizes = [len(panel.values) for panel in panels]
         self._owner = np.repeat(np.arange(len(panels)), sizes)
 
@@ -213,7 +233,7 @@ class _Fronts:
             for border, update in updates.pop(number, ()):
                 add_lower(update, np.searchsorted(front.rows, border), whole)
             root, info = potrf(whole[:size, :size], lower=1)
-            if info or (np.diagonal(root) ** 2 <= SINGULAR * self._diagonal[front.first : front.stop]).any():
+            if info or (np.diagonal(root) ** 2 <= self._least[front.first : front.stop]).any():
                 raise RuntimeError("it is not positive definite")
             panel.values[:, :size] = trtri(root, lower=1)[0].T
             if len(front.border):

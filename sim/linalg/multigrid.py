@@ -6,6 +6,7 @@ Algebra Appl. 22:664-680. The smoother is Chebyshev's polynomial of block Jacobi
 188:593-610. A coarse solver may have two levels itself (`sim/linalg/amg.py`).
 """
 
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -19,12 +20,31 @@ from ..runtime.device import Device, forward_kernel
 from .block_sparse import Sparse
 from .pcg import Preconditioner
 
-DEGREE = 3
-# The smoother damps eigenvalues from the largest down to this share of it; the coarse solver has the rest.
-DAMPED = 1.0 / 8.0
-POWER_ITERATIONS = 20
-# The power iteration comes from below.
-MARGIN = 1.1
+
+@dataclass(frozen=True)
+class Chebyshev:
+    """The smoother of a level.
+
+    Parameters
+    ----------
+    degree
+        Of the polynomial: products with the stiffness before the coarse solver, and as many after it.
+    damped
+        It damps eigenvalues from the largest down to this share of it; the coarse solver has the rest.
+    power_iterations
+        Products from which the largest eigenvalue is estimated, once.
+    margin
+        Times that estimate, which comes from below.
+    """
+
+    degree: int = 3
+    damped: float = 1.0 / 8.0
+    power_iterations: int = 20
+    margin: float = 1.1
+
+
+CHEBYSHEV = Chebyshev()
+"""The smoother of every level unless another is given."""
 
 
 @cache
@@ -70,18 +90,27 @@ class TwoLevel:
         Where its arrays live.
     name
         What a person calls it.
+    smoother
+        Of this level.
     """
 
     on_device = False  # a cycle makes its arrays as it goes: no captured graph may replay it
 
-    def __init__(self, coarse: Preconditioner, stiffness: sp.bsr_array, device: Device, name: str = "two levels"):
-        self.name = name
+    def __init__(
+        self,
+        coarse: Preconditioner,
+        stiffness: sp.bsr_array,
+        device: Device,
+        name: str = "two levels",
+        smoother: Chebyshev = CHEBYSHEV,
+    ):
+        self.name, self._smoother = name, smoother
         self._coarse, self._device = coarse, device
         self._stiffness = Sparse(stiffness, device)
         self._size = stiffness.blocksize[0]
         inverse = np.linalg.inv(_diagonal(stiffness))
         self._inverse = device.array(inverse, wp.types.matrix((self._size, self._size), device.scalar))
-        self._largest = MARGIN * self._power()
+        self._largest = smoother.margin * self._power()
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """The rest stiffness serves every state."""
@@ -105,12 +134,12 @@ class TwoLevel:
 
     def _smooth(self, x: wp.array, r: wp.array) -> None:
         """Add to x the polynomial of its residual r, which is overwritten. Saad 2003, algorithm 12.1."""
-        low = DAMPED * self._largest
+        low = self._smoother.damped * self._largest
         centre, radius = (self._largest + low) / 2.0, (self._largest - low) / 2.0
         ratio = radius / centre
         d = self._device.zeros(*r.shape)
         self._step(0.0, 1.0 / centre, r, d, x)
-        for _ in range(DEGREE - 1):
+        for _ in range(self._smoother.degree - 1):
             self._stiffness.add_to(r, -1.0, d)
             following = 1.0 / (2.0 * centre / radius - ratio)
             self._step(following * ratio, 2.0 * following / radius, r, d, x)
@@ -131,7 +160,7 @@ class TwoLevel:
         device = self._device
         x = device.array(np.random.default_rng(0).normal(size=(self._stiffness.rows, 1)))
         largest = 1.0
-        for _ in range(POWER_ITERATIONS):
+        for _ in range(self._smoother.power_iterations):
             new, sum_ = device.zeros(*x.shape), device.zeros(*x.shape)
             self._step(0.0, 1.0, self._stiffness.times(x), new, sum_)
             size = float(np.sqrt(dots(device, new, new)[0]))

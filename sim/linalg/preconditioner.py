@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -16,14 +17,31 @@ from ..discretisation.space import Discretisation
 from ..errors import InputError
 from ..runtime.device import Device
 from .multifrontal import Factor, node_of
-from .multigrid import Lifted, TwoLevel, over_free
+from .multigrid import CHEBYSHEV, Chebyshev, Lifted, TwoLevel, over_free
 from .pcg import BlockJacobi, Preconditioner
 
-# On the CPU, above this many unknowns levels cost less than a factor. Of 17,000 nodes, levels against factor: 6.8 and
-# 7.1 s to set up, 16 and 11 ms to apply to one column, 51 and 83 ms to eight. CUDA inverts what fits.
-LARGEST_FACTOR = 50_000
-# Smoothed strains link the neighbours of neighbours: their own factor pays up to this many unknowns.
-LARGEST_SMOOTHED_FACTOR = 40_000
+
+@dataclass(frozen=True)
+class Preconditioning:
+    """Up to which sizes each kind of preconditioner pays, and what the levels do.
+
+    Parameters
+    ----------
+    largest_factor
+        Unknowns above which levels cost less than a factor on the CPU. Of 17,000 nodes, levels against factor: 6.8 and
+        7.1 s to set up, 16 and 11 ms to apply to one column, 51 and 83 ms to eight. CUDA inverts what fits.
+    largest_smoothed_factor
+        The same of smoothed strains, which link the neighbours of neighbours: their own factor has more entries.
+    largest_last
+        Nodes, of six unknowns each, that the last level of algebraic multigrid may have; it is factorised.
+    smoother
+        Of every level.
+    """
+
+    largest_factor: int = 50_000
+    largest_smoothed_factor: int = 40_000
+    largest_last: int = 1_000
+    smoother: Chebyshev = CHEBYSHEV
 
 
 def choose_preconditioner(
@@ -31,6 +49,7 @@ def choose_preconditioner(
     space: Discretisation,
     unsmoothed: Callable[[float], sp.csc_array],
     step: float = math.inf,
+    settings: Preconditioning = Preconditioning(),
 ) -> Preconditioner:
     """The rest stiffness, inverted (CUDA) or factorised where that pays; two levels where it has too many entries.
 
@@ -49,17 +68,18 @@ def choose_preconditioner(
     try:
         if space.element == "p2":
             stiffness = problem.rest_curvature(step)
-            if device.on_cuda and _direct_pays(len(constraint.basis().indptr) - 1, device):
-                return _solver(stiffness, constraint, space.nodes, device)
-            lifted = _on_corners(stiffness, space, constraint, device)
+            if device.on_cuda and _inverts(len(constraint.basis().indptr) - 1, device):
+                return _solver(stiffness, constraint, space.nodes, device, settings)
+            lifted = _on_corners(stiffness, space, constraint, device, settings)
             name = f"p-multigrid on {name_of(lifted.coarse)}"
-            return TwoLevel(lifted, over_free(stiffness, constraint), device, name)
-        if space.element == "smoothed" and problem.rows > LARGEST_SMOOTHED_FACTOR:
+            return TwoLevel(lifted, over_free(stiffness, constraint), device, name, settings.smoother)
+        if space.element == "smoothed" and problem.rows > settings.largest_smoothed_factor:
             # An average resists less than what is averaged, so that the coarse solver never overshoots.
-            coarse = _solver(unsmoothed(step), constraint, space.nodes, device)
+            coarse = _solver(unsmoothed(step), constraint, space.nodes, device, settings)
             name = f"two levels on {name_of(coarse)}"
-            return TwoLevel(coarse, over_free(problem.rest_curvature(step), constraint), device, name)
-        return _solver(problem.rest_curvature(step), constraint, space.nodes, device)
+            fine = over_free(problem.rest_curvature(step), constraint)
+            return TwoLevel(coarse, fine, device, name, settings.smoother)
+        return _solver(problem.rest_curvature(step), constraint, space.nodes, device, settings)
     except RuntimeError as error:
         raise InputError(f"the stiffness at rest cannot be factorised ({error}): is every part held?") from error
 
@@ -95,29 +115,34 @@ def rest_solver(problem: Problem) -> Preconditioner:
     return direct(problem.rest_curvature(), basis, node_of(basis), device, device.precision)
 
 
-def _on_corners(stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device) -> Lifted:
+def _on_corners(
+    stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device, settings: Preconditioning
+) -> Lifted:
     """What linear tetrahedra on the same corners can do, as far as it is free."""
     corner, free = np.unique(space.table[:, :4]), constraint.basis()
     every = sp.csc_array(free @ (free.T @ sp.kron(space.corner_interpolation, sp.eye_array(3))))
     own = Constraint(constraint.held[corner], constraint.normal[corner], device)
-    coarse = _solver(sp.csc_array(every.T @ stiffness @ every), own, space.nodes[corner], device)
+    coarse = _solver(sp.csc_array(every.T @ stiffness @ every), own, space.nodes[corner], device, settings)
     return Lifted(sp.bsr_array(sp.csr_array(every), blocksize=(3, 3)), coarse, device)
 
 
-def _solver(stiffness: sp.csc_array, constraint: Constraint, points: np.ndarray, device: Device) -> Preconditioner:
+def _solver(
+    stiffness: sp.csc_array, constraint: Constraint, points: np.ndarray, device: Device, settings: Preconditioning
+) -> Preconditioner:
     """K (3N, 3N) over what is free of nodes at points (N, 3): inverted or factorised where that pays."""
     basis = constraint.basis()
-    if _direct_pays(len(basis.indptr) - 1, device):
+    count = len(basis.indptr) - 1
+    if _inverts(count, device) if device.on_cuda else count <= settings.largest_factor:
         return direct(stiffness, basis, node_of(basis), device)
     from .amg import algebraic, rigid_motions
 
     motions = basis @ (basis.T @ rigid_motions(points))
-    return algebraic(over_free(stiffness, constraint), motions, partial(direct, device=device), device)
+    blocks, coarse = over_free(stiffness, constraint), partial(direct, device=device)
+    return algebraic(blocks, motions, coarse, device, settings.largest_last, settings.smoother)
 
 
-def _direct_pays(count: int, device: Device) -> bool:
-    if not device.on_cuda:
-        return count <= LARGEST_FACTOR
+def _inverts(count: int, device: Device) -> bool:
+    """Whether a card inverts so many unknowns."""
     from .dense_inverse import fits
 
     return fits(count, device)
@@ -135,7 +160,7 @@ def direct(
     RuntimeError
         It is singular.
     """
-    if device.on_cuda and _direct_pays(len(node), device):
+    if device.on_cuda and _inverts(len(node), device):
         from .dense_inverse import Dense
 
         return Dense(stiffness, motions, device)

@@ -14,12 +14,6 @@ from ..runtime.columns import norms
 from .pcg import Preconditioner, conjugate_gradients
 from .preconditioner import is_exact, rest_solver
 
-# Relative residual of the linear solves.
-TOLERANCE = 1e-9
-# Up to so many unknowns the solves are worth a factor of their own on the CPU. Of 17,000 smoothed nodes it takes 12 s,
-# and a solve 10 ms instead of 295 by two levels.
-LARGEST_FACTOR = 60_000
-
 
 @dataclass(frozen=True, eq=False)
 class Resting:
@@ -33,16 +27,23 @@ class Resting:
         Of the problem: for conjugate gradients, where no inverse is had.
     inner
         Most iterations of these.
+    tolerance
+        Relative residual of the linear solves.
+    largest_factor
+        Unknowns up to which the solves are worth a factor of their own on the CPU. Of 17,000 smoothed nodes it takes
+        12 s, and a solve 10 ms instead of 295 by two levels.
     """
 
     problem: Problem
     preconditioner: Preconditioner
     inner: int
+    tolerance: float = 1e-9
+    largest_factor: int = 60_000
 
     @cached_property
     def exact(self) -> Preconditioner | None:
         """The inverse of the rest stiffness in the solver's own precision, where one is had or pays for many solves."""
-        pays = not self.problem.device.on_cuda and self.problem.rows <= LARGEST_FACTOR
+        pays = not self.problem.device.on_cuda and self.problem.rows <= self.largest_factor
         return rest_solver(self.problem) if pays or is_exact(self.preconditioner) else None
 
     def answer(self, force: wp.array) -> wp.array:
@@ -61,11 +62,11 @@ class Resting:
             return out
         problem.linearise(problem.device.zeros(*force.shape), np.zeros(columns, bool))
         self.preconditioner.prepare(problem, columns)
-        wanted = TOLERANCE * norms(problem.device, force)
+        wanted = self.tolerance * norms(problem.device, force)
         found = conjugate_gradients(problem, self.preconditioner, force, wanted, self.inner)
         if (norms(problem.device, force) > 10.0 * wanted).any():
             raise InputError(
-                f"a linear solve of the series did not reach {TOLERANCE:g} in {self.inner} iterations: ask for an "
+                f"a linear solve of the series did not reach {self.tolerance:g} in {self.inner} iterations: ask for an "
                 "Accuracy of more `inner` ones."
             )
         return found.x

@@ -16,10 +16,21 @@ from ..runtime.device import Device
 from .multifrontal import node_of
 from .preconditioner import direct
 
-# Entries beside this share of the largest are what subtraction leaves of zero.
-ROUND_OFF = 1e-9
-# Columns that are solved for together: bounds the memory that it takes.
-STRIP = 256
+
+@dataclass(frozen=True)
+class Condensing:
+    """How a part is told from the rest of a body, and how the rest is solved for.
+
+    Parameters
+    ----------
+    round_off
+        Entries up to this share of the largest are what subtraction leaves of zero.
+    strip
+        Columns that are solved for together: bounds the memory that it takes.
+    """
+
+    round_off: float = 1e-9
+    strip: int = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +46,9 @@ class Condensation:
     follow: np.ndarray
 
 
-def condensed(problem: Problem, nodes: np.ndarray, own: sp.csc_array) -> Condensation:
+def condensed(
+    problem: Problem, nodes: np.ndarray, own: sp.csc_array, settings: Condensing = Condensing()
+) -> Condensation:
     """The rest of a body beside the part of `nodes` (n,), whose own elements have the stiffness `own` (3n, 3n) at rest.
 
     Raises
@@ -46,16 +59,16 @@ def condensed(problem: Problem, nodes: np.ndarray, own: sp.csc_array) -> Condens
     part = (3 * nodes[:, None] + np.arange(3)).ravel()
     whole, basis = sp.csr_array(problem.rest_curvature()), problem.constraint.basis()
     beyond = sp.csr_array(whole[part][:, part] - own)
-    rows = np.flatnonzero(abs(beyond).max(axis=1).toarray().ravel() > ROUND_OFF * abs(whole).max())
+    rows = np.flatnonzero(abs(beyond).max(axis=1).toarray().ravel() > settings.round_off * abs(whole).max())
     stiffness = beyond[rows][:, rows].toarray()
     far = sp.csc_array(basis[:, ~np.isin(node_of(basis), nodes)])
-    follow, taken = _followed(whole, far, sp.csc_array(whole[part[rows]].T), problem.device)
+    follow, taken = _followed(whole, far, sp.csc_array(whole[part[rows]].T), problem.device, settings.strip)
     stiffness -= taken
     return Condensation(rows, (stiffness + stiffness.T) / 2, follow)
 
 
 def _followed(
-    whole: sp.csr_array, far: sp.csc_array, coupling: sp.csc_array, device: Device
+    whole: sp.csr_array, far: sp.csc_array, coupling: sp.csc_array, device: Device, strip: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """-L (L^T K L)^-1 L^T B (3N, m) and what it takes from the stiffness (m, m), of motions L and a coupling B (3N, m).
 
@@ -74,11 +87,11 @@ def _followed(
     solver = direct(sp.csc_array(whole), far, node_of(far), fine, "float64")
     count = len(coupling.indptr) - 1
     follow, taken = np.zeros((len(whole.indptr) - 1, count), device.precision), np.zeros((count, count))
-    for first in range(0, count, STRIP):
-        some = coupling[:, first : first + STRIP].toarray()
+    for first in range(0, count, strip):
+        some = coupling[:, first : first + strip].toarray()
         out = fine.zeros(*some.shape)
         solver.apply(fine.array(some), np.ones(some.shape[1], bool), out)
         moved = out.numpy()
-        follow[:, first : first + STRIP] = -moved
-        taken[:, first : first + STRIP] = coupling.T @ moved
+        follow[:, first : first + strip] = -moved
+        taken[:, first : first + strip] = coupling.T @ moved
     return follow, taken

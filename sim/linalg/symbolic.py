@@ -12,12 +12,28 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse import csgraph
 
-# Whole subtrees of at most so many unknowns are one front.
-LEAF = 64
-# Two fronts are joined while that stores at most so many zeros: another dense product costs as much.
-ZEROS = 1000
-# Parts are not divided further once so many fronts are above them.
-MOST_ABOVE = 30
+
+@dataclass(frozen=True)
+class FrontSizes:
+    """How large fronts are, and how far the work is divided.
+
+    Parameters
+    ----------
+    leaf
+        Whole subtrees of at most so many unknowns are one front.
+    zeros
+        Two fronts are joined while that stores at most so many zeros: another dense product costs as much.
+    most_above
+        Parts are not divided further once so many fronts are above them.
+    """
+
+    leaf: int = 64
+    zeros: int = 1000
+    most_above: int = 30
+
+
+FRONT_SIZES = FrontSizes()
+"""Fronts as a factor has them unless others are given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +50,9 @@ class Front:
         return np.concatenate([np.arange(self.first, self.stop), self.border])
 
 
-def fronts_of(matrix: sp.csc_array, node: np.ndarray, parts: int = 1) -> tuple[np.ndarray, list[list[Front]]]:
+def fronts_of(
+    matrix: sp.csc_array, node: np.ndarray, parts: int = 1, settings: FrontSizes = FRONT_SIZES
+) -> tuple[np.ndarray, list[list[Front]]]:
     """An order (n,) of a matrix's unknowns with little fill, and its fronts; every front comes before those it touches.
 
     `node` (n,): unknowns of one node stay together. The fronts come in so many parts that do not touch one another, of
@@ -46,9 +64,9 @@ def fronts_of(matrix: sp.csc_array, node: np.ndarray, parts: int = 1) -> tuple[n
     across = first != second
     links = np.ones(int(across.sum()), np.int8), (first[across], second[across])
     graph = sp.csr_array(sp.coo_array(links, shape=(len(number),) * 2))
-    order = dissection(graph)
-    groups = _groups(sp.csr_array(graph[order][:, order]), weight[order])
-    divided = _divided(groups, weight[order], parts)
+    order = dissection(graph, settings.leaf)
+    groups = _groups(sp.csr_array(graph[order][:, order]), weight[order], settings)
+    divided = _divided(groups, weight[order], parts, settings.most_above)
     inner = np.concatenate([np.zeros(0, int), *(groups[number][0] for part in divided for number in part)])
     order, place = order[inner], np.argsort(inner)
     weight = weight[order]
@@ -66,11 +84,11 @@ def fronts_of(matrix: sp.csc_array, node: np.ndarray, parts: int = 1) -> tuple[n
     return np.argsort(np.argsort(order)[member], kind="stable"), fronts
 
 
-def dissection(graph: sp.csr_array) -> np.ndarray:
+def dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf) -> np.ndarray:
     """An order (N,) of a symmetric graph's nodes with little fill: nested dissection.
 
-    By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. Without pymetis by levels, with more fill: George,
-    Liu 1978, SIAM J. Numer. Anal. 15:1053-1069.
+    By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. Without pymetis by levels, down to some unknowns a
+    `leaf`, with more fill: George, Liu 1978, SIAM J. Numer. Anal. 15:1053-1069.
     """
     count = len(graph.indptr) - 1
     if count == 0:  # METIS divides by it
@@ -78,24 +96,24 @@ def dissection(graph: sp.csr_array) -> np.ndarray:
     try:
         import pymetis
     except ImportError:
-        return dissection_by_levels(graph, np.arange(count))
+        return dissection_by_levels(graph, np.arange(count), leaf)
     order, _ = pymetis.nested_dissection(pymetis.CSRAdjacency(np.ravel(graph.indptr), np.ravel(graph.indices)))
     return np.asarray(order)
 
 
-def dissection_by_levels(graph: sp.csr_array, nodes: np.ndarray) -> np.ndarray:
+def dissection_by_levels(graph: sp.csr_array, nodes: np.ndarray, leaf: int) -> np.ndarray:
     """The same nodes (k,), the middle level between two far ends last; both sides likewise."""
-    if 3 * len(nodes) <= LEAF:
+    if 3 * len(nodes) <= leaf:
         return nodes
     inside = graph[nodes][:, nodes]
     count, part = csgraph.connected_components(inside, directed=False)
     if count > 1:
-        return np.concatenate([dissection_by_levels(graph, nodes[part == number]) for number in range(count)])
+        return np.concatenate([dissection_by_levels(graph, nodes[part == number], leaf) for number in range(count)])
     end = csgraph.breadth_first_order(inside, 0, return_predecessors=False)[-1]
     level = csgraph.dijkstra(inside, indices=end, unweighted=True)
     middle = np.median(level)
     sides = [nodes[level < middle], nodes[level > middle]]
-    return np.concatenate([*(dissection_by_levels(graph, side) for side in sides), nodes[level == middle]])
+    return np.concatenate([*(dissection_by_levels(graph, side, leaf) for side in sides), nodes[level == middle]])
 
 
 def _spread(start: np.ndarray, count: np.ndarray) -> np.ndarray:
@@ -118,7 +136,7 @@ def _parents(graph: sp.csr_array) -> list[int]:
     return parent
 
 
-def _groups(graph: sp.csr_array, weight: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _groups(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> list[tuple[np.ndarray, np.ndarray]]:
     """Nodes that are eliminated together, and the later nodes that these couple, group by group.
 
     graph (N, N) in its order; weight (N,) unknowns a node.
@@ -129,7 +147,7 @@ def _groups(graph: sp.csr_array, weight: np.ndarray) -> list[tuple[np.ndarray, n
         if above != -1:
             below[above] += below[node]
     for node in reversed(range(count)):
-        if parent[node] != -1 and below[parent[node]] <= LEAF:
+        if parent[node] != -1 and below[parent[node]] <= settings.leaf:
             top[node] = top[parent[node]]
     members: dict[int, list[int]] = {}
     for node in range(count):
@@ -156,7 +174,7 @@ def _groups(graph: sp.csr_array, weight: np.ndarray) -> list[tuple[np.ndarray, n
         k, m = int(weight[own].sum()), size(border)
         for child in children[last]:
             inner, _, j, n = groups[child]
-            if entries(j + k, m) <= entries(k, m) + entries(j, n) + ZEROS:
+            if entries(j + k, m) <= entries(k, m) + entries(j, n) + settings.zeros:
                 own, k = inner + own, k + j
                 del groups[child]
         groups[last] = own, border, k, m
@@ -165,7 +183,9 @@ def _groups(graph: sp.csr_array, weight: np.ndarray) -> list[tuple[np.ndarray, n
     return [(np.array(own), _nodes(border, count)) for own, border, _, _ in groups.values()]
 
 
-def _divided(groups: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, parts: int) -> list[list[int]]:
+def _divided(
+    groups: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, parts: int, most_above: int
+) -> list[list[int]]:
     """Whole subtrees of groups in so many parts, and in a last one what is above them; each in its order.
 
     The heaviest subtree is opened, its top left to the last part, as long as that shortens the whole: the last part and
@@ -185,7 +205,7 @@ def _divided(groups: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, pa
         else:
             trees.append(number)
     shortest, best, top = np.inf, [], []
-    while trees and len(top) <= MOST_ABOVE:
+    while trees and len(top) <= most_above:
         trees.sort(key=lambda number: whole[number], reverse=True)
         shares: list[list[int]] = [[] for _ in range(parts)]
         loads = [0.0] * parts
