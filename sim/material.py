@@ -366,4 +366,8 @@ MATERIALS = {
         "mu 842 Pa, alpha -4.7, g 0.45 and 0.365, tau 0.5 and 50 s: Miller, Chinzei 2002, J. Biomech. 35:483-490",
     ),
 }
-"""Named tissues."""
+"""Tissues by the names that commands take, each with the time scale on which it behaves so and its source.
+
+Brain has no single stiffness: choose by how long a load lasts. `default` is what scenes and the shipped models have;
+`viscoelastic` depends on the time that its loads tell; `seed` is that of the published protocol.
+"""
