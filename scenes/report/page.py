@@ -50,8 +50,7 @@ NOTES = (
     "The linear answers of the cortex beside the tumour are given everywhere; the cortex is not compared. Minutes: of "
     "these solves, on the machine that made them, and of fitting.",
     "Time: one load at a time, from rest, learners on one core; median, and p99 where at least 1,000 were timed. It is "
-    "of the whole answer, its bound and limits included, for which series have a kernel of their own. The model alone "
-    "in NumPy compares learners: it is one kind of code for all. "
+    "of the whole answer, its bound and limits included; beside it that of the model alone. "
     "Set-up, compiling and warm-up are not in it. Memory: the largest resident size of the process that made and "
     "played the row alone; card: what it took of the graphics card.",
     "Bounds are promised for loads like those of the training. How often they hold in left-out discs of cortex, and "

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,15 +22,10 @@ from sim.runtime.threads import one_thread
 from ..data.cortex_patch import Patch, nearest, open_patch
 from ..data.encode import ENCODERS, Basis, directions
 from ..data.indentation import indented
-from ..regressors.force_series import Series
 from ..regressors.protocol import Fitted
-from ..regressors.series_residual import Remainder
 from .conformal import Bound, features_of
 from .tip_distance import Distance, TipModel
 from .training_range import Envelope, Measured, measured
-
-if TYPE_CHECKING:
-    from .single_load import Swift
 
 # Times the strongest force, or the widest footprint, that was taught. Of three loads so strong on the template's brain
 # the finite elements find an equilibrium of none, and at twice the force a prediction is off by up to 31 %.
@@ -133,24 +127,6 @@ class Learned:
         known[self.nodes] = True
         return known
 
-    @cached_property
-    def _swift(self) -> Swift | None:
-        """A shorter way for one load, where all that is known of the tumour is a series and what it leaves."""
-        tumour = self.anatomy.tumour_nodes
-        match [parts for parts, row in self._by_basis if (row[tumour] >= 0).any()]:
-            case [[Part("tool", Series() as series, basis)]]:
-                remainder = None
-            case [[Part("tool", Series() as series, basis), Part("tool", Remainder() as remainder)]]:
-                pass
-            case _:
-                return None
-        # Warp is loaded where a model is asked, not where it is read.
-        from .single_load import LANES, Swift
-
-        if not np.array_equal(basis.nodes, tumour) or len(basis.modes) > LANES:
-            return None
-        return Swift(series, remainder, basis, self._patch, self.envelope, self.bounds)
-
     def _demand_answerable(self, pushed: Pushed, doubtful: np.ndarray) -> None:
         """Refuse what has no answer to be near to: a footprint off the open cortex, a size far beyond what was taught.
 
@@ -204,11 +180,6 @@ class Learned:
         begun = time.perf_counter()
         pushed = self.asked(loads)
         nodes = self.nodes if at is None else whole_numbers("at", at)
-        if len(loads) == 1 and np.array_equal(nodes, self.anatomy.tumour_nodes) and self._swift is not None:
-            displacement, excess, promised = self._swift.answer(pushed)
-            if excess > 0.0 or pushed.footprint[0] < self.envelope.reach + STORED:
-                self._demand_answerable(pushed, np.zeros(1, int))
-            return predicted(displacement, nodes, loads, (excess > 0.0,), begun, promised, self.source)
         self._demand_known(nodes)
         with one_thread() if len(loads) == 1 else nullcontext():
             return self._summed(loads, pushed, nodes, begun)
@@ -248,9 +219,9 @@ class Learned:
         return tuple(found)
 
     def bare(self, pushed: Pushed) -> np.ndarray:
-        """Displacements (B, n, 3) [m] of the tumour by the model alone, in NumPy: no limits, no bound, no kernel.
+        """Displacements (B, n, 3) [m] of the tumour by the model alone, without limits and bound.
 
-        Learners are timed by it: all in one kind of implementation. Forces must lie in the envelope.
+        Learners are timed by it. Forces must lie in the envelope.
         """
         magnitude, features = directions(pushed)[0], {}
         total = np.zeros((len(magnitude), 3 * len(self.anatomy.tumour_nodes)), np.float32)
