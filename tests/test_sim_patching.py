@@ -17,7 +17,7 @@ from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
 from sim.local_solvers.outer_loop import Limits
 from sim.local_solvers.patch import Patch
-from sim.local_solvers.patch_elimination import NODES, patching
+from sim.local_solvers.patch_elimination import NODES, PatchSize, patching
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from surrogate.data.tool_loads import draw
 
@@ -120,7 +120,7 @@ def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[1:2])
     whole = descent_of(patching, problem, space, law)
-    part = descent_of(partial(patching, largest=60), problem, space, law)
+    part = descent_of(partial(patching, size=PatchSize(near=60)), problem, space, law)
     assert len(part._nodes) < 0.8 * len(whole._nodes) and np.isin(part._nodes, whole._nodes).all()
     found = part.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)
     assert found.status[0] == DONE and found.residual[0] <= FINE

@@ -35,10 +35,26 @@ from ..runtime.columns import combined, put_rows, rows_taken
 from ..runtime.dense_product import product_with
 from .outer_loop import USUAL, Limits, eliminated
 
-# The near part: such a share of the tetrahedra, where the free surface is at most such a share of all of it.
-NEAR, LARGEST_OPENING = 0.2, 0.25
-# The near part is solved in so many iterations or until few columns are left.
-ITERATIONS, STRAGGLERS = 100, 0.05
+
+@dataclass(frozen=True)
+class NearPart:
+    """Which tissue is near the opening, and how long it is solved by itself.
+
+    Parameters
+    ----------
+    share, largest_opening
+        Of the tetrahedra, where the free surface is at most such a share of all of it.
+    iterations, stragglers
+        Most of L-BFGS in one cycle, which ends earlier where at most this share of the columns is left.
+    """
+
+    share: float = 0.2
+    largest_opening: float = 0.25
+    iterations: int = 100
+    stragglers: float = 0.05
+
+
+NEAR = NearPart()
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +69,8 @@ class Elimination:
         The near part in its surroundings, and the descent that solves it.
     shared, follow
         (m,) rows of the near part that the far part touches, on the device; (x (m, b), out (3N, b)): how it follows.
-    limits
-        When cycles end.
+    limits, near
+        When cycles end; how long the near part is solved.
     """
 
     problem: Problem
@@ -65,6 +81,7 @@ class Elimination:
     shared: wp.array
     follow: Callable[[wp.array, wp.array], None]
     limits: Limits = USUAL
+    near: NearPart = NEAR
 
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
@@ -93,7 +110,9 @@ class Elimination:
         load = part.gradient(near)
         self.part.put(combined(device, load, -1.0, g, load))
         part.constraint.project_nodes(g)
-        found = self.lbfgs.descend(near, np.zeros(count), ITERATIONS, None, force, STRAGGLERS, (g, back))
+        found = self.lbfgs.descend(
+            near, np.zeros(count), self.near.iterations, None, force, self.near.stragglers, (g, back)
+        )
         missed = combined(device, found.u, -1.0, aim, aim)
         followed = wp.empty_like(out)
         self.follow(rows_taken(device, missed, self.shared), followed)
@@ -105,10 +124,10 @@ class Elimination:
 
 def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
     """Whether a part of the surface is free, and no large one."""
-    return 0 < len(_free(space, constraint)) <= LARGEST_OPENING * len(np.unique(space.mesh.surface))
+    return 0 < len(_free(space, constraint)) <= NEAR.largest_opening * len(np.unique(space.mesh.surface))
 
 
-def near_tetrahedra(space: Discretisation, constraint: Constraint, share: float = NEAR) -> np.ndarray:
+def near_tetrahedra(space: Discretisation, constraint: Constraint, share: float = NEAR.share) -> np.ndarray:
     """(T,) bool: the share nearest to where the surface is free."""
     mesh = space.mesh
     distance, _ = KDTree(mesh.nodes[_free(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))

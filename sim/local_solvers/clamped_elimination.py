@@ -27,14 +27,31 @@ from ..runtime.columns import combined
 from .clamped_part import Rimmed
 from .outer_loop import Limits, eliminated
 
-# The vicinity is what the linear answer strains more than this, the most strained tetrahedra first, of at most such a
-# share of all nodes; and all tetrahedra that touch these.
-STRAINED, LARGEST = 0.15, 0.03
-# Where a cycle leaves more than this share of the free force, and so many nodes have most of what is beyond the
-# vicinity, these and what touches them are added to it.
-LEFT, ADDED = 0.8, 60
-CUTS = 6
-DEAR = Limits(cycles=30, patience=8, rise=np.inf, forcing=0.1, enough=0.5)
+
+@dataclass(frozen=True)
+class ClampedSize:
+    """Which tissue is clamped off, and how often a step of the whole is cut.
+
+    Parameters
+    ----------
+    strained, largest
+        What the linear answer strains more than this, the most strained tetrahedra first, of at most this share of all;
+        and all tetrahedra that touch these.
+    left, added
+        Where a cycle leaves more than this share of the free force, and so many nodes have most of what is beyond the
+        part, these and what touches them are added to it.
+    cuts
+        Most of one step.
+    """
+
+    strained: float = 0.15
+    largest: float = 0.03
+    left: float = 0.8
+    added: int = 60
+    cuts: int = 6
+
+
+DEAR = Limits(cycles=30, patience=8, rise=1e6, forcing=0.1, enough=0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +62,8 @@ class Vicinity:
         The whole body's.
     effects, space
         What the problem was compiled from.
-    limits
-        When cycles end: one is dear here, and the line search cuts what explodes.
+    limits, size
+        When cycles end: one is dear here, and the line search cuts what explodes. Which part is clamped off.
     """
 
     problem: Problem
@@ -54,6 +71,7 @@ class Vicinity:
     effects: Iterable[Effect]
     space: Discretisation
     limits: Limits = DEAR
+    size: ClampedSize = ClampedSize()
 
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
@@ -84,7 +102,7 @@ class Vicinity:
             s, y = _host(new.u) - _host(now.u), _host(new.g) - _host(now.g)
             if s @ y > 0.0:
                 pairs = pairs.and_one(s, y, after - z)
-            if new.free[0] > LEFT * now.free[0]:
+            if new.free[0] > self.size.left * now.free[0]:
                 more = self._left(_host(new.g), part.nodes)
                 if len(more):
                     chosen |= self._touching(more)
@@ -102,7 +120,7 @@ class Vicinity:
         promised, device = -float(_host(now.g) @ d), self.problem.device
         way = device.array(d[:, None])
         length = float(self.problem.longest_step(now.u, way)[0])
-        for _ in range(CUTS if promised > 0.0 else 0):
+        for _ in range(self.size.cuts if promised > 0.0 else 0):
             new = judge(part.settled(combined(device, now.u, length, way, wp.empty_like(way)), force))
             slope = float(_host(new.g) @ d)
             if new.finite[0] and not goes_too_far(slope, promised):
@@ -122,14 +140,14 @@ class Vicinity:
         table = self.space.table
         slope = np.einsum("tai,taj->tij", u.reshape(-1, 3)[table[:, :4]], self._slopes)
         strain = np.sqrt(np.einsum("tij,tij->t", slope, slope))
-        most = min(int(LARGEST * len(strain)), int((strain > STRAINED).sum()))
+        most = min(int(self.size.largest * len(strain)), int((strain > self.size.strained).sum()))
         return table[np.argsort(-strain)[:most]].ravel()
 
     def _left(self, g: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         """The few nodes (k,) beyond these that have most of the free gradient g (3N,) there; none if no few have."""
         square = (g.reshape(-1, 3).astype(np.float64) ** 2).sum(axis=1)
         square[nodes] = 0.0
-        most = np.argsort(-square)[:ADDED]
+        most = np.argsort(-square)[: self.size.added]
         return most if 2.0 * square[most].sum() > square.sum() else most[:0]
 
     def _touching(self, nodes: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,10 +20,23 @@ from ..minimisers.lbfgs_kernels import BROKEN, DONE
 from ..minimisers.newton import find_equilibrium
 from ..minimisers.newton_cg import NewtonCG
 
-# What so many turns of L-BFGS leave is Newton's; a factor with which so many were taken is made anew.
-TURNS, STALE = 400, 25
-# Newton's budgets.
-OUTER, INNER = 60, 60
+
+@dataclass(frozen=True)
+class PartLimits:
+    """Budgets of a clamped part.
+
+    Parameters
+    ----------
+    iterations, stale
+        What so many iterations of L-BFGS leave is Newton's. A factor with which so many were taken is made anew.
+    outer, inner
+        Newton's, as `Accuracy` has them.
+    """
+
+    iterations: int = 400
+    stale: int = 25
+    outer: int = 60
+    inner: int = 60
 
 
 class Rimmed:
@@ -40,6 +54,8 @@ class Rimmed:
         (3N, 1) [N]: the gradient of the loads, which do not depend on where the body is.
     u
         (3N, 1) [m]: where the body is about.
+    limits
+        Budgets.
     """
 
     def __init__(
@@ -50,7 +66,9 @@ class Rimmed:
         chosen: np.ndarray,
         constant: wp.array,
         u: wp.array,
+        limits: PartLimits = PartLimits(),
     ):
+        self._limits = limits
         device, self.nodes = problem.device, np.unique(space.table[chosen])
         self._rows = (3 * self.nodes[:, None] + np.arange(3)).ravel()
         part, self._curvature = rimmed(effects, space, problem, chosen, self.nodes)
@@ -65,18 +83,19 @@ class Rimmed:
 
         As it is, where the part's forces are not finite.
         """
-        part, device, values = self._part, self._part.device, u.numpy().copy()
+        part, device, values, limits = self._part, self._part.device, u.numpy().copy(), self._limits
         part.constraint.begin(values[self._rows], None, None)
-        found = self._lbfgs.descend(device.array(values[self._rows]), np.zeros(1), TURNS, None, np.array([force]))
+        begun = device.array(values[self._rows])
+        found = self._lbfgs.descend(begun, np.zeros(1), limits.iterations, None, np.array([force]))
         end = found.u
         if found.status[0] == BROKEN:
             return u
         if found.status[0] != DONE:
             _, _, scale = part.residual(end)
             aim = float(np.clip(force / scale[0], FLOOR[device.precision], 0.5))
-            budget = Accuracy(aim, OUTER, INNER, device.precision, 0)
-            end = find_equilibrium(part, NewtonCG(self._factor, INNER), end, budget).u
-        if found.steps[0] > STALE:
+            budget = Accuracy(aim, limits.outer, limits.inner, device.precision, 0)
+            end = find_equilibrium(part, NewtonCG(self._factor, limits.inner), end, budget).u
+        if found.steps[0] > limits.stale:
             self._begin_at(end)
         values[self._rows] = end.numpy()
         return device.array(values)

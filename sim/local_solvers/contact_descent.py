@@ -31,14 +31,35 @@ from ..minimisers.residual import relative
 from ..runtime.threads import one_thread
 from .contact_forces import Softness, settled
 
-CUTS = 8
-# Tools' forces are exact to a share of the whole residual, or of the tolerance.
-FORCING, ENOUGH = 0.03, 0.1
-# A step does well that leaves so much of the free force, and is not cut shorter than this; after so many in a row that
-# do not, and after one that is cut to almost nothing, others go on.
-LEFT, LONG, PATIENCE, SHORTEST = 0.6, 0.5, 3, 0.1
-# Drags: the first that is tried where one is wanted, by how much it grows and shrinks, and how often at most it grows.
-DRAG, GROWTH, TIMES = 0.3, 3.0, 5
+
+@dataclass(frozen=True)
+class ContactLimits:
+    """When steps are cut, damped by a drag, and left to Newton.
+
+    Parameters
+    ----------
+    cuts
+        Most of one step.
+    forcing, enough
+        Tools' forces are exact to this share of the whole residual, or of the tolerance.
+    left, long
+        A step does well that leaves so much of the free force, and is not cut shorter than this.
+    patience, shortest
+        After so many in a row that do not, and after one that is cut to less than this, Newton goes on.
+    drag, growth, times
+        The first drag that is tried where one is wanted, by how much it grows and shrinks, and how often it grows.
+    """
+
+    cuts: int = 8
+    forcing: float = 0.03
+    enough: float = 0.1
+    left: float = 0.6
+    long: float = 0.5
+    patience: int = 3
+    shortest: float = 0.1
+    drag: float = 0.3
+    growth: float = 3.0
+    times: int = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +93,14 @@ class Proximal:
         Of this problem at rest, alike at every state.
     barrier
         Its only one.
+    limits
+        When it goes on, and when it gives up.
     """
 
     problem: Problem
     preconditioner: Preconditioner
     barrier: Local
+    limits: ContactLimits = ContactLimits()
 
     @cached_property
     def compliance(self) -> Compliance:
@@ -95,9 +119,9 @@ class Proximal:
             while status == LIVE:
                 if now.relative <= tolerance[0]:
                     status = DONE
-                if status == DONE or step >= most or slow >= PATIENCE:
+                if status == DONE or step >= most or slow >= self.limits.patience:
                     break
-                exact = max(FORCING * min(now.relative, 1.0), ENOUGH * tolerance[0])
+                exact = max(self.limits.forcing * min(now.relative, 1.0), self.limits.enough * tolerance[0])
                 aim = self._aimed(now, force, rest, pairs, exact, drag)
                 if aim is None:
                     break
@@ -107,12 +131,12 @@ class Proximal:
                 if not new.finite:
                     break
                 step += 1
-                well = t > LONG and new.free <= LEFT * now.free
-                slow = PATIENCE if t < SHORTEST else 0 if well else slow + 1
+                well = t > self.limits.long and new.free <= self.limits.left * now.free
+                slow = self.limits.patience if t < self.limits.shortest else 0 if well else slow + 1
                 if well:
-                    drag = drag / GROWTH if drag >= DRAG else 0.0
-                elif t < LONG or new.free > now.free:
-                    drag = max(DRAG, GROWTH * drag)
+                    drag = drag / self.limits.growth if drag >= self.limits.drag else 0.0
+                elif t < self.limits.long or new.free > now.free:
+                    drag = max(self.limits.drag, self.limits.growth * drag)
                 if new.relative > tolerance[0]:
                     moved, change = new.u - now.u, new.smooth - now.smooth
                     way = self._answered(change)
@@ -136,14 +160,14 @@ class Proximal:
             return np.zeros_like(force), drag
         free = now.u - rest - pairs.motion(pairs.weights(now.smooth + self._everywhere(force)))
         soft = Softness(self.compliance, pairs)
-        for _ in range(TIMES):
+        for _ in range(self.limits.times):
             try:
                 found = settled(barrier, soft, now.u[rows], free[rows], force, tolerance, drag)
             except LinAlgError:  # steps so small that what is learnt from them is round-off
                 return None
             if found is not None:
                 return found, drag
-            drag = max(DRAG, GROWTH * drag)
+            drag = max(self.limits.drag, self.limits.growth * drag)
         return None
 
     def _felt(self, now: State) -> np.ndarray:
@@ -166,7 +190,7 @@ class Proximal:
         t = float(self.problem.longest_step(device.array(now.u[:, None]), device.array(x[:, None]))[0])
         promised = -float(now.whole @ x)
         new = self._judged(now.u + t * x)
-        for _ in range(CUTS):
+        for _ in range(self.limits.cuts):
             ahead = float(new.whole @ x) if new.finite else np.inf
             if not goes_too_far(ahead, promised):
                 break

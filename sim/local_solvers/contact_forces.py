@@ -22,13 +22,31 @@ from ..linalg.compliance import Compliance
 from ..minimisers.compact_lbfgs import Pairs
 from ..minimisers.line_search import goes_too_far, kept_of
 
-STEPS, CUTS = 60, 20
-# More touched nodes than these are no few.
-MOST = 300
-# A model that is not convex after so many steps is not going to be.
-LATE = 12
 # A compliance is rounded: this share of its mean makes it definite.
 ROUNDED = 1e-6
+
+
+@dataclass(frozen=True)
+class ForceLimits:
+    """When Newton's method for the tools' forces ends.
+
+    Parameters
+    ----------
+    iterations, cuts
+        Most, and most cuts of one step.
+    most
+        Nodes: more that are touched are no few.
+    late
+        A model that is not convex after so many iterations is not going to be.
+    """
+
+    iterations: int = 60
+    cuts: int = 20
+    most: int = 300
+    late: int = 12
+
+
+FORCES = ForceLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +79,14 @@ def settled(
     known: np.ndarray,
     tolerance: float,
     drag: float,
+    limits: ForceLimits = FORCES,
 ) -> np.ndarray | None:
     """The forces f (3n,) [N], from where the nodes are, `here` (3n,) [m]; w1 is `there` and f1 `known` (3n,).
 
     They are exact to a `tolerance`, relative. `drag` is d in units of how stiff a touched node is. None where the model
     is not convex: its tools are sharper than its tissue is stiff, and it would go far astray.
     """
-    touched = _touched(barrier.slope(here))[:MOST]
+    touched = _touched(barrier.slope(here))[: limits.most]
     force, held = known.copy(), np.zeros_like(here)
     if len(touched):
         own, rows = soft.between(touched), _rows(touched)
@@ -79,17 +98,17 @@ def settled(
 
     w, convex = there - soft.moved(force - known), True
     slope = pushed(w)
-    for step in range(STEPS):
+    for step in range(limits.iterations):
         left = slope - force
         if np.linalg.norm(left) <= tolerance * np.linalg.norm(slope):
             break
-        change, convex = _newton(barrier, soft, w, slope, left, held)
-        if not convex and step >= LATE:
+        change, convex = _newton(barrier, soft, w, slope, left, held, limits.most)
+        if not convex and step >= limits.late:
             return None
         way = -soft.moved(change)
         promised, t = -float(left @ way), barrier.longest_step(w, way)
         slope = pushed(w + t * way)
-        for _ in range(CUTS):
+        for _ in range(limits.cuts):
             ahead = float((slope - force - t * change) @ way)
             if not goes_too_far(ahead, promised):
                 break
@@ -100,16 +119,16 @@ def settled(
 
 
 def _newton(
-    barrier: Reduction, soft: Softness, w: np.ndarray, slope: np.ndarray, left: np.ndarray, held: np.ndarray
+    barrier: Reduction, soft: Softness, w: np.ndarray, slope: np.ndarray, left: np.ndarray, held: np.ndarray, most: int
 ) -> tuple[np.ndarray, bool]:
     """The change (3n,) of the forces that 1 + D C has for what is `left` (3n,), D = c'' at w; whether it is convex.
 
-    Where it is not, D is taken without what bends.
+    Where it is not, D is taken without what bends. More than the `most` nodes are no few.
     """
     touched, change = _touched(slope), left.copy()
     if not len(touched):
         return change, True
-    if len(touched) > MOST:
+    if len(touched) > most:
         return change, False
     rows = _rows(touched)
     own, along = soft.between(touched), soft.moved(left)[rows]

@@ -16,7 +16,7 @@ from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
 from ..runtime.threads import one_thread
-from .contact_forces import MOST
+from .contact_forces import FORCES
 
 
 class Touched:
@@ -45,7 +45,7 @@ class Touched:
         self._felt = None
         if columns == 1:
             nodes, curvature = self._barrier.pressed()
-            if 0 < len(nodes) <= MOST:
+            if 0 < len(nodes) <= FORCES.most:
                 # Threads of BLAS wait for one another, ages where something else runs on their cores.
                 with one_thread():
                     whole = np.eye(len(curvature)) + curvature @ self._compliance.between(nodes)

@@ -13,6 +13,7 @@ step needs C^-1, for every direction is C times a force, plus steps whose forces
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import get_blas_funcs
@@ -25,7 +26,13 @@ from ..minimisers.compact_lbfgs import no_pairs
 from ..minimisers.lbfgs_kernels import LEAST_CURVATURE
 from ..minimisers.line_search import goes_too_far, kept_of
 
-ITERATIONS, CUTS = 150, 12
+
+@dataclass(frozen=True)
+class PatchLimits:
+    """Most evaluations of a patch, and most cuts of one step."""
+
+    evaluations: int = 150
+    cuts: int = 12
 
 
 class Patch:
@@ -54,7 +61,9 @@ class Patch:
         constraint = part.constraint
         self._bound = bool(constraint.held.any() or constraint.normal.any())
 
-    def settled(self, u: np.ndarray, e: np.ndarray, force: float) -> tuple[float, np.ndarray]:
+    def settled(
+        self, u: np.ndarray, e: np.ndarray, force: float, limits: PatchLimits = PatchLimits()
+    ) -> tuple[float, np.ndarray]:
         """A share s, and the forces f (m,) [N] by which the body moves s e + C f, at u (m,) and e (m,) [m].
 
         The share is as much of e as no element forbids. The forces are q but for the gradient, whose 2-norm is at most
@@ -67,7 +76,7 @@ class Patch:
         start = self._excess(u, beside)
         g = self._free(self._excess(u, x) - start)
         z = self._answered(g)
-        while tried < ITERATIONS and np.linalg.norm(g) > force:
+        while tried < limits.evaluations and np.linalg.norm(g) > force:
             weights = pairs.weights(g)
             along_s, along_w = np.split(weights.astype(g.dtype), 2)
             d = (-z - pairs.motion(weights)).astype(g.dtype)
@@ -76,7 +85,7 @@ class Patch:
             if not promised > 0.0:  # round-off, or forces that are not finite
                 break
             t = 1.0  # a step that an element forbids has forces that are not finite, and is cut
-            for _ in range(CUTS):
+            for _ in range(limits.cuts):
                 tried += 1
                 moved = x + t * d
                 new = self._free(beside + t * pull + self._excess(u, moved) - start)

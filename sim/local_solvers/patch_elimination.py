@@ -8,7 +8,7 @@ it instead of five to twenty. `batch_elimination.py` does so for batches, with o
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -25,15 +25,32 @@ from .batch_elimination import NEAR, near_tetrahedra
 from .outer_loop import USUAL, Limits, eliminated
 from .patch import Patch, patch_of
 
-# A patch has at most so many nodes, and less where what lies beyond has such a share of the forces.
-LARGEST, NEGLIGIBLE = 550, 0.02
-# A patch stays while each cycle leaves at most such a share of the free force.
-LEFT = 0.3
-# The near part has about so many nodes at most: its compliance is a matrix of three times as many rows. (Of the default
-# brain's 1,244 it takes a second and 55 MB.)
-LARGEST_NEAR = 2000
 # What a descent has learnt: the nodes (1, n) of its patch.
 NODES = "patch"
+
+
+@dataclass(frozen=True)
+class PatchSize:
+    """Which nodes a patch may have.
+
+    Parameters
+    ----------
+    largest, negligible
+        Most nodes, and fewer where what lies beyond has this share of the forces.
+    left
+        A patch stays while each cycle leaves at most this share of the free force.
+    near
+        About so many nodes may be in patches at all: their compliance has three times as many rows. Of the default
+        brain's 1,244 it takes a second and 55 MB.
+    """
+
+    largest: int = 550
+    negligible: float = 0.02
+    left: float = 0.3
+    near: int = 2000
+
+
+SIZE = PatchSize()
 
 
 class Patching:
@@ -47,8 +64,8 @@ class Patching:
         What the problem was compiled from.
     near
         (T,) bool: the tetrahedra that a patch may be made of.
-    limits
-        When cycles end.
+    limits, size
+        When cycles end; how large a patch may be.
     """
 
     def __init__(
@@ -59,16 +76,17 @@ class Patching:
         space: Discretisation,
         near: np.ndarray,
         limits: Limits = USUAL,
+        size: PatchSize = SIZE,
     ):
         self._problem, self._factor, self._effects, self._space = problem, factor, tuple(effects), space
-        self._limits = limits
+        self._limits, self._size = limits, size
         self._near, self._table = np.flatnonzero(near), space.table[near]
         self._nodes = np.unique(self._table)
         self._rows = (3 * self._nodes[:, None] + np.arange(3)).ravel()
         self._last: tuple[np.ndarray, Patch, np.ndarray] | None = None
         self._compliance = factor.compliance(self._rows)
         # A patch's rows of it, and its own columns of these: the last patch stands there.
-        rows, kind = min(3 * LARGEST, len(self._rows)), self._compliance.dtype
+        rows, kind = min(3 * size.largest, len(self._rows)), self._compliance.dtype
         self._room = np.empty((rows, len(self._rows)), kind), np.empty(rows**2, kind)
 
     def descend(
@@ -82,7 +100,7 @@ class Patching:
             new, nodes, here = self._cycle(judge, now, nodes, float(force[0]))
             if new.finite[0]:
                 forces = np.maximum(forces, here / np.linalg.norm(here))
-                if nodes is not None and new.free[0] > LEFT * now.free[0]:
+                if nodes is not None and new.free[0] > self._size.left * now.free[0]:
                     nodes = self._strained(forces)
             return new
 
@@ -131,14 +149,16 @@ class Patching:
         order = np.argsort(-size, kind="stable")
         with np.errstate(over="ignore"):
             rest = np.cumsum(size[order][::-1] ** 2)[::-1]
-        some = order[: max(1, int((rest > NEGLIGIBLE**2 * rest[0]).sum()))] if np.isfinite(rest[0]) else order
+        some = (
+            order[: max(1, int((rest > self._size.negligible**2 * rest[0]).sum()))] if np.isfinite(rest[0]) else order
+        )
         nodes, first = np.unique(self._table[some], return_index=True)
-        return np.sort(nodes[np.argsort(first)[:LARGEST]])
+        return np.sort(nodes[np.argsort(first)[: self._size.largest]])
 
     def _known(self, learnt: Mapping[str, np.ndarray] | None) -> np.ndarray | None:
         """The nodes of a patch that served before, if that was here."""
         nodes = (learnt or {}).get(NODES)
-        if nodes is None or nodes.shape[1] > LARGEST or not np.isin(nodes, self._nodes).all():
+        if nodes is None or nodes.shape[1] > self._size.largest or not np.isin(nodes, self._nodes).all():
             return None
         return nodes[0]
 
@@ -159,11 +179,11 @@ class Patching:
 
 
 def patching(
-    problem: Problem, factor: Factor, effects: Iterable[Effect], space: Discretisation, largest: int = LARGEST_NEAR
+    problem: Problem, factor: Factor, effects: Iterable[Effect], space: Discretisation, size: PatchSize = SIZE
 ) -> Patching:
-    """For single loads on the CPU, on a body with a small opening: about the `largest` number of nodes near it."""
-    near = near_tetrahedra(space, problem.constraint, min(NEAR, largest / space.count))
-    return Patching(problem, factor, effects, space, near)
+    """For single loads on the CPU, on a body with a small opening."""
+    near = near_tetrahedra(space, problem.constraint, min(NEAR.share, size.near / space.count))
+    return Patching(problem, factor, effects, space, near, size=size)
 
 
 def _norms(force: wp.array) -> np.ndarray:

@@ -1,8 +1,8 @@
 """L-BFGS from the rest stiffness on a batch of load cases, steered where the numbers are: the host only counts.
 
-One turn evaluates the gradient of every column at its own trial, accepts or cuts that, applies the preconditioner, and
-aims anew: always the same launches, so that a graphics card replays them as one captured graph. Between turns the host
-drops the columns that have ended.
+One iteration evaluates the gradient of every column at its own trial, accepts or cuts that, applies the preconditioner,
+and aims anew. The launches are always the same, so that a graphics card replays them as one captured graph. Between
+iterations the host drops the columns that have ended.
 """
 
 from __future__ import annotations
@@ -21,13 +21,30 @@ from ..runtime.columns import EXACT, WIDTHS, gathered, scattered
 from .lbfgs_kernels import LEFT, LIVE, PAIRS
 from .lbfgs_state import Room, ground_of
 
-# On CUDA the host looks after so many turns; it moves what is live to a room of at most such a share of the width.
-TURNS_ON_CUDA, SMALLER_ON_CUDA, SMALLER = 2, 0.75, 0.85
 # What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
 # the newest pair and how many there are (b,).
 LEARNT = ("s", "w", "sy", "yw", "head", "known")
 # Learnt curvature travels with the answers of so few load cases: a larger batch has no next frame.
 TAUGHT = EXACT
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How often the host looks, and when columns that go on move to a narrower workspace.
+
+    Parameters
+    ----------
+    between
+        Iterations between two looks.
+    smaller
+        They move where that is at most this share as wide.
+    """
+
+    between: int = 1
+    smaller: float = 0.85
+
+
+ON_CUDA = Schedule(between=2, smaller=0.75)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +72,13 @@ class Lbfgs:
         Whose potential is minimised.
     preconditioner
         Of this problem at rest.
+    schedule
+        Of the host; None: as serves the device.
     """
 
-    def __init__(self, problem: Problem, preconditioner: Preconditioner):
+    def __init__(self, problem: Problem, preconditioner: Preconditioner, schedule: Schedule | None = None):
         self._problem = problem
+        self._schedule = schedule or (ON_CUDA if problem.device.on_cuda else Schedule())
         self._preconditioner = preconditioner
         self._rooms: dict[int, Room] = {}
         self._ground: dict[str, wp.array] = {}
@@ -78,7 +98,7 @@ class Lbfgs:
         stragglers: float = 0.0,
         ahead: tuple[wp.array, wp.array] | None = None,
     ) -> Descended:
-        """Minimise the potential of the batch that the problem has begun, from start (3N, b) [m], in `most` turns.
+        """Minimise the potential of the batch that the problem has begun, from start (3N, b) [m], in `most` iterations.
 
         The start satisfies the constraints, and no footprint is moved. A column ends at its tolerance (b,), relative as
         `Problem.residual` has it, or where the free gradient's 2-norm is at most force (b,) [N]. `learnt` is
@@ -93,21 +113,20 @@ class Lbfgs:
         teach = learnt is not None and count <= TAUGHT
         if count == 0:
             return Descended(u, status, steps, residual, {})
-        smaller = SMALLER_ON_CUDA if device.on_cuda else SMALLER
-        room, turns = self._room(count), 0
+        room, tried = self._room(count), 0
         room.begin(
             start, tolerance, np.zeros(count) if force is None else force, (learnt or {}) if count <= TAUGHT else {}
         )
         if ahead is not None:
             room.aim(*ahead)
         while True:
-            more = min(TURNS_ON_CUDA if device.on_cuda else 1, most - turns)
+            more = min(self._schedule.between, most - tried)
             room.turn(more)
-            turns += more
+            tried += more
             now = room.columns["status"].numpy()[: len(place)]
             left = int((now == LIVE).sum())
-            last = turns >= most or left <= stragglers * count
-            if last or (count > TAUGHT and self._width(left) <= smaller * room.width):
+            last = tried >= most or left <= stragglers * count
+            if last or (count > TAUGHT and self._width(left) <= self._schedule.smaller * room.width):
                 leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
                 there = place[leave]
                 scattered(device, gathered(device, room.columns["u"], leave), there, u)

@@ -5,6 +5,8 @@ Energies are not compared: in single precision their differences drown in round-
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import warp as wp
 
@@ -13,12 +15,25 @@ from ..runtime.columns import combined, dots
 from .lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
 from .newton_cg import Direction
 
-# A step that was cut and still descends more steeply than this share is lengthened again, so many times at most.
-UNDERSHOOT = 0.5
-REFINEMENTS = 4
-TRIALS = 16
-# A shorter step leads nowhere.
-SHORTEST = 1e-8
+
+@dataclass(frozen=True)
+class Search:
+    """When a search along a line ends.
+
+    Parameters
+    ----------
+    undershoot, refinements
+        A step that was cut and still descends more steeply than this share is lengthened again, so often at most.
+    trials
+        Most lengths that are tried.
+    shortest
+        A shorter step leads nowhere.
+    """
+
+    undershoot: float = 0.5
+    refinements: int = 4
+    trials: int = 16
+    shortest: float = 1e-8
 
 
 def goes_too_far(ahead: float, promised: float) -> bool:
@@ -32,7 +47,7 @@ def kept_of(ahead: float, promised: float) -> float:
     return float(np.clip(kept, LEAST_KEPT, MOST_KEPT))
 
 
-def search(problem: Problem, u: wp.array, direction: Direction) -> np.ndarray:
+def search(problem: Problem, u: wp.array, direction: Direction, settings: Search = Search()) -> np.ndarray:
     """Step lengths (b,) in (0, 1] along a direction from u (3N, b); zero where none was found.
 
     A length is accepted when phi'(t) <= 0.5 x the promised decrease: the energy still falls, or its minimum along
@@ -45,7 +60,7 @@ def search(problem: Problem, u: wp.array, direction: Direction) -> np.ndarray:
     slope_low, slope_high = -promised, np.full(len(t), np.inf)
     found, refinements = np.zeros(len(t), bool), np.zeros(len(t), int)
     trial = problem.device.zeros(*u.shape)
-    for _ in range(TRIALS):
+    for _ in range(settings.trials):
         g = problem.gradient(combined(problem.device, u, t, direction.d, trial))
         problem.constraint.project(g)
         slope = dots(problem.device, g, direction.d)
@@ -54,12 +69,12 @@ def search(problem: Problem, u: wp.array, direction: Direction) -> np.ndarray:
         near = ~found & ~far
         low, slope_low = np.where(near, t, low), np.where(near, slope, slope_low)
         high, slope_high = np.where(far, t, high), np.where(far, slope, slope_high)
-        short = near & (slope < -UNDERSHOOT * promised) & np.isfinite(high)
+        short = near & (slope < -settings.undershoot * promised) & np.isfinite(high)
         refinements += short | (far & (low > 0.0))
-        found |= (near & ~short) | (refinements >= REFINEMENTS)
+        found |= (near & ~short) | (refinements >= settings.refinements)
         if found.all():
             break
         with np.errstate(invalid="ignore"):
             share = np.clip(slope_low / (slope_low - slope_high), LEAST_KEPT, MOST_KEPT)
             t = np.where(found, low, low + share * (high - low))
-    return np.where(low >= SHORTEST, low, 0.0)
+    return np.where(low >= settings.shortest, low, 0.0)

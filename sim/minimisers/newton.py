@@ -18,12 +18,24 @@ from .line_search import search
 from .newton_cg import Descent
 from .residual import relative
 
-# Inexact Newton: the linear residual is never larger than this share.
-LARGEST_FORCING = 0.25
-# A residual that was not lowered by a tenth in so many steps is held against round-off.
-PATIENCE = 4
-# What the last digit of every displacement does to the residual, times this, is round-off.
-ROUND_OFF = 4.0
+
+@dataclass(frozen=True)
+class Newton:
+    """How exactly linear systems are solved, and what counts as round-off.
+
+    Parameters
+    ----------
+    largest_forcing
+        Inexact Newton: the linear residual is never larger than this share.
+    patience
+        A residual that was not lowered by a tenth in so many iterations is held against round-off.
+    round_off
+        What the last digit of every displacement does to the residual, times this, is round-off.
+    """
+
+    largest_forcing: float = 0.25
+    patience: int = 4
+    round_off: float = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +49,9 @@ class Equilibrium:
     linear_iterations: int
 
 
-def find_equilibrium(problem: Problem, descent: Descent, start: wp.array, accuracy: Accuracy) -> Equilibrium:
+def find_equilibrium(
+    problem: Problem, descent: Descent, start: wp.array, accuracy: Accuracy, settings: Newton = Newton()
+) -> Equilibrium:
     """Minimise the potential of a problem that has begun a batch, from start (3N, B) [m].
 
     The last finite, accepted state of every case is returned, whatever its outcome. A case whose forces all vanish
@@ -64,9 +78,9 @@ def find_equilibrium(problem: Problem, descent: Descent, start: wp.array, accura
         done = ~bad & ~open_gap & (share <= accuracy.tolerance)
         idle[live] = np.where(share <= 0.9 * best[live], 0, idle[live] + 1)
         best[live] = np.fmin(best[live], share)
-        stuck = ~done & ~bad & (failed | (idle[live] >= PATIENCE))
+        stuck = ~done & ~bad & (failed | (idle[live] >= settings.patience))
         if stuck.any():
-            drowned = stuck & ~open_gap & (free <= ROUND_OFF * round_off(problem, u, g))
+            drowned = stuck & ~open_gap & (free <= settings.round_off * round_off(problem, u, g))
             outcome[live[failed]] = Outcome.STALLED
             outcome[live[drowned]] = Outcome.ROUND_OFF
             failed |= drowned
@@ -86,7 +100,9 @@ def find_equilibrium(problem: Problem, descent: Descent, start: wp.array, accura
             u, g, gap = (gathered(device, array, stay) for array in (u, g, gap))
             live, taken, open_gap, share = live[stay], taken[stay], open_gap[stay], share[stay]
         # Superlinear, and never finer than the tolerance needs.
-        forcing = np.clip(np.sqrt(share), 0.3 * accuracy.tolerance / np.maximum(share, 1e-300), LARGEST_FORCING)
+        forcing = np.clip(
+            np.sqrt(share), 0.3 * accuracy.tolerance / np.maximum(share, 1e-300), settings.largest_forcing
+        )
         found = descent.find(problem, u, g, gap if open_gap.any() else None, forcing, taken)
         linear_iterations += found.iterations
         length = search(problem, u, found)

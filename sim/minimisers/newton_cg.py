@@ -13,9 +13,6 @@ from ..linalg.pcg import Preconditioner, conjugate_gradients
 from ..runtime.columns import combined, dots, norms
 from ..runtime.device import Device
 
-# The next step may be so many times as long as the one that was taken.
-GROWTH = 2.0
-
 
 @dataclass(frozen=True, eq=False)
 class Direction:
@@ -53,11 +50,12 @@ class Descent(Protocol):
 class NewtonCG:
     """Inexact Newton: K d = -g by truncated conjugate gradients, within a radius that follows the steps taken.
 
-    The radius is in the preconditioner's norm, and infinite until a step has been cut: Steihaug 1983.
+    The radius is in the preconditioner's norm, and infinite until a step has been cut: Steihaug 1983. The next step may
+    be `growth` times as long as the one that was taken.
     """
 
-    def __init__(self, preconditioner: Preconditioner, most: int):
-        self._preconditioner, self._most = preconditioner, most
+    def __init__(self, preconditioner: Preconditioner, most: int, growth: float = 2.0):
+        self._preconditioner, self._most, self._growth = preconditioner, most, growth
         self.begin()
 
     def begin(self) -> None:
@@ -91,7 +89,7 @@ class NewtonCG:
     def _followed(self, taken: np.ndarray) -> np.ndarray:
         if self._radius is None:
             return np.full(len(taken), np.inf)
-        step = GROWTH * taken * self._size
+        step = self._growth * taken * self._size
         return np.where((taken == 1.0) & ~self._truncated, np.maximum(self._radius, step), step)
 
 

@@ -23,9 +23,13 @@ from ..minimisers.residual import relative
 from ..runtime.columns import combined, dots
 from .strategy import Answer, Ladder
 
-# The linear residual that may be left, and the most iterations: what is settled before leaves so little that more are
-# not seen.
-FORCING, ITERATIONS = 0.2, 12
+
+@dataclass(frozen=True)
+class Linear:
+    """The linear residual that may be left, and the most iterations: after the local solver more are not seen."""
+
+    forcing: float = 0.2
+    iterations: int = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,7 @@ class Step:
     seconds: dict[str, float]
 
 
-def step_from(ladder: Ladder, cases: Cases, guess: np.ndarray) -> Step:
+def step_from(ladder: Ladder, cases: Cases, guess: np.ndarray, linear: Linear = Linear()) -> Step:
     """One step from guess (3N, B) [m], which is first put on the constraints; from rest where it lies inside out."""
     problem, device, count = ladder.problem, ladder.problem.device, len(cases.loads)
     clocks = [time.perf_counter()]
@@ -65,7 +69,7 @@ def step_from(ladder: Ladder, cases: Cases, guess: np.ndarray) -> Step:
     g, free, _ = problem.residual(u)
     clocks.append(time.perf_counter())
     rhs = combined(device, device.zeros(*g.shape), -1.0, g, wp.empty_like(g))
-    found = _solved(problem, ladder, u, rhs, FORCING * free)
+    found = _solved(problem, ladder, u, rhs, linear.forcing * free, linear.iterations)
     clocks.append(time.perf_counter())
     length = search(problem, u, Direction(found.x, dots(device, rhs, found.x), found.iterations))
     u = combined(device, u, length, found.x, wp.empty_like(u))
@@ -84,10 +88,13 @@ def step_from(ladder: Ladder, cases: Cases, guess: np.ndarray) -> Step:
     return Step(answer, before, left, {"relax": relax, "solve": solve, "search": along})
 
 
-def _solved(problem: Problem, ladder: Ladder, u: wp.array, rhs: wp.array, tolerance: np.ndarray) -> LinearSolution:
-    """K(u) d = rhs (3N, B) to `tolerance` (B,) [N]; columns whose curvature is negative on the way are solved anew.
+def _solved(
+    problem: Problem, ladder: Ladder, u: wp.array, rhs: wp.array, tolerance: np.ndarray, most: int
+) -> LinearSolution:
+    """K(u) d = rhs (3N, B) to `tolerance` (B,) [N], in at most so many iterations.
 
-    There the curvature at rest stands in wherever the current one is not definite.
+    Columns whose curvature is negative on the way are solved anew. There the curvature at rest stands in wherever the
+    current one is not definite.
     """
     found, definite = None, np.zeros(rhs.shape[1], bool)
     while found is None or (found.truncated & ~definite).any():
@@ -95,5 +102,5 @@ def _solved(problem: Problem, ladder: Ladder, u: wp.array, rhs: wp.array, tolera
             definite = definite | found.truncated
         problem.linearise(u, definite)
         ladder.preconditioner.prepare(problem, rhs.shape[1])
-        found = conjugate_gradients(problem, ladder.preconditioner, wp.clone(rhs), tolerance, ITERATIONS)
+        found = conjugate_gradients(problem, ladder.preconditioner, wp.clone(rhs), tolerance, most)
     return found

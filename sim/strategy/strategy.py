@@ -1,4 +1,4 @@
-"""What is tried for a load, rung by rung: from the start, from rest, in load steps. Batches of cases climb together."""
+"""What a plan (`plan.py`) says is tried for a load, one solver after the other: from the start, from rest, in steps."""
 
 from __future__ import annotations
 
@@ -29,21 +29,9 @@ from ..minimisers.residual import shortfall
 from ..runtime.columns import gathered, scattered
 from ..runtime.device import Device
 from .plan import Plan, Step
+from .stepping import GAPS, STEPPING, Gaps, Stepping
 
 NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
-# Load steps as shares of the load: the first, the least, and what is left of one that failed.
-FIRST_STEP, LEAST_STEP, CUT = 1.0 / 4.0, 1.0 / 64.0, 1.0 / 4.0
-# The next load step is as long as lets expect so many outer steps; one that takes more than the most is too long.
-STEP_OUTER, MOST_STEP_OUTER = 8, 15
-# Tools that go farther than so many gaps at once begin with one that is wider by a power of the closing; until it is
-# their own they are settled to this tolerance.
-WIDE_ENOUGH, CLOSING, OPEN_TOLERANCE = 8.0, 4.0, 0.05
-# A step that failed is tried again, shorter, from a gap so many times as wide.
-WIDER = 16.0
-# What touches is settled in so many steps first; where that ends so near, Newton goes on in as many.
-SETTLING, NEARLY = 16, 0.1
-# Load steps end when the batch has spent so many times the linear iterations that one outer step may take.
-PATIENCE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +84,8 @@ class Ladder:
         Makes, or has made, what `plan` solves by itself for many loads.
     alone
         What it solves by itself for one.
+    stepping, gaps
+        How load steps go, and the gaps of tools.
     """
 
     problem: Problem
@@ -105,6 +95,8 @@ class Ladder:
     plan: Plan
     near: Callable[[], Elimination | None] = lambda: None
     alone: Patching | Vicinity | None = None
+    stepping: Stepping = STEPPING
+    gaps: Gaps = GAPS
 
     @cached_property
     def _lbfgs(self) -> Lbfgs:
@@ -254,13 +246,13 @@ class Ladder:
         if touch is None or len(cases.loads) > 1 or problem.constraint.imposes or problem.gap(start)[1].any():
             return self._closed(cases, start, outer, gaps)
         start = self._rested(start)
-        found = touch.descend(start, np.array([self.accuracy.tolerance]), min(SETTLING, outer))
+        found = touch.descend(start, np.array([self.accuracy.tolerance]), min(self.gaps.alone, outer))
         if found.status[0] == DONE:
             outcome = np.full(1, Outcome.CONVERGED, object)
             return self._answer(found.u, outcome, found.steps, found.residual, 0)
         spent = found.steps
-        if found.residual[0] <= NEARLY:
-            answer = self._thorough(found.u, min(SETTLING, outer))
+        if found.residual[0] <= self.gaps.nearly:
+            answer = self._thorough(found.u, min(self.gaps.alone, outer))
             spent = spent + answer.iterations
             if answer.good.all():
                 return replace(answer, iterations=spent)
@@ -273,12 +265,12 @@ class Ladder:
         In a narrow gap tissue would be thrown out of a tool, and caught again, node by node; a wide one leads it.
         """
         iterations, linear = np.zeros(start.shape[1], int), 0
-        widest = int(np.ceil(np.log(max(gaps / WIDE_ENOUGH, 1.0)) / np.log(CLOSING)))
-        for times in CLOSING ** np.arange(widest, 0.0, -1.0):
+        widest = int(np.ceil(np.log(max(gaps / self.gaps.wide_enough, 1.0)) / np.log(self.gaps.closing)))
+        for times in self.gaps.closing ** np.arange(widest, 0.0, -1.0):
             self.problem.begin(cases)
             for term in self.problem.barriers:
                 term.widen(float(times))
-            found = self._thorough(self._rested(start), outer, max(OPEN_TOLERANCE, self.accuracy.tolerance))
+            found = self._thorough(self._rested(start), outer, max(self.gaps.tolerance, self.accuracy.tolerance))
             start, iterations, linear = found.u, iterations + found.iterations, linear + found.linear_iterations
         self.problem.begin(cases)
         found = self._thorough(self._rested(start), outer)
@@ -310,7 +302,7 @@ class Ladder:
             return replace(part, loads=part.loads.scaled(share), share=share)
 
         start = device.zeros(problem.rows, len(index))
-        found = self._by_steps(cases, start, raised, FIRST_STEP, self.accuracy.steps)
+        found = self._by_steps(cases, start, raised, self.stepping.first, self.accuracy.steps)
         outcome = failed.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
         none = np.flatnonzero(found.reached <= failed.reached[index])
@@ -360,13 +352,13 @@ class Ladder:
         outcome = np.full(count, Outcome.BUDGET, object)
         lets = outer = self.accuracy.outer
         if not problem.barriers:
-            lets, outer = STEP_OUTER, min(MOST_STEP_OUTER, outer)
+            lets, outer = self.stepping.aimed, min(self.stepping.most, outer)
         while left >= 0:
             strides = [term.stride(aimed(cases, reached), u) for term in problem.barriers]
             longest = np.minimum.reduce([np.ones(count), *strides])
             step = np.minimum(step, longest)
-            live = np.flatnonzero((reached < 1.0) & (step >= LEAST_STEP * np.minimum(1.0, 4.0 * longest)))
-            if len(live) == 0 or spent > PATIENCE * self.accuracy.inner * done:
+            live = np.flatnonzero((reached < 1.0) & (step >= self.stepping.least * np.minimum(1.0, 4.0 * longest)))
+            if len(live) == 0 or spent > self.stepping.patience * self.accuracy.inner * done:
                 break
             aim = np.minimum(reached[live] + step[live], 1.0)
             gone = float(((aim - reached[live]) * gaps[live]).max())
@@ -376,8 +368,8 @@ class Ladder:
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
             iterations[live] += found.iterations
-            gaps[live] *= np.where(good, 1.0, WIDER)
-            step[live] *= np.where(good, np.clip(lets / np.maximum(found.iterations, 1), 0.5, 2.0), CUT)
+            gaps[live] *= np.where(good, 1.0, self.gaps.wider)
+            step[live] *= np.where(good, np.clip(lets / np.maximum(found.iterations, 1), 0.5, 2.0), self.stepping.cut)
             scattered(device, gathered(device, found.u, np.flatnonzero(good)), live[good], u)
             reached[live[good]], residual[live[good]] = aim[good], found.residual[good]
             outcome[live] = found.outcome
