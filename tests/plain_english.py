@@ -49,6 +49,20 @@ def docstrings(path: Path) -> Iterator[tuple[str, str]]:
                 yield f"{path.name}:{child.lineno}", inspect.cleandoc(told.value)
 
 
+def messages(path: Path) -> Iterator[tuple[str, str]]:
+    """The place and the text of each string of a file that is no docstring; what is filled in counts as a word."""
+    tree = ast.parse(path.read_text())
+    inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+    inner |= {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+        if id(node) in inner or not any(isinstance(part, ast.Constant) for part in parts):
+            continue
+        text = "".join(str(part.value) if isinstance(part, ast.Constant) else "x" for part in parts)
+        if "{" not in text:  # a style sheet or a script
+            yield f"{path.name}:{node.lineno}", re.sub("<[^>]*>", "\n\n", text)
+
+
 def prose(docstring: str) -> str:
     """The running text of a numpydoc docstring: no headings, examples, formulas, or names that are described."""
     text = re.sub(r"^Examples\n-{3,}\n(?s:.*)", "", docstring, flags=re.MULTILINE)

@@ -10,7 +10,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
-from plain_english import docstrings, paragraphs, prose, sentences, too_long, words
+from plain_english import docstrings, messages, paragraphs, prose, sentences, too_long, words
 
 HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
@@ -71,7 +71,7 @@ JOBS = {
 """Libraries with several jobs: these files, at least, must import them."""
 PAGES = sorted(name.relative_to(HOUSE).as_posix() for name in (*HOUSE.glob("*.md"), *HOUSE.glob("docs/*.md")))
 PLAIN = ("ar", "scenes")
-"""Packages whose docstrings are held to plain English."""
+"""Packages whose docstrings and messages are held to plain English."""
 OURS = re.compile(r"\b(?:(?:un)?taught|teach(?:es|ing)?|told|vicinit(?:y|ies)|lanes?|rungs?)\b", re.IGNORECASE)
 """Words of our own, for which the field has others: trained, given or stated, local problem, columns, steps."""
 IMPORT_NAMES = {
@@ -256,7 +256,7 @@ def test_everything_public_has_a_docstring():
 
 
 @pytest.mark.parametrize("room", PLAIN)
-def test_docstrings_are_in_plain_english(room):
+def test_docstrings_and_messages_are_in_plain_english(room):
     """Sentences of less than 30 words, and none of the words that we once had for the field's own."""
     long, ours = {}, {}
     for path in FILES:
@@ -265,6 +265,8 @@ def test_docstrings_are_in_plain_english(room):
                 said = prose(text)
                 long |= {f"{room} {place}": found for found in [too_long(said)] if found}
                 ours |= {f"{room} {place}": found for found in [OURS.findall(said)] if found}
+            for place, text in messages(path):
+                long |= {f"{room} {place}": found for found in [too_long(text)] if found}
     assert not long and not ours
 
 

@@ -83,8 +83,8 @@ def run(args: argparse.Namespace) -> int:
     where = machine(args.device)
     print(
         f"{where}\n\nLog neo-Hookean, E 3 kPa, nu 0.45, linear tetrahedra, skull nodes held (not sliding: not every "
-        f"peer can); {args.loads} palpation loads as nodal forces, each from rest and alone; all residuals, and "
-        f"distances from our answers to 1e-11, by one routine; {args.threads} threads; imports not counted, compiled "
+        f"peer can). {args.loads} palpation loads as nodal forces, each from rest and alone. One routine measures all "
+        f"residuals, and distances from our answers to 1e-11. {args.threads} threads; imports not counted, compiled "
         "code in its cache.",
         file=table,
     )

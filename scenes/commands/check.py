@@ -65,8 +65,9 @@ def run(args: argparse.Namespace) -> int:
         rows.append({**played, "frames": len(frames), **figures.row(), "broken": broken})
         print(
             f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}: the tumour is off by {figures.error_mm:.3f} "
-            f"mm of the {figures.motion_mm:.2f} mm that it moves; its outline by {figures.drawn:.1f} px, overlap "
-            f"{figures.overlap:.3f} (1 is best); {figures.leaked:.0%} leaks out of the skull{_bond(figures.bond)}",
+            f"mm of the {figures.motion_mm:.2f} mm that it moves. Its outline is off by {figures.drawn:.1f} px, "
+            f"overlap {figures.overlap:.3f} (1 is best). {figures.leaked:.0%} leaks out of the "
+            f"skull{_bond(figures.bond)}",
             file=table,
         )
         if args.certify:

@@ -31,10 +31,10 @@ WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
 """Columns of a line that fits into 120; the file has every figure."""
 NOTE = """
 One thing is changed at a time. F: tools of known force. M: the same tools of known motion, namely what those forces
-give by default. How far the tumour is from where it is by default, over load x vertex: mean [mm]; 95 [mm], which in 95
-of 100 loads no vertex exceeds, as a surrogate's bound is stated; %, the mean over the motion; x, the motion over that
-by default. --out and --json give the 95th percentile and the largest too. What a tool is off by counts in every way in
-which it can be: more and less, about two axes, to four sides along the cortex.
+give by default. The columns say how far the tumour is from where it is by default, over load x vertex. Mean [mm]; 95
+[mm], which in 95 of 100 loads no vertex exceeds, as a surrogate's bound is stated. %: the mean over the motion; x:
+the motion over that by default. --out and --json give the 95th percentile and the largest too. What a tool is off by
+counts in every way in which it can be: more and less, about two axes, to four sides along the cortex.
 """
 
 # What the element does to the rows of nu: `sulcus bench elements`, default brain.
