@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from boxes import blurred_faces
 
-from sim.geometry.surface import blurred_normals, unit, vertex_normals
+from sim.geometry.surface import Sight, blurred_normals, unit, vertex_normals
 
 BALL = trimesh.creation.icosphere(subdivisions=5, radius=0.07)  # edges of 2.5 mm
 ARM = unit(BALL.vertices)
@@ -74,7 +74,7 @@ def test_a_mesh_far_coarser_than_the_blur_faces_outward_too():
     assert off(blurred_normals(ball.vertices, ball.faces, ball.vertices, 6e-3), unit(ball.vertices)).max() < 0.2
 
 
-def test_more_points_than_are_summed_at_once(monkeypatch):
+def test_more_points_than_are_summed_at_once():
     whole = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3)
-    monkeypatch.setattr("sim.geometry.surface.TOGETHER", 7)
-    np.testing.assert_array_equal(blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3), whole)
+    parts = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3, Sight(together=7))
+    np.testing.assert_array_equal(parts, whole)

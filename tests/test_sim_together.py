@@ -11,7 +11,7 @@ from sim.compile import compile_problem
 from sim.effects import Elasticity, Held
 from sim.linalg.preconditioner import rest_solver
 from sim.runtime.device import find_device
-from sim.runtime.threads import LEAST, cores, together
+from sim.runtime.threads import Sharing, cores, together
 
 
 def test_every_task_is_done_when_it_returns():
@@ -43,7 +43,8 @@ def test_errors_come_out_and_the_threads_stay(bad: int):
 
 def test_one_core_at_least_and_one_for_little() -> None:
     assert cores(10**6) >= 1
-    assert cores(LEAST - 1) == 1
+    assert cores(Sharing().least - 1) == 1
+    assert cores(10**6, Sharing(most=1)) == 1
 
 
 def test_two_cores_find_what_one_does(monkeypatch: pytest.MonkeyPatch) -> None:

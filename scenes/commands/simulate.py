@@ -20,7 +20,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import tissue_to_json
-from sim.runtime.memory import WIDEST, WIDEST_ON_CUDA
+from sim.runtime.memory import Budget
 from sim.runtime.timing import stage
 from sim.tools import Ball
 from surrogate.data.dataset import read_outcomes
@@ -61,9 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_element_argument(parser)
     add_skull_argument(parser, ("bonded", "slide"))
     parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
-    parser.add_argument(
-        "--batch", type=int, help=f"loads solved together (default: as fit, up to {WIDEST}, on CUDA {WIDEST_ON_CUDA})"
-    )
+    widest = f"up to {Budget.widest}, on CUDA {Budget.widest_on_cuda}"
+    parser.add_argument("--batch", type=int, help=f"loads solved together (default: as fit, {widest})")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")

@@ -9,9 +9,6 @@ from scipy.spatial import KDTree
 
 from .tetmesh import TetMesh
 
-# Tetrahedra whose middles are nearest to a point: in graded meshes the one that holds it is among so many.
-CANDIDATES = 64
-
 
 @dataclass(frozen=True, eq=False)
 class Located:
@@ -25,10 +22,13 @@ class Located:
         return np.einsum("nc,bnck->bnk", self.weights, field[:, self.vertices])
 
 
-def locate(mesh: TetMesh, points: np.ndarray) -> Located:
-    """Find points (n, 3) [m]; one outside is read at the place nearest to it by barycentric coordinates."""
+def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> Located:
+    """Find points (n, 3) [m]; one outside is read at the place nearest to it by barycentric coordinates.
+
+    In graded meshes the tetrahedron that holds a point is among the 64 `candidates` whose middles are nearest to it.
+    """
     corners = mesh.nodes[mesh.tets]
-    _, near = KDTree(corners.mean(axis=1)).query(points, k=min(CANDIDATES, len(corners)))
+    _, near = KDTree(corners.mean(axis=1)).query(points, k=min(candidates, len(corners)))
     near = near.reshape(len(points), -1)
     a, *others = np.moveaxis(corners[near], 2, 0)
     edges = np.stack([other - a for other in others], axis=-1)

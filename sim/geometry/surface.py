@@ -2,31 +2,50 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import KDTree
 
-# Blurs, beyond which nothing counts; points whose surroundings are summed at once.
-REACH, TOGETHER = 3.5, 2_000
-# Of the longest edge, the narrowest blur: every corner has the middle of a triangle within two thirds of that edge.
-NARROWEST = 0.25
+
+@dataclass(frozen=True)
+class Sight:
+    """How much of a surface a point sees through a blur.
+
+    Parameters
+    ----------
+    reach
+        Standard deviations of the blur, beyond which nothing counts.
+    narrowest
+        The narrowest blur, as a share of the longest edge: every corner has the middle of a triangle within two thirds
+        of that edge.
+    together
+        Points whose surroundings are summed at once: bounds the memory that it takes.
+    """
+
+    reach: float = 3.5
+    narrowest: float = 0.25
+    together: int = 2_000
 
 
-def blurred_normals(nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, blur: float) -> np.ndarray:
+def blurred_normals(
+    nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, blur: float, sight: Sight = Sight()
+) -> np.ndarray:
     """Unit normals (n, 3) at points (n, 3) [m] of the body within outward triangles (S, 3), seen through a blur.
 
     The gradient of a body's indicator after a Gaussian of standard deviation `blur` [m] is, by the divergence theorem,
     the integral over its surface of the Gaussian times the inward normal: of folds narrower than the blur nothing is
     left, and the finer the mesh, the less the normals depend on it. Triangles that are so wide that none of their
-    middles need be in sight of a corner are seen through a wider blur, a quarter of their longest edge.
+    middles need be in sight of a corner are seen through a wider blur, a share of their longest edge.
     """
     a, b, c = np.moveaxis(nodes[triangles], 1, 0)
     longest = np.linalg.norm([b - a, c - b, a - c], axis=2).max()
-    blur = max(blur, NARROWEST * longest)
+    blur = max(blur, sight.narrowest * longest)
     twice, middle = np.cross(b - a, c - a), KDTree((a + b + c) / 3.0)
     out = np.zeros_like(points)
-    for first in range(0, len(points), TOGETHER):
-        some = slice(first, first + TOGETHER)
-        near = KDTree(points[some]).sparse_distance_matrix(middle, REACH * blur, output_type="coo_matrix").tocsr()
+    for first in range(0, len(points), sight.together):
+        some = slice(first, first + sight.together)
+        near = KDTree(points[some]).sparse_distance_matrix(middle, sight.reach * blur, output_type="coo_matrix").tocsr()
         near.data = np.exp(-0.5 * (near.data / blur) ** 2)
         out[some] = near @ twice
     return unit(out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,31 +13,48 @@ from .device import Device
 
 # Columns of the solver at its widest: pairs of L-BFGS, those that move elsewhere, vectors of the elimination around it.
 WORK_COLUMNS = 60
-# Load cases that are worth solving together: more fill the processor no better.
-WIDEST, WIDEST_ON_CUDA = 64, 16384
 # Copies of the answer on the host while batches are joined, in double precision.
 ANSWER_COPIES = 3
-# Of what is free, this share may be used: other programs live too.
-SHARE = 0.9
-# Where Linux says what a group of processes, a container say, may have and has.
-GROUP = Path("/sys/fs/cgroup")
 COARSER = "take a coarser mesh, or a larger machine."
 
 
-def free_bytes(device: Device) -> int:
+@dataclass(frozen=True)
+class Budget:
+    """What of a machine's memory a solver may use.
+
+    Parameters
+    ----------
+    share
+        Of what is free: other programs live too.
+    batches
+        Share of what is free that a batch of unnamed width may take: half, so that answers and others have room.
+    widest, widest_on_cuda
+        Load cases that are worth solving together: more fill the processor no better.
+    group
+        Folder in which Linux tells what a group of processes, a container say, may have and has.
+    """
+
+    share: float = 0.9
+    batches: float = 0.5
+    widest: int = 64
+    widest_on_cuda: int = 16384
+    group: Path = Path("/sys/fs/cgroup")
+
+
+def free_bytes(device: Device, budget: Budget = Budget()) -> int:
     """Memory that is free: the card's, or what the host and its control group still give."""
     if device.on_cuda:
         return int(wp.get_device(device.name).free_memory)
-    return host_bytes()
+    return host_bytes(budget)
 
 
-def host_bytes() -> int:
+def host_bytes(budget: Budget = Budget()) -> int:
     """Memory that the host and its control group still give; without bound where neither says."""
     found = [2**62]
     for line in _lines(Path("/proc/meminfo")):
         if line.startswith("MemAvailable:"):
             found.append(1024 * int(line.split()[1]))
-    most, used, parts = (_lines(GROUP / name) for name in ("memory.max", "memory.current", "memory.stat"))
+    most, used, parts = (_lines(budget.group / name) for name in ("memory.max", "memory.current", "memory.stat"))
     if most and used and most[0].strip().isdigit():
         # Cached files count as used, and are given up when memory is asked for.
         cached = sum(int(line.split()[1]) for line in parts if line.startswith("inactive_file "))
@@ -44,14 +62,14 @@ def host_bytes() -> int:
     return min(found)
 
 
-def fitting_batch(rows: int, device: Device) -> int:
-    """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it, or half of memory."""
+def fitting_batch(rows: int, device: Device, budget: Budget = Budget()) -> int:
+    """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it and fit."""
     column = _column(rows, device)
-    widest = WIDEST_ON_CUDA if device.on_cuda else WIDEST
-    return int(np.clip(free_bytes(device) / 2 / max(column, 1), 1, widest))
+    widest = budget.widest_on_cuda if device.on_cuda else budget.widest
+    return int(np.clip(budget.batches * free_bytes(device, budget) / max(column, 1), 1, widest))
 
 
-def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0) -> None:
+def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0, budget: Budget = Budget()) -> None:
     """Refuse `count` load cases of `rows` = 3N unknowns, `batch` together, that would not fit.
 
     `held` bytes are the solver's own already.
@@ -62,8 +80,8 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0)
         Naming what it takes, what is free, and what would fit.
     """
     column = _column(rows, device)
-    free = host_bytes()  # read once: Linux counts for a good part of a millisecond
-    each, host = ANSWER_COPIES * 8 * rows, SHARE * free
+    free = host_bytes(budget)  # read once: Linux counts for a good part of a millisecond
+    each, host = ANSWER_COPIES * 8 * rows, budget.share * free
     answers, alone = each * count, 0 if device.on_cuda else column
     if answers + alone > host:
         fitting = int((host - alone) / each)
@@ -71,7 +89,8 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0)
             f"the answers to {count} loads take about {_gigabytes(answers)}, and {_gigabytes(host)} are free: "
             + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
         )
-    room = SHARE * (free_bytes(device) if device.on_cuda else free) + held - (0 if device.on_cuda else answers)
+    available = free_bytes(device) if device.on_cuda else free
+    room = budget.share * available + held - (0 if device.on_cuda else answers)
     columns = min(batch, count)
     if column * columns > room:
         fitting = int(room / column)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from queue import SimpleQueue
 from threading import Lock, Thread
@@ -39,19 +40,31 @@ def one_thread() -> Iterator[None]:
                 limit.restore_original_limits()
 
 
-# More than these share one memory, and were not measured.
-MOST = 2
-# To hand fewer elements or unknowns over takes longer, a tenth of a millisecond, than they do.
-LEAST = 3000
 Task = Callable[[], object]
 
 
-def cores(work: int) -> int:
+@dataclass(frozen=True)
+class Sharing:
+    """When native loops are divided among threads.
+
+    Parameters
+    ----------
+    most
+        Threads; more share one memory, and were not measured.
+    least
+        Elements or unknowns: to hand fewer over takes longer, a tenth of a millisecond, than they do.
+    """
+
+    most: int = 2
+    least: int = 3000
+
+
+def cores(work: int, sharing: Sharing = Sharing()) -> int:
     """How many threads native loops over so many elements or unknowns are divided among."""
-    if work < LEAST:
+    if work < sharing.least:
         return 1
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(MOST, here)
+    return min(sharing.most, here)
 
 
 def together(tasks: Sequence[Task]) -> None:
