@@ -18,9 +18,31 @@ from .errors import InputError
 from .fem import Fem
 from .loads import Loads
 
-# Solves after which a tear is given up that has not come to rest; how far what let go may pass the skull [m]; and how
-# strongly a vertex may be pulled that slides, as a share of what the hardest pressed one bears.
-ROUNDS, THROUGH, PULL = 60, 1e-7, 1e-3
+
+@dataclass(frozen=True)
+class Tearing:
+    """By which patches a bond tears, and when it has come to rest.
+
+    Parameters
+    ----------
+    rounds
+        Solves after which a tear is given up that has not come to rest.
+    through
+        [m] How far what let go may pass the skull.
+    pull
+        How strongly a vertex may be pulled that slides, as a share of what the hardest pressed one bears.
+    around
+        [m] Tractions are means over so far: a tear grows by patches of that size whatever the mesh.
+    """
+
+    rounds: int = 60
+    through: float = 1e-7
+    pull: float = 1e-3
+    around: float = 5e-3
+
+
+TEARING = Tearing()
+"""Tears as they are followed unless others are asked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +75,13 @@ def torn(
     accuracy: Accuracy = TRAIN,
     device: str = "auto",
     element: str | None = None,
+    tearing: Tearing = TEARING,
 ) -> Torn:
     """Solve one load; let go what bears too much, as well as what slides and is pulled; hold what would pass the skull.
 
-    Brittle: no energy is left in what is torn, and it does not heal. The traction is the mean over
-    `bond_traction.ROUND`, so that a tear grows by patches of that size whatever the mesh. What let go meets the plane
-    across its normal at rest, without a gap: an active set of constraints, in which a strength near zero is a skull
-    that only presses.
+    Brittle: no energy is left in what is torn, and it does not heal. What let go
+    meets the plane across its normal at rest, without a gap: an active set of constraints, in which a strength near
+    zero is a skull that only presses.
 
     Parameters
     ----------
@@ -67,6 +89,8 @@ def torn(
         With `Bonded`, whose strengths count.
     loads
         One load.
+    tearing
+        Size of the patches that tear, and when a tear has come to rest.
 
     Returns
     -------
@@ -99,14 +123,14 @@ def torn(
         fem = Fem(body, (*others, Slide()), accuracy, device, element=element)
         last = fem.deform(loads, start=last)
         force = _reaction(fem, loads, last)
-        share = _shares(skull, anatomy, fem, bonded, force)
+        share = _shares(skull, anatomy, fem, bonded, force, tearing.around)
         pull = (_at_vertices(fem, force) * anatomy.slide_normal).sum(axis=1)
         holding = bonded & (share <= 1.0)
-        pressed = (bonded & ~holding | sliding) & (pull <= PULL * -pull.min())
-        passing = (last.displacement[0] * anatomy.slide_normal).sum(axis=1) > THROUGH
+        pressed = (bonded & ~holding | sliding) & (pull <= tearing.pull * -pull.min())
+        passing = (last.displacement[0] * anatomy.slide_normal).sum(axis=1) > tearing.through
         pressed |= covered & ~bonded & ~sliding & passing
         rested = bool((holding == bonded).all() and (pressed == sliding).all())
-        if rested or rounds == ROUNDS or not last.outcome[0].good:
+        if rested or rounds == tearing.rounds or not last.outcome[0].good:
             break
         bonded, sliding = holding, pressed
     most = share[bonded].max(initial=0.0)
@@ -121,13 +145,15 @@ def _reaction(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
     return problem.gradient(problem.device.array(fem.guess(loads, answer)))
 
 
-def _shares(skull: Bonded, anatomy: Anatomy, fem: Fem, bonded: np.ndarray, force: wp.array) -> np.ndarray:
+def _shares(
+    skull: Bonded, anatomy: Anatomy, fem: Fem, bonded: np.ndarray, force: wp.array, around: float
+) -> np.ndarray:
     """Round each mesh vertex that is bonded, of what the bond bears, as a share of its strength: (V,).
 
     Means over what holds alone: what has let go bears nothing.
     """
     body = replace(anatomy, slide_normal=np.where(bonded[:, None], anatomy.slide_normal, 0.0))
-    bond = Bond(skull, body, fem.space, fem.problem.device)
+    bond = Bond(skull, body, fem.space, fem.problem.device, around)
     own = bond.nodes < len(bonded)
     out = np.zeros(len(bonded))
     out[bond.nodes[own]] = bond.shares(force)[own, 0]

@@ -1,10 +1,12 @@
 """What the skull decides, as the bench measures it."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
+from scenes.bench.skull_models import rows
 from scenes.cli import main
 from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL
@@ -14,6 +16,7 @@ from sim.bodies.template import Tumour, template_subject
 from sim.effects import Bonded, Slide, pushed_effects
 from sim.fem import Fem
 from sim.material import Material
+from sim.tearing import Tearing
 from surrogate.data.dataset import read_dataset
 from surrogate.data.tool_loads import draw
 from surrogate.model.applicability import taught_skull
@@ -59,11 +62,12 @@ def test_a_skull_that_only_presses_lets_the_tumour_go_farther_than_one_that_hold
 
 
 def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkeypatch):
-    monkeypatch.setattr("sim.tearing.ROUNDS", 1)
-    words = [brain[0], "--loads", "1", "--poisson", "0.45", "--device", "cpu", "--json"]
-    assert main(["bench", "skull", *words, "--skulls", "pressing"]) == 1
-    (row,) = json.loads(capsys.readouterr().out)["rows"]
-    assert row["failed"] == 1 and row["bond"] is None
+    path, anatomy = brain
+    (row,) = rows([anatomy], ["pressing"], [0.45], draw("palpation", anatomy, 1, 0), "cpu", Tearing(rounds=1))
+    assert row.failed == 1 and row.bond is None
+    monkeypatch.setattr("scenes.bench.skull_models.rows", lambda *words: iter([row]))
+    assert main(["bench", "skull", path, "--loads", "1", "--device", "cpu", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["rows"] == [asdict(row) | {"motion": pytest.approx(np.nan, nan_ok=True)}]
 
 
 @pytest.mark.parametrize(

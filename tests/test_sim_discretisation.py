@@ -12,7 +12,7 @@ from boxes import VTK_EDGES, base_held, box, hold, quadratic
 from sim.accuracy import Accuracy
 from sim.compile import compile_problem
 from sim.diagnostics.skull_leak import surface_vectors
-from sim.discretisation.space import FACING, Discretisation, discretise
+from sim.discretisation.space import Discretisation, discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.errors import InputError
 from sim.fem import MIDDLES, Fem
@@ -21,6 +21,7 @@ from sim.loads import push
 from sim.runtime.device import find_device
 
 TIGHT = Accuracy(tolerance=1e-10)
+FACING = 0.75
 THIN = box((3, 3, 1), 0.1)
 """One cell thick: many edges inside join two surface nodes."""
 CUBE = box((3, 3, 3), 0.1)
@@ -84,7 +85,7 @@ def sliding() -> tuple[Discretisation, np.ndarray, np.ndarray, np.ndarray]:
     held = np.repeat((surface & (kind == 1))[:, None], 3, axis=1)
     normal = np.where((surface & (kind == 2))[:, None], ARM / LENGTH, 0.0)
     space = discretise(ROUND, "p2")
-    return space, held, normal, space.sliding(normal, held)
+    return space, held, normal, space.sliding(normal, held, FACING)
 
 
 def test_an_added_node_slides_along_the_triangles_that_meet_there() -> None:

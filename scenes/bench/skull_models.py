@@ -15,10 +15,10 @@ from sim.effects import Bonded, pushed_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
-from sim.tearing import torn
+from sim.tearing import TEARING, Tearing, torn
 
 # A bond that lets go where it bears too much, and one that bears nothing: the skull presses only, without a gap.
-TEARING = {"tearing": Bonded(), "pressing": Bonded(1e-6, 1e-6)}
+TORN = {"tearing": Bonded(), "pressing": Bonded(1e-6, 1e-6)}
 
 
 @dataclass(frozen=True)
@@ -49,19 +49,25 @@ class Row:
 
 
 def rows(
-    anatomies: Sequence[Anatomy], skulls: Sequence[str], poissons: Sequence[float], loads: Loads, device: str
+    anatomies: Sequence[Anatomy],
+    skulls: Sequence[str],
+    poissons: Sequence[float],
+    loads: Loads,
+    device: str,
+    tearing: Tearing = TEARING,
 ) -> Iterator[Row]:
     """The same loads on every mesh, Poisson's ratio and skull; E 3 kPa, neo-Hookean, the recommended element."""
     for poisson in poissons:
         for skull in skulls:
             for anatomy in anatomies:
-                yield _measured(anatomy, skull, poisson, loads, device)
+                yield _measured(anatomy, skull, poisson, loads, device, tearing)
 
 
-def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device: str) -> Row:
+def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device: str, tearing: Tearing) -> Row:
     mesh, tissue = anatomy.mesh, Material("neo-hookean", 3000.0, poisson)
-    _answered(anatomy, skull, tissue, loads.rows(slice(0, 1)).scaled(1e-3), device)  # kernels are compiled or loaded
-    answer, good, seconds = _answered(anatomy, skull, tissue, loads, device)
+    weak = loads.rows(slice(0, 1)).scaled(1e-3)
+    _answered(anatomy, skull, tissue, weak, device, tearing)  # kernels are compiled or loaded
+    answer, good, seconds = _answered(anatomy, skull, tissue, loads, device, tearing)
     if not good.any():
         return Row(skull, poisson, len(mesh.nodes), float("nan"), None, None, seconds, len(good))
     inside = mesh.region == TUMOUR_LABEL
@@ -71,18 +77,19 @@ def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device
     leaked, bond = (float(values[good].max()) for values in (answer.leaked, answer.bond))
     return Row(
         skull, poisson, len(mesh.nodes), 1e3 * float(np.linalg.norm(moved, axis=1).mean()),
-        None if skull in TEARING else leaked, bond if np.isfinite(bond) else None, seconds, int((~good).sum()),
+        None if skull in TORN else leaked, bond if np.isfinite(bond) else None, seconds, int((~good).sum()),
     )  # fmt: skip
 
 
 def _answered(
-    anatomy: Anatomy, skull: str, tissue: Material, loads: Loads, device: str
+    anatomy: Anatomy, skull: str, tissue: Material, loads: Loads, device: str, tearing: Tearing
 ) -> tuple[Deformation, np.ndarray, float]:
     """Answers, which of them are good (B,), and seconds a load: set-up left out, but for what tears, which needs it."""
-    if skull in TEARING:
-        effects = [TEARING[skull] if isinstance(one, Bonded) else one for one in pushed_effects(anatomy, tissue)]
+    if skull in TORN:
+        effects = [TORN[skull] if isinstance(one, Bonded) else one for one in pushed_effects(anatomy, tissue)]
         begun = clock.perf_counter()
-        found = [torn(anatomy, effects, loads.rows(np.array([row])), TRAIN, device) for row in range(len(loads))]
+        each = (loads.rows(np.array([row])) for row in range(len(loads)))
+        found = [torn(anatomy, effects, load, TRAIN, device, tearing=tearing) for load in each]
         good = np.array([one.rested and one.answer.outcome[0].good for one in found])
         return joined([one.answer for one in found]), good, (clock.perf_counter() - begun) / len(loads)
     fem = Fem(anatomy, pushed_effects(anatomy, tissue, skull), TRAIN, device)

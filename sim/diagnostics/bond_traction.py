@@ -12,9 +12,6 @@ from ..effects import Bonded
 from ..geometry.surface import areas
 from ..runtime.device import Device, forward_kernel
 
-# Tractions are means over so far [m] round a node: at the rim of an opening they have no limit, but a mean.
-ROUND = 5e-3
-
 
 @cache
 def kernel_of(device: Device) -> wp.Kernel:
@@ -56,9 +53,10 @@ class Bond:
 
     Tension and shear count together, as sqrt((t_n / tension)^2 + (t_s / shear)^2): the quadratic nominal stress
     criterion of cohesive layers (Camanho, Davila 2002, NASA/TM-2002-211737, eq. 16). Pressure breaks nothing.
+    Tractions are means over `around` [m] of each node: at the rim of an opening they have no limit, but a mean.
     """
 
-    def __init__(self, effect: Bonded, anatomy: Anatomy, space: Discretisation, device: Device):
+    def __init__(self, effect: Bonded, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 5e-3):
         self._effect, self._device = effect, device
         covered = (anatomy.slide_normal != 0.0).any(axis=1)
         corners = space.mesh.surface
@@ -68,7 +66,7 @@ class Bond:
         # Of a quadratic triangle's area the corners' shape functions have none.
         area = np.bincount(triangles[:, -3:].ravel(), share.ravel(), space.count)
         nodes = np.unique(triangles)
-        near = KDTree(space.nodes[nodes]).query_ball_point(space.nodes[nodes], ROUND)
+        near = KDTree(space.nodes[nodes]).query_ball_point(space.nodes[nodes], around)
         normal = space.sliding(anatomy.slide_normal, anatomy.held)[nodes]
         kept = np.flatnonzero(normal.any(axis=1) & np.array([area[nodes[patch]].any() for patch in near], bool))
         patches = [nodes[near[patch]] for patch in kept]

@@ -16,10 +16,21 @@ from ..errors import InputError
 from ..runtime.columns import CHUNK, combined, gathered
 from ..runtime.device import Device, forward_kernel
 
-# A normal, of which held components leave less than this, says nothing about the others.
-LEAST_NORMAL = 1e-6
-# Of a footprint that a tool moves, at least this share of the squared weights must be free in every direction.
-LEAST_FREE = 1e-2
+
+@dataclass(frozen=True)
+class Freedom:
+    """How little may be left free before it counts as held.
+
+    Parameters
+    ----------
+    normal
+        A normal, of which held components leave less than this, says nothing about the others.
+    footprint
+        Of a footprint that a tool moves, at least this share of the squared weights must be free in every direction.
+    """
+
+    normal: float = 1e-6
+    footprint: float = 1e-2
 
 
 @dataclass(frozen=True)
@@ -115,11 +126,13 @@ class Constraint:
         others follow them along the plane.
     device
         Where its arrays live.
+    freedom
+        What counts as held.
     """
 
-    def __init__(self, held: np.ndarray, normal: np.ndarray, device: Device):
-        self.held = held
-        self.normal, drag = _within_free(held, normal)
+    def __init__(self, held: np.ndarray, normal: np.ndarray, device: Device, freedom: Freedom = Freedom()):
+        self.held, self._freedom = held, freedom
+        self.normal, drag = _within_free(held, normal, freedom.normal)
         self.device = device
         self._held = device.array(held.astype(np.int8), wp.int8)
         self._normal = device.array(self.normal, device.vector)
@@ -146,7 +159,7 @@ class Constraint:
             free = np.eye(3) * ~self.held[:, None, :] - self.normal[:, :, None] * self.normal[:, None, :]
             self._gram = np.einsum("nb,nij->bij", square, free)
             share = np.linalg.eigvalsh(self._gram)[:, 0] / square.sum(axis=0)
-            if (share < LEAST_FREE).any():
+            if (share < self._freedom.footprint).any():
                 raise InputError(
                     f"load {np.argmin(share)} moves a footprint that is held, wholly or nearly: choose a free place."
                 )
@@ -239,14 +252,14 @@ class Constraint:
         self.device.launch(kernels_of(self.device).spread, (len(self.held), v.shape[1]), inputs, [v])
 
 
-def _within_free(held: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _within_free(held: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
     """Normals (N, 3) with their held components removed, of unit length again; zero where next to nothing is left.
 
     And (N, 3) the motion along them that a unit of each held component causes: normal . u stays zero.
     """
     inside = np.where(held, 0.0, normal)
     length = np.linalg.norm(inside, axis=1, keepdims=True)
-    left = length > LEAST_NORMAL
+    left = length > least
     unit = np.divide(inside, length, out=np.zeros_like(inside), where=left)
     drag = np.divide(inside - normal, length, out=np.zeros_like(inside), where=left)
     return unit, drag

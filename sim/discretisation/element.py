@@ -14,8 +14,6 @@ from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh
 # rest, elements under a tool fold at their corners, where no point looks.
 EIGHT_POINTS = np.vstack([np.eye(4), (np.ones((4, 4)) - np.eye(4)) / 3.0])
 EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)
-# Element matrices are summed in parts of so many entries, which bounds the memory that it takes.
-ENTRIES = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +92,11 @@ def quadratic_slopes(corner: np.ndarray) -> np.ndarray:
     return slope[:, :, 1:] - slope[:, :, :1]
 
 
-def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray) -> sp.csc_array:
+def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray, together: int = 20_000_000) -> sp.csc_array:
     """Stiffness at rest (3N, 3N) [N/m] of isotropic elements with Lamé's mu, lam (T,) [Pa].
 
-    K_ab = integral of mu (g_a . g_b I + g_b (x) g_a) + lambda g_a (x) g_b.
+    K_ab = integral of mu (g_a . g_b I + g_b (x) g_a) + lambda g_a (x) g_b. Element matrices are summed in parts of so
+    many entries `together`, which bounds the memory that it takes.
     """
     rows = 3 * elements.nodes
     total = sp.csc_array((rows, rows))
@@ -105,7 +104,7 @@ def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray) -> sp.c
     size = np.full(count, most) if elements.size is None else elements.size
     for places in np.unique(size):
         alike = np.flatnonzero(size == places)
-        for part in np.array_split(alike, -(-len(alike) * 9 * places**2 // ENTRIES)):
+        for part in np.array_split(alike, -(-len(alike) * 9 * places**2 // together)):
             total += _assembled(elements, part, int(places), mu[part], lam[part])
     return total
 

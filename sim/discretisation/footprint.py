@@ -14,16 +14,29 @@ import warp as wp
 from ..errors import InputError
 from ..runtime.device import Device, find_device, forward_kernel
 
-# Triangles are divided until their longest edge is below this share of the footprint's radius.
-FINENESS = 0.12
-# Each edge in so many pieces at least, and then in twice as many until that is fine enough.
-PIECES = 8
-# No edge is cut into more: a footprint of 0.1 mm needs them on a triangle of 50 m.
-MOST_PIECES = 2**22
 # Triangles that one thread searches, and findings of which it takes the nearest.
 CHUNK = wp.constant(16)
 
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Into how many pieces each edge of a triangle is divided under a footprint.
+
+    Parameters
+    ----------
+    fineness
+        Triangles are divided until their longest edge is below this share of the footprint's radius.
+    fewest
+        Pieces of each edge at least, and then twice as many until that is fine enough.
+    most
+        No edge is cut into more: a footprint of 0.1 mm needs them on a triangle of 50 m.
+    """
+
+    fineness: float = 0.12
+    fewest: int = 8
+    most: int = 2**22
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +91,26 @@ class Skin:
         Where its arrays live.
     name
         What a sentence calls it.
+    pieces
+        Of its triangles under a footprint.
     """
 
-    def __init__(self, nodes: np.ndarray, triangles: np.ndarray, device: Device, name: str = "surface"):
-        self.device, self._name = device, name
+    def __init__(
+        self,
+        nodes: np.ndarray,
+        triangles: np.ndarray,
+        device: Device,
+        name: str = "surface",
+        pieces: Pieces = Pieces(),
+    ):
+        self.device, self._name, self._pieces = device, name, pieces
         self.nodes, table = np.unique(triangles, return_inverse=True)
         self.numbers = device.array(self.nodes, wp.int32)
         corners = nodes[triangles[:, :3]]
         centre = corners.mean(axis=1)
         reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
         edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0)
-        self._least = edge / (FINENESS * MOST_PIECES)
+        self._least = edge / (pieces.fineness * pieces.most)
         self._corners = device.array(corners, wp.vec3d)
         self._ball = device.array(np.column_stack([centre, reach]), wp.vec4d)
         self._table = device.array(table.reshape(triangles.shape), wp.int32)
@@ -135,6 +157,7 @@ class Skin:
         imprint.weight.zero_()
         imprint.sums.zero_()
         inputs = [self._corners, self._ball, self._table, self._position, imprint.tools, imprint.touched]
+        inputs += [self._pieces.fineness, self._pieces.fewest, self._pieces.most]
         self.device.launch(_press, (len(self._ball), len(imprint.tools)), inputs, [imprint.weight, imprint.sums])
 
     def demand_touch(self, points: np.ndarray, radii: np.ndarray) -> None:
@@ -286,6 +309,9 @@ def _press(
     position: wp.array(dtype=wp.vec3d),
     tools: wp.array(dtype=wp.vec4d),
     touched: wp.array(dtype=wp.vec4d),
+    fineness: wp.float64,
+    fewest: int,
+    most: int,
     # outputs
     weight: wp.array2d(dtype=wp.float64),
     sums: wp.array(dtype=wp.vec4d),
@@ -302,8 +328,8 @@ def _press(
     zero, one, two = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0)
     start, first, second = corners[s, 0] - point, corners[s, 1] - corners[s, 0], corners[s, 2] - corners[s, 0]
     longest = wp.max(wp.max(wp.length(first), wp.length(second)), wp.length(first - second))
-    n = int(PIECES)
-    while longest > wp.float64(FINENESS) * radius * wp.float64(n) and n < MOST_PIECES:
+    n = int(fewest)
+    while longest > fineness * radius * wp.float64(n) and n < most:
         n *= 2
     h = one / wp.float64(n)
     step = h * second

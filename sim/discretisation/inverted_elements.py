@@ -11,15 +11,11 @@ from ..runtime.device import Device, forward_kernel
 from .element import linear_elements, quadratic_elements
 from .space import Discretisation
 
-# A volume below this share of its rest value is collapsed: round-off decides on which side of zero it lies.
-COLLAPSED = 1e-6
-
 
 @cache
-def kernel_of(device: Device, size: int, points: int) -> wp.Kernel:
+def kernel_of(device: Device, size: int, points: int, least: float) -> wp.Kernel:
     """The kernel for tetrahedra of `size` nodes and `points` quadrature points, over (tetrahedron, column)."""
     scalar, vec = device.scalar, device.vector
-    least = COLLAPSED
 
     @forward_kernel(module="unique")
     def count_inverted(
@@ -29,7 +25,7 @@ def kernel_of(device: Device, size: int, points: int) -> wp.Kernel:
         # outputs
         out: wp.array(dtype=wp.int32),
     ):
-        """n += 1 where det F <= 1e-6 at some point, F = I + sum over nodes of u_a (x) grad N_a."""
+        """n += 1 where det F <= least at some point, F = I + sum over nodes of u_a (x) grad N_a."""
         e, c = wp.tid()
         for q in range(points):
             F = wp.identity(n=3, dtype=scalar)
@@ -47,16 +43,17 @@ class Inversion:
     """Counts tetrahedra that lie inside out, or collapsed, at some quadrature point.
 
     Linear tetrahedra have one point, quadratic ones eight. Smoothed strains are averages: there too every tetrahedron
-    is looked at by itself.
+    is looked at by itself. A volume below the share `collapsed` of its rest value is collapsed: round-off decides on
+    which side of zero it lies.
     """
 
-    def __init__(self, space: Discretisation, device: Device):
+    def __init__(self, space: Discretisation, device: Device, collapsed: float = 1e-6):
         every = np.ones(len(space.mesh.tets), bool)
         quadratic = space.element == "p2"
         elements = (
             quadratic_elements(space.nodes, space.table, every) if quadratic else linear_elements(space.mesh, every)
         )
-        self._device = device
+        self._device, self._collapsed = device, collapsed
         self._table = device.array(elements.table, wp.int32)
         self._gradient = device.array(elements.gradient, device.vector)
 
@@ -70,4 +67,5 @@ class Inversion:
         """Add how many in u (3N, B) [m] to out (B,) int32, on the device alone."""
         _, points, size = self._gradient.shape
         inputs = [u, self._table, self._gradient]
-        self._device.launch(kernel_of(self._device, size, points), (len(self._table), u.shape[1]), inputs, [out])
+        kernel = kernel_of(self._device, size, points, self._collapsed)
+        self._device.launch(kernel, (len(self._table), u.shape[1]), inputs, [out])

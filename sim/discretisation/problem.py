@@ -18,9 +18,6 @@ from ..runtime.device import Device
 from .constraint import Constraint
 from .term import Barrier, Cases, Paced, Term
 
-# A gap of so many last digits of the largest displacement is closed.
-CLOSED = 100.0
-
 
 @dataclass(frozen=True, eq=False)
 class Imposed:
@@ -41,7 +38,8 @@ class Problem:
     """Terms, constraints, and how loads impose displacements; N nodes on one device.
 
     Arrays are (3N, b): one column per live load case. `barriers` are those of the terms that bodies touch.
-    `elastic`: nothing but elasticity resists by itself; an effect of somebody's own might.
+    `elastic`: nothing but elasticity resists by itself; an effect of somebody's own might. A gap of up to `closed` last
+    digits of the largest displacement is closed.
     """
 
     terms: tuple[Term, ...]
@@ -50,6 +48,7 @@ class Problem:
     impose: Callable[[Loads], Imposed] = nothing_imposed
     barriers: tuple[Barrier, ...] = ()
     elastic: bool = True
+    closed: float = 100.0
 
     @property
     def rows(self) -> int:
@@ -129,7 +128,7 @@ class Problem:
         What round-off leaves open counts as closed, and its motion is zero.
         """
         gap, size = self.constraint.close_gap(u)
-        off = size > CLOSED * np.finfo(self.device.precision).eps * np.abs(u.numpy()).max(axis=0, initial=0.0)
+        off = size > self.closed * np.finfo(self.device.precision).eps * np.abs(u.numpy()).max(axis=0, initial=0.0)
         return combined(self.device, gap, off - 1.0, gap, gap), off
 
     def linearise(self, u: wp.array, definite: np.ndarray) -> None:

@@ -9,15 +9,13 @@ from ..anatomy import Anatomy
 from ..errors import InputError
 from ..geometry.tetmesh import FACES, TetMesh, row_keys
 
-# A rigid motion is felt when the constraints move by more than this share of it, in the mean.
-FELT = 1e-6
 
-
-def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray) -> None:
+def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float = 1e-6) -> None:
     """Refuse a body, or a part of one, that can translate or rotate freely.
 
     held (V, 3) bool and normal (V, 3) are the constraints. A node of no element must be held: nothing else stops it.
-    Elements joined by faces make a rigid cluster; clusters that share a corner or an edge only are hinged there.
+    Elements joined by faces make a rigid cluster; clusters that share a corner or an edge only are hinged there. A
+    rigid motion is felt when the constraints move by more than the share `felt` of it, in the mean.
 
     Raises
     ------
@@ -35,7 +33,7 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray) -> None:
     piece = _components(cluster, cluster.max() + 1 + node, cluster.max() + 1 + count)[cluster]
     for number in np.unique(piece):
         mine = piece == number
-        free, at = _free_motions(mesh.nodes, held, normal, cluster[mine], node[mine])
+        free, at = _free_motions(mesh.nodes, held, normal, cluster[mine], node[mine], felt)
         if free == 0:
             continue
         hinged = len(np.unique(cluster[mine])) > 1
@@ -52,7 +50,7 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray) -> None:
         )
 
 
-def loosened(anatomy: Anatomy, slides: bool = True) -> np.ndarray:
+def loosened(anatomy: Anatomy, slides: bool = True, felt: float = 1e-6) -> np.ndarray:
     """Tetrahedra (n,) that can move rigidly: joined by faces to nothing held, nor borne by what slides, if it does."""
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
     cluster, nodes = _clusters(anatomy.mesh.tets), anatomy.mesh.nodes
@@ -62,7 +60,7 @@ def loosened(anatomy: Anatomy, slides: bool = True) -> np.ndarray:
         node = np.unique(anatomy.mesh.table[mine])
         if not anatomy.held[node].any():
             one = np.zeros(len(node), np.int64)
-            if _free_motions(nodes, anatomy.held, normal, one, node)[0]:
+            if _free_motions(nodes, anatomy.held, normal, one, node, felt)[0]:
                 loose.append(mine)
     return np.concatenate(loose) if loose else np.zeros(0, np.int64)
 
@@ -82,7 +80,7 @@ def _clusters(tets: np.ndarray) -> np.ndarray:
 
 
 def _free_motions(
-    nodes: np.ndarray, held: np.ndarray, normal: np.ndarray, cluster: np.ndarray, node: np.ndarray
+    nodes: np.ndarray, held: np.ndarray, normal: np.ndarray, cluster: np.ndarray, node: np.ndarray, felt: float
 ) -> tuple[int, int]:
     """How many rigid motions of clusters nothing resists, and the cluster that moves most in one of them.
 
@@ -105,8 +103,8 @@ def _free_motions(
     order, x = np.argsort(node, kind="stable"), np.arange(3)
     joint = np.flatnonzero(node[order[1:]] == node[order[:-1]])
     one, other = ((3 * order[joint + k][:, None] + x).ravel() for k in (0, 1))
-    felt = sp.vstack([moves[held[node].ravel()], across, moves[one] - moves[other]])
+    resisted = sp.vstack([moves[held[node].ravel()], across, moves[one] - moves[other]])
     equations = int(held[node].sum() + (normal[node] != 0.0).any(axis=1).sum() + len(one))
-    values, vectors = np.linalg.eigh((felt.T @ felt).toarray())
+    values, vectors = np.linalg.eigh((resisted.T @ resisted).toarray())
     amount = np.abs(vectors[:, 0]).reshape(-1, 6).max(axis=1)
-    return int((values <= FELT**2 * max(equations, 1)).sum()), int(names[np.argmax(amount)])
+    return int((values <= felt**2 * max(equations, 1)).sum()), int(names[np.argmax(amount)])

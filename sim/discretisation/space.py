@@ -23,10 +23,6 @@ RECOMMENDED = "smoothed"
 """The element of every scene and command that names none, on meshes of linear tetrahedra."""
 
 
-# The least cosine between the normal at the middle of an edge and the normals of its ends: less is another wall's.
-FACING = 0.75
-
-
 @dataclass(frozen=True, eq=False)
 class Part:
     """Elements, and which of a tissue's stiffness they carry: "whole", "shape" or "volume"."""
@@ -113,12 +109,13 @@ class Discretisation:
             out[wall[wall >= len(held)], component] = True
         return out
 
-    def sliding(self, normal: np.ndarray, held: np.ndarray) -> np.ndarray:
+    def sliding(self, normal: np.ndarray, held: np.ndarray, facing: float = 0.75) -> np.ndarray:
         """Slide normals (N, 3) from the mesh's own (V, 3); held (V, 3) bool.
 
         An added node slides where its edge lies on a surface triangle whose corners all slide or are held. Its normal
         is along the integral of its shape function's gradient, as that of the triangles that meet there, so that no
-        volume passes; where these do not face as its ends do (at the edge of a box, say), of those triangles alone.
+        volume passes; where these do not face as its ends do (at the edge of a box, say), of those triangles alone. A
+        cosine between them up to `facing` is another wall's.
         """
         out = np.zeros((self.count, 3))
         out[: len(normal)] = normal
@@ -133,7 +130,7 @@ class Discretisation:
         np.add.at(near, self.surface[wall, 3:], twice[wall, None])
         np.add.at(every, self.surface[:, 3:], twice[:, None])
         near, every = unit(near[len(normal) :]), unit(every[len(normal) :])
-        agrees = (np.einsum("nei,ni->ne", normal[self.edges], every) > FACING) | ~slides[self.edges]
+        agrees = (np.einsum("nei,ni->ne", normal[self.edges], every) > facing) | ~slides[self.edges]
         found = np.where(agrees.all(axis=1, keepdims=True), every, near)
         out[len(normal) :] = np.where((near != 0.0).any(axis=1, keepdims=True), found, 0.0)
         return out
