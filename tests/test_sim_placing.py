@@ -1,11 +1,9 @@
 """Where the skull is opened, and what places are called."""
 
-import re
-
 import numpy as np
 import pytest
 
-import sim.bodies.mesher
+from sim.bodies.mesher import Meshing, too_intricate
 from sim.bodies.placement import Placement, opening_at, opening_over, side_of, site_over
 from sim.errors import InputError
 
@@ -46,6 +44,13 @@ def test_an_opening_that_cannot_be_is_a_sentence(cortex, place, reason):
         opening_at(cortex, np.array(place))
 
 
+def test_how_far_off_a_point_may_lie_is_asked_for(cortex):
+    asked = np.array([0.0, 0.0, 0.12])
+    with pytest.raises(InputError, match="50 mm is the most"):
+        opening_at(cortex, 1.3 * asked, Placement(near=0.05))
+    assert opening_at(cortex, asked, Placement(near=0.06))[2] > 0.06
+
+
 def test_over_a_point_outside_nothing_is_opened(cortex):
     with pytest.raises(InputError, match="lies 30 mm outside the brain"):
         opening_over(cortex, np.array([0.1, 0.0, 0.0]), -0.03)
@@ -68,16 +73,13 @@ def test_places_are_called_as_clinicians_call_them(place, words):
     assert side_of(np.array(place), LOW, HIGH) == words
 
 
-def test_too_few_nodes_are_told_how_many_would_do(monkeypatch):
+def test_too_few_nodes_are_told_how_many_would_do():
     asked = []
 
-    def meshed(solids, count, settings):
+    def would_do(count):
         asked.append(count)
-        return "mesh" if count >= 4000 else None
+        return count >= 4000
 
-    monkeypatch.setattr(sim.bodies.mesher, "_meshed", meshed)
-    with pytest.raises(InputError, match=re.escape("too intricate for 3000 nodes: ask for 4800, or smooth")):
-        sim.bodies.mesher.mesh_solids(None, 3000)
-    assert asked == [3000, 3800, 4800]
-    with pytest.raises(InputError, match="for 1000 nodes: smooth the labels"):
-        sim.bodies.mesher.mesh_solids(None, 1000)
+    told = str(too_intricate(3000, Meshing().more, would_do))
+    assert "too intricate for 3000 nodes: ask for 4800, or smooth" in told and asked == [3800, 4800]
+    assert "for 1000 nodes: smooth the labels" in str(too_intricate(1000, Meshing().more, would_do))

@@ -6,7 +6,7 @@ import pytest
 from sim.bodies.bcc_lattice import graded_lattice
 from sim.bodies.isosurface_stuffing import cut, whole
 from sim.bodies.manifold_repair import clean, ears
-from sim.bodies.mesh_smoothing import enclosed_volume, fitted, improved, smallest_sines
+from sim.bodies.mesh_smoothing import Smoothing, enclosed_volume, fitted, improved, smallest_sines
 from sim.bodies.signed_distance import onto_level
 from sim.geometry.tetmesh import dihedral_angles, faces_once, row_keys, signed_volumes
 
@@ -62,6 +62,7 @@ def test_bad_angles_improve_and_surface_nodes_stay_on_the_surface(body):
 
     nodes = project(nodes, np.arange(len(nodes)))
     moved = improved(nodes, body.tets, project)
+    np.testing.assert_array_equal(improved(nodes, body.tets, project, Smoothing(rounds=0)), nodes)
     assert smallest_sines(nodes[body.tets]).min() < np.sin(np.radians(5.0))
     assert smallest_sines(moved[body.tets]).min() > np.sin(np.radians(14.0))
     assert np.abs(ball(moved[surface])).max() < 1e-6

@@ -6,6 +6,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from sim.anatomy import TUMOUR_LABEL
+from sim.bodies.mesher import Meshing
 from sim.bodies.subject import Plan, make_anatomy
 from sim.bodies.template import Head, Tumour, template_subject
 from sim.errors import InputError
@@ -61,6 +62,12 @@ def test_at_17k_nodes_angles_surface_and_volume_are_as_promised(shape):
     )
     assert distance.mean() < 3e-4
     assert np.percentile(distance, 95) < 1e-3
+
+
+def test_the_mesh_is_searched_for_as_the_plan_says(subject):
+    meshing = Meshing(trials=1, farthest=0.0)
+    with pytest.raises(InputError, match="3000 nodes cannot be had for this anatomy"):
+        make_anatomy(subject, Plan(3000, meshing=meshing))
 
 
 def test_it_has_the_volume_of_a_person(anatomy):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -96,12 +97,17 @@ def mesh_solids(solids: Solids, count: int, settings: Meshing = Meshing()) -> Te
         that the search for a lattice size does not reach.
     """
     mesh = _meshed(solids, count, settings)
-    if mesh is not None:
-        return mesh
-    more = (int(round(count * times, -2)) for times in settings.more)
-    would_do = next((number for number in more if _would_do(solids, number, settings)), None)
-    remedy = "smooth the labels" if would_do is None else f"ask for {would_do}, or smooth the labels"
-    raise InputError(f"the surfaces are too intricate for {count} nodes: {remedy}.")
+    if mesh is None:
+        raise too_intricate(count, settings.more, lambda number: _would_do(solids, number, settings))
+    return mesh
+
+
+def too_intricate(count: int, more: Sequence[float], would_do: Callable[[int], bool]) -> InputError:
+    """What is said where `count` nodes do not show a solid: the first of `more` times as many that `would_do`."""
+    numbers = (int(round(count * times, -2)) for times in more)
+    enough = next(filter(would_do, numbers), None)
+    remedy = "smooth the labels" if enough is None else f"ask for {enough}, or smooth the labels"
+    return InputError(f"the surfaces are too intricate for {count} nodes: {remedy}.")
 
 
 def _would_do(solids: Solids, count: int, settings: Meshing) -> bool:
