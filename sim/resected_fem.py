@@ -24,8 +24,6 @@ from .runtime.exclusive import alone
 DONE = "resection"
 # Shape of a tool's pose.
 POSE = (4, 4)
-# Solvers that are kept.
-KEPT = 4
 
 
 class Operated:
@@ -41,13 +39,15 @@ class Operated:
     make
         Makes the solver of one of them.
     ahead
-        All are made at once, and kept: no load waits for one. Else each when it is first asked for, and a few are kept.
+        All are made at once, and kept: no load waits for one. Else each when it is first asked for.
+    kept
+        Of the latter, how many stay in memory.
     """
 
-    def __init__(self, bodies: tuple[Remains, ...], make: Callable[[Anatomy], Fem], ahead: bool = False):
+    def __init__(self, bodies: tuple[Remains, ...], make: Callable[[Anatomy], Fem], ahead: bool = False, kept: int = 4):
         self.lock = RLock()
         self._bodies = bodies
-        self._solver = lru_cache(len(bodies) if ahead else KEPT)(lambda done: make(bodies[done].anatomy))
+        self._solver = lru_cache(len(bodies) if ahead else kept)(lambda done: make(bodies[done].anatomy))
         self._rows = lru_cache(None)(lambda done: _rows(self._solver(done)))
         self._place = lru_cache(None)(lambda done, name: _found(self._rows(0)[name][0], self._rows(done)[name][0]))
         for done in range(len(bodies) if ahead else 0):

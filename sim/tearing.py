@@ -80,8 +80,8 @@ def torn(
     """Solve one load; let go what bears too much, as well as what slides and is pulled; hold what would pass the skull.
 
     Brittle: no energy is left in what is torn, and it does not heal. What let go
-    meets the plane across its normal at rest, without a gap: an active set of constraints, in which a strength near
-    zero is a skull that only presses.
+    meets the plane across its normal at rest, without a gap: these constraints are an active set. With a strength near
+    zero the skull only presses.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from sim.effects import Elasticity, Held, NodalForce, SkullContact
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.terms.contact.skull_surface import EDGE_FELT, FELT, bone_of, edge_of, inside_opening, rim_of
+from sim.terms.contact.skull_surface import BONE, bone_of, edge_of, inside_opening, rim_of
 
 MESH = box((10, 6, 3), 0.05)
 HEIGHT = MESH.nodes[:, 2].max()
@@ -65,7 +65,7 @@ def test_a_body_without_an_opening_has_bone_alone() -> None:
     body = half_open(np.zeros(len(TOP), bool))
     bone = bone_of(body, discretise(MESH, "p1"), GAP)
     np.testing.assert_array_equal(bone.nodes, np.flatnonzero(TOP & ~OPEN))
-    np.testing.assert_array_equal(bone.felt, FELT)
+    np.testing.assert_array_equal(bone.felt, BONE.felt)
     assert (bone.inside < 0.0).all()
 
 
@@ -92,7 +92,7 @@ def test_open_cortex_slides_under_bone_and_not_into_it(element: str) -> None:
 
     assert depth(dragged(half_open(np.zeros(len(TOP), bool)), element)).max() > 1e-3
     barred = depth(dragged(half_open(), element))
-    assert barred.max() < 0.1 * EDGE_FELT * edge
+    assert barred.max() < 0.1 * BONE.edge_felt * edge
     assert barred.max() > -edge, "nothing came near the edge"
 
 

@@ -15,11 +15,11 @@ from .placement import Placement
 def bounded(mesh: TetMesh, site: np.ndarray, craniotomy: float, settings: Placement) -> Anatomy:
     """The anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
 
-    Stem: surface nodes within a share of the brain's height from the lowest one (least superior); held. Craniotomy:
-    surface nodes within half of the diameter `craniotomy` [m] along the surface from the point nearest to `site`;
-    free. Skull: the rest of the surface, each node with its unit normal n_i, along the integral of grad N_i: a body of
-    linear tetrahedra whose nodes do not move along theirs passes no volume through the skull (Engelman, Sani, Gresho
-    1982, Int. J. Numer. Methods Fluids 2:225-238). Effects say what the skull does.
+    The stem is held: surface nodes within a share of the brain's height from the lowest one (least superior). The
+    craniotomy is free: surface nodes within half of the diameter `craniotomy` [m] along the surface from the point
+    nearest to `site`. The skull covers the rest of the surface, and effects say what it does. Each of its nodes has its
+    unit normal n_i, along the integral of grad N_i. A body of linear tetrahedra whose nodes do not move along theirs
+    passes no volume through the skull (Engelman, Sani, Gresho 1982, Int. J. Numer. Methods Fluids 2:225-238).
 
     Raises
     ------

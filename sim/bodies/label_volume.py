@@ -60,8 +60,9 @@ def volume_subject(
     Raises
     ------
     InputError
-        What `read_volume` refuses; labels that are not whole, not there, or named twice; a brain of less than 20 ml or
-        more than 5,000 ml; a tumour outside the brain or of fewer than 27 voxels (or what else `settings` say).
+        What `read_volume` refuses; labels that are not whole, not there, or named twice; a tumour outside the brain.
+        What `settings` refuse: by default a brain of less than 20 ml or more than 5,000 ml, and a tumour of fewer than
+        27 voxels.
     """
     volume = read_volume(path)
     _check_labels(path, volume.values, brain, tumour)

@@ -55,9 +55,9 @@ def read_volume(path: str | Path, voxels: Voxels = Voxels()) -> Volume:
     Raises
     ------
     InputError
-        A path that is no readable NIfTI file; several volumes, a slice, colours or complex numbers; values that are
-        not finite; an affine that is singular; voxels that are too coarse or too fine, or too many of them; a
-        slope that is no number; a file that ends before its voxels do.
+        A path that is no readable NIfTI file, or a file that ends before its voxels do. Several volumes, a slice,
+        colours or complex numbers. Values or a slope that are not finite. An affine that is singular. Voxels that are
+        too coarse or too fine, or too many of them.
     """
     import nibabel
 

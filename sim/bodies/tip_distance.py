@@ -20,8 +20,8 @@ class TipGauge:
     """Measures from the tip of a round tool to the closest point of the tumour's surface.
 
     A tool that pushes is a ball of its footprint's radius. It comes down along the open cortex's inward axis until it
-    rests on the deformed open cortex, on the line through the point that it pushes, where the tissue has carried that.
-    Its tip is its lowest point along that axis. Where poses are told, the tip is where they have it.
+    rests on the deformed open cortex. Its line goes through the point that it pushes, where the tissue has carried
+    that. Its tip is its lowest point along that axis. Where poses are given, the tip is where they have it.
 
     Parameters
     ----------

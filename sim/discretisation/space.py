@@ -113,9 +113,9 @@ class Discretisation:
         """Slide normals (N, 3) from the mesh's own (V, 3); held (V, 3) bool.
 
         An added node slides where its edge lies on a surface triangle whose corners all slide or are held. Its normal
-        is along the integral of its shape function's gradient, as that of the triangles that meet there, so that no
-        volume passes; where these do not face as its ends do (at the edge of a box, say), of those triangles alone. A
-        cosine between them up to `facing` is another wall's.
+        is along the integral of its shape function's gradient over all triangles that meet there: no volume passes.
+        Where these do not face as its ends do (at the edge of a box, say), the normal is of those triangles alone. A
+        cosine between the normals of up to `facing` is another wall's.
         """
         out = np.zeros((self.count, 3))
         out[: len(normal)] = normal

@@ -33,10 +33,10 @@ def blurred_normals(
 ) -> np.ndarray:
     """Unit normals (n, 3) at points (n, 3) [m] of the body within outward triangles (S, 3), seen through a blur.
 
-    The gradient of a body's indicator after a Gaussian of standard deviation `blur` [m] is, by the divergence theorem,
-    the integral over its surface of the Gaussian times the inward normal: of folds narrower than the blur nothing is
-    left, and the finer the mesh, the less the normals depend on it. Triangles that are so wide that none of their
-    middles need be in sight of a corner are seen through a wider blur, a share of their longest edge.
+    They are the gradient of the body's indicator after a Gaussian of standard deviation `blur` [m]. By the divergence
+    theorem that is the integral over its surface of the Gaussian times the inward normal. Of folds narrower than the
+    blur nothing is left, and the finer the mesh, the less the normals depend on it. Triangles that are so wide that
+    none of their middles need be in sight of a corner are seen through a wider blur, a share of their longest edge.
     """
     a, b, c = np.moveaxis(nodes[triangles], 1, 0)
     longest = np.linalg.norm([b - a, c - b, a - c], axis=2).max()

@@ -19,7 +19,7 @@ from .preconditioner import direct
 
 @dataclass(frozen=True)
 class Condensing:
-    """How a part is told from the rest of a body, and how the rest is solved for.
+    """How a part is parted from the rest of a body, and how the rest is solved for.
 
     Parameters
     ----------

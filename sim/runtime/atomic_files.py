@@ -15,19 +15,17 @@ from typing import BinaryIO
 
 from ..errors import InputError
 
-# Seconds after which another machine's unfinished file is a left-over: whoever writes, writes every few minutes.
-STALE = 24 * 3600.0
-
 
 def why(error: OSError) -> str:
     """Why a file cannot be had, in the system's own words and not a library's."""
     return os.strerror(error.errno) if error.errno else "the library that writes it failed"
 
 
-def check_output(path: str | Path, suffix: str) -> Path:
+def check_output(path: str | Path, suffix: str, stale: float = 24 * 3600.0) -> Path:
     """The path of a file that can be written, its folder made; asked before long work, so that none is lost.
 
-    What an earlier run of the same output left behind when it was killed is removed.
+    What an earlier run of the same output left behind when it was killed is removed. Another machine's unfinished file
+    is such a left-over after `stale` seconds: whoever writes, writes every few minutes.
 
     Raises
     ------
@@ -43,7 +41,7 @@ def check_output(path: str | Path, suffix: str) -> Path:
         raise InputError(f"{path}: its folder cannot be made ({why(error)}). Choose another folder.") from error
     if path.is_dir():
         raise InputError(f"{path}: cannot be written, it is a folder. Choose another name.")
-    _sweep(path)
+    _sweep(path, stale)
     probe = _partial(path)
     try:  # permissions alone do not tell: a file system may be read-only, or make no files
         probe.touch()
@@ -189,15 +187,15 @@ def _partial(path: Path) -> Path:
     return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")
 
 
-def _sweep(path: Path) -> None:
-    """Remove what dead processes of this machine left of `path`, and what others have not touched for a day."""
+def _sweep(path: Path, stale: float) -> None:
+    """Remove what dead processes of this machine left of `path`, and what others have not touched for `stale` [s]."""
     form = re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-{re.escape(path.name)}")
     try:
         for left in list(path.parent.iterdir()):
             found = form.fullmatch(left.name)
             if found is None:
                 continue
-            dead = not _alive(int(found[2])) if found[1] == _host() else time.time() - left.stat().st_mtime > STALE
+            dead = not _alive(int(found[2])) if found[1] == _host() else time.time() - left.stat().st_mtime > stale
             if dead:
                 left.unlink(missing_ok=True)
     except OSError:  # a folder that may not be listed, or a left-over that may not be removed, stops no work

@@ -18,8 +18,6 @@ from ..runtime.device import Device
 from .dead_force import DeadForce, Forces
 
 STANDARD_GRAVITY = 9.80665  # [m/s^2]
-# So many postures are weighed once and kept: a solver takes the same loads several times.
-KEPT = 64
 
 
 def change_of_weight(effect: Gravity, space: Discretisation, device: Device) -> DeadForce:
@@ -27,20 +25,21 @@ def change_of_weight(effect: Gravity, space: Discretisation, device: Device) -> 
     return DeadForce("gravity", changes(effect, space, device), device)
 
 
-def changes(effect: Gravity, space: Discretisation, device: Device) -> Callable[[Loads], Forces | None]:
+def changes(effect: Gravity, space: Discretisation, device: Device, kept: int = 64) -> Callable[[Loads], Forces | None]:
     """Loads -> the nodal forces f_a = s (w_a(now) - w_a(scan)), or None without a `Posture`.
 
     w_a = g d integral of (rho - rho_csf [x is under the level]) N_a(x) dV in the rest configuration, N_a the elements'
-    own shape functions. The part of an element under the level is cut out exactly, so that the total is
-    g d (rho V - rho_csf V_under) and a level that moves changes the forces continuously. (A curved element is cut where
-    the plane meets it before it is bent.)
+    own shape functions. The part of an element under the level is cut out exactly: the total is
+    g d (rho V - rho_csf V_under). A level that moves changes the forces continuously. (A curved element is cut where
+    the plane meets it before it is bent.) So many postures are weighed once and `kept`: a solver takes the same loads
+    several times.
     """
     table, count = space.table, space.count
     ones = np.broadcast_to(np.eye(4), (len(table), 4, 4))
     whole = nodal_volumes(space, np.arange(len(table)), ones)
     volume = summed(table, whole, count)
 
-    @lru_cache(KEPT)
+    @lru_cache(kept)
     def weights(*posture: float) -> np.ndarray:
         """How much each node weighs (N, 3) [N] in a posture: direction, then level [m]."""
         direction, level = np.array(posture[:3]), posture[3]

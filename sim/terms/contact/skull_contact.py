@@ -20,14 +20,28 @@ from ...discretisation.term import Cases
 from ...effects import SkullContact
 from ...runtime.device import Device, forward_kernel
 from .barrier import RELAXED, barrier, barrier_curvature, barrier_slope
-from .skull_surface import Bone, bone_of
+from .skull_surface import BONE, Bone, BoneSettings, bone_of
 
 # A step takes no node farther than this share of its distance to the bone.
 ROOM_KEPT = wp.constant(0.9)
-# Preconditioners count the skull as stiff as this share of the shear modulus over what is felt: between open and shut.
-HALF_SHUT = 0.2
-# How far [m] brain may come at once, from rest and from where it was: the barrier is as wide at first.
-AT_FIRST, AGAIN = 1e-2, 5e-4
+
+
+@dataclass(frozen=True)
+class SkullBarrier:
+    """How stiff preconditioners take the skull to be, and how wide its barrier is at first.
+
+    Parameters
+    ----------
+    half_shut
+        Preconditioners count the skull as stiff as this share of the shear modulus over what is felt: between open and
+        shut.
+    at_first, again
+        [m] How far brain may come at once, from rest and from where it was: the barrier is as wide at first.
+    """
+
+    half_shut: float = 0.2
+    at_first: float = 1e-2
+    again: float = 5e-4
 
 
 @dataclass(frozen=True)
@@ -233,13 +247,15 @@ class Skull:
         Shear modulus [Pa] of the tissue.
     device
         Where its arrays live.
+    settings
+        Of its barrier.
     """
 
     name = "skull contact"
     constant, passive, steep = False, False, True
 
-    def __init__(self, bone: Bone, count: int, shear: float, device: Device):
-        self._device, self._kernels, self._bone = device, kernels_of(device), bone
+    def __init__(self, bone: Bone, count: int, shear: float, device: Device, settings: SkullBarrier = SkullBarrier()):
+        self._device, self._kernels, self._bone, self._settings = device, kernels_of(device), bone, settings
         self._wall = Wall()
         self._wall.nodes = device.array(bone.nodes, wp.int32)
         self._wall.bend = device.array(bone.bend, wp.mat33d)
@@ -251,7 +267,7 @@ class Skull:
         self.widen(1.0)
         covered = bone.inside < 0.0
         nodes, normal, times = bone.nodes[covered], bone.normal[covered], (bone.area / bone.felt)[covered]
-        blocks = (HALF_SHUT * shear * times)[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        blocks = (settings.half_shut * shear * times)[:, None, None] * normal[:, :, None] * normal[:, None, :]
         row = (3 * nodes[:, None, None] + np.arange(3)[:, None]).repeat(3, axis=2)
         place = row.ravel(), row.swapaxes(1, 2).ravel()
         self._rest = sp.csc_array(sp.coo_array((blocks.ravel(), place), shape=(3 * count, 3 * count)))
@@ -265,7 +281,7 @@ class Skull:
         known = np.full(len(cases.loads), cases.displacement is not None)
         if cases.anew is not None:
             known &= ~cases.anew
-        return np.where(known, AGAIN, AT_FIRST) / self._bone.felt.min()
+        return np.where(known, self._settings.again, self._settings.at_first) / self._bone.felt.min()
 
     def buried(self, u: wp.array) -> np.ndarray:
         """The skull is never inside what it holds."""
@@ -321,6 +337,14 @@ class Skull:
         self._device.launch(kernel, (len(self._bone.nodes), out.shape[-1]), [*inputs, self._wall], [out])
 
 
-def skull_of(effect: SkullContact, anatomy: Anatomy, space: Discretisation, shear: float, device: Device) -> Skull:
+def skull_of(
+    effect: SkullContact,
+    anatomy: Anatomy,
+    space: Discretisation,
+    shear: float,
+    device: Device,
+    bone: BoneSettings = BONE,
+    settings: SkullBarrier = SkullBarrier(),
+) -> Skull:
     """The term of `SkullContact` on tissue with a shear modulus [Pa]."""
-    return Skull(bone_of(anatomy, space, effect.gap), space.count, shear, device)
+    return Skull(bone_of(anatomy, space, effect.gap, bone), space.count, shear, device, settings)

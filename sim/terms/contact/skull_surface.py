@@ -13,19 +13,42 @@ from ...discretisation.space import Discretisation
 from ...errors import InputError
 from ...geometry.surface import Sight, areas, blurred_normals, edge_lengths, unit
 
-# The skull is felt in the last of the gap: so far [m] from it, or within all of a narrower one.
-FELT = 1e-4
 # What was under bone stays so far [m] from where it ends, and is barred wherever it goes.
 UNDER_BONE = -1.0
-# The edge of an opening is as round as a mesh can tell, and felt from this share of its radius: on a sharp or a hard
-# one nodes snap from above it to below.
-EDGE_FELT = 0.25
-# The blur through which bone over an opening goes on from that beside it, in the radii of the edge.
-BLUR = 1.5
-# The wall's bend at a node is read off so many nearest nodes, of those whose normals are less than 60 degrees apart.
-NEIGHBOURS, FACING = 16, 0.5
 # Of a quadratic triangle's area each corner's share, and each middle's: all positive, so that no node is forgotten.
 CORNER, MIDDLE = 1.0 / 12.0, 1.0 / 4.0
+
+
+@dataclass(frozen=True)
+class BoneSettings:
+    """From where bone is felt, and how its bend and its edge are read off a mesh.
+
+    Parameters
+    ----------
+    felt
+        [m] The skull is felt in the last of the gap: so far from it, or within all of a narrower one.
+    edge_felt
+        The edge of an opening is as round as a mesh can show, and felt from this share of its radius. On a sharp or a
+        hard edge nodes would snap from above it to below.
+    blur
+        The blur through which bone over an opening goes on from that beside it, in the radii of the edge.
+    neighbours, facing
+        The wall's bend at a node is read off so many nearest nodes, of those with a larger cosine between their
+        normals.
+    far
+        Blurs from the edge, beyond which too little of it is seen.
+    """
+
+    felt: float = 1e-4
+    edge_felt: float = 0.25
+    blur: float = 1.5
+    neighbours: int = 16
+    facing: float = 0.5
+    far: float = 2.5
+
+
+BONE = BoneSettings()
+"""Bone as it is felt unless settings are given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +83,7 @@ class Bone:
     edge: float
 
 
-def bone_of(anatomy: Anatomy, space: Discretisation, gap: float) -> Bone:
+def bone_of(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneSettings = BONE) -> Bone:
     """Over what a skull covers, and over the craniotomy near its edge; `gap` [m] at rest. Held nodes stay.
 
     Raises
@@ -75,21 +98,23 @@ def bone_of(anatomy: Anatomy, space: Discretisation, gap: float) -> Bone:
         raise InputError(
             "SkullContact finds no node that could touch: this anatomy has no slide normals, or holds all."
         )
-    inside, way, felt = np.full(space.count, UNDER_BONE), np.zeros_like(normal), np.full(space.count, min(FELT, gap))
+    inside, way = np.full(space.count, UNDER_BONE), np.zeros_like(normal)
+    felt = np.full(space.count, min(settings.felt, gap))
     edge, rim = 0.0, rim_of(anatomy)
     if len(rim):
         opened = np.zeros(space.count, bool)
         opened[space.surface[about_opening(anatomy) & anatomy.craniotomy[space.mesh.surface].any(axis=1)]] = True
         opened &= ~slides & ~held
         edge = edge_of(space.nodes, rim)
-        normal[opened] = blurred_normals(space.nodes, space.surface[:, :3], space.nodes[opened], BLUR * edge)
-        r, way[opened] = inside_opening(anatomy, space.nodes[opened], normal[opened], edge)
-        inside[opened], felt[opened] = r.clip(0.0), EDGE_FELT * edge
+        blur, points = settings.blur * edge, space.nodes[opened]
+        normal[opened] = blurred_normals(space.nodes, space.surface[:, :3], points, blur)
+        r, way[opened] = inside_opening(anatomy, points, normal[opened], edge, settings.far)
+        inside[opened], felt[opened] = r.clip(0.0), settings.edge_felt * edge
     nodes = np.flatnonzero(slides | (way != 0.0).any(axis=1))
     return Bone(
         nodes,
         normal[nodes],
-        bend_of(space.nodes[nodes], normal[nodes]),
+        bend_of(space.nodes[nodes], normal[nodes], settings),
         inside[nodes],
         way[nodes],
         felt[nodes],
@@ -106,18 +131,18 @@ def _areas(space: Discretisation) -> np.ndarray:
     return np.bincount(space.surface.ravel(), (area[:, None] * shares).ravel(), space.count)
 
 
-def bend_of(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def bend_of(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BONE) -> np.ndarray:
     """How unit normals (k, 3) at points (k, 3) [m] of a wall change along it: (k, 3, 3) [1/m], symmetric.
 
     The least-squares fit of n_j - n_i = H (x_j - x_i) to the nearest points whose normals face the same way, along the
     wall alone; where the wall is hollow (a negative curvature) it counts as flat.
     """
-    count = min(NEIGHBOURS, len(points))
+    count = min(settings.neighbours, len(points))
     near = KDTree(points).query(points, count)[1].reshape(len(points), count)
     across = np.linalg.svd(normal[:, None])[2][:, 1:]  # two directions along the wall
     step = np.einsum("kja,kia->kij", across, points[near] - points[:, None])
     turn = np.einsum("kja,kia->kij", across, normal[near] - normal[:, None])
-    weight = np.einsum("kia,ka->ki", normal[near], normal) > FACING
+    weight = np.einsum("kia,ka->ki", normal[near], normal) > settings.facing
     x, y = np.moveaxis(step * weight[:, :, None], 2, 0)
     none = np.zeros_like(x)
     # Unknowns H_xx, H_xy, H_yy.
@@ -129,10 +154,6 @@ def bend_of(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(flat)
     along = np.einsum("kja,kjm->kam", across, vectors)
     return np.einsum("kam,km,kbm->kab", along, values.clip(0.0), along)
-
-
-# Blurs from the edge, beyond which too little of it is seen.
-FAR = 2.5
 
 
 def rim_of(anatomy: Anatomy) -> np.ndarray:
@@ -148,15 +169,15 @@ def edge_of(nodes: np.ndarray, rim: np.ndarray) -> float:
 
 
 def inside_opening(
-    anatomy: Anatomy, points: np.ndarray, normal: np.ndarray, blur: float
+    anatomy: Anatomy, points: np.ndarray, normal: np.ndarray, blur: float, far: float = BONE.far
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far (n,) [m] points (n, 3) [m] of the surface are inside the craniotomy, and which way its middle is (n, 3).
 
-    Negative under bone. The way is of unit length and across the points' unit normals (n, 3); it is zero more than two
-    and a half blurs from the edge.
+    Negative under bone. The way is of unit length and across the points' unit normals (n, 3); it is zero more than
+    `far` blurs from the edge.
 
     Of a straight edge a Gaussian of standard deviation `blur` [m] leaves the share Phi(r / blur) of what is open to a
-    point that is r inside: that is inverted.
+    point that is r inside. That is inverted.
     """
     mesh, opened = anatomy.mesh, anatomy.craniotomy
     triangles = mesh.surface[about_opening(anatomy)]
@@ -172,8 +193,8 @@ def inside_opening(
     # The share's gradient, but for a positive factor.
     uphill = seen @ (middle * bare[:, None]) - share[:, None] * (seen @ middle)
     across = unit(uphill - (uphill * normal).sum(axis=1, keepdims=True) * normal)
-    inside = ndtri(share).clip(-FAR, FAR)
-    return blur * inside, np.where(np.abs(inside[:, None]) < FAR, across, 0.0)
+    inside = ndtri(share).clip(-far, far)
+    return blur * inside, np.where(np.abs(inside[:, None]) < far, across, 0.0)
 
 
 def about_opening(anatomy: Anatomy) -> np.ndarray:

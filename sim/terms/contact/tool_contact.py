@@ -17,15 +17,8 @@ from ...runtime.device import Device
 from ...tools import Tool, cores_of, distances_to
 from .reduced import HOST, Reduced
 from .tool_kernels import BULGE, Scale, Surface, Tools, kernels_of
-from .tool_path import Way, approach
+from .tool_path import TOUCH, Touch, Way, approach
 
-# Surfaces are looked at in points; between them they are nearer to a tool by at most this share of the gap, which is
-# added to the tool's radius: no point of a surface is inside.
-SAG = 0.25
-# Triangles may be stretched so many times.
-STRETCH = 1.3
-# Of so many poses it is kept where their tools came from: a solver asks again and again.
-KEPT = 4096
 # Of a triangle cut into smaller ones, the farthest point is so many of their edges from the nearest centre.
 FARTHEST = 2.0 / 3.0
 
@@ -51,6 +44,8 @@ class Contact:
         Shear modulus [Pa] of the tissue: contact is as stiff as fits it.
     device
         Where its arrays live.
+    touch
+        How finely the surface is looked at, and how far tools go at once.
     """
 
     constant, passive, steep = False, False, True
@@ -66,17 +61,18 @@ class Contact:
         gap: float,
         shear: float,
         device: Device,
+        touch: Touch = TOUCH,
     ):
         self.name = name
         cores = [core for tool in tools for core in cores_of(tool)]
         self._owner = np.repeat(np.arange(len(tools)), [len(cores_of(tool)) for tool in tools])
         self._whole, self._corners = (nodes, whole), [core.corners for core in cores]
         self._triangles = triangles
-        self._shapes, self._way, self._device = tools, way, device
+        self._shapes, self._way, self._device, self._touch = tools, way, device, touch
         self._kernels = kernels_of(device, triangles.shape[1])
         corners = nodes[triangles[:, :3]]
-        longest = STRETCH * edge_lengths(corners).max(axis=1)
-        fine = np.sqrt(2.0 * min(core.radius for core in cores) * SAG * gap) / FARTHEST
+        longest = touch.stretch * edge_lengths(corners).max(axis=1)
+        fine = np.sqrt(2.0 * min(core.radius for core in cores) * touch.sag * gap) / FARTHEST
         self._surface = Surface()
         self._surface.rest = device.array(nodes, wp.vec3d)
         self._surface.table = device.array(triangles, wp.int32)
@@ -85,8 +81,8 @@ class Contact:
         self._tools = Tools()
         self._tools.centre = device.array(np.array([core.centre for core in cores]), wp.vec3d)
         self._tools.half = device.array(np.array([core.half for core in cores]), wp.vec3d)
-        self._tools.radius = device.array(np.array([core.radius + SAG * gap for core in cores]), wp.float64)
-        self._asked, self._gap, self._shear = gap, (1.0 - SAG) * gap, shear
+        self._tools.radius = device.array(np.array([core.radius + touch.sag * gap for core in cores]), wp.float64)
+        self._asked, self._gap, self._shear = gap, (1.0 - touch.sag) * gap, shear
         self.widen(1.0)
         self._pose: np.ndarray | None = None
 
@@ -102,7 +98,7 @@ class Contact:
             [(distances_to(tool, at, points) - far).min() for tool, at in zip(self._shapes, pose, strict=True)]
             for pose, points, far in zip(way.at(cases.gone), middle, reach, strict=True)
         ]
-        return way.stride(self._shapes, np.reshape(clear, way.end.shape[:2]).clip(0.0))
+        return way.stride(self._shapes, np.reshape(clear, way.end.shape[:2]).clip(0.0), self._touch)
 
     def gaps(self, cases: Cases) -> np.ndarray:
         """As the farthest-moved tool goes."""
@@ -176,7 +172,10 @@ class Contact:
     def _alone(self) -> "tuple[Contact, Reduced]":
         """The same on the touchable nodes alone, and as a function of where these go."""
         nodes, own = self._whole[0][self.touchable], np.searchsorted(self.touchable, self._triangles)
-        term = Contact(self.name, self._shapes, self._way, nodes, own, own[:, :3], self._asked, self._shear, HOST)
+        corners = own[:, :3]
+        term = Contact(
+            self.name, self._shapes, self._way, nodes, own, corners, self._asked, self._shear, HOST, self._touch
+        )
         return term, Reduced(term, len(nodes))
 
     def reduced(self) -> Reduced | None:
@@ -221,7 +220,12 @@ class Contact:
 
 
 def contact_of(
-    effect: ToolContact | Retraction, anatomy: Anatomy, space: Discretisation, shear: float, device: Device
+    effect: ToolContact | Retraction,
+    anatomy: Anatomy,
+    space: Discretisation,
+    shear: float,
+    device: Device,
+    touch: Touch = TOUCH,
 ) -> Contact:
     """The term of an effect on tissue with a shear modulus [Pa]."""
     contact = isinstance(effect, ToolContact)
@@ -231,9 +235,9 @@ def contact_of(
         raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is held or slides.")
     points, reach = space.nodes[np.unique(triangles)], _reach(space.nodes, triangles)
 
-    @lru_cache(KEPT)
+    @lru_cache(touch.kept)
     def came_from(number: int, pose: bytes) -> np.ndarray:
-        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, reach)
+        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, reach, touch.march)
 
     def clear(pose: np.ndarray) -> np.ndarray:
         """Where tools (B, tools, 4, 4) came from."""
@@ -259,7 +263,8 @@ def contact_of(
         held[:, 0, :3, 3] += cause.displacement
         return Way(_begun(last, cases.anew, lambda pose: pose, laid), held)
 
-    return Contact(name, tools, way, space.nodes, triangles, space.surface[:, :3], effect.gap, shear, device)
+    whole = space.surface[:, :3]
+    return Contact(name, tools, way, space.nodes, triangles, whole, effect.gap, shear, device, touch)
 
 
 def _begun(

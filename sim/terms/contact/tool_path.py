@@ -9,10 +9,36 @@ from scipy.spatial.transform import Rotation
 
 from ...tools import Core, Tool, cores_of, distances_to, extent_of
 
-# A step moves no point of a tool farther into tissue than this share of its radius: none comes out at its other side.
-STRIDE = 0.5
-# Most steps of a tool's way through the air, each as far as nothing can be touched.
-MARCH = 40
+
+@dataclass(frozen=True)
+class Touch:
+    """How finely a surface is looked at under tools, and how these come there.
+
+    Parameters
+    ----------
+    sag
+        Surfaces are looked at in points. Between them they are nearer to a tool by at most this share of the gap. It is
+        added to the tool's radius, so that no point of a surface is inside.
+    stretch
+        Triangles may be stretched so many times before that may fail.
+    stride
+        A step moves no point of a tool farther into tissue than this share of its radius: none comes out at its other
+        side.
+    march
+        Most steps of a tool's way through the air, each as far as nothing can be touched.
+    kept
+        Poses of which it is kept where their tools came from: a solver asks again and again.
+    """
+
+    sag: float = 0.25
+    stretch: float = 1.3
+    stride: float = 0.5
+    march: int = 40
+    kept: int = 4096
+
+
+TOUCH = Touch()
+"""Contact with tools as it is unless another is given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,21 +70,24 @@ class Way:
         extent = np.array([extent_of(tool) for tool in tools])
         return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
 
-    def stride(self, tools: tuple[Tool, ...], clear: np.ndarray) -> np.ndarray:
+    def stride(self, tools: tuple[Tool, ...], clear: np.ndarray, touch: Touch = TOUCH) -> np.ndarray:
         """The longest shares (B,), at most 1, of the way that tools may go at once that are `clear` (B, tools) [m]."""
-        most = clear + STRIDE * np.array([min(core.radius for core in cores_of(tool)) for tool in tools])
+        most = clear + touch.stride * np.array([min(core.radius for core in cores_of(tool)) for tool in tools])
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
 
 
-def approach(tool: Tool, pose: np.ndarray, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
+def approach(
+    tool: Tool, pose: np.ndarray, points: np.ndarray, reach: np.ndarray, march: int = Touch.march
+) -> np.ndarray:
     """Where a tool at `pose` (4, 4) came from along its shaft: just clear of a surface with vertices `points` (n, 3).
 
     `reach` (n,) [m] is how far the surface goes on round each vertex. A tool that is clear where it is came from there.
+    It is followed through the air in `march` steps at most.
     """
     out, shaft = pose.copy(), pose[:3, 2]
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     back, room = max(_above(core, local, reach) for core in cores_of(tool)), 0.0
-    for _ in range(MARCH):
+    for _ in range(march):
         back = max(0.0, back - room)
         out[:3, 3] = pose[:3, 3] + back * shaft
         room = max(0.0, float((distances_to(tool, out, points) - reach).min()))

@@ -11,10 +11,27 @@ from ...errors import InputError
 from ...material import Tissue, portion
 from ...runtime.device import Device, Precision, find_device, forward_kernel
 
-# Random displacement gradients: how many, and their standard deviation at large strain, at small, in single precision.
-COUNT, LARGE, SMALL, SINGLE = 60, 0.3, 1e-6, 1e-3
-# A step of central differences: of the energy, and of the stress.
-STEP, SHORT_STEP = 1e-5, 1e-6
+
+@dataclass(frozen=True)
+class Strains:
+    """The strains at which a law is checked.
+
+    Parameters
+    ----------
+    count
+        Random displacement gradients.
+    large, small, single
+        Their standard deviation at large strain, at small, and in single precision.
+    step, short_step
+        A step of central differences: of the energy, and of the stress.
+    """
+
+    count: int = 60
+    large: float = 0.3
+    small: float = 1e-6
+    single: float = 1e-3
+    step: float = 1e-5
+    short_step: float = 1e-6
 
 
 @dataclass(frozen=True)
@@ -93,7 +110,7 @@ class Finding:
         return f"{self.name}: off by {self.error:.1e}, at most {self.limit:.0e} allowed"
 
 
-def check_tissue(tissue: Tissue, small_strain: bool = False) -> tuple[Finding, ...]:
+def check_tissue(tissue: Tissue, small_strain: bool = False, strains: Strains = Strains()) -> tuple[Finding, ...]:
     """Hold a tissue's law to what the solver asks of it, at random strains on the CPU; a few seconds to compile.
 
     `small_strain`: the law is for small rotations only, as Hooke's, and need not turn with the tissue.
@@ -104,14 +121,15 @@ def check_tissue(tissue: Tissue, small_strain: bool = False) -> tuple[Finding, .
         Every check that the law does not pass, with its figures.
     """
     with np.errstate(invalid="ignore"):  # of two infinities: no number, and no check is passed by it
-        found = tuple(_findings(tissue, small_strain))
+        found = tuple(_findings(tissue, small_strain, strains))
     broken = [str(finding) for finding in found if not finding.kept]
     if broken:
         raise InputError(f"the law {tissue.law} does not hold: {'; '.join(broken)}.")
     return found
 
 
-def _findings(tissue: Tissue, small_strain: bool) -> Iterator[Finding]:
+def _findings(tissue: Tissue, small_strain: bool, strains: Strains) -> Iterator[Finding]:
+    count, step = strains.count, strains.short_step
     mu, lam = tissue.lame
     if not (mu > 0.0 and 3.0 * lam + 2.0 * mu > 0.0 and np.isfinite([mu, lam]).all()):
         raise InputError(f"the law {tissue.law} has the Lamé constants {mu}, {lam} Pa: no tissue is at rest with them.")
@@ -123,16 +141,16 @@ def _findings(tissue: Tissue, small_strain: bool) -> Iterator[Finding]:
         )
     yield Finding("coefficients_at its own Lamé constants are its coefficients", _off(again, given), 1e-12)
     double, random = evaluator(tissue, "float64"), np.random.default_rng(3)
-    H = random.normal(0.0, LARGE, (3 * COUNT, 3, 3))
+    H = random.normal(0.0, strains.large, (3 * count, 3, 3))
     J = np.linalg.det(np.eye(3) + H)
     positive = tissue.functions.needs_positive_volume
-    H = H[J > 0.1][:COUNT] if positive else H[np.abs(J) > 0.02][:COUNT]
+    H = H[J > 0.1][:count] if positive else H[np.abs(J) > 0.02][:count]
     D, E = random.normal(size=(2, *H.shape))
     here = double(H, D)
 
     still = double(np.zeros((1, 3, 3)))
     yield Finding("no energy and no stress at rest", max(_largest(still.stress), abs(still.energy[0])) / mu, 1e-9)
-    small = random.normal(0.0, SMALL, (COUNT, 3, 3))
+    small = random.normal(0.0, strains.small, (count, 3, 3))
     for carries in ("whole", "shape", "volume"):
         share = portion(tissue, carries)
         stress = double.at(small, None, tissue.coefficients_at(*share)).stress
@@ -145,11 +163,11 @@ def _findings(tissue: Tissue, small_strain: bool) -> Iterator[Finding]:
 
     numeric = np.zeros_like(H)
     for i, j in np.ndindex(3, 3):
-        step = np.zeros((3, 3))
-        step[i, j] = STEP
-        numeric[:, i, j] = (double(H + step).energy - double(H - step).energy) / (2.0 * STEP)
+        one = np.zeros((3, 3))
+        one[i, j] = strains.step
+        numeric[:, i, j] = (double(H + one).energy - double(H - one).energy) / (2.0 * strains.step)
     yield Finding("stress is the energy's derivative", _off(numeric, here.stress), 1e-6)
-    numeric = (double(H + SHORT_STEP * D).stress - double(H - SHORT_STEP * D).stress) / (2.0 * SHORT_STEP)
+    numeric = (double(H + step * D).stress - double(H - step * D).stress) / (2.0 * step)
     yield Finding("stress_change is the stress's derivative", _off(numeric, here.change), 1e-6)
     one, other = (np.einsum("nij,nij->n", change, way) for change, way in ((here.change, E), (double(H, E).change, D)))
     yield Finding("stress_change is symmetric", _off(other, one), 1e-8)
@@ -167,7 +185,7 @@ def _findings(tissue: Tissue, small_strain: bool) -> Iterator[Finding]:
             "infinite energy where J < 0, which needs_positive_volume promises", float(inverted < np.inf), 0.0
         )
     single = evaluator(tissue, "float32")
-    strained = random.normal(0.0, SINGLE, (COUNT, 3, 3)).astype(np.float32).astype(np.float64)
+    strained = random.normal(0.0, strains.single, (count, 3, 3)).astype(np.float32).astype(np.float64)
     yield Finding("stress in single precision", _off(single(strained).stress, double(strained).stress), 1e-3)
 
 
