@@ -10,7 +10,7 @@ import warp as wp
 from boxes import box
 from scipy.spatial import Delaunay
 
-from sim.discretisation.footprint import CHUNK, Skin, footprint_weights, nearest_on
+from sim.discretisation.footprint import CHUNK, Division, Skin, footprint_weights, nearest_on
 from sim.errors import InputError
 from sim.runtime.device import find_device
 
@@ -208,6 +208,19 @@ def test_the_nearest_point_is_found_in_any_chunk() -> None:
     np.testing.assert_allclose(found, above * [1.0, 1.0, 0.0], atol=1e-15)
     np.testing.assert_allclose(distance, 1e-3, rtol=1e-12)
     assert np.isinf(skin.nearest(above, np.full(len(above), 0.9e-3))[1]).all()
+
+
+def test_finer_pieces_find_nearly_the_same_weights() -> None:
+    """And a tool that some pieces are too coarse for is refused."""
+    nodes, triangles = sheet(60)
+    device, point, radius = find_device("cpu", "float64"), np.zeros((1, 3)), np.array([5e-3])
+    coarse, fine = (
+        Skin(nodes, triangles, device, division=Division(fineness=share)).press(point, radius).rows(len(nodes))
+        for share in (0.12, 0.03)
+    )
+    assert 0.0 < np.abs((coarse - fine).toarray()).max() < 2e-3
+    with pytest.raises(InputError, match="too small"):
+        Skin(nodes, triangles, device, division=Division(most=1)).press(point, radius)
 
 
 @pytest.mark.parametrize("mesh", [sheet(300), quadratic_sheet(60)], ids=["linear", "quadratic"])

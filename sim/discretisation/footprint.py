@@ -21,7 +21,7 @@ vec6d = wp.types.vector(length=6, dtype=wp.float64)
 
 
 @dataclass(frozen=True)
-class Pieces:
+class Division:
     """Into how many pieces each edge of a triangle is divided under a footprint.
 
     Parameters
@@ -91,7 +91,7 @@ class Skin:
         Where its arrays live.
     name
         What a sentence calls it.
-    pieces
+    division
         Of its triangles under a footprint.
     """
 
@@ -101,16 +101,16 @@ class Skin:
         triangles: np.ndarray,
         device: Device,
         name: str = "surface",
-        pieces: Pieces = Pieces(),
+        division: Division = Division(),
     ):
-        self.device, self._name, self._pieces = device, name, pieces
+        self.device, self._name, self._division = device, name, division
         self.nodes, table = np.unique(triangles, return_inverse=True)
         self.numbers = device.array(self.nodes, wp.int32)
         corners = nodes[triangles[:, :3]]
         centre = corners.mean(axis=1)
         reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
         edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0)
-        self._least = edge / (pieces.fineness * pieces.most)
+        self._least = edge / (division.fineness * division.most)
         self._corners = device.array(corners, wp.vec3d)
         self._ball = device.array(np.column_stack([centre, reach]), wp.vec4d)
         self._table = device.array(table.reshape(triangles.shape), wp.int32)
@@ -157,7 +157,7 @@ class Skin:
         imprint.weight.zero_()
         imprint.sums.zero_()
         inputs = [self._corners, self._ball, self._table, self._position, imprint.tools, imprint.touched]
-        inputs += [self._pieces.fineness, self._pieces.fewest, self._pieces.most]
+        inputs += [self._division.fineness, self._division.fewest, self._division.most]
         self.device.launch(_press, (len(self._ball), len(imprint.tools)), inputs, [imprint.weight, imprint.sums])
 
     def demand_touch(self, points: np.ndarray, radii: np.ndarray) -> None:
