@@ -6,7 +6,7 @@ from .bodies.label_volume import volume_subject
 from .bodies.meshfile import MeshFile, read_anatomy, read_mesh, write_anatomy, write_mesh
 from .bodies.open_cortex import OpenCortex, Place, open_cortex
 from .bodies.refine import refined
-from .bodies.subject import Plan, Subject, make_anatomy
+from .bodies.subject import MeshPlan, Subject, make_anatomy
 from .bodies.template import Lobed, Tumour, template_subject
 from .contact_pressure import pressure
 from .deformation import Cost, Deformation, Deformer, Outcome
@@ -83,6 +83,7 @@ __all__ = [
     "Lobed",
     "Material",
     "MeshFile",
+    "MeshPlan",
     "MeshWarning",
     "Nodal",
     "NodalForce",
@@ -93,7 +94,6 @@ __all__ = [
     "OwnEffect",
     "OwnTool",
     "Place",
-    "Plan",
     "Posture",
     "Prescribed",
     "Pulsation",

@@ -39,10 +39,10 @@ from .runtime.memory import check_fits, fitting_batch
 from .runtime.threads import one_thread
 from .strategy.captured_frame import Frame
 from .strategy.extrapolation import moved_on, pushes_of, way_of
-from .strategy.frame_sequence import Following
+from .strategy.frame_sequence import FrameSequence
 from .strategy.newton_correction import step_from
 from .strategy.plan import Step, local_solvers, plan_for
-from .strategy.strategy import Answer, Ladder
+from .strategy.strategy import Answer, Strategy
 from .strategy.time_steps import KEPT, Still, alike
 
 # The memory's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
@@ -115,8 +115,8 @@ class Fem:
         self._leak = Leak(anatomy, self.space, problem.device)
         bonded = (effect for effect in self.effects if isinstance(effect, Bonded))
         self._bond = next((Bond(effect, anatomy, self.space, problem.device) for effect in bonded), None)
-        self._ladder = Ladder(problem, preconditioner, inversion, accuracy, self.plan, *parts)
-        self._paced = lru_cache(KEPT)(self._ladder_over)
+        self._strategy = Strategy(problem, preconditioner, inversion, accuracy, self.plan, *parts)
+        self._paced = lru_cache(KEPT)(self._strategy_over)
         self._resting = Resting(problem, preconditioner, accuracy.inner)
 
     @property
@@ -132,7 +132,7 @@ class Fem:
     @property
     def problem(self) -> Problem:
         """What is minimised."""
-        return self._ladder.problem
+        return self._strategy.problem
 
     @property
     def anatomy(self) -> Anatomy:
@@ -158,7 +158,7 @@ class Fem:
             answer = self._following.answer(loads, start, lambda: self.guess(loads, start))
             if answer is not None:
                 return answer if at is None else answer.at(at)
-        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
+        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._strategy.held)
         last = None if start is None else self.guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads)))
         if start is not None and last is not None:
@@ -169,33 +169,33 @@ class Fem:
         parts = []
         for step, rows in batches:
             guess = None if last is None else last[:, rows]
-            parts.append(self._solve(self._ladder_at(step), cases.rows(rows), guess, at))
+            parts.append(self._solve(self._strategy_at(step), cases.rows(rows), guess, at))
         answer = _joined(parts)
         return answer.rows(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
-    def _ladder_at(self, step: float) -> Ladder | Still:
-        """Whose preconditioner knows the step in time [s]; of an infinite one, the ladder of statics."""
+    def _strategy_at(self, step: float) -> Strategy | Still:
+        """Whose preconditioner knows the step in time [s]; of an infinite one, that of statics."""
         if step == 0.0 or step == math.inf:
-            return self._ladder if step else Still(self.problem, self._ladder.inversion)
+            return self._strategy if step else Still(self.problem, self._strategy.inversion)
         return self._paced(step)
 
-    def _ladder_over(self, step: float) -> Ladder:
+    def _strategy_over(self, step: float) -> Strategy:
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed, step)
-        return Ladder(self.problem, preconditioner, self._ladder.inversion, self.accuracy, self.plan)
+        return Strategy(self.problem, preconditioner, self._strategy.inversion, self.accuracy, self.plan)
 
     def _batches(self, count: int) -> Iterator[slice]:
         """The rows of each batch, at least one."""
         return (slice(first, first + self.batch) for first in range(0, max(count, 1), self.batch))
 
     @cached_property
-    def _following(self) -> Following | None:
+    def _following(self) -> FrameSequence | None:
         """Who answers frame after frame on CUDA. The CPU waits for nothing that this would spare it."""
         return self._follower() if self.plan.frames else None
 
-    def _follower(self) -> Following:
-        ladder = self._ladder
-        frame = Frame(self.problem, ladder.preconditioner, ladder.inversion, self._skin, self.accuracy.tolerance)
-        return Following(self.problem, ladder.inversion, frame, self.lock, self.description)
+    def _follower(self) -> FrameSequence:
+        strategy = self._strategy
+        frame = Frame(self.problem, strategy.preconditioner, strategy.inversion, self._skin, self.accuracy.tolerance)
+        return FrameSequence(self.problem, strategy.inversion, frame, self.lock, self.description)
 
     def _vertices(self, at: np.ndarray) -> np.ndarray:
         return vertex_numbers("at", at, len(self._anatomy.mesh.nodes))
@@ -239,11 +239,11 @@ class Fem:
         """
         self._check_static(loads)
         at = self._vertices(at)
-        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._ladder.held)
+        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._strategy.held)
         guess, cases = self.guess(loads, answer), Cases(loads, answer.time, answer.memory)
         parts = []
         for rows in self._batches(len(loads)):
-            step = step_from(self._ladder, cases.rows(rows), guess[:, rows])
+            step = step_from(self._strategy, cases.rows(rows), guess[:, rows])
             left = unstacked(self.problem.device, step.left, at)
             parts.append((self._answered(cases.rows(rows), step.answer, {}, None, step.seconds), step.before, left))
         answers, before, left = zip(*parts, strict=True)
@@ -260,7 +260,7 @@ class Fem:
         """
         nodes = self._vertices(nodes)
         device, rows = self.problem.device, (3 * nodes[:, None] + np.arange(3)).ravel()
-        check_fits(self.problem.rows, self.batch, len(modes), device, self._ladder.held)
+        check_fits(self.problem.rows, self.batch, len(modes), device, self._strategy.held)
         answers = np.empty((len(modes), self.problem.rows))
         for some in self._batches(len(modes)):
             force = np.zeros((self.problem.rows, len(modes[some])))
@@ -297,7 +297,7 @@ class Fem:
         widest = len(factors(sizes, orders))
         groups = min(len(loads) // sizes, max(1, self.batch // widest))
         columns = groups * widest
-        check_fits(self.problem.rows, columns, columns, self.problem.device, self._ladder.held)
+        check_fits(self.problem.rows, columns, columns, self.problem.device, self._strategy.held)
         edge = float(np.cbrt(self._anatomy.mesh.volumes.mean() * 6.0))
         found = np.empty((len(loads) // sizes, terms_of(sizes, orders), reading.count))
         # Threads of BLAS wait for one another, ages where something else runs on their cores.
@@ -320,11 +320,11 @@ class Fem:
         return full.reshape(len(loads), self.problem.rows).T
 
     def _solve(
-        self, ladder: Ladder | Still, cases: Cases, last: np.ndarray | None, at: np.ndarray | None
+        self, strategy: Strategy | Still, cases: Cases, last: np.ndarray | None, at: np.ndarray | None
     ) -> Deformation:
         clock = time.perf_counter()
         guesses = () if last is None else (moved_on(cases.loads, last, cases.warm), last)
-        found = ladder.climb(cases, guesses)
+        found = strategy.solve(cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
         way = way_of(pushes_of(cases.loads), last, cases.warm) if len(cases.loads) <= TAUGHT else {}
         return self._answered(cases, found, way, at, seconds)

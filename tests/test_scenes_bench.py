@@ -13,7 +13,7 @@ from scenes.bench.robustness import SETS, Record, Trial, records, shares, tallie
 from scenes.cli import main
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.refine import refined
-from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
 from sim.deformation import Outcome
 from sim.effects import Elasticity, Held, Slide, ToolForce
@@ -21,7 +21,7 @@ from sim.effects import Elasticity, Held, Slide, ToolForce
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return make_anatomy(template_subject(Tumour()), Plan(2000))
+    return make_anatomy(template_subject(Tumour()), MeshPlan(2000))
 
 
 def test_medians_leave_the_warm_up_aside(monkeypatch):

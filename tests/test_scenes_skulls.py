@@ -11,7 +11,7 @@ from scenes.cli import main
 from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
-from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
 from sim.effects import Bonded, Slide, pushed_effects
 from sim.fem import Fem
@@ -28,7 +28,7 @@ def brain(tmp_path_factory):
     """A file and its anatomy."""
     path, anatomy = (
         tmp_path_factory.mktemp("skulls") / "brain.vtu",
-        make_anatomy(template_subject(Tumour()), Plan(2000)),
+        make_anatomy(template_subject(Tumour()), MeshPlan(2000)),
     )
     write_anatomy(path, anatomy)
     return str(path), anatomy
@@ -80,7 +80,7 @@ def test_what_cannot_be_measured_is_a_sentence(brain, capsys, words, reason):
 
 def test_what_is_taught_of_a_skull_is_of_that_skull(tmp_path):
     """From the command to the finite elements that a learner asks: they slide where the data did."""
-    write_anatomy(tmp_path / "brain.vtu", make_anatomy(template_subject(Tumour()), Plan(2000, craniotomy=0.03)))
+    write_anatomy(tmp_path / "brain.vtu", make_anatomy(template_subject(Tumour()), MeshPlan(2000, craniotomy=0.03)))
     for skull, effect in (("slide", Slide()), ("bonded", Bonded())):
         out = tmp_path / f"{skull}.h5"
         words = ["--count", "2", "--skull", skull, "--element", "p1", "--tolerance", "1e-3", "--device", "cpu"]

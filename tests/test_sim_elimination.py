@@ -19,7 +19,7 @@ from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
 from sim.linalg.preconditioner import rest_solver
 from sim.linalg.schur import condensed
-from sim.local_solvers.batch_elimination import Elimination, eliminating, near_tetrahedra
+from sim.local_solvers.batch_elimination import BatchElimination, batch_elimination, near_tetrahedra
 from sim.local_solvers.outer_loop import Limits
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from sim.runtime.device import find_device
@@ -32,7 +32,7 @@ from surrogate.data.tool_loads import draw
 def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
     problem, space = begun(law, element)
     start = problem.device.zeros(problem.rows, len(TOTAL))
-    found = descent_of(eliminating, problem, space, law).descend(start, np.full(len(TOTAL), FINE), 100)
+    found = descent_of(batch_elimination, problem, space, law).descend(start, np.full(len(TOTAL), FINE), 100)
     assert (found.status == DONE).all() and (found.residual <= FINE).all()
     expected = equilibria(problem)
     np.testing.assert_allclose(found.u.numpy(), expected, atol=1e-5 * np.abs(expected).max())
@@ -43,7 +43,7 @@ def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
     anatomy = read_anatomy(template_path())
     effects = (Elasticity(), Held(), Slide(), ToolForce())
     fem, loads = Fem(anatomy, effects, TRAIN, "cpu", element="p1"), draw("spatula", anatomy, 3, 1)
-    near = eliminating(fem.problem, rest_solver(fem.problem), effects, fem.space)
+    near = batch_elimination(fem.problem, rest_solver(fem.problem), effects, fem.space)
     assert near is not None and 0.1 < len(near.rows) / fem.problem.rows < 0.3
     fem.problem.begin(Cases(loads, np.zeros(3)))
     rest, tolerance = fem.problem.device.zeros(fem.problem.rows, 3), np.full(3, TRAIN.tolerance)
@@ -58,7 +58,7 @@ def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
 def test_columns_go_each_by_itself() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law)
-    elimination = descent_of(eliminating, problem, space, law)
+    elimination = descent_of(batch_elimination, problem, space, law)
     together = elimination.descend(problem.device.zeros(problem.rows, len(TOTAL)), np.full(len(TOTAL), 1e-5), 100)
     for row in range(len(TOTAL)):
         problem.begin(Cases(loads_of(TOTAL[[row]]), np.zeros(1)))
@@ -70,7 +70,7 @@ def test_columns_go_each_by_itself() -> None:
 def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law)
-    elimination = descent_of(eliminating, problem, space, law)
+    elimination = descent_of(batch_elimination, problem, space, law)
     start = problem.device.zeros(problem.rows, len(TOTAL)).numpy()
     start[:, 1] = np.nan
     found = elimination.descend(problem.device.array(start), np.full(len(TOTAL), 1e-12), 1)
@@ -90,10 +90,10 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
     device = find_device("cpu", "float32")
     problem = compile_problem((Elasticity(tissue(law)), *EFFECTS), anatomy, device, space)
     problem.begin(Cases(loads_of(TOTAL[:4]), np.zeros(4)))
-    elimination = descent_of(eliminating, problem, space, law)
-    inside = Elimination._corrected
+    elimination = descent_of(batch_elimination, problem, space, law)
+    inside = BatchElimination._corrected
     monkeypatch.setattr(
-        Elimination, "_corrected", lambda *args: device.array(factor * inside(*args).numpy().astype(np.float64))
+        BatchElimination, "_corrected", lambda *args: device.array(factor * inside(*args).numpy().astype(np.float64))
     )
     found = elimination.descend(device.zeros(problem.rows, 4), np.full(4, 1e-4), 100)
     assert (found.status == LIVE).all() and not found.u.numpy().any()
@@ -103,7 +103,7 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
 def test_rounding_of_what_follows_leaves_no_plane() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law)
-    elimination, random = descent_of(eliminating, problem, space, law), np.random.default_rng(0)
+    elimination, random = descent_of(batch_elimination, problem, space, law), np.random.default_rng(0)
 
     def rounded(x: wp.array, out: wp.array) -> None:
         elimination.follow(x, out)
@@ -118,7 +118,7 @@ def test_rounding_of_what_follows_leaves_no_plane() -> None:
 def test_what_gets_no_nearer_is_left_to_others() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[:1])
-    elimination = descent_of(eliminating, problem, space, law)
+    elimination = descent_of(batch_elimination, problem, space, law)
     found = elimination.descend(problem.device.zeros(problem.rows, 1), np.zeros(1), 100)
     assert found.status[0] == LIVE and found.residual[0] < 1e-12
     assert found.steps[0] < 20 + Limits().patience
@@ -151,11 +151,11 @@ def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves() -> None:
     fem, without = (Fem(anatomy, effects, Accuracy(FINE), "cpu", None, "p1", False, out) for out in ((), (Step.NEAR,)))
     many = np.repeat(TOTAL, 4, axis=0)
     plain = without.deform(loads_of(many))
-    near = eliminating(fem.problem, rest_solver(fem.problem), effects, space)
+    near = batch_elimination(fem.problem, rest_solver(fem.problem), effects, space)
     assert near is not None
     for cycles in (12, 3):
         some = replace(near, limits=Limits(cycles=cycles))
-        fem._ladder = replace(fem._ladder, near=lambda some=some: some)
+        fem._strategy = replace(fem._strategy, near=lambda some=some: some)
         found = fem.deform(loads_of(many))
         assert all(outcome.good for outcome in found.outcome)
         assert (found.iterations != plain.iterations).any()

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.label_volume import volume_subject
-from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.errors import InputError
 from sim.geometry.tetmesh import dihedral_angles, faces_once, row_keys
 
@@ -62,7 +62,7 @@ def labelled(path, axes, tumour=ball):
 @pytest.mark.parametrize("kind", AFFINES)
 def test_every_affine_gives_the_same_brain(tmp_path, kind):
     path, labels, affine = labelled(tmp_path / "labels.nii", AFFINES[kind])
-    anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), Plan(nodes=3000))
+    anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=3000))
     mesh = anatomy.mesh
     assert abs(len(mesh.nodes) - 3000) <= 300
     assert dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
@@ -88,7 +88,7 @@ def test_every_affine_gives_the_same_brain(tmp_path, kind):
 
 def test_the_same_volume_gives_the_same_anatomy(tmp_path):
     path, _, _ = labelled(tmp_path / "labels.nii", AFFINES["oblique"])
-    first, second = (make_anatomy(volume_subject(path, (1, 2), (3, 4)), Plan(nodes=2000)) for _ in range(2))
+    first, second = (make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)) for _ in range(2))
     assert first.digest == second.digest
 
 
@@ -97,7 +97,7 @@ def test_a_tumour_that_reaches_or_breaks_the_cortex_is_meshed(tmp_path, rise):
     middle = MIDDLE + [0.0, 0.0, AXES[2] - RADIUS + rise]
     path, labels, affine = labelled(tmp_path / "l.nii", AFFINES["straight"], lambda points: ball(points, middle))
     voxel = 1e-9 * abs(np.linalg.det(affine[:3, :3]))
-    anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), Plan(nodes=4000))
+    anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=4000))
     mesh = anatomy.mesh
     assert dihedral_angles(mesh.nodes, mesh.tets).min() > 5.0
     assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx((labels > 2).sum() * voxel, rel=0.02)
@@ -121,7 +121,7 @@ def test_components_and_holes(tmp_path):
     for part in ("of brain that is not connected", "of holes", "of tumour outside", "of tumour in specks"):
         assert part in text
     assert subject.tumour_volume == pytest.approx(sum(piece.volume for piece in subject.pieces))
-    anatomy = make_anatomy(subject, Plan(nodes=4000))
+    anatomy = make_anatomy(subject, MeshPlan(nodes=4000))
     inside = anatomy.mesh.nodes[anatomy.tumour_nodes]
     assert KDTree(inside).query(np.stack([TUMOUR, second]))[0].max() < 0.006
     wanted = 4 / 3 * np.pi * (RADIUS**3 + 0.007**3)

@@ -17,7 +17,7 @@ from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
 from sim.local_solvers.outer_loop import Limits
 from sim.local_solvers.patch import Patch
-from sim.local_solvers.patch_elimination import NODES, PatchSize, patching
+from sim.local_solvers.patch_elimination import NODES, PatchSize, patch_elimination
 from sim.minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from surrogate.data.tool_loads import draw
 
@@ -25,7 +25,7 @@ from surrogate.data.tool_loads import draw
 @LAWS_AND_ELEMENTS
 def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
     problem, space = begun(law, element)
-    descent, expected = descent_of(patching, problem, space, law), equilibria(problem)
+    descent, expected = descent_of(patch_elimination, problem, space, law), equilibria(problem)
     for row in range(len(TOTAL)):
         problem.begin(Cases(loads_of(TOTAL[[row]]), np.zeros(1)))
         found = descent.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)
@@ -49,7 +49,7 @@ def test_on_a_brain_hard_pushes_take_few_looks_at_the_whole() -> None:
 def test_the_next_frame_begins_with_the_patch_of_the_last() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[3:4])
-    descent = descent_of(patching, problem, space, law)
+    descent = descent_of(patch_elimination, problem, space, law)
     rest, tolerance = problem.device.zeros(problem.rows, 1), np.full(1, FINE)
     first = descent.descend(rest, tolerance, 100, {})
     again = descent.descend(rest, tolerance, 100, first.learnt)
@@ -66,7 +66,7 @@ def test_the_next_frame_begins_with_the_patch_of_the_last() -> None:
 def test_the_budget_leaves_the_best_state_and_says_so() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[3:4])
-    descent, rest = descent_of(patching, problem, space, law), problem.device.zeros(problem.rows, 1)
+    descent, rest = descent_of(patch_elimination, problem, space, law), problem.device.zeros(problem.rows, 1)
     found = descent.descend(rest, np.full(1, 1e-12), 2)
     assert found.status[0] == LIVE and found.steps[0] == 2
     _, free, scale = problem.residual(found.u)
@@ -80,7 +80,7 @@ def test_the_budget_leaves_the_best_state_and_says_so() -> None:
 def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[3:4])
-    descent = descent_of(patching, problem, space, law)
+    descent = descent_of(patch_elimination, problem, space, law)
     inside = Patch.settled
 
     def exploded(*args) -> tuple[float, np.ndarray]:
@@ -95,7 +95,9 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
 def test_what_gets_no_nearer_is_left_to_others() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[:1])
-    found = descent_of(patching, problem, space, law).descend(problem.device.zeros(problem.rows, 1), np.zeros(1), 100)
+    found = descent_of(patch_elimination, problem, space, law).descend(
+        problem.device.zeros(problem.rows, 1), np.zeros(1), 100
+    )
     assert found.status[0] == LIVE and found.residual[0] < 1e-12
     assert found.steps[0] <= Limits().cycles and found.steps[0] < 12 + Limits().patience
 
@@ -103,7 +105,7 @@ def test_what_gets_no_nearer_is_left_to_others() -> None:
 def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[3:4])
-    descent = descent_of(patching, problem, space, law)
+    descent = descent_of(patch_elimination, problem, space, law)
     patch, reach = descent._patch(np.unique(descent._table[:80]))
     inner = reach[:, np.isin(descent._nodes, patch.nodes).repeat(3)]
     pull = problem.device.zeros(problem.rows, 1)
@@ -119,8 +121,8 @@ def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
 def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[1:2])
-    whole = descent_of(patching, problem, space, law)
-    part = descent_of(partial(patching, size=PatchSize(near=60)), problem, space, law)
+    whole = descent_of(patch_elimination, problem, space, law)
+    part = descent_of(partial(patch_elimination, size=PatchSize(near=60)), problem, space, law)
     assert len(part._nodes) < 0.8 * len(whole._nodes) and np.isin(part._nodes, whole._nodes).all()
     found = part.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)
     assert found.status[0] == DONE and found.residual[0] <= FINE

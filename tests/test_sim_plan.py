@@ -14,9 +14,9 @@ from sim.accuracy import TRAIN, Accuracy
 from sim.effects import Effect, Elasticity, Held, Inertia, Retraction, ToolContact, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.local_solvers.batch_elimination import Elimination
-from sim.local_solvers.clamped_elimination import Vicinity
-from sim.local_solvers.patch_elimination import Patching
+from sim.local_solvers.batch_elimination import BatchElimination
+from sim.local_solvers.clamped_elimination import ClampedElimination
+from sim.local_solvers.patch_elimination import PatchElimination
 from sim.minimisers.lbfgs import Lbfgs
 from sim.strategy import strategy
 from sim.strategy.plan import EVALUATIONS, FEWEST, WORTH, Plan, Step
@@ -116,13 +116,18 @@ def test_quadratic_loads_go_one_by_one():
 def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     """Each step that is asked passes every load on, so that all are heard."""
     tried, left = [], [EVALUATIONS]
-    kinds = {Elimination: Step.NEAR, Patching: Step.PATCH, Vicinity: Step.CLAMPED, Lbfgs: Step.LBFGS}
+    kinds = {
+        BatchElimination: Step.NEAR,
+        PatchElimination: Step.PATCH,
+        ClampedElimination: Step.CLAMPED,
+        Lbfgs: Step.LBFGS,
+    }
 
     def deaf(kind):
         original = kind.descend
 
         def descend(self, start, tolerance, most, *rest, **named):
-            if kind is Lbfgs and self is not fem._ladder._lbfgs:  # that of a part
+            if kind is Lbfgs and self is not fem._strategy._lbfgs:  # that of a part
                 return original(self, start, tolerance, most, *rest, **named)
             assert most == left[-1]
             tried.append(kinds[kind])

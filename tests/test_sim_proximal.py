@@ -16,8 +16,8 @@ from sim.fem import Fem
 from sim.linalg.compliance import Columns, Compliance
 from sim.linalg.pcg import Preconditioner
 from sim.loads import Loads, Touching
-from sim.local_solvers.contact_descent import Proximal
-from sim.local_solvers.contact_preconditioner import Touched
+from sim.local_solvers.contact_descent import ContactDescent
+from sim.local_solvers.contact_preconditioner import ContactPreconditioner
 from sim.material import Material
 from sim.minimisers.compact_lbfgs import Pairs, no_pairs
 from sim.minimisers.lbfgs_kernels import PAIRS
@@ -51,10 +51,10 @@ def solver(accuracy: Accuracy) -> Fem:
 
 
 @cache
-def parts() -> tuple[Fem, Proximal]:
+def parts() -> tuple[Fem, ContactDescent]:
     """A solver, and its descent."""
     fem = solver(Accuracy(1e-6))
-    found = fem._ladder._proximal
+    found = fem._strategy._proximal
     assert found is not None
     return fem, found
 
@@ -109,7 +109,7 @@ def test_columns_are_what_the_preconditioner_does() -> None:
 
 def test_columns_are_the_same_bits_in_whatever_order_they_are_made() -> None:
     fem, descent = parts()
-    nodes, preconditioner = descent.barrier.touchable, fem._ladder.preconditioner
+    nodes, preconditioner = descent.barrier.touchable, fem._strategy.preconditioner
     assert len(nodes) > 3 * Columns().block
     one, other = (Compliance(fem.problem, preconditioner, nodes) for _ in range(2))
     every, last = np.arange(len(nodes)), np.array([len(nodes) - 1])
@@ -143,10 +143,10 @@ def test_the_reduced_barrier_is_the_whole_one(definite: bool) -> None:
 def test_what_is_touched_is_known_to_the_preconditioner() -> None:
     """It is the inverse of the rest stiffness and the barrier's curvature: that times it is what it was given."""
     fem, descent = parts()
-    problem, preconditioner = fem.problem, fem._ladder.preconditioner
+    problem, preconditioner = fem.problem, fem._strategy.preconditioner
     problem.begin(Cases(touching(DOWN), np.zeros(1)))
     problem.linearise(problem.device.zeros(problem.rows, 1), np.ones(1, bool))
-    touched = Touched(preconditioner, descent.compliance, descent.barrier)
+    touched = ContactPreconditioner(preconditioner, descent.compliance, descent.barrier)
     touched.prepare(problem, 1)
     r = problem.device.array(np.random.default_rng(3).normal(size=(problem.rows, 1)))
     problem.constraint.project(r)

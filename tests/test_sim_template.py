@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.mesher import Meshing
-from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Head, Tumour, template_subject
 from sim.errors import InputError
 from sim.geometry.geodesic import distances
@@ -21,7 +21,7 @@ def subject():
 
 @pytest.fixture(scope="module")
 def anatomy(subject):
-    return make_anatomy(subject, Plan())
+    return make_anatomy(subject, MeshPlan())
 
 
 def distances_to_voxel_faces(points, mask, affine):
@@ -52,7 +52,7 @@ def spread_points(mesh, count):
 @pytest.mark.parametrize("shape", ["sphere", "lobed"])
 def test_at_17k_nodes_angles_surface_and_volume_are_as_promised(shape):
     subject = template_subject(Tumour(shape=shape, seed=7))
-    mesh = make_anatomy(subject, Plan(nodes=17_000)).mesh
+    mesh = make_anatomy(subject, MeshPlan(nodes=17_000)).mesh
     assert abs(len(mesh.nodes) - 17_000) <= 1_700
     assert dihedral_angles(mesh.nodes, mesh.tets).min() >= 10.0
     assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.02)
@@ -67,7 +67,7 @@ def test_at_17k_nodes_angles_surface_and_volume_are_as_promised(shape):
 def test_the_mesh_is_searched_for_as_the_plan_says(subject):
     meshing = Meshing(trials=1, farthest=0.0)
     with pytest.raises(InputError, match="3000 nodes cannot be had for this anatomy"):
-        make_anatomy(subject, Plan(3000, meshing=meshing))
+        make_anatomy(subject, MeshPlan(3000, meshing=meshing))
 
 
 def test_it_has_the_volume_of_a_person(anatomy):
@@ -158,4 +158,4 @@ def test_what_cannot_be_placed_is_refused(subject):
         ({"craniotomy": 0.2}, "outside 15 to 120 mm"),
     ):
         with pytest.raises(InputError, match=reason):
-            Plan(**values)
+            MeshPlan(**values)

@@ -105,7 +105,7 @@ def test_a_prediction_that_lies_inside_out_is_left_alone(fem, truth, loads, box)
 
 
 def test_quadratic_elements_are_certified_too(box):
-    """On the CPU their preconditioner is no inverse, so that each load's own vicinity is settled."""
+    """On the CPU their preconditioner is no inverse, so that each load's own part is solved by itself."""
     quadratic, load = Fem(box, EFFECTS, Accuracy(1e-4), "cpu", element="p2"), push([0, 0, 0], [0.01, 0, -0.05], 8e-3)
     truth = quadratic.deform(load)
     found = certify(quadratic, load, replace(truth, displacement=1.05 * truth.displacement))

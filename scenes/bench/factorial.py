@@ -11,7 +11,7 @@ import numpy as np
 from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.bodies.open_cortex import open_cortex
-from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
 from sim.effects import Elasticity, ToolDisplacement, pushed_effects
 from sim.fem import Fem
@@ -52,7 +52,7 @@ def cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> I
     """Every combination, on meshes of the template of about so many nodes; the tool presses at three places."""
     for opening, depth in product(levels["opening [mm]"], levels["depth [mm]"]):
         subject = template_subject(Tumour(cover=1e-3 * float(depth)))
-        anatomy = make_anatomy(subject, Plan(nodes, 1e-3 * float(opening)))
+        anatomy = make_anatomy(subject, MeshPlan(nodes, 1e-3 * float(opening)))
         cortex = open_cortex(anatomy)
         places = [cortex.place(*place) for place in PLACES]
         forces = stacked([push(place.point, FORCE * place.inward, FOOTPRINT) for place in places])

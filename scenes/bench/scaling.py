@@ -20,7 +20,7 @@ import warp as wp
 
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import read_anatomy, write_anatomy
-from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
 from sim.effects import pushed_effects
 from sim.errors import InputError
@@ -70,7 +70,7 @@ class Trial:
         """The template's brain of about `size` nodes; made if it is not there."""
         path = self.folder / f"template_{size}.vtu"
         if not path.exists():
-            write_anatomy(path, make_anatomy(template_subject(Tumour()), Plan(size)))
+            write_anatomy(path, make_anatomy(template_subject(Tumour()), MeshPlan(size)))
         return path
 
 

@@ -17,7 +17,7 @@ from sim.bodies.label_volume import volume_subject
 from sim.bodies.mesher import surface_errors
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.placement import side_of
-from sim.bodies.subject import Plan, Subject, make_anatomy
+from sim.bodies.subject import MeshPlan, Subject, make_anatomy
 from sim.bodies.template import SITES, Tumour, template_subject
 from sim.errors import InputError
 from sim.geometry.tetmesh import dihedral_angles
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     beside = sidecar(args.out)
     claimed(beside, ".gz", "a scan that sulcus put beside an anatomy", args.force, read)
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
-    plan = Plan(args.nodes, 1e-3 * chosen["craniotomy"])
+    plan = MeshPlan(args.nodes, 1e-3 * chosen["craniotomy"])
     with stage("labels" if args.labels else "template"):
         subject = opened(_subject(args, chosen), args)
     for note in subject.notes:

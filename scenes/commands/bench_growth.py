@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
     from ar.screen import write_png
-    from sim.bodies.subject import Plan
+    from sim.bodies.subject import MeshPlan
     from sim.runtime.device import find_device
 
     from ..bench.loglog_chart import drawn
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if min(args.batch) < 1:
         raise InputError(f"--batch {min(args.batch)} solves nothing: give whole numbers from 1 up.")
     for size in args.sizes:
-        Plan(size)
+        MeshPlan(size)
     find_device(args.device, "float32")
     out = claimed(args.out, ".png", "a picture of sulcus", args.force)
     where, record = machine(args.device), out.with_suffix(".jsonl")

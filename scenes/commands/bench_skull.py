@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from sim.bodies.meshfile import read_anatomy
-from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
 from sim.effects import SKULLS
 from sim.errors import InputError
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.loads < 1:
         raise InputError(f"--loads {args.loads}: give a whole number from 1 up.")
-    plans = [Plan(count) for count in args.nodes]
+    plans = [MeshPlan(count) for count in args.nodes]
     bodies = [read_anatomy(path) for path in args.anatomies]
     bodies = bodies or [make_anatomy(template_subject(Tumour()), plan) for plan in plans]
     loads = draw(args.preset, bodies[0], args.loads, 0)

@@ -11,7 +11,7 @@ from sim.accuracy import FLOOR, Accuracy, Precision
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.refine import refined
-from sim.bodies.subject import Plan, make_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
 from sim.discretisation.footprint import nearest_on
 from sim.effects import pushed_effects
@@ -119,7 +119,7 @@ def body_of(study: Study, mesh: str) -> Anatomy:
         return refined(study.anatomy)
     path = study.folder / "meshes" / f"template_{mesh}.vtu"
     if not path.exists():
-        write_anatomy(path, make_anatomy(template_subject(Tumour()), Plan(int(mesh))))
+        write_anatomy(path, make_anatomy(template_subject(Tumour()), MeshPlan(int(mesh))))
     return read_anatomy(path)
 
 

@@ -21,7 +21,7 @@ SMALLEST_CRANIOTOMY, LARGEST_CRANIOTOMY = 0.015, 0.120  # [m]
 
 
 @dataclass(frozen=True)
-class Plan:
+class MeshPlan:
     """How a subject becomes an anatomy.
 
     Parameters
@@ -89,7 +89,7 @@ class Subject:
     pieces: tuple[Piece, ...] = ()
 
 
-def make_anatomy(subject: Subject, plan: Plan) -> Anatomy:
+def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     """Mesh a subject and bound it. The same subject and plan give the same anatomy, bit by bit.
 
     Raises

@@ -58,7 +58,7 @@ NEAR = NearPart()
 
 
 @dataclass(frozen=True, eq=False)
-class Elimination:
+class BatchElimination:
     """A descent for problems that are nonlinear in a small place.
 
     problem, preconditioner
@@ -140,9 +140,9 @@ def _free(space: Discretisation, constraint: Constraint) -> np.ndarray:
     return surface[~constraint.held[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
 
 
-def eliminating(
+def batch_elimination(
     problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
-) -> Elimination | None:
+) -> BatchElimination | None:
     """Of the tissue near the opening, which is small; None where that is too nearly singular to be taken apart.
 
     The preconditioner is an inverse: levels, which solve nearly, would leave a share of every correction to the next
@@ -158,7 +158,7 @@ def eliminating(
         solver = rest_solver(part.problem)
     except RuntimeError:
         return None
-    return Elimination(
+    return BatchElimination(
         problem=problem,
         preconditioner=preconditioner,
         rows=device.array((3 * nodes[:, None] + np.arange(3)).ravel(), wp.int32),

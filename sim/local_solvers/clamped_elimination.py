@@ -24,7 +24,7 @@ from ..minimisers.lbfgs import Descended
 from ..minimisers.line_search import goes_too_far, kept_of
 from ..minimisers.residual import Judge, State
 from ..runtime.columns import combined
-from .clamped_part import Rimmed
+from .clamped_part import ClampedPart
 from .outer_loop import Limits, eliminated
 
 
@@ -55,7 +55,7 @@ DEAR = Limits(cycles=30, patience=8, rise=1e6, forcing=0.1, enough=0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Vicinity:
+class ClampedElimination:
     """A descent for single loads on one problem: quadratic elements, whose rest stiffness has levels and no inverse.
 
     problem, preconditioner
@@ -91,7 +91,7 @@ class Vicinity:
                 chosen = self._touching(self._strained(now.u.numpy()[:, 0] - z))
                 if not chosen.any():
                     return replace(now, free=np.full(1, np.inf))
-                part = Rimmed(self.problem, self.effects, self.space, chosen, judge.constant, now.u)
+                part = ClampedPart(self.problem, self.effects, self.space, chosen, judge.constant, now.u)
                 new = judge(part.settled(now.u, force[0]))
                 z = self._solved(new.g)
                 return new
@@ -106,13 +106,13 @@ class Vicinity:
                 more = self._left(_host(new.g), part.nodes)
                 if len(more):
                     chosen |= self._touching(more)
-                    part = Rimmed(self.problem, self.effects, self.space, chosen, judge.constant, new.u)
+                    part = ClampedPart(self.problem, self.effects, self.space, chosen, judge.constant, new.u)
             z = after
             return new
 
         return eliminated(self.problem, start, tolerance, most, self.limits, cycle)
 
-    def _lower(self, judge: Judge, now: State, part: Rimmed, d: np.ndarray, force: float) -> State:
+    def _lower(self, judge: Judge, now: State, part: ClampedPart, d: np.ndarray, force: float) -> State:
         """A step along d (3N,) that does not go too far, and the part settled to `force` [N] there.
 
         Its free force is not finite where no step that was tried leads on.

@@ -39,7 +39,7 @@ class PartLimits:
     inner: int = 60
 
 
-class Rimmed:
+class ClampedPart:
     """A part of one load case, whose rim does not move.
 
     Parameters

@@ -19,7 +19,7 @@ from ..runtime.threads import one_thread
 from .contact_forces import FORCES
 
 
-class Touched:
+class ContactPreconditioner:
     """A Preconditioner of batches of one column; of wider ones it is the rest's alone.
 
     Parameters

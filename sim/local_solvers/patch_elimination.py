@@ -53,7 +53,7 @@ class PatchSize:
 SIZE = PatchSize()
 
 
-class Patching:
+class PatchElimination:
     """A descent for single loads on one problem, on the CPU.
 
     Parameters
@@ -178,12 +178,12 @@ class Patching:
         return self._last[1:]
 
 
-def patching(
+def patch_elimination(
     problem: Problem, factor: Factor, effects: Iterable[Effect], space: Discretisation, size: PatchSize = SIZE
-) -> Patching:
+) -> PatchElimination:
     """For single loads on the CPU, on a body with a small opening."""
     near = near_tetrahedra(space, problem.constraint, min(NEAR.share, size.near / space.count))
-    return Patching(problem, factor, effects, space, near, size=size)
+    return PatchElimination(problem, factor, effects, space, near, size=size)
 
 
 def _norms(force: wp.array) -> np.ndarray:

@@ -19,7 +19,7 @@ from ..discretisation.term import Cases
 from ..linalg.pcg import Preconditioner
 from ..runtime.columns import EXACT, WIDTHS, gathered, scattered
 from .lbfgs_kernels import LEFT, LIVE, PAIRS
-from .lbfgs_state import Room, ground_of
+from .lbfgs_state import Workspace, ground_of
 
 # What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
 # the newest pair and how many there are (b,).
@@ -80,7 +80,7 @@ class Lbfgs:
         self._problem = problem
         self._schedule = schedule or (ON_CUDA if problem.device.on_cuda else Schedule())
         self._preconditioner = preconditioner
-        self._rooms: dict[int, Room] = {}
+        self._workspaces: dict[int, Workspace] = {}
         self._ground: dict[str, wp.array] = {}
 
     @property
@@ -113,42 +113,42 @@ class Lbfgs:
         teach = learnt is not None and count <= TAUGHT
         if count == 0:
             return Descended(u, status, steps, residual, {})
-        room, tried = self._room(count), 0
-        room.begin(
+        workspace, tried = self._workspace(count), 0
+        workspace.begin(
             start, tolerance, np.zeros(count) if force is None else force, (learnt or {}) if count <= TAUGHT else {}
         )
         if ahead is not None:
-            room.aim(*ahead)
+            workspace.aim(*ahead)
         while True:
             more = min(self._schedule.between, most - tried)
-            room.turn(more)
+            workspace.turn(more)
             tried += more
-            now = room.columns["status"].numpy()[: len(place)]
+            now = workspace.columns["status"].numpy()[: len(place)]
             left = int((now == LIVE).sum())
             last = tried >= most or left <= stragglers * count
-            if last or (count > TAUGHT and self._width(left) <= self._schedule.smaller * room.width):
+            if last or (count > TAUGHT and self._width(left) <= self._schedule.smaller * workspace.width):
                 leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
                 there = place[leave]
-                scattered(device, gathered(device, room.columns["u"], leave), there, u)
+                scattered(device, gathered(device, workspace.columns["u"], leave), there, u)
                 status[there], steps[there], residual[there] = (
-                    room.columns[name].numpy()[leave] for name in ("status", "steps", "residual")
+                    workspace.columns[name].numpy()[leave] for name in ("status", "steps", "residual")
                 )
                 if last:
-                    learnt = {name: rows_first(room.columns[name]) for name in LEARNT} if teach else {}
+                    learnt = {name: rows_first(workspace.columns[name]) for name in LEARNT} if teach else {}
                     return Descended(u, status, steps, residual, learnt)
                 stay = np.flatnonzero(now == LIVE)
-                place, before, room = place[stay], room, self._room(len(stay))
-                room.take(before, stay)
+                place, before, workspace = place[stay], workspace, self._workspace(len(stay))
+                workspace.take(before, stay)
 
-    def _room(self, count: int) -> Room:
+    def _workspace(self, count: int) -> Workspace:
         """For so many columns or a few more."""
         width = self._width(count)
-        if width > max(self._rooms, default=0):
-            self._rooms, self._ground = {}, {}  # what is there is given back before more is taken
+        if width > max(self._workspaces, default=0):
+            self._workspaces, self._ground = {}, {}  # what is there is given back before more is taken
             self._ground = ground_of(self._problem, width)
-        if width not in self._rooms:
-            self._rooms[width] = Room(self._problem, self._preconditioner, width, self._ground)
-        return self._rooms[width]
+        if width not in self._workspaces:
+            self._workspaces[width] = Workspace(self._problem, self._preconditioner, width, self._ground)
+        return self._workspaces[width]
 
     def _width(self, count: int) -> int:
         if self._problem.device.on_cuda:
@@ -157,8 +157,8 @@ class Lbfgs:
 
 
 def rows_first(array: wp.array) -> np.ndarray:
-    """A copy (b, ...) on the host of an array (..., b) in a room."""
-    return np.moveaxis(array.numpy(), -1, 0).copy()  # what stands in a room is written over
+    """A copy (b, ...) on the host of an array (..., b) in a workspace."""
+    return np.moveaxis(array.numpy(), -1, 0).copy()  # what stands in a workspace is written over
 
 
 def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
@@ -177,7 +177,7 @@ def learnt_from(cases: Cases, rows: int) -> dict[str, np.ndarray]:
         ((found[name] >= 0) & (found[name] <= last)).all() for name, last in most.items()
     ):
         return {}
-    # Other places hold whatever stood in the room.
+    # Other places hold whatever stood in the workspace.
     used = (found["head"][:, None] - np.arange(PAIRS)) % PAIRS < found["known"][:, None]
     places = {"s": used, "w": used} | dict.fromkeys(("sy", "yw"), used[:, :, None] & used[:, None, :])
     return found if all(all_finite(found[name][place]) for name, place in places.items()) else {}

@@ -82,7 +82,7 @@ def standing(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> St
     return State(columns, together, ground)
 
 
-class Room:
+class Workspace:
     """Columns last, on the ground that rooms share. On a graphics card the turn is captured once.
 
     Parameters
@@ -90,7 +90,7 @@ class Room:
     problem, preconditioner
         Whose turns these are.
     width
-        How many columns there is room for.
+        How many columns there is workspace for.
     ground
         As `ground_of` makes it, for at least this width.
     """
@@ -120,7 +120,7 @@ class Room:
             wp.copy(a["u"], start)
         for name, value in (("promised", np.inf), ("residual", np.inf), ("head", PAIRS - 1)):
             a[name].fill_(value)
-        # What is there to fill the room ends at once.
+        # What is there to fill the workspace ends at once.
         a["tolerance"].assign(np.append(tolerance, np.full(spare, np.inf)))
         a["force"].assign(np.append(force, np.full(spare, np.inf)))
         constant, loud = constants_of(self._problem, a["u"])
@@ -142,8 +142,8 @@ class Room:
         a["t"].fill_(1.0)
         self._clamp()
 
-    def take(self, other: Room, stay: np.ndarray) -> None:
-        """Go on with these columns (k,) of another room's batch."""
+    def take(self, other: Workspace, stay: np.ndarray) -> None:
+        """Go on with these columns (k,) of another workspace's batch."""
         index = self._padded(stay)
         self._problem.keep(index)
         there = self._problem.device.array(index, wp.int32)
@@ -154,7 +154,7 @@ class Room:
         self.prepare()
 
     def _padded(self, stay: np.ndarray) -> np.ndarray:
-        """The last of them again, until the room is full."""
+        """The last of them again, until the workspace is full."""
         return np.append(stay, np.full(self.width - len(stay), stay[-1]))
 
     def prepare(self) -> None:

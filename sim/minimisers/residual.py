@@ -27,42 +27,42 @@ class Balance:
     own: wp.array
 
 
-def _balance_room(problem: Problem, count: int) -> Balance:
+def _balance_workspace(problem: Problem, count: int) -> Balance:
     device = problem.device
     sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
     return Balance(device.zeros(problem.rows, count), device.zeros(problem.rows, count), sums, own)
 
 
 def balance(
-    problem: Problem, v: wp.array, constant: wp.array, d: wp.array | None = None, room: Balance | None = None
+    problem: Problem, v: wp.array, constant: wp.array, d: wp.array | None = None, workspace: Balance | None = None
 ) -> Balance:
     """The balance at v (3N, b) [m] of a batch with `constant` gradients (3N, b) [N], and its slope along d (3N, b).
 
-    In the arrays of `room`, if it is given.
+    In the arrays of `workspace`, if it is given.
     """
     device, (rows, count) = problem.device, v.shape
-    room = room or _balance_room(problem, count)
+    workspace = workspace or _balance_workspace(problem, count)
     varying = [term for term in problem.terms if not term.constant]
-    room.sums.zero_()
-    wp.copy(room.g, constant)
+    workspace.sums.zero_()
+    wp.copy(workspace.g, constant)
     if len(varying) == 1:
-        varying[0].add_gradient(v, room.g)
-        room = replace(room, own=room.sums[OWN : OWN + 1])
+        varying[0].add_gradient(v, workspace.g)
+        workspace = replace(workspace, own=workspace.sums[OWN : OWN + 1])
     else:
         absorb = kernels_of(device, PAIRS).absorb
-        room.own.zero_()
+        workspace.own.zero_()
         for number, term in enumerate(varying):
-            term.add_gradient(v, room.part)
-            device.launch(absorb, (-(-rows // CHUNK), count), [], [room.part, room.g, room.own[number]])
+            term.add_gradient(v, workspace.part)
+            device.launch(absorb, (-(-rows // CHUNK), count), [], [workspace.part, workspace.g, workspace.own[number]])
     inputs = [constant, *problem.constraint.nodes, v if d is None else d]
     spread = lbfgs_trial_kernels.spread_of(device, count)
     device.launch(
         lbfgs_trial_kernels.kernels_of(device, spread).finish,
         (spread.threads(rows // 3), count),
         inputs,
-        [room.g, room.sums],
+        [workspace.g, workspace.sums],
     )
-    return room
+    return workspace
 
 
 def constants_of(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:

@@ -16,7 +16,7 @@ from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs_kernels import LIVE, PAIRS
-from ..minimisers.lbfgs_state import Room, State, ground_of, standing
+from ..minimisers.lbfgs_state import State, Workspace, ground_of, standing
 from ..runtime.columns import lanes_of, summed
 from ..runtime.device import Device, forward_kernel
 
@@ -173,9 +173,9 @@ class Frame:
         self, problem: Problem, preconditioner: Preconditioner, inversion: Inversion, skin: Skin, tolerance: float
     ):
         self._device, self._inversion, self._skin = problem.device, inversion, skin
-        self._room = Room(problem, preconditioner, 1, ground_of(problem, 1))
-        self._room.columns["tolerance"].fill_(tolerance)
-        self._room.prepare()
+        self._workspace = Workspace(problem, preconditioner, 1, ground_of(problem, 1))
+        self._workspace.columns["tolerance"].fill_(tolerance)
+        self._workspace.prepare()
         self._before = standing(problem, 1, ground_of(problem, 1))
         self._past = problem.device.zeros(problem.rows, 1)
         name = problem.device.name
@@ -188,7 +188,7 @@ class Frame:
     @property
     def state(self) -> State:
         """Of the last answer."""
-        return self._room.state
+        return self._workspace.state
 
     @property
     def before(self) -> State:
@@ -197,7 +197,7 @@ class Frame:
 
     def take(self, u: np.ndarray, past: np.ndarray | None, learnt: Mapping[str, np.ndarray]) -> None:
         """Another state: displacements u (3N, 1) [m], those before them, and learnt pairs, as far as there are any."""
-        columns = self._room.columns
+        columns = self._workspace.columns
         columns["u"].assign(u)
         self._past.assign(u if past is None else past)
         for name in ("s", "w", "known"):
@@ -228,10 +228,10 @@ class Frame:
         return self._down.numpy()
 
     def _once(self) -> None:
-        a, k, device, imprint = self._room.columns, kernels_of(self._device), self._device, self._imprint
+        a, k, device, imprint = self._workspace.columns, kernels_of(self._device), self._device, self._imprint
         wp.copy(self._given, self._up)
         for kind, array in self._before.moved.items():
-            wp.copy(array, self._room.state.moved[kind])
+            wp.copy(array, self._workspace.state.moved[kind])
         self._skin.put(imprint)
         names = ("t", "promised", "residual", "loud", "sg", "wg", "steps", "cut", "status")
         outputs = [*(a[name] for name in names), self._tried, self._going, self._inverted]
@@ -248,8 +248,8 @@ class Frame:
         wp.copy(self._down, self._out)
 
     def _iterate(self) -> None:
-        self._room.once()
-        inputs = [self._room.columns["status"]]
+        self._workspace.once()
+        inputs = [self._workspace.columns["status"]]
         self._device.launch(kernels_of(self._device).look, (1,), inputs, [self._tried, self._going])
 
     def _both_sides(self, count: int) -> tuple[wp.array, wp.array]:

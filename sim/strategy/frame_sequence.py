@@ -61,7 +61,7 @@ class Kept(Mapping[str, Any]):
         return len(self._own)
 
 
-class Following:
+class FrameSequence:
     """Answers single pushes that have a start, on meshes whose vertices are the discretisation's nodes.
 
     Parameters

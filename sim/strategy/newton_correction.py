@@ -21,7 +21,7 @@ from ..minimisers.line_search import search
 from ..minimisers.newton_cg import Direction
 from ..minimisers.residual import relative
 from ..runtime.columns import combined, dots
-from .strategy import Answer, Ladder
+from .strategy import Answer, Strategy
 
 
 @dataclass(frozen=True)
@@ -52,44 +52,44 @@ class Step:
     seconds: dict[str, float]
 
 
-def step_from(ladder: Ladder, cases: Cases, guess: np.ndarray, linear: Linear = Linear()) -> Step:
+def step_from(strategy: Strategy, cases: Cases, guess: np.ndarray, linear: Linear = Linear()) -> Step:
     """One step from guess (3N, B) [m], which is first put on the constraints; from rest where it lies inside out."""
-    problem, device, count = ladder.problem, ladder.problem.device, len(cases.loads)
+    problem, device, count = strategy.problem, strategy.problem.device, len(cases.loads)
     clocks = [time.perf_counter()]
     problem.begin(cases)
     start = device.array(guess)
-    start = device.array(np.where(ladder.inversion.count(start) > 0, 0.0, guess))
+    start = device.array(np.where(strategy.inversion.count(start) > 0, 0.0, guess))
     u = combined(device, start, 1.0, problem.gap(start)[0], start)
     _, free, scale = problem.residual(u)
     before = relative(free, scale)
-    near = ladder.local(count) or ladder.near()
+    near = strategy.local(count) or strategy.near()
     if near is not None and not problem.constraint.imposes:
-        u = near.descend(u, np.full(count, ladder.accuracy.tolerance), 1).u
+        u = near.descend(u, np.full(count, strategy.accuracy.tolerance), 1).u
         problem.begin(cases)  # columns that were done have left
     g, free, _ = problem.residual(u)
     clocks.append(time.perf_counter())
     rhs = combined(device, device.zeros(*g.shape), -1.0, g, wp.empty_like(g))
-    found = _solved(problem, ladder, u, rhs, linear.forcing * free, linear.iterations)
+    found = _solved(problem, strategy, u, rhs, linear.forcing * free, linear.iterations)
     clocks.append(time.perf_counter())
     length = search(problem, u, Direction(found.x, dots(device, rhs, found.x), found.iterations))
     u = combined(device, u, length, found.x, wp.empty_like(u))
     g, free, scale = problem.residual(u)
     after, left = relative(free, scale), wp.zeros_like(g)
-    ladder.preconditioner.apply(g, np.ones(count, bool), left)
+    strategy.preconditioner.apply(g, np.ones(count, bool), left)
     problem.constraint.project(left)
     combined(device, wp.zeros_like(left), -1.0, left, left)
     clocks.append(time.perf_counter())
-    good = after <= ladder.accuracy.tolerance
+    good = after <= strategy.accuracy.tolerance
     outcome = np.full(count, Outcome.BUDGET, object)
     outcome[good] = Outcome.CONVERGED
     steps, reached = np.ones(count, int), good.astype(float)
-    answer = Answer(u, outcome, steps, after, reached, ladder.inversion.count(u), found.iterations)
+    answer = Answer(u, outcome, steps, after, reached, strategy.inversion.count(u), found.iterations)
     relax, solve, along = np.diff(clocks).tolist()
     return Step(answer, before, left, {"relax": relax, "solve": solve, "search": along})
 
 
 def _solved(
-    problem: Problem, ladder: Ladder, u: wp.array, rhs: wp.array, tolerance: np.ndarray, most: int
+    problem: Problem, strategy: Strategy, u: wp.array, rhs: wp.array, tolerance: np.ndarray, most: int
 ) -> LinearSolution:
     """K(u) d = rhs (3N, B) to `tolerance` (B,) [N], in at most so many iterations.
 
@@ -101,6 +101,6 @@ def _solved(
         if found is not None:
             definite = definite | found.truncated
         problem.linearise(u, definite)
-        ladder.preconditioner.prepare(problem, rhs.shape[1])
-        found = conjugate_gradients(problem, ladder.preconditioner, wp.clone(rhs), tolerance, most)
+        strategy.preconditioner.prepare(problem, rhs.shape[1])
+        found = conjugate_gradients(problem, strategy.preconditioner, wp.clone(rhs), tolerance, most)
     return found

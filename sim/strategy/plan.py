@@ -18,9 +18,9 @@ from ..linalg.multifrontal import Factor
 from ..linalg.multigrid import TwoLevel
 from ..linalg.pcg import BlockJacobi, Preconditioner
 from ..linalg.preconditioner import is_exact, name_of
-from ..local_solvers.batch_elimination import Elimination, eliminating, has_small_opening
-from ..local_solvers.clamped_elimination import Vicinity
-from ..local_solvers.patch_elimination import Patching, patching
+from ..local_solvers.batch_elimination import BatchElimination, batch_elimination, has_small_opening
+from ..local_solvers.clamped_elimination import ClampedElimination
+from ..local_solvers.patch_elimination import PatchElimination, patch_elimination
 from .captured_frame import FRAME_EVALUATIONS
 
 # So many load cases are worth the set-up of a local problem that they share.
@@ -170,12 +170,12 @@ def can_follow(space: Discretisation, accuracy: Accuracy) -> bool:
 
 def local_solvers(
     plan: Plan, problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
-) -> tuple[Callable[[], Elimination | None], Patching | Vicinity | None]:
+) -> tuple[Callable[[], BatchElimination | None], PatchElimination | ClampedElimination | None]:
     """What a plan solves by itself: for many loads, made when it is asked for first, and for a single one."""
-    near = cache(partial(eliminating, problem, preconditioner, effects, space) if plan.many else lambda: None)
+    near = cache(partial(batch_elimination, problem, preconditioner, effects, space) if plan.many else lambda: None)
     if plan.single is Step.CLAMPED:
-        return near, Vicinity(problem, preconditioner, effects, space)
+        return near, ClampedElimination(problem, preconditioner, effects, space)
     if plan.single is Step.PATCH:
         assert isinstance(preconditioner, Factor)
-        return near, patching(problem, preconditioner, effects, space)
+        return near, patch_elimination(problem, preconditioner, effects, space)
     return near, None

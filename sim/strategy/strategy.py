@@ -16,11 +16,11 @@ from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases, Local
 from ..linalg.pcg import Preconditioner
-from ..local_solvers.batch_elimination import Elimination
-from ..local_solvers.clamped_elimination import Vicinity
-from ..local_solvers.contact_descent import Proximal
-from ..local_solvers.contact_preconditioner import Touched
-from ..local_solvers.patch_elimination import NODES, Patching
+from ..local_solvers.batch_elimination import BatchElimination
+from ..local_solvers.clamped_elimination import ClampedElimination
+from ..local_solvers.contact_descent import ContactDescent
+from ..local_solvers.contact_preconditioner import ContactPreconditioner
+from ..local_solvers.patch_elimination import NODES, PatchElimination
 from ..minimisers.lbfgs import Lbfgs, learnt_from
 from ..minimisers.lbfgs_kernels import BROKEN, DONE
 from ..minimisers.newton import find_equilibrium
@@ -31,6 +31,7 @@ from ..runtime.device import Device
 from .plan import Plan, Step
 from .stepping import GAPS, STEPPING, Gaps, Stepping
 
+LocalSolver = BatchElimination | PatchElimination | ClampedElimination
 NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
@@ -67,8 +68,8 @@ class Answer:
 
 
 @dataclass(frozen=True, eq=False)
-class Ladder:
-    """The rungs: each takes what the one before it did not bring to equilibrium.
+class Strategy:
+    """The solvers of a plan: each takes what the one before it did not bring to equilibrium.
 
     problem
         What the cases are posed on.
@@ -93,8 +94,8 @@ class Ladder:
     inversion: Inversion
     accuracy: Accuracy
     plan: Plan
-    near: Callable[[], Elimination | None] = lambda: None
-    alone: Patching | Vicinity | None = None
+    near: Callable[[], BatchElimination | None] = lambda: None
+    alone: PatchElimination | ClampedElimination | None = None
     stepping: Stepping = STEPPING
     gaps: Gaps = GAPS
 
@@ -103,14 +104,14 @@ class Ladder:
         return Lbfgs(self.problem, self.preconditioner)
 
     @cached_property
-    def _proximal(self) -> Proximal | None:
+    def _proximal(self) -> ContactDescent | None:
         if self.plan.contact is not Step.CONTACT:
             return None
         (barrier,) = self.problem.barriers
         assert isinstance(barrier, Local)
-        return Proximal(self.problem, self.preconditioner, barrier)
+        return ContactDescent(self.problem, self.preconditioner, barrier)
 
-    def local(self, count: int) -> Elimination | Patching | Vicinity | None:
+    def local(self, count: int) -> LocalSolver | None:
         """What solves a part by itself for so many loads, if anything does."""
         step = self.plan.local(count)
         return None if step is None else self.near() if step is Step.NEAR else self.alone
@@ -119,14 +120,18 @@ class Ladder:
     def _touched(self) -> Preconditioner:
         """The preconditioner that knows contact: on CUDA half precision is rougher than contact is stiff."""
         touch = None if self.problem.device.on_cuda else self._proximal
-        return Touched(self.preconditioner, touch.compliance, touch.barrier) if touch else self.preconditioner
+        return (
+            ContactPreconditioner(self.preconditioner, touch.compliance, touch.barrier)
+            if touch
+            else self.preconditioner
+        )
 
     @property
     def held(self) -> int:
         """Bytes that L-BFGS keeps for the next batch to stand in."""
         return self._lbfgs.held
 
-    def climb(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
+    def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
         """The equilibria of B cases, each from the first of its guesses (3N, B) [m] that will do; from rest without.
 
         A start that lies inside out is left alone, and so is a state that does to which a start led: a body turned
@@ -189,7 +194,7 @@ class Ladder:
         return guess, astray
 
     def _lost(self, answer: Answer) -> np.ndarray:
-        """Which cases (B,) another rung may save: at round-off none is nearer to equilibrium."""
+        """Which cases (B,) another solver may save: at round-off none is nearer to equilibrium."""
         return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
     def _whole(
@@ -210,9 +215,7 @@ class Ladder:
             learnt = None
         if Step.LBFGS not in self.plan.steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
-        descents: list[tuple[Elimination | Patching | Vicinity | Lbfgs, Mapping[str, np.ndarray] | None]] = [
-            (self._lbfgs, learnt)
-        ]
+        descents: list[tuple[LocalSolver | Lbfgs, Mapping[str, np.ndarray] | None]] = [(self._lbfgs, learnt)]
         near = self.local(count)
         if near is not None:
             patch = {NODES: cases.warm[NODES]} if NODES in cases.warm else {}

@@ -16,12 +16,12 @@ from .strategy import Answer
 
 @dataclass(frozen=True, eq=False)
 class Still:
-    """Stands in for a `Ladder`: what has mass does not move at once, whatever pulls at it, nor do tools."""
+    """Stands in for a `Strategy`: what has mass does not move at once, whatever pulls at it, nor do tools."""
 
     problem: Problem
     inversion: Inversion
 
-    def climb(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
+    def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
         """Where the bodies were (3N, B) [m], the last of the guesses; at rest without."""
         device, count = self.problem.device, len(cases.loads)
         u = device.array(guesses[-1]) if guesses else device.zeros(self.problem.rows, count)

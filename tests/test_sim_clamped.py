@@ -1,4 +1,4 @@
-"""The vicinity of a load against L-BFGS and Newton on the whole body."""
+"""Elimination of a clamped part against L-BFGS and Newton on the whole body."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, push
-from sim.local_solvers.clamped_elimination import Vicinity
-from sim.local_solvers.clamped_part import Rimmed
+from sim.local_solvers.clamped_elimination import ClampedElimination
+from sim.local_solvers.clamped_part import ClampedPart
 from sim.minimisers.lbfgs_kernels import DONE, LIVE
 from sim.minimisers.residual import constants_of
 from sim.strategy.plan import Step
@@ -27,14 +27,14 @@ def pressed(down: float) -> Loads:
     return push(np.array([0.05, 0.05, 0.1]), np.array([0.3 * down, 0.0, -down]), 0.02)
 
 
-def fem_and_vicinity() -> tuple[Fem, Vicinity]:
+def fem_and_elimination() -> tuple[Fem, ClampedElimination]:
     fem = Fem(BODY, EFFECTS, Accuracy(1e-8), "cpu", element="p2")
-    return fem, Vicinity(fem.problem, fem._ladder.preconditioner, EFFECTS, fem.space)
+    return fem, ClampedElimination(fem.problem, fem._strategy.preconditioner, EFFECTS, fem.space)
 
 
 def test_finds_the_equilibrium() -> None:
     """Under a force that presses a box in by a twentieth of its height."""
-    fem, vicinity = fem_and_vicinity()
+    fem, elimination = fem_and_elimination()
     load = pressed(0.6)
     answer = fem.deform(load)
     expected = Fem(BODY, EFFECTS, Accuracy(1e-8), "cpu", element="p2", avoid=(Step.CLAMPED,)).deform(load)
@@ -42,38 +42,38 @@ def test_finds_the_equilibrium() -> None:
     assert answer.outcome[0].good and moved > 5e-3
     np.testing.assert_allclose(answer.displacement, expected.displacement, atol=1e-5 * moved)
     fem.problem.begin(Cases(load, np.zeros(1)))
-    found = vicinity.descend(fem.problem.device.zeros(fem.problem.rows, 1), np.array([1e-8]), 60)
+    found = elimination.descend(fem.problem.device.zeros(fem.problem.rows, 1), np.array([1e-8]), 60)
     assert found.status[0] == DONE and found.steps[0] > 0
     assert fem.problem.residual(found.u)[1][0] <= 1.01e-8 * fem.problem.residual(found.u)[2][0]
 
 
 def test_what_it_does_not_bring_home_is_left_nearer_to_it() -> None:
-    fem, vicinity = fem_and_vicinity()
+    fem, elimination = fem_and_elimination()
     fem.problem.begin(Cases(pressed(0.6), np.zeros(1)))
     start = fem.problem.device.zeros(fem.problem.rows, 1)
-    found = vicinity.descend(start, np.array([1e-8]), 3)
+    found = elimination.descend(start, np.array([1e-8]), 3)
     assert found.status[0] == LIVE and found.steps[0] == 3
     before, after = (fem.problem.residual(u)[1][0] for u in (start, found.u))
     assert after < 0.5 * before
 
 
 def test_what_is_hardly_strained_is_left_to_others() -> None:
-    fem, vicinity = fem_and_vicinity()
+    fem, elimination = fem_and_elimination()
     fem.problem.begin(Cases(pressed(1e-3), np.zeros(1)))
-    found = vicinity.descend(fem.problem.device.zeros(fem.problem.rows, 1), np.array([1e-8]), 60)
+    found = elimination.descend(fem.problem.device.zeros(fem.problem.rows, 1), np.array([1e-8]), 60)
     assert found.status[0] == LIVE and found.steps[0] == 0 and not found.u.numpy().any()
     assert fem.deform(pressed(1e-3)).outcome[0].good
 
 
 def test_a_part_is_settled_between_what_holds_its_rim() -> None:
-    fem, _ = fem_and_vicinity()
+    fem, _ = fem_and_elimination()
     problem, device = fem.problem, fem.problem.device
     problem.begin(Cases(pressed(0.6), np.zeros(1)))
     u = device.array(1e-4 * np.random.default_rng(0).normal(size=(problem.rows, 1)))
     problem.constraint.project(u)
     chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.08
     constant, _ = constants_of(problem, u)
-    part = Rimmed(problem, EFFECTS, fem.space, chosen, constant, u)
+    part = ClampedPart(problem, EFFECTS, fem.space, chosen, constant, u)
     settled = part.settled(u, 1e-9)
     inside = np.setdiff1d(part.nodes, fem.space.table[~chosen])
     moved = (settled.numpy() != u.numpy()).reshape(-1, 3).any(axis=1)
@@ -116,5 +116,5 @@ def test_a_part_whose_forces_are_not_finite_stays_as_it_is() -> None:
     rest = problem.device.zeros(problem.rows, 1)
     folded = problem.device.array(-2.0 * fem.space.nodes.reshape(-1, 1) * (fem.space.nodes[:, 2:] > 0.0).repeat(3, 0))
     chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.04
-    part = Rimmed(problem, fem.effects, fem.space, chosen, constants_of(problem, rest)[0], rest)
+    part = ClampedPart(problem, fem.effects, fem.space, chosen, constants_of(problem, rest)[0], rest)
     np.testing.assert_array_equal(part.settled(folded, 1e-9).numpy(), folded.numpy())
