@@ -28,6 +28,7 @@ ORDER = (
     {"sim.strategy"},
     {"sim.fem"},
     {"sim.resected_fem", "sim.contact_pressure", "sim.tearing"},
+    {"surrogate.array_functions"},
     {"surrogate.data", "surrogate.regressors"},
     {"surrogate.model"},
     {"surrogate.evaluation", "surrogate.onnx_export"},

@@ -7,12 +7,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import distances_to, rim_of
 from sim.errors import InputError
 from sim.geometry.surface import areas, vertex_normals
+
+from ..array_functions import squared_distances, taken
 
 if TYPE_CHECKING:
     from sim.discretisation.footprint import Skin
@@ -83,7 +84,7 @@ class Patch:
 
     def normal_near(self, points: np.ndarray) -> np.ndarray:
         """Unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""
-        return self.inward[nearest(points, self.points)[0]]
+        return taken(squared_distances(points, self.points).argmin(axis=1), self.inward)
 
     def covered(self, centres: np.ndarray, radius: float) -> float:
         """Share of the area within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
@@ -109,6 +110,5 @@ def open_patch(anatomy: Anatomy) -> Patch:
 
 def nearest(points: np.ndarray, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which of the `sites` (n, 3) is nearest to each of the `points` (B, 3), and how far it is: (B,), (B,)."""
-    distance = cdist(points, sites)
-    which = distance.argmin(axis=1)
-    return which, distance[np.arange(len(points)), which]
+    squared = squared_distances(points, sites)
+    return squared.argmin(axis=1), np.sqrt(squared.min(axis=1))

@@ -24,8 +24,12 @@ def directions(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
 def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Forces (B, 3 m) at the patch's nodes, for one newton: the finite elements' own integral over the footprint."""
     weights = patch.skin.press(pushed.point, pushed.footprint).rows(len(patch.points))
-    shares = np.einsum("bm,bi->bmi", weights.toarray(), directions(pushed)[1])
-    return shares.reshape(len(shares), 3 * len(patch.points))
+    return shared_out(weights.toarray(), pushed)
+
+
+def shared_out(weights: np.ndarray, pushed: Pushed) -> np.ndarray:
+    """Forces (B, 3 m) at m nodes, for one newton, of which each bears its weight (B, m)."""
+    return np.einsum("bm,bi->bmi", weights, directions(pushed)[1]).reshape(-1, 3 * weights.shape[1])
 
 
 def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from sim.loads import Pushed
 
+from ..array_functions import taken
 from ..regressors.protocol import standardisation
 from .training_range import Measured
 
@@ -62,7 +63,7 @@ class Bound:
     def of(self, features: np.ndarray, force: np.ndarray, excess: np.ndarray) -> np.ndarray:
         """Bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N] and `Envelope.excess` (B,)."""
         scale = np.exp(_monomials(_standard(features, self.mean, self.deviation)) @ self.weights)
-        return self.quantile[:, np.searchsorted(self.edges, force)] * scale * (1.0 + GROWTH * excess)
+        return taken(np.searchsorted(self.edges, force), self.quantile.T).T * scale * (1.0 + GROWTH * excess)
 
 
 def fitted_bound(
@@ -128,7 +129,7 @@ def _standard(features: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> 
 def _monomials(x: np.ndarray) -> np.ndarray:
     """1, x_i and x_i x_j of (B, f): (B, t)."""
     first, second = _pairs(x.shape[1])
-    return np.concatenate([np.ones((len(x), 1)), x, x[:, first] * x[:, second]], axis=1)
+    return np.concatenate([np.ones_like(x[:, :1]), x, x[:, first] * x[:, second]], axis=1)
 
 
 def _used(count: int, curved: int) -> np.ndarray:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache, reduce
+from operator import add
 
 import numpy as np
 
@@ -20,10 +21,10 @@ from sim.material import tissue_from_json
 from sim.runtime.threads import one_thread
 
 from ..data.cortex_patch import Patch, nearest, open_patch
-from ..data.encode import ENCODERS, Basis, directions
+from ..data.encode import ENCODERS, Basis, Encoder, directions
 from ..data.indentation import indented
 from ..regressors.protocol import Fitted
-from .conformal import Bound, features_of
+from .conformal import LEVELS, Bound, features_of
 from .tip_distance import Distance, TipModel
 from .training_range import Envelope, Measured, measured
 
@@ -110,15 +111,24 @@ class Learned:
         return open_patch(self.anatomy)
 
     @cached_property
-    def _by_basis(self) -> tuple[tuple[list[Part], np.ndarray], ...]:
-        """Parts of one basis, and (V,) the row of each mesh vertex in it, or -1."""
+    def _modes_at(self) -> Callable[[bytes], tuple[tuple[list[Part], np.ndarray], ...]]:
+        """Parts of one basis, and its modes (r, 3 n) at mesh vertices, zero at those that it does not know."""
         groups: dict[int, list[Part]] = {}
         for part in self.parts:
             groups.setdefault(id(part.basis.modes), []).append(part)
-        rows = np.full((len(groups), len(self.anatomy.mesh.nodes)), -1)
-        for row, parts in zip(rows, groups.values(), strict=True):
-            row[parts[0].basis.nodes] = np.arange(len(parts[0].basis.nodes))
-        return tuple(zip(groups.values(), rows, strict=True))
+
+        def modes_at(nodes: bytes) -> tuple[tuple[list[Part], np.ndarray], ...]:
+            asked, found = np.frombuffer(nodes, np.int64), []
+            for parts in groups.values():
+                basis = parts[0].basis
+                here, row = np.nonzero(asked[:, None] == basis.nodes)
+                modes = np.zeros((len(basis.modes), len(asked), 3), np.float32)
+                modes[:, here] = basis.modes.reshape(len(modes), -1, 3)[:, row]
+                if len(here):
+                    found.append((parts, modes.reshape(len(modes), -1)))
+            return tuple(found)
+
+        return lru_cache(maxsize=4)(modes_at)
 
     @cached_property
     def _knows(self) -> np.ndarray:
@@ -190,52 +200,31 @@ class Learned:
         excess = self.envelope.excess(pushed, known)
         small = pushed.footprint < self.envelope.reach + STORED
         self._demand_answerable(pushed, np.flatnonzero((excess > 0.0) | small))
-        magnitude, direction = directions(pushed)
-        # Beyond the taught forces the response stays what it was at the nearest of them.
-        within = np.clip(magnitude, *self.envelope.force)
-        asked = replace(pushed, force=within[:, None] * direction)
-        features: dict[str, np.ndarray] = {}  # of each encoder that is needed
-        displacement = np.zeros((len(loads), len(nodes), 3))
-        for parts, row_of in self._by_basis:
-            row = row_of[nodes]
-            here = row >= 0
-            if here.any():
-                for encoder in {part.encoder for part in parts} - set(features):
-                    features[encoder] = ENCODERS[encoder](self._patch, asked)
-                coefficients = sum(part.regressor.predict(features[part.encoder]) for part in parts)
-                response = parts[0].basis.decode(np.asarray(coefficients))
-                displacement[:, here] += magnitude[:, None, None] * response[:, row[here]]
-        promised = self._promised(self.bounds, pushed, known, excess)
-        return predicted(displacement, nodes, loads, excess > 0.0, begun, promised, self.source)
+        promised = self.promised(self.bounds, pushed, known, excess)
+        return predicted(self.motion(pushed, nodes), nodes, loads, excess > 0.0, begun, promised, self.source)
 
-    @cached_property
-    def _of_tumour(self) -> tuple[tuple[tuple[Part, ...], np.ndarray], ...]:
-        """Parts of one basis that know of the tumour, and its modes there (r, 3 n)."""
-        tumour, found = self.anatomy.tumour_nodes, []
-        for parts, row in self._by_basis:
-            if (row[tumour] >= 0).all():
-                modes = parts[0].basis.modes
-                found.append((tuple(parts), modes.reshape(len(modes), -1, 3)[:, row[tumour]].reshape(len(modes), -1)))
-        return tuple(found)
+    def motion(self, pushed: Pushed, nodes: np.ndarray, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
+        """Displacements (B, n, 3) [m] of mesh vertices `nodes` (n,) by the model alone, without limits and bound.
 
-    def bare(self, pushed: Pushed) -> np.ndarray:
-        """Displacements (B, n, 3) [m] of the tumour by the model alone, without limits and bound.
-
-        Learners are timed by it. Forces must lie in the envelope.
+        Beyond the forces of the training the response stays what it was at the nearest of them.
         """
-        magnitude, features = directions(pushed)[0], {}
-        total = np.zeros((len(magnitude), 3 * len(self.anatomy.tumour_nodes)), np.float32)
-        for parts, modes in self._of_tumour:
-            for part in parts:
-                if part.encoder not in features:
-                    features[part.encoder] = ENCODERS[part.encoder](self._patch, pushed)
-                total += part.regressor.predict(features[part.encoder]) @ modes
-        return (magnitude[:, None] * total).reshape(len(magnitude), -1, 3)
+        magnitude, direction = directions(pushed)
+        if not len(nodes):
+            return np.zeros((len(magnitude), 0, 3))
+        asked = replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
+        groups = self._modes_at(np.asarray(nodes, np.int64).tobytes())
+        names = {part.encoder for parts, _ in groups for part in parts}
+        features = {name: encoders[name](self._patch, asked) for name in sorted(names)}
+        responses = [
+            reduce(add, [part.regressor.predict(features[part.encoder]) for part in parts]) @ modes
+            for parts, modes in groups
+        ]
+        return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
 
-    def _promised(self, bound: Bound | None, pushed: Pushed, known: Measured, excess: np.ndarray) -> np.ndarray:
+    def promised(self, bound: Bound | None, pushed: Pushed, known: Measured, excess: np.ndarray) -> np.ndarray:
         """What a bound (2, B) [m] says of loads; NaN where there is none."""
         if bound is None:
-            return np.full((2, len(excess)), np.nan)
+            return np.stack([np.nan * excess] * len(LEVELS))
         # As the motion, so its error: in proportion to a force weaker than any that was taught.
         weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
         told = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *self.envelope.force)))
@@ -266,7 +255,7 @@ class Learned:
         within = np.clip(magnitude, *self.envelope.force)[:, None] * direction
         found = tip.corrected(apart, self._patch, replace(pushed, force=within), magnitude)
         known = measured(self._patch, pushed)
-        return Distance(found, self._promised(tip.bound, pushed, known, self.envelope.excess(pushed, known)))
+        return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.excess(pushed, known)))
 
     def asked(self, loads: Loads) -> Pushed:
         """What the model is asked: pushes, or the poses of its ball as `indentation.indented` has them.

@@ -10,7 +10,8 @@ from scipy.spatial import KDTree
 
 from sim.loads import Pushed
 
-from ..data.cortex_patch import Patch, nearest
+from ..array_functions import squared_distances
+from ..data.cortex_patch import Patch
 from ..data.encode import directions
 
 # Round-off must not put a taught load outside.
@@ -76,7 +77,7 @@ class Envelope:
         magnitude, angle, overhang = known
         beyond = np.stack(
             [
-                1e3 * (nearest(pushed.point, self.points)[1] - self.reach - SLACK),
+                1e3 * (np.sqrt(squared_distances(pushed.point, self.points).min(axis=1)) - self.reach - SLACK),
                 1e3 * (overhang - self.overhang - SLACK),
                 np.where(magnitude == 0.0, 0.0, angle - self.angle - SLACK),
                 magnitude / self.force[1] - 1.0 - SLACK,

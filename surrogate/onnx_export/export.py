@@ -1,26 +1,39 @@
-"""Learned models as ONNX files: one graph from loads to displacements and bounds, for programs without this project."""
+"""Learned models as ONNX files: one graph from loads to displacements and bounds, for programs without this project.
+
+The graph is what the model's own formulas do with wires in place of arrays: no formula is written a second time.
+"""
 
 from __future__ import annotations
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim.errors import InputError
+from sim.loads import Pushed
 from sim.runtime.atomic_files import written_whole
 
-from ..data.cortex_patch import open_patch
+from ..data.cortex_patch import Patch, open_patch
+from ..data.encode import shared_out, tool_features
 from ..model.conformal import LEVELS
-from ..model.learned import Learned, Part
-from .bound import Push, excess_of, place_of, promised, push_of, unpromised
-from .graph import Port, Sheet, Wire
-from .regressors import WIRED
+from ..model.learned import Learned
+from ..model.training_range import measured
+from ..regressors.ann import Ann
+from ..regressors.compliance_table import Linear
+from ..regressors.force_series import Series
+from ..regressors.gp import Gp
+from ..regressors.pcr import Pcr
+from ..regressors.series_residual import Remainder
+from ..regressors.svr import Svr
+from .graph import Port, Sheet
 
 if TYPE_CHECKING:
     from onnx import ModelProto
 
+# Regressors whose formulas use nothing but what a wire knows.
+TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, Remainder, Series)
 # Of names, shapes and meaning of inputs, outputs and metadata.
 FORMAT = "sulcus onnx 1"
 TEXT = (
@@ -40,39 +53,43 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     Outputs, as `Learned.deform` answers: `displacement` (B, n, 3) [m] of the mesh vertices `nodes` (n,), which lie at
     `rest` (n, 3) [m]; `bound` (B, 2) [m] of the tumour, at the metadata's levels, NaN where nothing was calibrated;
     `excess` (B,), that of `Envelope`; and `extrapolated` (B,), whether it is more than zero. All in single precision,
-    but in between in double where sums cancel.
+    but in between in the precision that the model has.
 
     Raises
     ------
     InputError
         A regressor that has no graph; the package `onnx` not installed.
     """
-    sheet, patch = Sheet(), open_patch(model.anatomy)
-    push = push_of(
-        sheet.input("point", ("B", 3), "where the tool touches the resting tissue [m], RAS"),
-        sheet.input("force", ("B", 3), "of the tool on the tissue [N], RAS"),
-        sheet.input("footprint", ("B",), "radius of the disc that it presses [m]"),
-    )
+    sheet, patch, envelope = Sheet(), open_patch(model.anatomy), model.envelope
     nodes = model.nodes if cortex else model.anatomy.tumour_nodes
-    parts = [part for part in model.parts if np.isin(part.basis.nodes, nodes).any()]
-    encoded = {"tool": _tool_features(push, model.envelope.force)}
-    if any(part.encoder == "nodal" for part in parts):
-        weight = sheet.input("weight", ("B", len(patch.nodes)), "share of the force on each of the nodes `pressed`")
-        # (B, 3 m), as `nodal_shares`.
-        encoded["nodal"] = (weight.shaped(0, -1, 1) * push.direction.shaped(0, 1, -1)).shaped(0, -1)
-        sheet.output(sheet.constant(patch.nodes), Port("pressed", np.int64, patch.nodes.shape, "of the mesh"))
-    responses = [_response(name, part, encoded[part.encoder], nodes) for part in parts]
-    displacement = (push.magnitude * sum(responses[1:], responses[0])).shaped(0, -1, 3)
-    place = place_of(patch, push)
-    excess = excess_of(model.envelope, push, place)
-    bound = (
-        unpromised(push) if model.bounds is None else promised(model.bounds, push, place, excess, model.envelope.force)
+    for part in model.parts:
+        if np.isin(part.basis.nodes, nodes).any() and not isinstance(part.regressor, TRACEABLE):
+            kind = type(part.regressor).__name__
+            raise InputError(f"{name} has a part of the kind {kind}, which has no ONNX graph: export another learner.")
+    # Any two loads of the training range show the formulas which kinds and shapes their arrays have.
+    down = np.array([0.0, 0.0, -envelope.force[1]])
+    pushed = Pushed(
+        sheet.input("point", np.tile(patch.points[0], (2, 1)), "where the tool touches the resting tissue [m], RAS"),
+        sheet.input("force", np.tile(down, (2, 1)), "of the tool on the tissue [N], RAS"),
+        sheet.input("footprint", np.full(2, envelope.footprint[1]), "radius of the disc that it presses [m]"),
     )
+
+    def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
+        """`surrogate.data.encode.nodal_shares`, whose integral over the footprint is given."""
+        sample = np.full((2, len(patch.nodes)), 1.0 / len(patch.nodes))
+        weight = sheet.input("weight", sample, "share of the force on each of the nodes `pressed`")
+        sheet.output(sheet.constant(patch.nodes), Port("pressed", np.int64, patch.nodes.shape, "of the mesh"))
+        return shared_out(weight, pushed)
+
+    displacement: Any = model.motion(pushed, nodes, {"tool": tool_features, "nodal": nodal_shares})
+    known = measured(patch, pushed)
+    excess: Any = envelope.excess(pushed, known)
+    bound: Any = model.promised(model.bounds, pushed, known, excess)
     rest = model.anatomy.mesh.nodes[nodes]
     sheet.output(displacement, Port("displacement", np.float32, ("B", len(nodes), 3), "of the vertices `nodes` [m]"))
-    sheet.output(bound, Port("bound", np.float32, ("B", len(LEVELS)), "no tumour vertex is farther off [m]"))
-    sheet.output(excess.shaped(-1), Port("excess", np.float32, ("B",), "how far outside the training range; 0 inside"))
-    sheet.output((excess > 0.0).shaped(-1), Port("extrapolated", np.bool_, ("B",), "outside: do not rely on it"))
+    sheet.output(bound.T, Port("bound", np.float32, ("B", len(LEVELS)), "no tumour vertex is farther off [m]"))
+    sheet.output(excess, Port("excess", np.float32, ("B",), "how far outside the training range; 0 inside"))
+    sheet.output(excess > 0.0, Port("extrapolated", np.bool_, ("B",), "outside: do not rely on it"))
     sheet.output(sheet.constant(nodes), Port("nodes", np.int64, nodes.shape, "of the mesh"))
     sheet.output(sheet.constant(rest), Port("rest", np.float32, rest.shape, "where the vertices `nodes` lie [m], RAS"))
     return sheet.model(name, TEXT, version("sulcus"), _notes(name, model))
@@ -89,25 +106,6 @@ def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False
     graph = onnx_model(name, model, cortex)
     with written_whole(path, ".onnx") as partial:
         partial.write_bytes(graph.SerializeToString())
-
-
-def _tool_features(push: Push, taught: tuple[float, float]) -> Wire:
-    """`tool_features` (B, 8): beyond the `taught` forces [N], of the nearest of them."""
-    return push.point.sheet.joined(push.point, push.direction, push.magnitude.clip(*taught), push.footprint)
-
-
-def _response(name: str, part: Part, features: Wire, nodes: np.ndarray) -> Wire:
-    """Responses (B, 3 n) [m/N] of vertices `nodes` (n,), zero where the part does not know them."""
-    kind = type(part.regressor)
-    if kind not in WIRED:
-        raise InputError(
-            f"{name} has a part of the kind {kind.__name__}, which has no ONNX graph: export another learner."
-        )
-    modes = part.basis.modes.reshape(len(part.basis.modes), -1, 3)
-    here, row = np.nonzero(nodes[:, None] == part.basis.nodes)
-    wanted = np.zeros((len(modes), len(nodes), 3), np.float32)
-    wanted[:, here] = modes[:, row]
-    return WIRED[kind](features, part.regressor.state()) @ wanted.reshape(len(modes), -1)
 
 
 def _notes(name: str, model: Learned) -> dict[str, str]:

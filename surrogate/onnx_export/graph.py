@@ -1,14 +1,16 @@
-"""Formulas as ONNX graphs: wires add, multiply and compare as arrays do, and the graph is what they did."""
+"""ONNX graphs that are traced: NumPy's own functions, given a wire, write the operator that they stand for."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from sim.errors import InputError
+
+from ..array_functions import squared_distances, taken
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -16,12 +18,31 @@ if TYPE_CHECKING:
 # Of 2021 and 2022: every runtime of today reads them.
 OPSET, FORMAT_VERSION = 17, 8
 # As `onnx.TensorProto` numbers them.
-KINDS: dict[type, int] = {np.float32: 1, np.int64: 7, np.bool_: 9, np.float64: 11}
+KINDS = {np.dtype(kind): number for kind, number in (("f4", 1), ("i8", 7), ("?", 9), ("f8", 11))}
+OPERATORS = {
+    np.add: "Add",
+    np.subtract: "Sub",
+    np.multiply: "Mul",
+    np.true_divide: "Div",
+    np.matmul: "MatMul",
+    np.power: "Pow",
+    np.maximum: "Max",
+    np.minimum: "Min",
+    np.greater: "Greater",
+    np.less: "Less",
+    np.equal: "Equal",
+    np.negative: "Neg",
+    np.absolute: "Abs",
+    np.sqrt: "Sqrt",
+    np.exp: "Exp",
+    np.log: "Log",
+    np.tanh: "Tanh",
+}
+"""NumPy's universal functions and their operators."""
 
 
-@dataclass(frozen=True, eq=False)
-class Wire:
-    """A named array of a graph; operators follow numpy's rules of shapes.
+class Wire(NDArrayOperatorsMixin):
+    """A named array of a graph, whose first axis is the batch. Operators and functions of NumPy write on its sheet.
 
     Parameters
     ----------
@@ -29,74 +50,78 @@ class Wire:
         Where it is written.
     name
         Its own there.
-    real
-        The precision in which constants meet it.
+    sample
+        What it is for a batch of sample loads: its kind and shape are NumPy's own. No formula may keep the batch's
+        length, which is another in use.
     """
 
-    sheet: Sheet
-    name: str
-    real: type = np.float32
+    def __init__(self, sheet: Sheet, name: str, sample: np.ndarray):
+        self.sheet, self.name, self.sample = sheet, name, np.asarray(sample)
 
-    # numpy leaves `array - wire` to the wire.
-    __array_ufunc__ = None
+    def __len__(self) -> int:
+        return len(self.sample)
 
-    def through(self, kind: str, *others: Operand, **attributes: int | tuple[int, ...]) -> Wire:
-        """The outcome of an ONNX operator whose first input this is."""
-        return self.sheet.put(kind, self, *others, **attributes)
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *operands: Operand, **_: object) -> Wire:
+        """Write a universal function; assignment in place makes another wire."""
+        if method == "__call__" and ufunc is np.arccos:
+            return _arccos(self)
+        if method != "__call__" or ufunc not in OPERATORS:
+            return NotImplemented
+        return self.sheet.put(OPERATORS[ufunc], ufunc(*map(_sample, operands)), *self.sheet.alike(operands))
 
-    def __add__(self, other: Operand) -> Wire:
-        return self.through("Add", other)
+    def __array_function__(self, function: Callable, _: object, args: Sequence, kwargs: Mapping[str, Any]) -> Wire:
+        """Write another function of NumPy."""
+        return FUNCTIONS[function](self.sheet, *args, **kwargs) if function in FUNCTIONS else NotImplemented
 
-    def __sub__(self, other: Operand) -> Wire:
-        return self.through("Sub", other)
+    def __getitem__(self, key: Any) -> Wire:
+        """Take rows of axes, or add axes of length one; the batch is taken whole."""
+        out, axis = self, 0
+        for each in key if isinstance(key, tuple) else (key,):
+            if each is None:
+                out = self.sheet.put("Unsqueeze", np.expand_dims(out.sample, axis), out, np.array([axis]))
+            elif not isinstance(each, slice) or each != slice(None):
+                index = np.arange(out.shape[axis])[each]
+                out = self.sheet.put("Gather", out.sample.take(index, axis), out, index, axis=axis)
+                axis -= index.ndim == 0
+            axis += 1
+        return out
 
-    def __rsub__(self, other: Operand) -> Wire:
-        return self.sheet.put("Sub", other, self)
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the sample."""
+        return self.sample.shape
 
-    def __mul__(self, other: Operand) -> Wire:
-        return self.through("Mul", other)
+    @property
+    def T(self) -> Wire:
+        """With its axes in reverse."""
+        return self.sheet.put("Transpose", self.sample.T, self)
 
-    __radd__, __rmul__ = __add__, __mul__
+    def astype(self, kind: type) -> Wire:
+        """The same numbers of another kind."""
+        if self.sample.dtype == kind:
+            return self
+        return self.sheet.put("Cast", self.sample.astype(kind), self, to=KINDS[np.dtype(kind)])
 
-    def __truediv__(self, other: Operand) -> Wire:
-        return self.through("Div", other)
+    def reshape(self, *shape: int) -> Wire:
+        """In another shape, of which the batch is -1."""
+        return self.sheet.put("Reshape", self.sample.reshape(shape), self, np.array(shape))
 
-    def __matmul__(self, other: Operand) -> Wire:
-        return self.through("MatMul", other)
+    def argmin(self, axis: int) -> Wire:
+        """Where an axis is least (whole numbers)."""
+        return self.sheet.put("ArgMin", self.sample.argmin(axis), self, axis=axis, keepdims=0)
 
-    def __gt__(self, other: Operand) -> Wire:
-        return self.through("Greater", other)
+    def sum(self, axis: int, keepdims: bool = False) -> Wire:
+        """Over an axis."""
+        sample = self.sample.sum(axis, keepdims=keepdims)
+        return self.sheet.put("ReduceSum", sample, self, np.array([axis]), keepdims=int(keepdims))
 
-    def __lt__(self, other: Operand) -> Wire:
-        return self.through("Less", other)
+    def min(self, axis: int) -> Wire:
+        """Over an axis."""
+        return self.sheet.put("ReduceMin", self.sample.min(axis), self, axes=(axis,), keepdims=0)
 
-    def of(self, kind: type) -> Wire:
-        """The same numbers as one of `KINDS`."""
-        return replace(self.through("Cast", to=KINDS[kind]), real=np.float64 if kind is np.float64 else np.float32)
-
-    def clip(self, least: Operand, most: Operand) -> Wire:
-        """Between two numbers."""
-        return self.through("Clip", least, most)
-
-    def columns(self, *index: int | np.integer) -> Wire:
-        """Some of the last axis, in this order."""
-        return self.through("Gather", np.array(index), axis=-1)
-
-    def shaped(self, *shape: int) -> Wire:
-        """In another shape: 0 keeps the length that stands there, -1 takes what is left."""
-        return self.through("Reshape", np.array(shape))
-
-    def argmin(self) -> Wire:
-        """Where the last axis is least (whole numbers), which stays with length one."""
-        return replace(self.through("ArgMin", axis=-1), real=np.float32)
-
-    def sum(self) -> Wire:
-        """Over the last axis, which stays with length one."""
-        return self.through("ReduceSum", np.array([-1]))
-
-    def least(self) -> Wire:
-        """Over the last axis, which stays with length one."""
-        return self.through("ReduceMin", axes=(-1,))
+    def max(self, axis: int) -> Wire:
+        """Over an axis."""
+        return self.sheet.put("ReduceMax", self.sample.max(axis), self, axes=(axis,), keepdims=0)
 
 
 Operand = Wire | np.ndarray | float
@@ -130,38 +155,38 @@ class Sheet:
         self._constants: dict[str, np.ndarray] = {}
         self._made: dict[object, Wire] = {}
 
-    def put(self, kind: str, *inputs: Operand, **attributes: int | tuple[int, ...]) -> Wire:
-        """The outcome of an ONNX operator on wires and constants."""
-        real = next((each.real for each in inputs if isinstance(each, Wire)), np.float32)
-        names = tuple((each if isinstance(each, Wire) else self.constant(each, real)).name for each in inputs)
+    def put(self, kind: str, sample: np.ndarray, *inputs: Wire | np.ndarray, **attributes: Any) -> Wire:
+        """Write an ONNX operator on wires and constants; `sample` is its outcome for the sample loads."""
+        names = tuple((each if isinstance(each, Wire) else self.constant(each)).name for each in inputs)
         key = kind, names, tuple(attributes.items())
         if key not in self._made:
-            self._made[key] = Wire(self, f"{kind}_{len(self._nodes)}", real)
+            self._made[key] = Wire(self, f"{kind}_{len(self._nodes)}", sample)
             self._nodes.append(Node(kind, names, self._made[key].name, attributes))
         return self._made[key]
 
-    def constant(self, value: np.ndarray | float, real: type = np.float32) -> Wire:
-        """An array or a number: in `real` precision, if not in half; in 64 bits, if whole."""
-        array = np.asarray(value)
-        array = array.astype({"f4": real, "f8": real, "i4": np.int64}.get(array.dtype.str[1:], array.dtype))
+    def alike(self, operands: Sequence[Operand]) -> list[Wire]:
+        """Operands in the kind that NumPy brings them to: its operators mix kinds, those of graphs do not."""
+        kind = np.result_type(*map(_sample, operands))
+        wires = (each if isinstance(each, Wire) else self.constant(np.asarray(each, kind)) for each in operands)
+        return [wire.astype(kind.type) for wire in wires]
+
+    def constant(self, array: np.ndarray) -> Wire:
+        """An array of its own kind; whole numbers in 64 bits."""
+        array = np.asarray(array, np.int64) if array.dtype.kind in "iu" else array
         key = array.dtype.str, array.shape, array.tobytes()
         if key not in self._made:
-            self._made[key] = Wire(self, f"constant_{len(self._constants)}", real)
+            self._made[key] = Wire(self, f"constant_{len(self._constants)}", array)
             self._constants[self._made[key].name] = array
         return self._made[key]
 
-    def joined(self, *wires: Wire) -> Wire:
-        """Side by side along the last axis."""
-        return self.put("Concat", *wires, axis=-1)
-
-    def input(self, name: str, shape: tuple[int | str, ...], text: str) -> Wire:
-        """Numbers (float32) that the graph is given."""
-        self._inputs.append(Port(name, np.float32, shape, text))
-        return Wire(self, name)
+    def input(self, name: str, sample: np.ndarray, text: str) -> Any:
+        """A wire of numbers (B, ...), given in single precision; formulas, which compute in double, know arrays."""
+        self._inputs.append(Port(name, np.float32, ("B", *sample.shape[1:]), text))
+        return Wire(self, name, sample.astype(np.float32)).astype(np.float64)
 
     def output(self, wire: Wire, port: Port) -> None:
-        """What the graph answers."""
-        self._nodes.append(Node("Identity", (wire.name,), port.name, {}))
+        """What the graph answers, as the port's kind."""
+        self._nodes.append(Node("Identity", (wire.astype(port.kind).name,), port.name, {}))
         self._outputs.append(port)
 
     def model(self, name: str, text: str, version: str, notes: Mapping[str, str]) -> ModelProto:
@@ -177,14 +202,18 @@ class Sheet:
         except ImportError as error:
             raise InputError("the package onnx is not installed: pip install onnx.") from error
 
-        def told(ports: list[Port]) -> list:
-            return [helper.make_tensor_value_info(port.name, KINDS[port.kind], port.shape, port.text) for port in ports]
+        def described(ports: list[Port]) -> list:
+            kinds = [KINDS[np.dtype(port.kind)] for port in ports]
+            return [
+                helper.make_tensor_value_info(port.name, kind, port.shape, port.text)
+                for port, kind in zip(ports, kinds, strict=True)
+            ]
 
         graph = helper.make_graph(
             [helper.make_node(node.kind, node.inputs, [node.output], **node.attributes) for node in self._nodes],
             name,
-            told(self._inputs),
-            told(self._outputs),
+            described(self._inputs),
+            described(self._outputs),
             [numpy_helper.from_array(array, name) for name, array in self._constants.items()],
         )
         model = helper.make_model(
@@ -197,3 +226,78 @@ class Sheet:
         )
         helper.set_model_props(model, dict(notes))
         return model
+
+
+def _sample(operand: Operand) -> np.ndarray | float:
+    return operand.sample if isinstance(operand, Wire) else operand
+
+
+def _concatenate(sheet: Sheet, arrays: Sequence[Operand], axis: int = 0) -> Wire:
+    sample = np.concatenate([_sample(each) for each in arrays], axis)
+    return sheet.put("Concat", sample, *sheet.alike(arrays), axis=axis)
+
+
+def _column_stack(sheet: Sheet, arrays: Sequence[Wire]) -> Wire:
+    return _concatenate(sheet, [each if len(each.shape) > 1 else each[:, None] for each in arrays], 1)
+
+
+def _stack(sheet: Sheet, arrays: Sequence[Wire]) -> Wire:
+    return _concatenate(sheet, [each[None] for each in arrays])
+
+
+def _where(sheet: Sheet, condition: Wire, yes: Operand, no: Operand) -> Wire:
+    sample = np.where(condition.sample, _sample(yes), _sample(no))
+    return sheet.put("Where", sample, condition, *sheet.alike([yes, no]))
+
+
+def _einsum(sheet: Sheet, equation: str, *operands: Any) -> Wire:
+    (first, second), out = equation.partition("->")[0].split(","), equation.partition("->")[2]
+    if first == out + second[-1] and first.endswith(second):  # a product and a sum, which runtimes do ten times as fast
+        return (operands[0] * operands[1]).sum(axis=len(out))
+    sample = np.einsum(equation, *map(_sample, operands))
+    return sheet.put("Einsum", sample, *sheet.alike(operands), equation=equation)
+
+
+def _searchsorted(_: Sheet, sites: np.ndarray, values: Wire) -> Wire:
+    # With infinity at its end: no operator reads an empty array.
+    return (values[:, None] > np.append(sites, np.inf)).astype(np.int64).sum(axis=1)
+
+
+FUNCTIONS: dict[Callable, Callable[..., Wire]] = {
+    np.concatenate: _concatenate,
+    np.column_stack: _column_stack,
+    np.stack: _stack,
+    np.where: _where,
+    np.einsum: _einsum,
+    np.searchsorted: _searchsorted,
+    np.clip: lambda _, x, least, most: np.minimum(np.maximum(x, least), most),
+    np.ones_like: lambda _, x: 0.0 * x + 1.0,
+}
+"""Other functions of NumPy, given the sheet and what they were called with."""
+
+
+def _arccos(cosine: Wire) -> Wire:
+    """By the arc over the chord: runtimes have no arc functions but those of single precision."""
+    half = np.sqrt(0.5 * np.maximum(1.0 - np.absolute(cosine), 0.0)).astype(np.float32)
+    arc = 2.0 * cosine.sheet.put("Asin", np.arcsin(half.sample), half).astype(np.float64)
+    return np.where(cosine < 0.0, np.pi - arc, arc)
+
+
+@squared_distances.register
+def _(points: Wire, sites: np.ndarray) -> Any:
+    """|x|^2 - 2 x y + |y|^2, thus in double precision: differences would take the memory of B n f numbers."""
+    x, y = points.astype(np.float64), sites.astype(np.float64)
+    return np.maximum((x * x).sum(axis=1, keepdims=True) - x @ (2.0 * y.T) + (y * y).sum(axis=1), 0.0)
+
+
+@taken.register
+def _(index: Wire, table: np.ndarray) -> Any:
+    """A table that half precision holds without loss, as a series on disk, is stored so, in units of its columns."""
+    found = table[index.sample]
+    if table.dtype == np.float32 and table.ndim == 2:
+        unit = np.maximum(np.abs(table).max(axis=0), np.finfo(np.float32).tiny)
+        share = (table / unit).astype(np.float16)
+        if np.array_equal(share.astype(np.float32) * unit, table):
+            half = index.sheet.put("Gather", share[index.sample], share, index, axis=0)
+            return half.astype(np.float32) * unit
+    return index.sheet.put("Gather", found, table, index, axis=0)

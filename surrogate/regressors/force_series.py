@@ -10,6 +10,8 @@ from typing import Self
 
 import numpy as np
 
+from ..array_functions import taken
+
 ORDERS = 3
 # Which components of the direction are multiplied, order by order: 3, 6 and 10 products.
 FACTORS = [np.array(list(combinations_with_replacement(range(3), order))).T for order in range(1, ORDERS + 1)]
@@ -60,18 +62,19 @@ class Series:
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of `tool_features` (B, 8)."""
-        parts = [self._predicted(X[first : first + CHUNK]) for first in range(0, max(len(X), 1), CHUNK)]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        if len(X) <= CHUNK:
+            return self._predicted(X)
+        return np.concatenate([self._predicted(X[first : first + CHUNK]) for first in range(0, len(X), CHUNK)])
 
     def _predicted(self, X: np.ndarray) -> np.ndarray:
         place, share = self._located(X[:, :3])
         radius, weight = self._between_radii(X[:, 7])
-        row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(len(X), place.shape[1] * radius.shape[1])
-        factor = (share[:, :, None] * weight[:, None]).reshape(len(X), 1, row.shape[1]).astype(np.float32)
-        products = forms(X[:, 3:6], X[:, 6]).astype(np.float32)
-        flat = self.table.reshape(len(self.table) * len(self.radii), -1)
-        mixed = (factor @ flat[row]).reshape(len(X), TERMS, self.table.shape[-1])
-        return (products[:, None] @ mixed)[:, 0]
+        count = place.shape[1] * radius.shape[1]
+        row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(-1, count)
+        factor = (share[:, :, None] * weight[:, None]).reshape(-1, 1, count).astype(np.float32)
+        known = taken(row, self.table.reshape(-1, TERMS * self.table.shape[-1]))
+        mixed = (factor @ known).reshape(-1, TERMS, self.table.shape[-1])
+        return (forms(X[:, 3:6], X[:, 6]).astype(np.float32)[:, None] @ mixed)[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:
         """Places, radii, and the table in half precision, in units of its largest number for each term and mode."""
@@ -92,39 +95,41 @@ class Series:
         return type(self)(self.corners, self.triangles, self.radii, table)
 
     @cached_property
-    def frames(self) -> np.ndarray:
-        """(4 S, 4): from (point, 1) to the shares of a triangle's three corners and the height over it [m]."""
+    def _frames(self) -> np.ndarray:
+        """(S, 4, 4): from (point, 1) to the shares of a triangle's three corners and the height over it [m]."""
         a, b, c = (self.corners[self.triangles[:, corner]] for corner in range(3))
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         frame = np.zeros((len(a), 4, 4))
         frame[:, :3, 0], frame[:, :3, 1], frame[:, :3, 2], frame[:, :3, 3] = a, b, c, normal
         frame[:, 3, :3] = 1.0
-        return np.linalg.inv(frame).reshape(-1, 4)
+        return np.linalg.inv(frame)
+
+    @cached_property
+    def _columns(self) -> np.ndarray:
+        """The frames as one matrix (4, 4 S)."""
+        return np.ascontiguousarray(self._frames.transpose(2, 1, 0).reshape(4, -1))
 
     def _located(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Six places (B, 6) of the triangle nearest to each point (B, 3) [m], and their shares of it (B, 6)."""
-        count = len(self.triangles)
-        local = (self.frames @ np.column_stack([point, np.ones(len(point))]).T).reshape(count, 4, -1)
-        miss = np.abs(local[:, 3]) - BESIDE * np.minimum(local[:, :3].min(axis=1), 0.0)
-        best, rows = miss.argmin(axis=0), np.arange(len(point))
-        corner = local[best, :3, rows].clip(min=0.0)
-        corner /= corner.sum(axis=1, keepdims=True)
-        share = np.concatenate(
-            [corner * (2.0 * corner - 1.0), 4.0 * corner[:, [1, 2, 0]] * corner[:, [2, 0, 1]]], axis=1
-        )
-        return self.triangles[best], share
+        local = (point @ self._columns[:3] + self._columns[3]).reshape(-1, 4, len(self.triangles))
+        miss = np.absolute(local[:, 3]) - BESIDE * np.minimum(local[:, :3].min(axis=1), 0.0)
+        best = miss.argmin(axis=1)
+        frame = taken(best, self._frames[:, :3])
+        corner = np.maximum(np.einsum("bij,bj->bi", frame[:, :, :3], point) + frame[:, :, 3], 0.0)
+        corner = corner / corner.sum(axis=1, keepdims=True)
+        share = [corner * (2.0 * corner - 1.0), 4.0 * corner[:, [1, 2, 0]] * corner[:, [2, 0, 1]]]
+        return taken(best, self.triangles), np.concatenate(share, axis=1)
 
     def _between_radii(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which radii (B, k), and their weights (B, k): the parabola through the three about each radius (B,) [m]."""
-        if len(self.radii) == 1:
-            return np.zeros((len(radius), 1), int), np.ones((len(radius), 1))
+        width = min(STENCIL, len(self.radii))
         inside = np.clip(radius, self.radii[0], self.radii[-1])
-        first = np.clip(np.searchsorted(self.radii, inside) - 2, 0, len(self.radii) - STENCIL)
-        index = first[:, None] + np.arange(STENCIL)
-        at, x = np.log(self.radii[index]), np.log(inside)[:, None]
-        weight = np.ones(index.shape)
-        for other in range(1, STENCIL):
-            beside = np.roll(at, other, axis=1)
-            weight *= (x - beside) / (at - beside)
+        first = np.clip(np.searchsorted(self.radii, inside) - 2, 0, len(self.radii) - width)
+        index = first[:, None] + np.arange(width)
+        at, x = taken(index, np.log(self.radii)), np.log(inside)[:, None]
+        weight = np.ones((1, width))
+        for other in range(1, width):
+            beside = at[:, np.roll(np.arange(width), other)]
+            weight = weight * (x - beside) / (at - beside)
         return index, weight

@@ -14,6 +14,7 @@ from scipy.spatial.distance import cdist
 
 from sim.runtime.threads import one_thread
 
+from ..array_functions import squared_distances
 from .protocol import filled, standardisation
 
 # Lengths in standard deviations of a feature, and noise against the variance of an output.
@@ -94,7 +95,7 @@ class Gp:
         return filled(cls(), state)
 
     def _distance(self, X: np.ndarray) -> np.ndarray:
-        return cdist((X - self.mean_) / (self.deviation_ * self.length_), self.seen_)
+        return np.sqrt(squared_distances((X - self.mean_) / (self.deviation_ * self.length_), self.seen_))
 
     @cached_property
     def _factor(self) -> tuple[np.ndarray, bool]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
+from ..array_functions import squared_distances
 from .protocol import filled, standardisation
 
 
@@ -65,8 +65,8 @@ class Svr:
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of features (B, f)."""
-        squared = cdist((X - self.mean_) / self.deviation_, self.support_, "sqeuclidean")
-        return (np.exp(squared / -X.shape[1]) @ self.dual_ + self.intercept_).astype(np.float32)
+        squared = squared_distances((X - self.mean_) / self.deviation_, self.support_)
+        return (np.exp(squared / -len(self.mean_)) @ self.dual_ + self.intercept_).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
         """Standardisation, support vectors (s, f), dual coefficients (s, r), intercepts (r,)."""

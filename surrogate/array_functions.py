@@ -1,0 +1,20 @@
+"""Two array functions that NumPy lacks. A type of array registers its own version, as graphs do for export."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+
+@singledispatch
+def squared_distances(points: np.ndarray, sites: np.ndarray) -> np.ndarray:
+    """Squared distances (B, n) of points (B, f) from sites (n, f)."""
+    return cdist(points, sites, "sqeuclidean")
+
+
+@singledispatch
+def taken(index: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Rows of a table (n, ...) at whole numbers of any shape: `table[index]`."""
+    return table[index]
