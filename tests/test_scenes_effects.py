@@ -29,7 +29,7 @@ from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, posture, stacked
 from sim.material import Material, tissue_to_json
-from surrogate.model.applicability import refusal, taught_effects
+from surrogate.model.applicability import refusal, trained_effects
 
 EFFECTS = (Elasticity(), Held(), Slide())
 STILL = guess(np.zeros((1, 3, 3)))
@@ -122,10 +122,10 @@ class TestLearnt:
 
     def test_its_file_says_what_it_was_taught_under(self, theatre):
         model = theatre.models["linear"]
-        assert taught_effects(model.training) == {"Elasticity", "Held", "Slide", "ToolForce"}  # its file does not say
+        assert trained_effects(model.training) == {"Elasticity", "Held", "Slide", "ToolForce"}  # its file does not say
         effects = (Elasticity(regions={2: Elasticity().default}), Held(), ToolForce(), NodalForce())  # type: ignore
         stated = replace(model, training={"effects": repr(effects)})
-        assert taught_effects(stated.training) == {"Elasticity", "Held", "ToolForce", "NodalForce"}
+        assert trained_effects(stated.training) == {"Elasticity", "Held", "ToolForce", "NodalForce"}
         # Nothing slides in this body, and nodal forces act where loads hold some.
         assert refusal(stated, short().effects) is None
         why = refusal(stated, (Elasticity(), ToolForce()))

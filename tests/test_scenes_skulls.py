@@ -19,7 +19,7 @@ from sim.material import Material
 from sim.tearing import Tearing
 from surrogate.data.dataset import read_dataset
 from surrogate.data.tool_loads import draw
-from surrogate.model.applicability import taught_skull
+from surrogate.model.applicability import trained_skull
 from surrogate.training.shared_inputs import Expansion
 
 
@@ -86,5 +86,5 @@ def test_what_is_taught_of_a_skull_is_of_that_skull(tmp_path):
         words = ["--count", "2", "--skull", skull, "--element", "p1", "--tolerance", "1e-3", "--device", "cpu"]
         assert main(["simulate", str(tmp_path / "brain.vtu"), "--out", str(out), *words]) == 0
         data = read_dataset(out)
-        assert taught_skull(data.provenance) == skull
+        assert trained_skull(data.provenance) == skull
         assert effect in Expansion(data, "cpu")._fem().effects

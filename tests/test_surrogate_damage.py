@@ -159,7 +159,7 @@ class TestFinished:
         [
             (lambda file: file["anatomy/nodes"].__setitem__(3, 0.5), "anatomy inside was changed|volume"),
             (lambda file: file["loads/Pushed/force"].__setitem__(3, 0.5), "loads inside were changed"),
-            (lambda file: file.attrs.modify("preset", "mixed"), "what it says of itself was changed"),
+            (lambda file: file.attrs.modify("preset", "mixed"), "what it states of itself was changed"),
             (lambda file: file["unit/node"].__setitem__(5, 10**6), "`unit/node` are not the nodes"),
             (lambda file: file["answers/outcome"].__setitem__(0, b"FINE"), "damaged"),
             (lambda file: file.__delitem__("answers/residual"), "has no array `answers/residual`"),

@@ -202,7 +202,7 @@ def test_at_most_so_many_loads_are_taught(data):
     some = train(data, ["linear", "svr"], most=40)
     assert len(some.models["svr"].envelope.points) == 40
     assert some.models["svr"].parts[0].regressor.support_.shape[0] <= 40
-    with pytest.raises(InputError, match="0 loads teach nothing"):
+    with pytest.raises(InputError, match="0 loads train nothing"):
         train(data, ["svr"], most=0)
 
 

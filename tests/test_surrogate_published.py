@@ -27,9 +27,9 @@ from surrogate.training import published_models
 from surrogate.training.published_models import (
     MACHINES,
     from_angles,
+    published_model,
     published_nodes,
     sites_of,
-    taught,
     thirteen,
     to_angles,
 )
@@ -180,7 +180,7 @@ def test_a_position_left_out_is_never_shown(box, loads, truth, monkeypatch):
         assert here.any() and not here.all()
         for node, machine in enumerate(part.machines):
             assert np.array_equal(machine.rows, features[node][~here]) and machine.threads == {1}
-        # Each load is answered by the model that was taught without its position, in the order that was asked.
+        # Each load is answered by the model that was trained without its position, in the order that was asked.
         first = model.deform(loads).displacement[here][:, :, 0]
         assert np.allclose(first, (~here).sum())
 
@@ -189,7 +189,7 @@ def test_a_position_left_out_is_never_shown(box, loads, truth, monkeypatch):
 def test_it_learns_what_bodies_do(name, box, loads, truth):
     """At positions that it saw, and better than motion itself at one that it did not."""
     rows = np.arange(len(loads))
-    model = taught(name, box, loads.rows(rows[::2]), truth[::2])
+    model = published_model(name, box, loads.rows(rows[::2]), truth[::2])
     miss = np.linalg.norm(model.deform(loads.rows(rows[1::2])).displacement - truth[1::2], axis=2).mean()
     assert miss < {"published-ann": 0.1, "published-svr": 0.25}[name] * np.linalg.norm(truth, axis=2).mean()
 
@@ -199,7 +199,7 @@ def test_it_is_a_deformer(model, box, loads, truth):
     assert isinstance(model, Deformer) and model.anatomy is box and np.array_equal(model.nodes, published_nodes(box))
     assert answer.displacement.shape == truth.shape and answer.cost.total > 0.0
     assert np.array_equal(answer.reaction[:, 0, :3], loads.of(Pushed).force)
-    # Each load is answered by a model that was taught none at its position.
+    # Each load is answered by a model that has no training load at its position.
     assert set(answer.outcome) == {Outcome.EXTRAPOLATED}
     single = np.concatenate([model.deform(loads.rows(slice(k, k + 1))).displacement for k in range(5)])
     assert np.allclose(single, answer.displacement[:5], atol=1e-8)
@@ -219,7 +219,7 @@ def test_what_it_does_not_know_is_refused(model, box, loads, truth):
     with pytest.raises(InputError, match=r"does not know vertex"):
         model.deform(loads, at=np.array([box.tumour_nodes[1]]))
     with pytest.raises(InputError, match=r"no published learner is called 'forest'"):
-        taught("forest", box, loads, truth)
+        published_model("forest", box, loads, truth)
     with pytest.raises(InputError, match=r"have 1 positions"):
         taught_in_turn("published-ann", box, push([0, 0, 0], [0, 0, -0.1], 6e-3), truth[:1])
     with pytest.raises(InputError, match=r"have 40 positions.*--preset seed"):

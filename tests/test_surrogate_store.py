@@ -89,7 +89,7 @@ def encoder(name):
         (envelope(angle=float("nan")), "angle is none"),
         (envelope(force=(1.0, 0.1)), "range of force is none"),
         (envelope(footprint=(0.0, 0.1)), "range of footprint is none"),
-        (envelope(points=np.full((3, 3), np.nan)), "taught points are none"),
+        (envelope(points=np.full((3, 3), np.nan)), "training points are none"),
         (bounds(quantile=lambda q: -q), "bounds are negative"),
         (bounds(quantile=lambda q: q[::-1] * [[2.0], [1.0]]), "shrink with their probability"),
         (bounds(quantile=lambda q: np.full_like(q, np.nan)), "no numbers"),

@@ -15,7 +15,7 @@ from surrogate.data.disc_split import Split
 from surrogate.evaluation.coverage import TENTHS, coverage
 from surrogate.evaluation.score import bare_microseconds, single_seconds
 from surrogate.evaluation.solve_counts import Told
-from surrogate.training.published_models import MACHINES, published_nodes, taught
+from surrogate.training.published_models import MACHINES, published_model, published_nodes
 from surrogate.training.train import train
 
 from .adaptation import debulked_study, simulating_seconds
@@ -141,7 +141,7 @@ def _taught(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> tup
         return trained.models[spec.name], told
     rows = np.flatnonzero(split.taught)
     told = Told(len(rows), 0, 0, 0, study.dataset.seconds("load", len(rows)))
-    return taught(spec.name, study.anatomy, study.converged.rows(rows), truth[rows]), told
+    return published_model(spec.name, study.anatomy, study.converged.rows(rows), truth[rows]), told
 
 
 def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> tuple[Figures | None, float]:

@@ -28,7 +28,7 @@ def row_type(vertices: int) -> np.dtype:
 
 
 def rows_of(answer: Deformation, unit: float) -> np.ndarray:
-    """Rows (B,) of answers at every vertex, whose displacements are told in `unit` [m]."""
+    """Rows (B,) of answers at every vertex, whose displacements are in units of `unit` [m]."""
     rows = np.empty(len(answer), row_type(answer.displacement.shape[1]))
     rows["displacement"] = answer.displacement / unit if unit != 1.0 else answer.displacement
     rows["outcome"] = [outcome.name for outcome in answer.outcome]

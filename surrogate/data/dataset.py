@@ -116,7 +116,7 @@ class Dataset:
         return np.array([outcome.good for outcome in self.outcome], bool)
 
     def seconds(self, each: str, count: int) -> float | None:
-        """What `count` solves took of `each` kind, "load" or "unit response" [s]; None where the data do not say."""
+        """What `count` solves took of `each` kind, "load" or "unit response" [s]; None if not stated."""
         try:
             found = count * float(self.provenance[f"seconds a {each}"])
         except (KeyError, ValueError):
@@ -187,8 +187,8 @@ def read_dataset(path: str | Path) -> Dataset:
         )
         raise InputError(f"{path}: no such file; {remedy}.")
     with read_as(path, "a data set", REMEDY), h5py.File(path, "r") as file:
-        said = provenance_of(file)
-        if said.get("format") not in (FORMAT, UNCHECKED):
+        stated = provenance_of(file)
+        if stated.get("format") not in (FORMAT, UNCHECKED):
             raise InputError(
                 f"{path}: is HDF5, but not a data set that this version knows, {FORMAT!r}: make one with "
                 "`sulcus simulate`."
@@ -199,7 +199,7 @@ def read_dataset(path: str | Path) -> Dataset:
             raise InputError(f"{path}: `unit/node` are not the nodes of the open cortex: it is damaged. Simulate anew.")
         for group, rows in (("answers", len(loads)), ("unit", 3 * len(nodes))):
             stored(file, f"{group}/displacement", "f", (rows, len(anatomy.mesh.nodes), 3))
-            if said["format"] == UNCHECKED and not stored(file, f"{group}/done", "b", (rows,))[:].all():
+            if stated["format"] == UNCHECKED and not stored(file, f"{group}/done", "b", (rows,))[:].all():
                 raise InputError(f"{path}: rows of `{group}` are not done, so it was never finished. Simulate anew.")
         return Dataset(
             path,
@@ -209,32 +209,32 @@ def read_dataset(path: str | Path) -> Dataset:
             stored(file, "answers/iterations", "iu", (len(loads),))[:],
             stored(file, "answers/residual", "f", (len(loads),))[:],
             np.array([outcome.good for outcome in read_outcomes(file, "unit")], bool),
-            said,
+            stated,
         )
 
 
 def provenance_of(file: h5py.File) -> dict[str, str]:
-    """What the file says of itself, as text.
+    """What the file states of itself, as text.
 
     Raises
     ------
     InputError
         Texts that do not have the digest written beside them.
     """
-    said = {name: str(value) for name, value in file.attrs.items()}
-    if said.get("format") == FORMAT and said.pop(SEAL, None) != digest_of_texts(said):
-        raise InputError(f"{file.filename}: what it says of itself was changed after it was written: simulate anew.")
-    return said
+    stated = {name: str(value) for name, value in file.attrs.items()}
+    if stated.get("format") == FORMAT and stated.pop(SEAL, None) != digest_of_texts(stated):
+        raise InputError(f"{file.filename}: what it states of itself was changed after it was written: simulate anew.")
+    return stated
 
 
-def write_provenance(file: h5py.File, said: Mapping[str, str]) -> None:
-    """Store what the file says of itself."""
-    file.attrs.update({**said, SEAL: digest_of_texts(said)})
+def write_provenance(file: h5py.File, stated: Mapping[str, str]) -> None:
+    """Store what the file states of itself."""
+    file.attrs.update({**stated, SEAL: digest_of_texts(stated)})
 
 
-def digest_of_texts(said: Mapping[str, str]) -> str:
+def digest_of_texts(stated: Mapping[str, str]) -> str:
     """Hash of texts and their names."""
-    return digest_of(np.frombuffer(repr(sorted(said.items())).encode(), np.uint8))
+    return digest_of(np.frombuffer(repr(sorted(stated.items())).encode(), np.uint8))
 
 
 def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:

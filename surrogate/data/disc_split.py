@@ -49,7 +49,7 @@ class Split:
         return self.disc == -1
 
     def covers(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (n, 3) [m] lie in a disc: nothing may be told there of a model that is scored. (n,) bool."""
+        """Whether points (n, 3) [m] lie in a disc: a scored model may be given nothing there. (n,) bool."""
         return nearest(points, self.centres)[1] <= self.radius
 
     def summary(self) -> str:

@@ -1,7 +1,7 @@
 """Poses of a ball as pushes: where on the cortex at rest it is deepest, and how deep.
 
 A tool's pose is tracked where its force is not known. A ball without friction presses along the surface's normal, and
-its answer depends on where its middle is, not on how it came there: place and depth say all of it. To learners a depth
+its answer depends on where its middle is, not on how it came there: place and depth determine it. To learners a depth
 is what a force is: both are nothing where nothing moves.
 """
 

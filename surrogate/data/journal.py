@@ -23,7 +23,7 @@ from sim.runtime.atomic_files import why, written_whole
 MARK = b"sulcus\r\n"
 # Mark, group, first row, length of the payload that follows, digest of all that is not the mark.
 HEAD = struct.Struct("<8s8sQQ16s")
-# The group of the first record, which says what the run is; it has no key, so that another run can read it.
+# The group of the first record, which describes the run; it has no key, so that another run can read it.
 RUN = "run"
 Batch = tuple[str, int]
 Held = bytes | mmap.mmap
@@ -80,8 +80,8 @@ class Journal:
 
 
 @contextmanager
-def opened(path: Path, said: Mapping[str, str]) -> Iterator[Journal]:
-    """The journal of the run that `said` describes, begun or gone on with; the file stays.
+def opened(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
+    """The journal of the run that `stated` describes, begun or gone on with; the file stays.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def opened(path: Path, said: Mapping[str, str]) -> Iterator[Journal]:
     DamageWarning
         Records that are damaged, which are left out.
     """
-    opening = _record((RUN, 0), json.dumps(dict(said)).encode(), b"")
+    opening = _record((RUN, 0), json.dumps(dict(stated)).encode(), b"")
     key = hashlib.sha256(opening).digest()
     if not path.exists():
         with written_whole(path, path.suffix) as draft:
@@ -104,11 +104,11 @@ def opened(path: Path, said: Mapping[str, str]) -> Iterator[Journal]:
         raise InputError(f"{path}: cannot be opened ({why(error)}). Delete it.") from error
     with file:
         _lock(path, file)
-        yield Journal(path, file, key, _taken_up(path, file, opening, key, said))
+        yield Journal(path, file, key, _taken_up(path, file, opening, key, stated))
 
 
 def _taken_up(
-    path: Path, file: BinaryIO, opening: bytes, key: bytes, said: Mapping[str, str]
+    path: Path, file: BinaryIO, opening: bytes, key: bytes, stated: Mapping[str, str]
 ) -> dict[Batch, tuple[int, int]]:
     """Start and size of the whole records, after the last of which the file is cut."""
     foreign = f"{path}: is no unfinished run, or its beginning is damaged: delete it, and the same command begins anew."
@@ -117,7 +117,7 @@ def _taken_up(
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as held:
         whole = held[: len(opening)] == opening
         if not whole:
-            _demand_same(path, held, said)
+            _demand_same(path, held, stated)
         places, damaged = _records(held, len(opening), key)
     if not whole and not places:
         raise InputError(foreign)
@@ -136,12 +136,12 @@ def _taken_up(
     return places
 
 
-def _demand_same(path: Path, held: Held, said: Mapping[str, str]) -> None:
-    """Raise where the file's beginning is whole and says something else."""
+def _demand_same(path: Path, held: Held, stated: Mapping[str, str]) -> None:
+    """Raise where the file's beginning is whole and states something else."""
     if _proved(held, 0, b"") != (RUN, 0):
         return
     before = json.loads(held[HEAD.size : HEAD.size + HEAD.unpack(held[: HEAD.size])[3]])
-    for name, wanted in said.items():
+    for name, wanted in stated.items():
         found = before.get(name, "nothing")
         if found != wanted:
             raise InputError(

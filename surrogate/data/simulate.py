@@ -43,10 +43,10 @@ from .journal import Batch, DamageWarning, Journal, opened
 # Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
 # solve with the rest stiffness is the answer.
 UNIT_FORCE = 1e-6
-# What the groups of the file are called where their seconds are told, and what their displacements are told in [m].
+# Names of the file's groups where their seconds are reported, and the unit of their displacements [m].
 STAGES = {"unit": "unit responses", "answers": "loads"}
 UNITS = {"unit": UNIT_FORCE, "answers": 1.0}
-# From this version of HDF5 on, whatever says where arrays lie has checksums.
+# From this version of HDF5 on, the metadata of arrays have checksums.
 READERS = ("v108", "v108")
 UNTIMED = "not known"  # as wide as a number
 T = TypeVar("T")
@@ -141,7 +141,7 @@ def simulate(
     provenance
         Texts that must agree for a run to go on.
     progress
-        Told the rows that are done and their total after every batch.
+        Called with the rows that are done and their total after every batch.
 
     Raises
     ------
@@ -173,12 +173,12 @@ def simulate(
     size = work.row.itemsize * sum(work.counts.values())
     held = partial.stat().st_size if partial.exists() else 0
     demand_space(path, max(size - held, 0) + size, size)
-    said = {
+    run = {
         **stated,
         "number of loads": str(len(work.loads)),
         "hash of the loads": digest_of_loads(work.loads),
     }
-    with listened() as seconds, opened(partial, said) as journal:
+    with listened() as seconds, opened(partial, run) as journal:
         solved = _fill(journal, work, finished, progress)
         with stage(STAGES["answers"]):
             _write(path, work, {**stated, **_rates(path, solved, seconds)}, journal)
@@ -294,7 +294,7 @@ def _tool(loads: Loads, stated: Mapping[str, str]) -> str:
     """What acts, in a sentence."""
     if loads.of(Touching) is None:
         return "a force on a round footprint that stays with the tissue: see loads/Pushed"
-    return f"a rigid ball, radius {stated.get('ball', 'not told')} m, moved by pose: see loads/Touching"
+    return f"a rigid ball, radius {stated.get('ball', 'not stated')} m, moved by pose: see loads/Touching"
 
 
 def _batch(file: h5py.File, work: Work, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
@@ -306,11 +306,11 @@ def _batch(file: h5py.File, work: Work, batch: Batch) -> tuple[np.ndarray, np.nd
 def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
     """The loads of a finished file, which must be the first of `loads` or begin with them, and its texts the same."""
     with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
-        said = provenance_of(file)
-        if said.get("format") == UNCHECKED:
+        recorded = provenance_of(file)
+        if recorded.get("format") == UNCHECKED:
             raise InputError(f"{path}: is of an earlier version, whose files do not go on: choose another --out.")
         for name, wanted in stated.items():
-            found = said.get(name, "nothing")
+            found = recorded.get(name, "nothing")
             if found != wanted:
                 raise InputError(
                     f"{path}: was made with {name} {found}, but now {name} is {wanted}: repeat the first command, or "

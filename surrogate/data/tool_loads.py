@@ -31,7 +31,7 @@ class Tool:
     Parameters
     ----------
     name
-        As `--preset` says it.
+        As `--preset` names it.
     footprint
         Least and greatest radius [m], uniform between; a plate counts as the disc of its area.
     force
@@ -104,7 +104,7 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
 def refused_share(preset: str) -> float:
     """The share of a preset's nominal loads, by radius and force, that are not drawn: they press too hard or too deep.
 
-    Nothing is taught of them. Zero of what is no preset of tools.
+    No model is trained on them. Zero of what is no preset of tools.
     """
     tools = {**{name: [tool] for name, tool in TOOLS.items()}, "mixed": list(TOOLS.values())}.get(preset, [])
     middles = (np.arange(LATTICE) + 0.5) / LATTICE
@@ -179,9 +179,9 @@ def _between(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.
 def _within_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
     """Unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniform by solid angle."""
     cosine = (1.0 - uniform[:, 0] * (1.0 - np.cos(angle)))[:, None]
-    turn = (2.0 * np.pi * uniform[:, 1])[:, None]
+    around = (2.0 * np.pi * uniform[:, 1])[:, None]
     first, second = across(axis)
-    sideways = np.cos(turn) * first + np.sin(turn) * second
+    sideways = np.cos(around) * first + np.sin(around) * second
     return cosine * axis + np.sqrt(1.0 - cosine**2) * sideways
 
 

@@ -1,4 +1,4 @@
-"""How far off a prediction is, told by the finite elements of the same mesh without solving them to the end.
+"""The error of a prediction, estimated by the finite elements of the same mesh without a full solve.
 
 The state where one step of the finite elements leads (`sim/strategy/newton_correction.py`) is so much nearer to
 equilibrium than the prediction that their distance is the prediction's error: Ainsworth, Oden 1997, "A posteriori error
@@ -21,7 +21,7 @@ from sim.loads import Loads
 
 STEPS = 3
 # An estimate is sound where no more than this share of it may still be missing, so that its effectivity is 0.8 to 1.25,
-# as far as the rest stiffness can tell: with more than this relative residual it cannot.
+# as far as the rest stiffness can estimate it: with more than this relative residual it cannot.
 SHARE, SETTLED = 0.2, 1e-2
 SCOPE = (
     "this certifies against the finite elements on this mesh alone: not against a finer mesh, another tissue, or the "
@@ -31,7 +31,7 @@ SCOPE = (
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What the finite elements say of B predictions.
+    """What the finite elements estimate of B predictions.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def largest(motion: np.ndarray) -> np.ndarray:
 
 def _check(vertices: int, tumour: np.ndarray, loads: Loads, prediction: Deformation) -> None:
     if not len(tumour):
-        raise InputError("the anatomy has no tumour whose error could be told: make it with one.")
+        raise InputError("the anatomy has no tumour whose error could be estimated: make it with one.")
     if len(prediction) != len(loads):
         raise InputError(f"{len(prediction)} predictions do not answer {len(loads)} loads: give one for each.")
     if prediction.nodes.max(initial=-1) >= vertices or not np.isin(tumour, prediction.nodes).all():

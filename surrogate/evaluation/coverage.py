@@ -33,7 +33,7 @@ class Coverage:
     bound_mm, error_mm
         Medians over the loads of the bound at the first level, and of the error [mm].
     extrapolated
-        Loads that the model says it was not taught.
+        Loads that the model marks as outside its training.
     """
 
     loads: int
@@ -82,8 +82,8 @@ def distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Covera
         raise InputError("this model has no calibrated bound of its distance: train it anew, with enough loads.")
     _demand_tenths(loads)
     answer = model.deform(loads, at=model.nodes)
-    told = model.distance(loads, answer)
-    return _covered(model, loads, answer, np.abs(told.value - truth), told.bound)
+    found = model.distance(loads, answer)
+    return _covered(model, loads, answer, np.abs(found.value - truth), found.bound)
 
 
 def _demand_tenths(loads: Loads) -> None:

@@ -17,7 +17,7 @@ from ..model.learned import Learned
 from .solve_counts import Told
 
 WARM_UP, TIMED = 20, 200
-# Fewer loads do not tell the greatest of a thousand.
+# Fewer loads do not determine the greatest of a thousand.
 FEWEST_FOR_P999 = 1000
 T = TypeVar("T")
 
@@ -41,7 +41,7 @@ class Score:
     bare_microseconds
         The same of the model alone in NumPy, which compares learners; None of what is no model of this project.
     told
-        The finite-element solves that the deformer was told, where that is known.
+        The finite-element solves that the deformer was given, where that is known.
     """
 
     name: str
@@ -89,7 +89,7 @@ def microseconds(deformer: Deformer, loads: Loads, nodes: np.ndarray) -> float:
 
 
 def bare_microseconds(deformer: Deformer, loads: Loads) -> float | None:
-    """Median wall time [us] of a learned model alone, of one load at a time, in NumPy; None of other deformers."""
+    """Median wall time [us] of a learned model alone, of one load at a time; None of other deformers."""
     if not isinstance(deformer, Learned):
         return None
     single = [deformer.asked(loads.rows(slice(row, row + 1))) for row in np.arange(WARM_UP + TIMED) % len(loads)]
@@ -120,7 +120,7 @@ def winner(scores: Sequence[Score]) -> Score:
 
 
 def table(scores: Sequence[Score], motion_mm: float) -> str:
-    """The scores for people, below them the winner of several, and what the learners were told where that is known."""
+    """The scores for people, then the winner of several, then the solves that learners were given, if known."""
     head = (
         "          mm, all vertices                | mm, worst vertex of a load | % of motion                 "
         "| us, model in NumPy\n"
@@ -137,9 +137,9 @@ def table(scores: Sequence[Score], motion_mm: float) -> str:
     best = winner(scores)
     fastest = min(scores, key=lambda row: row.microseconds)
     verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
-    said = f"{best.name} wins: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
+    wins = f"{best.name} wins: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
     few = [f"p99.9: not known from fewer than {FEWEST_FOR_P999} loads"] if scores[0].p999_mm is None else []
-    return "\n".join([head, *rows, *few, said if len(scores) > 1 else f"{best.name}: {verdict}", *_told(scores)])
+    return "\n".join([head, *rows, *few, wins if len(scores) > 1 else f"{best.name}: {verdict}", *_solve_lines(scores)])
 
 
 def _known(value: float | None, form: str) -> str:
@@ -147,8 +147,8 @@ def _known(value: float | None, form: str) -> str:
     return f"{'-':>{form.split('.')[0]}}" if value is None else f"{value:{form}}"
 
 
-def _told(scores: Sequence[Score]) -> list[str]:
-    """The solves that each learner was told, as lines."""
+def _solve_lines(scores: Sequence[Score]) -> list[str]:
+    """The solves that each learner was given, as lines."""
     known = [(row.name, row.told) for row in scores if row.told is not None]
     if not known:
         return []
@@ -158,7 +158,7 @@ def _told(scores: Sequence[Score]) -> list[str]:
         for name, told in known
     ]
     return [
-        "finite-element solves given to the learners above, their wall time, and how many tell of the tumour from "
+        "finite-element solves given to the learners above, their wall time, and how many are of the tumour from "
         "inside the discs:",
         "learner     loads    unit   series      all    inside   seconds",
         *rows,

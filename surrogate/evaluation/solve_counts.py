@@ -1,4 +1,4 @@
-"""How many finite-element solves a learner is told, and what they took."""
+"""How many finite-element solves a learner is given, and what they took."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ class Told:
     Parameters
     ----------
     loads
-        Nonlinear solves: the loads taught.
+        Nonlinear solves: the training loads.
     units
         Linear solves of unit forces at nodes of the cortex.
     series
         Linear solves of the power series: places x radii x terms.
     inside
-        Those of them inside the discs left out that tell of the tumour.
+        Those of them inside the discs left out that are of the tumour.
     seconds
-        Of all these solves, on the machine that made them; None where the data do not say.
+        Of all these solves, on the machine that made them; None where the data do not state it.
     """
 
     loads: int

@@ -23,26 +23,26 @@ from sim.tools import Ball
 
 from .learned import Learned
 
-# Effects that do nothing until a load calls for them: a model may have been taught under more of them than a scene has.
+# Effects that do nothing until a load calls for them: a model's training may have more of them than a scene.
 ON_CALL = {kind.__name__ for kind in (ToolForce, ToolDisplacement, NodalForce, Gravity)}
-# What models were taught under whose file does not say.
+# The training effects of models whose file does not state them.
 UNSAID = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
 
 
-def taught_effects(told: Mapping[str, str]) -> frozenset[str]:
-    """Names of the effects that a model was taught under, or a data set was made under, as its file states them."""
-    if "effects" not in told:
+def trained_effects(stated: Mapping[str, str]) -> frozenset[str]:
+    """Names of the effects that a model was trained under, or a data set was made under, as its file states them."""
+    if "effects" not in stated:
         return UNSAID
     with suppress(SyntaxError):
-        match ast.parse(told["effects"], mode="eval").body:  # what `repr` of a tuple of effects gave
+        match ast.parse(stated["effects"], mode="eval").body:  # what `repr` of a tuple of effects gave
             case ast.Tuple(elts):
                 return frozenset(ast.unparse(one.func) for one in elts if isinstance(one, ast.Call))
     return frozenset()
 
 
-def taught_skull(told: Mapping[str, str]) -> str:
+def trained_skull(stated: Mapping[str, str]) -> str:
     """What the skull did while a data set was made: one of `sim.effects.SKULLS`."""
-    names = taught_effects(told)
+    names = trained_effects(stated)
     return next((name for name, effect in SKULLS.items() if type(effect).__name__ in names), "bonded")
 
 
@@ -54,31 +54,31 @@ def refusal(model: Learned, effects: Iterable[Effect], element: str | None = Non
     it learned from; an `element` of None is not compared, nor what the model's file does not state.
     """
     effects = tuple(effects)
-    taught, asked = taught_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
+    trained, asked = trained_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
     if model.ball is not None:
         here = next((effect.tools for effect in effects if isinstance(effect, ToolContact)), ())
         if here != (Ball(model.ball),):
             tools = ", ".join(map(repr, here)) or "none"
             return f"it was trained on the poses of one ball of {1e3 * model.ball:g} mm, and the tools here are {tools}"
     elif ToolForce.__name__ not in asked:
-        others = ", ".join(sorted(asked - taught))
+        others = ", ".join(sorted(asked - trained))
         return f"it was trained on what a tool's force does, and here is none{f', but {others}' if others else ''}"
     idle = set() if model.anatomy.slide_normal.any() else {"Bonded", "Slide"}
-    strange, missing = asked - taught - idle, taught - asked - ON_CALL - idle
+    strange, missing = asked - trained - idle, trained - asked - ON_CALL - idle
     if not strange and not missing:
         return _other_body(model, effects, element)
     differences = [f"not under {', '.join(sorted(strange))}"] * bool(strange)
     differences += [f"never without {', '.join(sorted(missing))}"] * bool(missing)
-    return f"it was trained under {', '.join(sorted(taught))}, {' and '.join(differences)}"
+    return f"it was trained under {', '.join(sorted(trained))}, {' and '.join(differences)}"
 
 
 def _other_body(model: Learned, effects: tuple[Effect, ...], element: str | None) -> str | None:
     """Why a model's finite elements are others than these: tissue, or element."""
-    told, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
-    if "tissue" in told and here is not None:
-        taught = Elasticity(tissue_from_json(told["tissue"]))
-        if taught != here:
-            return f"it learned from the tissue {taught}, and here it is {here}"
-    if element is not None and told.get("element", element) != element:
-        return f"it learned from {told['element']} elements, and here they are {element}"
+    stated, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
+    if "tissue" in stated and here is not None:
+        trained = Elasticity(tissue_from_json(stated["tissue"]))
+        if trained != here:
+            return f"it learned from the tissue {trained}, and here it is {here}"
+    if element is not None and stated.get("element", element) != element:
+        return f"it learned from {stated['element']} elements, and here they are {element}"
     return None

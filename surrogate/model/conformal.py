@@ -23,9 +23,9 @@ LEVELS = (0.95, 0.99)
 CLASS, CLASSES = 200, 10
 # Of the squared weights, beside the squared misfit of logarithms of unit variance a load.
 RIDGE = 1e-2
-# Of the features, so many say what the load is: force, radius, angle, overhang. The rest say where it is.
+# The first features describe the load: force, radius, angle, overhang. The rest are its place.
 LOAD = 4
-# Fewer errors than ten a term tell no curvature.
+# Fewer errors than ten a term determine no curvature.
 BENDS = 150
 # Standard deviations beyond which a feature counts no further; and the share of the mean below which no error counts.
 FARTHEST, LEAST = 4.0, 1e-3
@@ -42,7 +42,7 @@ class Bound:
     Parameters
     ----------
     mean, deviation
-        (f,) of the features that the scale is told from.
+        (f,) of the scale's features.
     weights
         (t,) of the monomials up to the second degree of standardised features; their sum is the logarithm of the scale.
     edges
@@ -77,19 +77,19 @@ def fitted_bound(
 ) -> Bound:
     """A bound whose scale follows what was `seen`, calibrated on other loads.
 
-    The scale is told the load, not its place: where what was seen lies in few discs of the cortex, a scale that follows
-    the place runs away between them. One that did bounded a distance that was 0.05 mm off by 4.2 mm.
+    The scale depends on the load, not on its place. Where `seen` loads lie in few discs of the cortex, a scale that
+    follows the place runs away between them. One that did bounded a distance that was 0.05 mm off by 4.2 mm.
 
     Parameters
     ----------
     seen
-        Features (m, f) and largest errors (m,) [m] of loads that the model was not taught.
+        Features (m, f) and largest errors (m,) [m] of loads that are not of the model's training.
     features, force, error
         (n, f), (n,) [N] and errors (n, k) [m] at each vertex, of the calibration loads.
     each
         Calibration loads of a class of force, at least: fewer than 99 promise nothing at 0.99.
     curved
-        Whether the scale's logarithm is quadratic in what says the load, if `BENDS` loads were seen, or linear.
+        Whether the scale's logarithm is quadratic in the load's features, if `BENDS` loads were seen, or linear.
     """
     mean, deviation = standardisation(seen[0])
     used = _used(len(mean), LOAD if curved and len(seen[1]) >= BENDS else 0)
@@ -111,7 +111,7 @@ def fitted_bound(
 
 
 def features_of(pushed: Pushed, known: Measured) -> np.ndarray:
-    """What an error's size is told from (B, 7): logarithms of force and radius, angle, overhang and point [mm]."""
+    """The features of an error's size (B, 7): logarithms of force and radius, angle, overhang and point [mm]."""
     force = np.log(np.maximum(known.magnitude, np.finfo(float).tiny))
     return np.column_stack([force, np.log(pushed.footprint), known.angle, 1e3 * known.overhang, 1e3 * pushed.point])
 

@@ -1,4 +1,4 @@
-"""Learned: a deformer that answers from what it was taught, for the tumour and the open cortex."""
+"""A deformer that answers from its training, for the tumour and the open cortex."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from .conformal import LEVELS, Bound, features_of
 from .tip_distance import Distance, TipModel
 from .training_range import Envelope, Measured, measured
 
-# Times the strongest force, or the widest footprint, that was taught. Of three loads so strong on the template's brain
+# Times the strongest force, or the widest footprint, of the training. Of three loads so strong on the template's brain
 # the finite elements find an equilibrium of none, and at twice the force a prediction is off by up to 31 %.
 FARTHEST = 3.0
-# Taught points are stored in single precision [m].
+# Training points are stored in single precision [m].
 STORED = 1e-6
 
 
@@ -72,17 +72,17 @@ class Learned:
     parts
         Added where they overlap.
     envelope
-        The loads that it was taught.
+        The range of its training loads.
     bound
         Of 95 in 100 held-out loads the worst tumour vertex was within this distance [m] of the finite elements.
     bounds
         What it promises of each load, if loads were kept apart to calibrate it.
     training
-        What it was taught with, as text.
+        What it was trained with, as text.
     ball
-        Radius [m] of the ball whose poses it answers; None: it answers pushes. Where it says force, there is depth [m].
+        Radius [m] of the ball whose poses it answers; None: it answers pushes. Depth [m] then stands for force.
     tip
-        What it was taught of the distance from tip to tumour, if anything.
+        What it has learned of the distance from tip to tumour, if anything.
     """
 
     anatomy: Anatomy
@@ -97,9 +97,10 @@ class Learned:
     @cached_property
     def source(self) -> str:
         """Its learner, and what it learned from, in words: every answer carries them."""
-        told = self.training
-        tissue = str(tissue_from_json(told["tissue"])) if "tissue" in told else "tissue not stated"
-        return f"{told.get('learner', 'learned')}, from finite elements ({told.get('element', 'not stated')}; {tissue})"
+        stated = self.training
+        tissue = str(tissue_from_json(stated["tissue"])) if "tissue" in stated else "tissue not stated"
+        element = stated.get("element", "not stated")
+        return f"{stated.get('learner', 'learned')}, from finite elements ({element}; {tissue})"
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -138,7 +139,7 @@ class Learned:
         return known
 
     def _demand_answerable(self, pushed: Pushed, doubtful: np.ndarray) -> None:
-        """Refuse what has no answer to be near to: a footprint off the open cortex, a size far beyond what was taught.
+        """Refuse what has no answer to be near to: a footprint off the open cortex, a size far beyond the training.
 
         Of the `doubtful` (k,) rows alone: a load inside the envelope is neither, unless its radius is less than the
         reach.
@@ -177,7 +178,7 @@ class Learned:
         ------
         InputError
             Loads of another kind, or that do not touch the open cortex, or are more than `FARTHEST` times as strong
-            or as wide as any that was taught; a start with other rows; a vertex in `at` that the model does not know.
+            or as wide as any of the training; a start with other rows; a vertex in `at` that the model does not know.
         """
         check_loads(loads)
         if start is not None and not isinstance(start, Deformation):
@@ -222,13 +223,13 @@ class Learned:
         return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
 
     def promised(self, bound: Bound | None, pushed: Pushed, known: Measured, excess: np.ndarray) -> np.ndarray:
-        """What a bound (2, B) [m] says of loads; NaN where there is none."""
+        """The bounds (2, B) [m] of loads; NaN where there is none."""
         if bound is None:
             return np.stack([np.nan * excess] * len(LEVELS))
-        # As the motion, so its error: in proportion to a force weaker than any that was taught.
+        # As the motion, so its error: in proportion to a force weaker than any of the training.
         weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
-        told = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *self.envelope.force)))
-        return np.where(weaker > 0.0, bound.of(told, known.magnitude, excess), 0.0) * weaker
+        features = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *self.envelope.force)))
+        return np.where(weaker > 0.0, bound.of(features, known.magnitude, excess), 0.0) * weaker
 
     def distance(self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None) -> Distance:
         """Predict the distance from the tool's tip to the tumour, both in the deformed brain: see `TipGauge`.
@@ -291,13 +292,13 @@ def predicted(
     bound: np.ndarray,
     source: str,
 ) -> Deformation:
-    """What a learnt model, asked at `begun` [s], answers loads with; `outside` (B,) of what it was taught or not.
+    """The answer of a trained model asked at `begun` [s]; `outside` (B,): whether loads lie outside its training.
 
     displacement (B, n, 3) [m] of `nodes` (n,); bound and source as in `Deformation`.
     """
     count = len(loads)
     pushed, unknown = loads.of(Pushed), np.full(count, np.nan)
-    reaction = np.zeros((count, 0 if pushed is None else 1, 6))  # what force a pose takes it was not taught
+    reaction = np.zeros((count, 0 if pushed is None else 1, 6))  # the force of a pose is unknown
     if pushed is not None:
         reaction[:, 0, :3] = pushed.force
     return Deformation(

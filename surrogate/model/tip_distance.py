@@ -1,4 +1,4 @@
-"""The distance from tip to tumour as a learnt model has it: what it is off on average, and what it promises."""
+"""The distance from tip to tumour by a trained model: its mean error is corrected, and it has a bound."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..regressors.gp import Gp
 from ..regressors.series_residual import with_pressing
 from .conformal import Bound
 
-# Of the taught loads, so many tell the process's lengths, and so many it is conditioned on, at most.
+# Training loads at most: those that fit the process's lengths, and those that it is conditioned on.
 ROWS, MOST = 300, 2000
 
 
@@ -37,7 +37,7 @@ class Distance:
 
 @dataclass(frozen=True)
 class TipModel:
-    """What is learnt of the distance itself.
+    """The learned correction and bound of the distance itself.
 
     The tip rests on the predicted cortex, and learners know the cortex less well than the tumour. A Gaussian process
     learns how far the distance between the two predictions is off, for each newton.
@@ -54,7 +54,7 @@ class TipModel:
     bound: Bound | None = None
 
     def corrected(self, distance: np.ndarray, patch: Patch, asked: Pushed, magnitude: np.ndarray) -> np.ndarray:
-        """Distances (B,) [m] corrected for loads `asked` within the taught forces, of true magnitude (B,) [N]."""
+        """Distances (B,) [m] corrected for loads `asked` within the training forces, of true magnitude (B,) [N]."""
         if self.correction is None:
             return distance
         off = self.correction.predict(correction_features(patch, asked))[:, 0]
@@ -62,7 +62,7 @@ class TipModel:
 
 
 def correction_features(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """What a correction is told from (B, 9): `tool_features`, and force over radius."""
+    """The features of a correction (B, 9): `tool_features`, and force over radius."""
     return with_pressing(tool_features(patch, pushed))
 
 

@@ -1,4 +1,4 @@
-"""The range of loads that a model was taught: outside it, a prediction says so."""
+"""The range of a model's training loads: outside it, an answer is marked as extrapolated."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..array_functions import squared_distances
 from ..data.cortex_patch import Patch
 from ..data.encode import directions
 
-# Round-off must not put a taught load outside.
+# Round-off must not put a training load outside.
 SLACK = 1e-6
 
 
@@ -28,14 +28,14 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Envelope:
-    """Bounds of the taught loads.
+    """Bounds of the training loads.
 
     Parameters
     ----------
     points
-        (n, 3) taught points [m].
+        (n, 3) points of the training loads [m].
     reach
-        The farthest that a taught point lies from the nearest other one [m]: so densely the cortex was taught.
+        The greatest distance of a training point from the nearest other one [m]: how densely they cover the cortex.
     overhang
         Greatest footprint radius less distance to the rim [m].
     angle
@@ -69,7 +69,7 @@ class Envelope:
         return bool((asked & known) - free)
 
     def excess(self, pushed: Pushed, known: Measured) -> np.ndarray:
-        """How far outside each load lies (B,), in shares of what was taught; zero inside.
+        """How far outside each load lies (B,), in shares of the training range; zero inside.
 
         The largest of: millimetres beyond the reach or over the rim, radians beyond the angle, and the shares by which
         force, radius and force over radius are too large or too small.
@@ -89,17 +89,17 @@ class Envelope:
         return np.maximum(beyond.max(axis=0), 0.0)
 
 
-def envelope_of(patch: Patch, taught: Pushed) -> Envelope:
-    """The envelope of the `taught` loads, of which nothing but these loads tells."""
-    magnitude, angle, overhang = measured(patch, taught)
+def envelope_of(patch: Patch, trained: Pushed) -> Envelope:
+    """The envelope of the training loads, which follows from these loads alone."""
+    magnitude, angle, overhang = measured(patch, trained)
     return Envelope(
-        taught.point.astype(np.float32),
-        _reach(taught.point),
+        trained.point.astype(np.float32),
+        _reach(trained.point),
         float(overhang.max()),
         float(angle.max()),
         (float(magnitude.min()), float(magnitude.max())),
-        (float(taught.footprint.min()), float(taught.footprint.max())),
-        float((magnitude / taught.footprint).max()),
+        (float(trained.footprint.min()), float(trained.footprint.max())),
+        float((magnitude / trained.footprint).max()),
     )
 
 
@@ -111,7 +111,7 @@ def _reach(point: np.ndarray) -> float:
 
 
 def measured(patch: Patch, pushed: Pushed) -> Measured:
-    """What decides whether loads lie inside."""
+    """Measure loads as the envelope compares them."""
     magnitude, direction = directions(pushed)
     cosine = np.einsum("bi,bi->b", direction, patch.normal_near(pushed.point))
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))

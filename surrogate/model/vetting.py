@@ -15,7 +15,7 @@ from .conformal import LEVELS, Bound
 from .learned import Learned, Part
 from .training_range import Envelope
 
-# Of tool features, and so of what bounds are told from.
+# Of tool features, and so of the features of bounds.
 FEATURES = 7
 
 
@@ -25,7 +25,7 @@ def demand_sound(name: str, model: Learned) -> None:
     Raises
     ------
     InputError
-        Parts, an envelope or bounds that no training makes; the text says which.
+        Parts, an envelope or bounds that no training makes; the text names which.
     """
     try:
         _demand(len(model.parts) > 0, "it has no parts")
@@ -35,7 +35,7 @@ def demand_sound(name: str, model: Learned) -> None:
         _demand(isinstance(model.bound, float) and not model.bound < 0.0, "its bound is no distance")
         _demand(model.ball is None or _positive(model.ball), "its ball has no radius")
         texts = (*model.training, *model.training.values())
-        _demand(all(isinstance(text, str) for text in texts), "what it says of its training is no text")
+        _demand(all(isinstance(text, str) for text in texts), "what it states of its training is no text")
         if model.bounds is not None:
             _check_bounds(model.bounds, len(model.anatomy.tumour_nodes))
         if model.tip is not None and model.tip.bound is not None:
@@ -66,7 +66,7 @@ def _check_part(part: Part, model: Learned) -> None:
     found = part.regressor.predict(features)
     _demand(
         found.shape == (len(features), len(part.basis.modes)) and bool(np.isfinite(found).all()),
-        "it answers no load that it was taught",
+        "it answers no load of its training",
     )
 
 
@@ -86,7 +86,7 @@ def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
 
 
 def _probe(encoder: str, model: Learned) -> np.ndarray:
-    """Features of a load that the model was taught, made without what presses a tool."""
+    """Features of a training load, made without a tool's footprint integral."""
     if encoder == "nodal":
         return np.ones((1, 3 * len(open_patch(model.anatomy).nodes)))
     envelope = model.envelope
@@ -99,7 +99,7 @@ def _check_envelope(envelope: Envelope) -> None:
     points = envelope.points
     _demand(
         points.ndim == 2 and points.shape[1] == 3 and len(points) > 0 and bool(np.isfinite(points).all()),
-        "its taught points are none",
+        "its training points are none",
     )
     for name in ("force", "footprint"):
         span = getattr(envelope, name)
@@ -123,8 +123,8 @@ def _check_bounds(bounds: Bound, count: int) -> None:
     }
     for name, shape in shapes.items():
         _demand(getattr(bounds, name).shape == shape, f"{name!r} of its bounds have another shape")
-    told = np.concatenate([bounds.mean, bounds.deviation, bounds.weights])
-    _demand(bool(np.isfinite(told).all() and (bounds.deviation > 0.0).all()), "the scale of its bounds is none")
+    numbers = np.concatenate([bounds.mean, bounds.deviation, bounds.weights])
+    _demand(bool(np.isfinite(numbers).all() and (bounds.deviation > 0.0).all()), "the scale of its bounds is none")
     _demand(bounds.edges.ndim == 1 and bool((np.diff(bounds.edges) > 0.0).all()), "its classes of force do not rise")
     _demand(bool((bounds.quantile >= 0.0).all()), "its bounds are negative")
     _demand(bool((bounds.quantile[1] >= bounds.quantile[0]).all()), "its bounds shrink with their probability")

@@ -109,7 +109,7 @@ def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False
 
 
 def _notes(name: str, model: Learned) -> dict[str, str]:
-    """Metadata: what the numbers mean, and all that is known of what was taught."""
+    """Metadata: what the numbers mean, and all that is known of the training."""
     return {
         **model.training,
         "format": FORMAT,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -24,6 +24,13 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def forward(x: Any, weights: Sequence[Any], biases: Sequence[Any], tanh: Callable[[Any], Any]) -> Any:
+    """Outputs (B, r) of the layers, of inputs x (B, f): arrays of NumPy or of torch, whose `tanh` is given."""
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        x = tanh(x @ weight + bias)
+    return x @ weights[-1] + biases[-1]
 
 
 @dataclass(eq=False)
@@ -69,10 +76,7 @@ class Ann:
         biases = [torch.zeros(b, dtype=torch.float64, requires_grad=True) for b in widths[1:]]
 
         def loss() -> torch.Tensor:
-            x = inputs
-            for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-                x = torch.tanh(x @ weight + bias)
-            misfit = (x @ weights[-1] + biases[-1] - targets).square().sum(dim=1).mean()
+            misfit = (forward(inputs, weights, biases, torch.tanh) - targets).square().sum(dim=1).mean()
             return misfit + self.decay / len(X) * torch.stack([weight.square().sum() for weight in weights]).sum()
 
         search = torch.optim.LBFGS(
@@ -98,9 +102,8 @@ class Ann:
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of features (B, f)."""
         x = ((X - self.mean_) / self.deviation_).astype(np.float32)
-        for weight, bias in zip(self.weights_[:-1], self.biases_[:-1], strict=True):
-            x = np.tanh(x @ weight + bias)
-        return (x @ self.weights_[-1] + self.biases_[-1]) * np.float32(self.scale_) + self.offset_.astype(np.float32)
+        y = forward(x, self.weights_, self.biases_, np.tanh)
+        return y * np.float32(self.scale_) + self.offset_.astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
         """Standardisation, and the weights and biases of each layer."""

@@ -34,7 +34,7 @@ FORGETFUL = 15
 # Places that give less than this share of what nodes do on average are bone's, which the ball enters: no force, or one
 # beyond all bounds, would keep it out.
 LEAST = 0.02
-# Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are told apart.
+# Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are distinct.
 APART = 1e-6
 
 
@@ -43,7 +43,7 @@ class Contact:
     """A regressor that predicts the response to one metre of indentation, from `tool_features` of an indentation.
 
     What nonlinearity adds far from the ball is nearly a factor of the force, that grows with depth over radius: a line,
-    which is all that is learnt.
+    which is all that is learned.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class Contact:
                 out[row] = self._pressed(point + (depth - radius) * direction, radius + THICKER)
         return out
 
-    def taught(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray) -> Self:
+    def fitted(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray) -> Self:
         """With the lines that fit coefficients Y (B, r) best; `alike` (r,) numbers those that share one."""
         found, line = self.linear(X), np.zeros_like(self.line)
         depth = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]])
@@ -115,7 +115,7 @@ class Contact:
         least = LEAST * np.einsum("nii->", own) / max(3 * len(nodes), 1)
         moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
         facet, share, settled = np.zeros(0, int), np.zeros((0, 3)), True
-        for turn in range(MOST):
+        for iteration in range(MOST):
             corners = (self.points[nodes] + moved)[table]
             nearest = nearest_shares(corners, middle)
             distance, normal = distances(corners, nearest, middle)
@@ -131,7 +131,7 @@ class Contact:
             bears = _bearing(lever @ compliance @ lever.T, radius - distance + lever @ moved.ravel())
             force = bears @ lever
             last, moved = moved, (compliance @ force).reshape(-1, 3)
-            kept = (bears > 0.0) | (turn >= FORGETFUL)
+            kept = (bears > 0.0) | (iteration >= FORGETFUL)
             facet, share = facet[kept], share[kept]
             settled = bool(np.abs(moved - last).max() < TOLERANCE)
         out = np.zeros(len(self.compliance))

@@ -12,7 +12,7 @@ from .protocol import filled
 
 # The damping of MATLAB's `trainbr`: the first, its factors after a good and a bad step, and where a network ends.
 DAMPING, DOWN, UP, MOST_DAMPING = 5e-3, 0.1, 10.0, 1e10
-# Least summed squared error, of outputs in [-1, 1], that is told from none.
+# Least summed squared error, of outputs in [-1, 1], that differs from none.
 NO_ERROR = 1e-20
 
 
@@ -24,7 +24,7 @@ class Bayesian:
     lowered, E_D and E_W half the sums of squared errors and weights, alpha and beta set anew before every step. Made
     after the description of MATLAB's `trainbr`, which Tonutti, Gras, Yang 2017 used: features and outputs scaled to
     [-1, 1], first weights by Nguyen and Widrow's rule, the same damping, at most 1,000 steps. It differs in that a
-    network also ends when a step gains less than `gain` of its objective, and in that all rows teach.
+    network also ends when a step gains less than `gain` of its objective, and in that all rows are trained on.
 
     Parameters
     ----------

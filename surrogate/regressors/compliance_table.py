@@ -1,4 +1,4 @@
-"""The compliance table: what superposition of small-strain responses says. The baseline that a learner must beat."""
+"""The compliance table: superposition of small-strain responses. The baseline that a learner must beat."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 class Linear:
     """Y = X C without intercept, C of least norm among the least-squares solutions.
 
-    Taught with unit responses at the nodes it is the exact compliance table; with any other rows, its least-squares
+    Trained with unit responses at the nodes it is the exact compliance table; with any other rows, its least-squares
     estimate.
     """
 

@@ -1,4 +1,4 @@
-"""A Gaussian process from a load to the coefficients of a reduced basis: it also tells its own deviation."""
+"""A Gaussian process from a load to the coefficients of a reduced basis: it also predicts its own deviation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables without some of their places: what the other places say there, for models that are scored on these."""
+"""Tables without some of their places: interpolated from the other places, for models that are scored on these."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FLAT = 1e-6
 
 
 def filled(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """A table without what it holds of the places that are `left_out`: there the others are interpolated.
+    """A table without the rows of the places that are `left_out`: there the others are interpolated.
 
     By cubic radial basis functions with a linear polynomial (Duchon 1977, "Splines minimizing rotation-invariant
     semi-norms"), which reproduce fields that are linear in the place.

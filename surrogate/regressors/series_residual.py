@@ -1,4 +1,4 @@
-"""What a power series to the third order leaves over: small where the force is, and learnt."""
+"""What a power series to the third order leaves over: small where the force is, and learned."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from .force_series import ORDERS
 from .gp import Gp
 
-# Of the largest taught force: below it the remainder is smaller than the table's own errors, which must not be learnt.
+# Share of the largest training force, below which the remainder is smaller than the table's own errors.
 FAINT = 0.4
 # Those of `tool_features`, and force over radius.
 FEATURES = 9

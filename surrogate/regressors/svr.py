@@ -46,13 +46,13 @@ class Svr:
         dual = np.zeros((len(X), Y.shape[1]))
         intercept = np.zeros(Y.shape[1])
 
-        def taught(mode: int) -> SVR:
+        def trained(mode: int) -> SVR:
             # In units of its quartile range an output meets libsvm's absolute stopping tolerance at any scale.
             return SVR(C=self.penalty, epsilon=self.tube, gamma=1.0 / X.shape[1]).fit(scaled, Y[:, mode] / spread[mode])
 
         modes = np.flatnonzero(spread > 0.0)
         with ThreadPoolExecutor() as pool:
-            machines = list(pool.map(taught, modes))
+            machines = list(pool.map(trained, modes))
         for mode, machine in zip(modes, machines, strict=True):
             dual[machine.support_, mode] = spread[mode] * machine.dual_coef_[0]
             intercept[mode] = spread[mode] * machine.intercept_[0]

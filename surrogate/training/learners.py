@@ -35,22 +35,22 @@ LEARNT: dict[str, tuple[str, Callable[[], Teachable]]] = {
     "gp": ("tool", Gp),
     "residual": ("tool", partial(Tuned, ANN)),
 }
-# Those that poses teach: where the ball is stands for what it presses with.
+# Learners of poses: the ball's place stands for its force.
 POSED = ("gp", "ann", "svr")
 
 
 def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
-    """The summands of one learner, taught with a lesson: for the tumour, and for the cortex beside it."""
+    """The summands of one learner, trained on a lesson: for the tumour, and for the cortex beside it."""
     known = room.expansion
     if name in EXPANDED:
         tumour, more = room.series
         cortex = () if more is None else (*known.cortex_table, more)
         if name == "series":
             return (tumour, *cortex)
-        learnt = _taught(("tool", Remainder), (tumour,), tumour.basis, known.patch, lesson.loads, lesson.tumour)
+        learnt = _trained(("tool", Remainder), (tumour,), tumour.basis, known.patch, lesson.loads, lesson.tumour)
         if more is None:
             return (tumour, learnt)
-        left = _taught(("tool", Remainder), cortex, more.basis, known.patch, lesson.loads, lesson.cortex)
+        left = _trained(("tool", Remainder), cortex, more.basis, known.patch, lesson.loads, lesson.cortex)
         return (tumour, learnt, *cortex, left)
     if name == "linear":
         return (room.table, *known.cortex_table)
@@ -58,14 +58,14 @@ def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
         contact, left = _touched(known, lesson)
         if name == "contact":
             return (contact,)
-        return (contact, *(_taught(LEARNT["gp"], (), nodes, known.patch, lesson.loads, rest) for nodes, rest in left))
+        return (contact, *(_trained(LEARNT["gp"], (), nodes, known.patch, lesson.loads, rest) for nodes, rest in left))
     if known.data.ball is not None:
         both = ((known.tumour, lesson.tumour), (known.cortex, lesson.cortex))
         return tuple(
-            _taught(_learnt(name), (), nodes, known.patch, lesson.loads, truth) for nodes, truth in both if len(nodes)
+            _trained(_learnt(name), (), nodes, known.patch, lesson.loads, truth) for nodes, truth in both if len(nodes)
         )
     before = (room.table,) if name == "residual" else ()
-    learnt = _taught(_learnt(name), before, known.tumour, known.patch, lesson.loads, lesson.tumour)
+    learnt = _trained(_learnt(name), before, known.tumour, known.patch, lesson.loads, lesson.tumour)
     return (*before, learnt, *known.cortex_table)
 
 
@@ -85,12 +85,12 @@ def _touched(known: Expansion, lesson: Lesson) -> tuple[Part, list[tuple[np.ndar
     truth = [lesson.tumour, lesson.cortex][: len(bases)]
     coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
     alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
-    part = Part("tool", contact.taught(features, coefficients, alike), side_by_side(bases))
+    part = Part("tool", contact.fitted(features, coefficients, alike), side_by_side(bases))
     answered = np.split(size * part.response(features), [len(known.tumour)], axis=1)
     return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
 
 
-def _taught(
+def _trained(
     kind: tuple[str, Callable[[], Teachable]],
     before: tuple[Part, ...],
     on: Basis | np.ndarray,
@@ -112,7 +112,7 @@ def _taught(
 
 
 def _check_own(regressor: Fitted, X: np.ndarray, Y: np.ndarray) -> None:
-    """Refuse a user's regressor that does not answer what it was taught with finite coefficients of its shape."""
+    """Refuse a user's regressor that does not answer what it was trained on finite coefficients of its shape."""
     found = np.asarray(regressor.predict(X))
     if found.shape != Y.shape or not np.isfinite(found).all():
         raise InputError(

@@ -49,7 +49,7 @@ class Published:
     machines
         k regressors from 13 features to magnitude and direction angles.
     envelope
-        The loads that it was taught.
+        The range of its training loads.
     """
 
     anatomy: Anatomy
@@ -125,7 +125,7 @@ def from_angles(angular: np.ndarray) -> np.ndarray:
     return angular[..., :1] * np.cos(angular[..., 1:])
 
 
-def taught(
+def published_model(
     name: str,
     anatomy: Anatomy,
     loads: Loads,

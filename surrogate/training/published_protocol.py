@@ -14,7 +14,7 @@ from sim.loads import Loads
 
 from ..data.cortex_patch import nearest
 from ..model.learned import only_pushed
-from .published_models import Published, taught
+from .published_models import Published, published_model
 
 # Positions closer than this are one [m]; the published protocol has eleven.
 SAME, MOST = 1e-6, 11
@@ -22,14 +22,14 @@ SAME, MOST = 1e-6, 11
 
 @dataclass(frozen=True, eq=False)
 class InTurn:
-    """Models of one body as one `Deformer`: a load is answered by that which was taught without its position.
+    """Models of one body as one `Deformer`: a load is answered by the one that was trained without its position.
 
     Parameters
     ----------
     positions
         (m, 3) [m].
     models
-        m models of the same vertices, each taught without the loads at its position.
+        m models of the same vertices, each trained without the loads at its position.
     """
 
     positions: np.ndarray
@@ -37,7 +37,7 @@ class InTurn:
 
     @property
     def anatomy(self) -> Anatomy:
-        """The body that they were taught on."""
+        """The body that they were trained on."""
         return self.models[0].anatomy
 
     @property
@@ -53,9 +53,9 @@ class InTurn:
         InputError
             Loads of another kind, or a vertex in `at` that the models do not know.
         """
-        turn = nearest(only_pushed(loads).point, self.positions)[0]
-        rows = [np.flatnonzero(turn == which) for which in np.unique(turn)]
-        answers = [self.models[turn[some[0]]].deform(loads.rows(some), at=at) for some in rows]
+        position = nearest(only_pushed(loads).point, self.positions)[0]
+        rows = [np.flatnonzero(position == which) for which in np.unique(position)]
+        answers = [self.models[position[some[0]]].deform(loads.rows(some), at=at) for some in rows]
         return joined(answers).rows(np.argsort(np.concatenate(rows)))
 
 
@@ -72,7 +72,7 @@ def taught_in_turn(
     truth: np.ndarray,
     progress: Callable[[], object] = lambda: None,
 ) -> InTurn:
-    """Teach `name` once for each position, on the loads at the others; `truth` (B, k, 3) [m] is of `published_nodes`.
+    """Train `name` once for each position, on the loads at the others; `truth` (B, k, 3) [m] is of `published_nodes`.
 
     Raises
     ------
@@ -85,9 +85,9 @@ def taught_in_turn(
             f"the loads have {len(positions)} positions, and leaving out one in turn takes 2 to {MOST}: simulate "
             "--preset seed."
         )
-    turn = nearest(only_pushed(loads).point, positions)[0]
+    position = nearest(only_pushed(loads).point, positions)[0]
     models = []
     for which in range(len(positions)):
-        others = np.flatnonzero(turn != which)
-        models.append(taught(name, anatomy, loads.rows(others), truth[others], progress))
+        others = np.flatnonzero(position != which)
+        models.append(published_model(name, anatomy, loads.rows(others), truth[others], progress))
     return InTurn(positions, tuple(models))

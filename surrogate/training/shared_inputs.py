@@ -1,4 +1,4 @@
-"""What every learner of a data set is given: loads and answers, and what its finite elements say without learning."""
+"""What every learner of a data set is given: loads and answers, and what its finite elements give without learning."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ..data.disc_split import Split
 from ..data.encode import ENCODERS, Basis, directions, reduce
 from ..data.tool_loads import spread
 from ..evaluation.solve_counts import Told
-from ..model.applicability import taught_skull
+from ..model.applicability import trained_skull
 from ..model.learned import Part, only_pushed
 from ..regressors.ball_contact import Contact
 from ..regressors.compliance_table import Linear
@@ -67,15 +67,15 @@ class Lesson:
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """What a data set's finite elements say without learning: compliance, power series, contact; made when asked for.
+    """What a data set's finite elements give without learning: compliance, power series, contact; made when asked for.
 
-    Answers to the data's loads tell nothing of it. The series is tabulated in wide bases, of what it is itself at a few
-    places, so that a table grows neither with the tumour nor with the cortex.
+    It does not depend on answers to the data's loads. The series is tabulated in wide bases, of its own values at a
+    few places, so that a table grows neither with the tumour nor with the cortex.
 
     Parameters
     ----------
     data
-        Its anatomy, tissue and element; its loads say how wide tools are.
+        Its anatomy, tissue and element; its loads give the widths of tools.
     device
         Where the finite elements work.
     progress
@@ -138,7 +138,7 @@ class Expansion:
         Raises
         ------
         InputError
-            Data that do not say what tissue they are of.
+            Data that do not state what tissue they are of.
         """
         triangles = with_middles(self.patch)[0]
         found = []
@@ -155,7 +155,7 @@ class Expansion:
         Raises
         ------
         InputError
-            Data that do not say what tissue they are of.
+            Data that do not state what tissue they are of.
         """
         begun = time.perf_counter()
         contact, bases = condensed(self._fem(), self._known)
@@ -180,7 +180,7 @@ class Expansion:
         Raises
         ------
         InputError
-            Data that do not say what tissue they are of.
+            Data that do not state what tissue they are of.
         """
         if self.kept is not None and self.kept.exists():
             with (
@@ -236,14 +236,14 @@ class Expansion:
         return radii_between(float(footprint.min()), float(footprint.max()))
 
     def _fem(self) -> Fem:
-        said = self.data.provenance
-        if "tissue" not in said:
+        stated = self.data.provenance
+        if "tissue" not in stated:
             raise InputError(
-                f"{self.data.path}: does not say what tissue it is of, so no series or contact can be had of it: "
+                f"{self.data.path}: does not state its tissue, so no series or contact can be had of it: "
                 "choose other learners, or simulate anew."
             )
-        effects = pushed_effects(self.data.anatomy, tissue_from_json(said["tissue"]), taught_skull(said))
-        return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=said.get("element"))
+        effects = pushed_effects(self.data.anatomy, tissue_from_json(stated["tissue"]), trained_skull(stated))
+        return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=stated.get("element"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,8 +274,8 @@ class Tabulated:
 class Classroom:
     """What every learner of a data set is given, made when it is asked for.
 
-    What finite elements say of the tumour under forces inside the discs left out is not among it. Of the cortex beside
-    the tumour they say all: a dent is no sum of dents elsewhere; and so they do of contact, which is made of it.
+    Finite-element answers of the tumour under forces inside the discs left out are not among it. Answers of the cortex
+    beside the tumour are all given: a dent is no sum of dents elsewhere. So it is with contact, which is made of them.
 
     Parameters
     ----------
@@ -306,7 +306,7 @@ class Classroom:
         return self.expansion.compliance(self.expansion.tumour, left_out) if left_out.any() else self.expansion.table
 
     def told(self, name: str, lesson: Lesson) -> Told:
-        """The solves that a learner of `LEARNERS` or `OF_POSES` is told, a user's own too."""
+        """The solves that a learner of `LEARNERS` or `OF_POSES` is given, a user's own too."""
         known, data, loads = self.expansion, self.expansion.data, len(lesson.loads.point)
         units = series = inside = 0
         seconds = [data.seconds("load", loads)]

@@ -1,4 +1,4 @@
-"""Teaching models the distance from tip to tumour: a correction, kept where it helps, and a calibrated bound."""
+"""Training models on the distance from tip to tumour: a correction, kept where it helps, and a calibrated bound."""
 
 from __future__ import annotations
 
@@ -45,17 +45,17 @@ def distance_errors(model: Learned, known: Measured) -> np.ndarray:
 
 
 def with_correction(model: Learned, patch: Patch, known: Measured) -> Learned:
-    """The model, taught how far off its distances are under the loads that it was taught, or under some of them."""
+    """The model with a correction of its distances, learned from its training loads or some of them."""
     plain, some = replace(model, tip=TipModel()), known.rows(slice(None, None, -(-len(known.loads) // MOST)))
     off = some.distance - plain.distance(some.loads).value
     return replace(model, tip=TipModel(fitted_correction(patch, model.asked(some.loads), off)))
 
 
 def corrected_if_better(
-    model: Learned, patch: Patch, taught: Measured, held_out: Measured
+    model: Learned, patch: Patch, trained: Measured, held_out: Measured
 ) -> tuple[Learned, np.ndarray]:
     """The model with a correction, if that brings held-out distances nearer on average; and their errors (B,) [m]."""
-    candidates = [replace(model, tip=TipModel()), with_correction(model, patch, taught)]
+    candidates = [replace(model, tip=TipModel()), with_correction(model, patch, trained)]
     error = [distance_errors(each, held_out) for each in candidates]
     best = int(error[1].mean() < error[0].mean())
     return candidates[best], error[best]
@@ -71,9 +71,9 @@ def calibrated_distance(
     Parameters
     ----------
     seen
-        Features (m, f) and errors (m,) [m] of loads that the model was not taught.
+        Features (m, f) and errors (m,) [m] of loads that are not of the model's training.
     features, known
-        (B, f), and what the finite elements say, of the calibration loads.
+        (B, f), and the finite elements' distances, of the calibration loads.
     """
     assert model.tip is not None
     force = directions(model.asked(known.loads))[0]

@@ -37,8 +37,8 @@ from .tip_distance import (
 # Of pushes, and of poses.
 LEARNERS = ("linear", *LEARNT, *EXPANDED)
 OF_POSES = (*TOUCHED, *POSED)
-# Fewer could not promise 95 in 100. So many tell the bounds' scale too, by one in three: they are drawn as what is
-# promised. Of fewer, the errors on the discs tell it.
+# Fewer could not promise 95 in 100. With so many, one in three fits the bounds' scale too: they are drawn as what is
+# promised. With fewer, the errors on the discs fit it.
 FEWEST_APART, ENOUGH_APART, SCALE = 19, 3 * CLASS, 3
 
 
@@ -46,11 +46,11 @@ FEWEST_APART, ENOUGH_APART, SCALE = 19, 3 * CLASS, 3
 class Trained:
     """Models by learner, how they scored on the discs left out, and what those were.
 
-    `motion` is the mean displacement [m] of the tumour over the held-out loads, `calibrated` the number of loads by
-    which the models' bounds were calibrated, `taught` that of those which the models were taught. `left_out` says by
-    learner how often bounds held on the discs left out, where nothing is promised: those of the scored model,
-    of which loads outside the discs tell all, one in three the scale and the others how much of it.
-    `distance_left_out` says the same of the distance from tip to tumour.
+    `motion` is the mean displacement [m] of the tumour over the held-out loads. `calibrated` counts the loads that
+    calibrated the models' bounds, `taught` the training loads. `left_out` gives by learner how often bounds held on
+    the discs left out, where nothing is promised. These are bounds of the scored model, from loads outside the discs:
+    one in three fits the scale, the others the quantiles. `distance_left_out` gives the same for the distance from tip
+    to tumour.
     """
 
     models: dict[str, Learned]
@@ -64,14 +64,14 @@ class Trained:
 
 
 def learners_for(data: Dataset) -> tuple[str, ...]:
-    """All that a data set can teach: series and contact need finite elements, of a tissue that the data names."""
-    told = "tissue" in data.provenance
+    """All learners that a data set can train: series and contact need finite elements of a stated tissue."""
+    stated = "tissue" in data.provenance
     kinds = LEARNERS if data.ball is None else OF_POSES
-    return tuple(name for name in kinds if told or name not in (*EXPANDED, *TOUCHED))
+    return tuple(name for name in kinds if stated or name not in (*EXPANDED, *TOUCHED))
 
 
 def check_learners(names: Sequence[str], of_poses: bool, where: str) -> None:
-    """Refuse learners that data of pushes, or of poses, cannot teach. `where` names the data in the sentence.
+    """Refuse learners that data of pushes, or of poses, cannot train. `where` names the data in the sentence.
 
     Raises
     ------
@@ -103,9 +103,9 @@ def train(
 ) -> Trained:
     """Fit `learners`, by default all that the data can train: first to be scored, then to be used.
 
-    Scored is what was taught outside discs of the cortex, on the loads inside them. What is returned was taught all
-    those loads, and its bounds were calibrated on others, which no fit has seen. Another `split`, with a row for each
-    load that converged, calibrates nothing and returns what was taught by it.
+    Scored models are trained outside discs of the cortex, and scored inside. Those returned are trained on all
+    those loads; their bounds are calibrated on others, which no fit has seen. Another `split`, with a row for each
+    load that converged, calibrates nothing and returns what was trained on it.
 
     Every model knows the tumour and the open cortex; the cortex is not scored, and the compliance table's where the
     learner is not one of `EXPANDED`. Cases that did not converge are left aside.
@@ -115,7 +115,7 @@ def train(
     progress
         Hears the name of each learner that is done.
     most
-        Loads that are taught, at most; those that calibrate or test are not counted.
+        Training loads, at most; those that calibrate or test are not counted.
     expansion
         The series of these data, by default made anew wherever there is a device: minutes on a CPU, so that whoever
         trains on them again hands it on.
@@ -123,14 +123,14 @@ def train(
     Raises
     ------
     InputError
-        Unknown learners, or such as loads of the data's kind do not teach, nothing to teach, data with other causes
+        Unknown learners, or such as loads of the data's kind do not train, nothing to train on, data with other causes
         than `Pushed` or the `Touching` of a ball, an anatomy without tumour, too few loads, or unit responses that did
         not converge.
     """
     wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
     check_learners(wanted, of_poses=data.ball is not None, where=str(data.path))
     if most is not None and most < 1:
-        raise InputError(f"{most} loads teach nothing: give at least 1.")
+        raise InputError(f"{most} loads train nothing: give at least 1.")
     if not data.unit_good.all():
         raise InputError(
             f"{data.path}: {int((~data.unit_good).sum())} unit responses did not converge, so there is no compliance "
@@ -151,7 +151,7 @@ def train(
         cortex = data.displacement(shared.cortex)[data.good]
         at = np.concatenate([nodes, shared.cortex])
         both = np.concatenate([truth, cortex], axis=1)
-        told = measured_distances(tip_gauge(data.anatomy), loads, both, at, data.ball)
+        distances = measured_distances(tip_gauge(data.anatomy), loads, both, at, data.ball)
 
     def lesson(rows: np.ndarray) -> Lesson:
         return Lesson(_rows(pushed, rows), truth[rows], cortex[rows])
@@ -180,7 +180,7 @@ def train(
             solves = rooms[0].told(name, lessons[0])
             scores.append(score(name, model, test, truth[split.test], nodes, solves))
             held_out = errors(model, test, truth[split.test], nodes).max(axis=1)
-            model, off = corrected_if_better(model, patch, told.rows(chosen[0]), told.rows(split.test))
+            model, off = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
         features = _features(patch, tested, envelopes[0])
         seen, seen_distance = (features, held_out), (features, off)
         models[name] = replace(model, bound=min(conformal(held_out, LEVELS[0]), float(held_out.max())))
@@ -188,23 +188,23 @@ def train(
             with stage("calibrate"):
                 known = fresh.rows(beside), truth[apart][beside]
                 left_out[name] = coverage(_bounded(model, patch, *known, nodes), test, truth[split.test])
-                bounded = _distance_bounded(model, patch, told.rows(apart).rows(beside))
-                distance_left_out[name] = distance_coverage(bounded, test, told.distance[split.test])
+                bounded = _distance_bounded(model, patch, distances.rows(apart).rows(beside))
+                distance_left_out[name] = distance_coverage(bounded, test, distances.distance[split.test])
         if apart.any():
             with stage(f"learn {name}"):
                 parts = parts_of(name, rooms[1], lessons[1])
                 models[name] = replace(models[name], parts=parts, envelope=envelopes[1])
                 if model.tip is not None and model.tip.correction is not None:
-                    models[name] = with_correction(models[name], patch, told.rows(chosen[1]))
+                    models[name] = with_correction(models[name], patch, distances.rows(chosen[1]))
         if apart.sum() >= ENOUGH_APART:
             with stage("calibrate"):
                 models[name] = _bounded(models[name], patch, fresh, truth[apart], nodes)
-                models[name] = _distance_bounded(models[name], patch, told.rows(apart))
+                models[name] = _distance_bounded(models[name], patch, distances.rows(apart))
         elif apart.sum() >= FEWEST_APART:
             with stage("calibrate"):
                 models[name] = _calibrated(models[name], patch, seen, fresh, truth[apart], nodes)
                 features = _features(patch, left, models[name].envelope)
-                models[name] = calibrated_distance(models[name], seen_distance, features, told.rows(apart))
+                models[name] = calibrated_distance(models[name], seen_distance, features, distances.rows(apart))
         progress(name)
     motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
     return Trained(
@@ -220,7 +220,7 @@ def train(
 
 
 def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> Learned:
-    """With bounds that nothing but these loads tell: some tell the scale, the others how much of it."""
+    """With bounds from these loads alone: some fit the scale, the others the quantiles."""
     scale, share = _scale_and_share(len(loads))
     known = loads.rows(scale)
     error = errors(model, known, truth[scale], nodes).max(axis=1)
@@ -236,9 +236,9 @@ def _distance_bounded(model: Learned, patch: Patch, known: Measured) -> Learned:
 
 
 def _scale_and_share(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which of `count` loads tell the bounds' scale, one in `SCALE`, and which how much of it."""
-    tells = np.arange(count) % SCALE == 0
-    return np.flatnonzero(tells), np.flatnonzero(~tells)
+    """Which of `count` loads fit the bounds' scale, one in `SCALE`, and which its quantiles."""
+    fits = np.arange(count) % SCALE == 0
+    return np.flatnonzero(fits), np.flatnonzero(~fits)
 
 
 def _calibrated(
@@ -257,7 +257,7 @@ def _calibrated(
 
 
 def _features(patch: Patch, pushed: Pushed, envelope: Envelope) -> np.ndarray:
-    """What a model's bounds are told of loads (B, 7), as `Learned.deform` tells them."""
+    """The features (B, 7) of a model's bounds, as in `Learned.deform`."""
     known = measured(patch, pushed)
     return features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *envelope.force)))
 

@@ -1,4 +1,4 @@
-"""Choosing a learner's settings inside the loads that it is taught: no other load has a say."""
+"""Choosing a learner's settings inside its training loads: no other load has an influence."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FEWEST, MOST, STRONGEST = 40, 600, 8
 
 @dataclass(frozen=True)
 class Tuned:
-    """Settings of a regressor, of which those are taken that are nearest on discs left out of the rows taught.
+    """Settings of a regressor, of which those are taken that are nearest on discs left out of the training rows.
 
     One fit for each of the settings, to the strongest outputs of four fifths of the first rows, then one to all rows.
 
@@ -32,7 +32,7 @@ class Tuned:
     settings: tuple[Callable[[], Teachable], ...]
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
-        """The best of the regressors, taught rows X (n, f) of `tool_features`, Y (n, r)."""
+        """The best of the regressors, trained on rows X (n, f) of `tool_features`, Y (n, r)."""
         return self.settings[self.best(X, Y)]().fit(X, Y)
 
     def best(self, X: np.ndarray, Y: np.ndarray) -> int:
