@@ -126,6 +126,12 @@ def test_runtime_answers_as_the_model(models, block, loads, name, cortex):
         assert_alike(alone, wanted.rows(np.array([row])))
 
 
+def test_a_graph_is_the_formula_that_numpy_runs(models, block, loads, monkeypatch):
+    monkeypatch.setattr("surrogate.regressors.gp.matern", lambda distance: np.exp(-distance))
+    answer, heard = asked(opened(onnx_model("gp", models["gp"])), loads, open_patch(block))
+    assert_alike(answer, models["gp"].deform(heard, at=block.tumour_nodes))
+
+
 def test_a_curved_cortex_and_the_model_that_ships():
     anatomy = read_anatomy(template_path())
     for name, model in load(template_path().with_suffix(".model.npz"), anatomy).items():

@@ -21,7 +21,7 @@ from surrogate.data.simulate import simulate
 from surrogate.model.store import load, save
 from surrogate.regressors.force_series import ORDERS, SPANS, Series, forms
 from surrogate.regressors.left_out_tables import filled
-from surrogate.training.shared_inputs import COARSE, EXPANDED, FINE, Expansion, Lesson
+from surrogate.training.shared_inputs import COARSE, EXPANDED, FINE, Examples, Expansion
 from surrogate.training.tabulate_series import radii_between, tabulated, with_middles
 from surrogate.training.train import learners_for, train
 
@@ -136,12 +136,12 @@ def trained(data):
     return train(data, ["linear", *EXPANDED], expansion=Expansion(data, "cpu"))
 
 
-def test_the_basis_of_a_lesson_lies_in_that_of_the_table(data, box, patch):
+def test_the_basis_of_examples_lies_in_that_of_the_table(data, box, patch):
     expansion, pushed = Expansion(data, "cpu"), data.loads.of(Pushed)
     some = np.flatnonzero(data.good)[:90]
     loads = Pushed(pushed.point[some], pushed.force[some], pushed.footprint[some])
     nodes = (expansion.tumour, expansion.cortex)
-    bases = expansion.bases(Lesson(loads, *(data.displacement(at)[some] for at in nodes)), FINE, COARSE)
+    bases = expansion.bases(Examples(loads, *(data.displacement(at)[some] for at in nodes)), FINE, COARSE)
     fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     places = np.array([0, 17, 60, 120, 198])
     point = np.repeat(with_middles(patch)[1][places], 3, axis=0)

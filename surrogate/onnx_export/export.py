@@ -63,7 +63,7 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     sheet, patch, envelope = Sheet(), open_patch(model.anatomy), model.envelope
     nodes = model.nodes if cortex else model.anatomy.tumour_nodes
     for part in model.parts:
-        if np.isin(part.basis.nodes, nodes).any() and not isinstance(part.regressor, TRACEABLE):
+        if np.isin(part.basis.nodes, nodes).any() and type(part.regressor) not in TRACEABLE:
             kind = type(part.regressor).__name__
             raise InputError(f"{name} has a part of the kind {kind}, which has no ONNX graph: export another learner.")
     # Any two loads of the training range show the formulas which kinds and shapes their arrays have.

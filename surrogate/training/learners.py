@@ -21,7 +21,7 @@ from ..regressors.protocol import Fitted, Teachable
 from ..regressors.series_residual import Remainder
 from ..regressors.svr import Svr
 from .condense_contact import side_by_side
-from .shared_inputs import COARSE, EXPANDED, TOUCHED, Classroom, Expansion, Lesson
+from .shared_inputs import COARSE, EXPANDED, TOUCHED, Examples, Expansion, SharedInputs
 from .tuning import Tuned
 
 # Settings to choose from, the usual ones first: units in a layer and weight decay; C and epsilon in quartile ranges.
@@ -39,33 +39,38 @@ LEARNT: dict[str, tuple[str, Callable[[], Teachable]]] = {
 POSED = ("gp", "ann", "svr")
 
 
-def parts_of(name: str, room: Classroom, lesson: Lesson) -> tuple[Part, ...]:
-    """The summands of one learner, trained on a lesson: for the tumour, and for the cortex beside it."""
-    known = room.expansion
+def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part, ...]:
+    """The summands of one learner, trained on examples: for the tumour, and for the cortex beside it."""
+    known = inputs.expansion
     if name in EXPANDED:
-        tumour, more = room.series
+        tumour, more = inputs.series
         cortex = () if more is None else (*known.cortex_table, more)
         if name == "series":
             return (tumour, *cortex)
-        learnt = _trained(("tool", Remainder), (tumour,), tumour.basis, known.patch, lesson.loads, lesson.tumour)
+        learnt = _trained(("tool", Remainder), (tumour,), tumour.basis, known.patch, examples.loads, examples.tumour)
         if more is None:
             return (tumour, learnt)
-        left = _trained(("tool", Remainder), cortex, more.basis, known.patch, lesson.loads, lesson.cortex)
+        left = _trained(("tool", Remainder), cortex, more.basis, known.patch, examples.loads, examples.cortex)
         return (tumour, learnt, *cortex, left)
     if name == "linear":
-        return (room.table, *known.cortex_table)
+        return (inputs.table, *known.cortex_table)
     if name in TOUCHED:
-        contact, left = _touched(known, lesson)
+        contact, left = _touched(known, examples)
         if name == "contact":
             return (contact,)
-        return (contact, *(_trained(LEARNT["gp"], (), nodes, known.patch, lesson.loads, rest) for nodes, rest in left))
-    if known.data.ball is not None:
-        both = ((known.tumour, lesson.tumour), (known.cortex, lesson.cortex))
-        return tuple(
-            _trained(_learnt(name), (), nodes, known.patch, lesson.loads, truth) for nodes, truth in both if len(nodes)
+        return (
+            contact,
+            *(_trained(LEARNT["gp"], (), nodes, known.patch, examples.loads, rest) for nodes, rest in left),
         )
-    before = (room.table,) if name == "residual" else ()
-    learnt = _trained(_learnt(name), before, known.tumour, known.patch, lesson.loads, lesson.tumour)
+    if known.data.ball is not None:
+        both = ((known.tumour, examples.tumour), (known.cortex, examples.cortex))
+        return tuple(
+            _trained(_learnt(name), (), nodes, known.patch, examples.loads, truth)
+            for nodes, truth in both
+            if len(nodes)
+        )
+    before = (inputs.table,) if name == "residual" else ()
+    learnt = _trained(_learnt(name), before, known.tumour, known.patch, examples.loads, examples.tumour)
     return (*before, learnt, *known.cortex_table)
 
 
@@ -78,11 +83,11 @@ def _learnt(name: str) -> tuple[str, Callable[[], Teachable]]:
     return own.encoder, own.regressor
 
 
-def _touched(known: Expansion, lesson: Lesson) -> tuple[Part, list[tuple[np.ndarray, np.ndarray]]]:
-    """The ball on tissue that stiffens as a lesson has it, and what that leaves of it: vertices, and (B, n, 3) [m]."""
+def _touched(known: Expansion, examples: Examples) -> tuple[Part, list[tuple[np.ndarray, np.ndarray]]]:
+    """The ball on tissue that stiffens as examples have it, and what that leaves of it: vertices, and (B, n, 3) [m]."""
     contact, bases, _ = known.contact
-    features, size = tool_features(known.patch, lesson.loads), directions(lesson.loads)[0][:, None, None]
-    truth = [lesson.tumour, lesson.cortex][: len(bases)]
+    features, size = tool_features(known.patch, examples.loads), directions(examples.loads)[0][:, None, None]
+    truth = [examples.tumour, examples.cortex][: len(bases)]
     coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
     alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
     part = Part("tool", contact.fitted(features, coefficients, alike), side_by_side(bases))

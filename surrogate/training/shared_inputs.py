@@ -49,7 +49,7 @@ STRIP = 1536
 
 
 @dataclass(frozen=True, eq=False)
-class Lesson:
+class Examples:
     """Loads and what they did to the tumour and to the rest of the open cortex.
 
     Parameters
@@ -119,21 +119,21 @@ class Expansion:
         """The cortex's compliance, if there is more than the tumour."""
         return (self.compliance(self.cortex),) if len(self.cortex) else ()
 
-    def bases(self, lesson: Lesson, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
-        """What a lesson's loads do to the tumour, and to the cortex, if there is more, beyond its compliance.
+    def bases(self, examples: Examples, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
+        """What a set of examples does to the tumour, and to the cortex, if there is more, beyond its compliance.
 
         `tumour` and `cortex` are what may be left of it, as a share, and the most modes.
         """
-        size = directions(lesson.loads)[0][:, None, None]
-        at_tumour = reduce(self.tumour, lesson.tumour / size, *tumour)
+        size = directions(examples.loads)[0][:, None, None]
+        at_tumour = reduce(self.tumour, examples.tumour / size, *tumour)
         if not len(self.cortex):
             return [at_tumour]
         # A dent as small as its tool is no sum of a few modes, but what nonlinearity adds to it is.
-        linear = sum(part.response(ENCODERS[part.encoder](self.patch, lesson.loads)) for part in self.cortex_table)
-        return [at_tumour, reduce(self.cortex, lesson.cortex / size - linear, *cortex)]
+        linear = sum(part.response(ENCODERS[part.encoder](self.patch, examples.loads)) for part in self.cortex_table)
+        return [at_tumour, reduce(self.cortex, examples.cortex / size - linear, *cortex)]
 
     def on(self, bases: list[Basis], left_out: np.ndarray) -> list[Series]:
-        """The series as coefficients of the `bases` of a lesson, without some places (P,) bool.
+        """The series as coefficients of the `bases` of examples, without some places (P,) bool.
 
         Raises
         ------
@@ -271,7 +271,7 @@ class Tabulated:
 
 
 @dataclass(frozen=True, eq=False)
-class Classroom:
+class SharedInputs:
     """What every learner of a data set is given, made when it is asked for.
 
     Finite-element answers of the tumour under forces inside the discs left out are not among it. Answers of the cortex
@@ -280,14 +280,14 @@ class Classroom:
     Parameters
     ----------
     basis_from
-        The lesson whose responses the series' bases span.
+        The examples whose responses the series' bases span.
     expansion
         Of the same data.
     split
         What was left out, if anything.
     """
 
-    basis_from: Lesson
+    basis_from: Examples
     expansion: Expansion
     split: Split | None = None
 
@@ -305,9 +305,9 @@ class Classroom:
         left_out = self._left_out(self.expansion.patch.points)
         return self.expansion.compliance(self.expansion.tumour, left_out) if left_out.any() else self.expansion.table
 
-    def told(self, name: str, lesson: Lesson) -> Told:
+    def solve_counts(self, name: str, examples: Examples) -> Told:
         """The solves that a learner of `LEARNERS` or `OF_POSES` is given, a user's own too."""
-        known, data, loads = self.expansion, self.expansion.data, len(lesson.loads.point)
+        known, data, loads = self.expansion, self.expansion.data, len(examples.loads.point)
         units = series = inside = 0
         seconds = [data.seconds("load", loads)]
         if data.ball is None and (len(known.cortex) or name in ("linear", "residual")):

@@ -24,7 +24,7 @@ from ..model.learned import Learned, only_pushed
 from ..model.own_learners import OWN, find_own
 from ..model.training_range import Envelope, envelope_of, measured
 from .learners import LEARNT, POSED, parts_of
-from .shared_inputs import EXPANDED, TOUCHED, Classroom, Expansion, Lesson
+from .shared_inputs import EXPANDED, TOUCHED, Examples, Expansion, SharedInputs
 from .tip_distance import (
     Measured,
     calibrated_distance,
@@ -153,31 +153,31 @@ def train(
         both = np.concatenate([truth, cortex], axis=1)
         distances = measured_distances(tip_gauge(data.anatomy), loads, both, at, data.ball)
 
-    def lesson(rows: np.ndarray) -> Lesson:
-        return Lesson(_rows(pushed, rows), truth[rows], cortex[rows])
+    def examples(rows: np.ndarray) -> Examples:
+        return Examples(_rows(pushed, rows), truth[rows], cortex[rows])
 
     chosen = [_first(split.taught, most), *([_first(~apart, most)] if apart.any() else [])]
-    lessons = [lesson(rows) for rows in chosen]
-    rooms = [Classroom(each, shared, left) for each, left in zip(lessons, (split, None), strict=False)]
+    example_sets = [examples(rows) for rows in chosen]
+    inputs = [SharedInputs(each, shared, left) for each, left in zip(example_sets, (split, None), strict=False)]
     test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
     tested, left = (_rows(pushed, rows) for rows in (split.test, apart))
     beside = np.zeros(0, int)
-    envelopes = [envelope_of(patch, lessons[0].loads)]
+    envelopes = [envelope_of(patch, example_sets[0].loads)]
     if apart.any():
         beside = np.flatnonzero(~split.covers(left.point))
-        envelopes.append(envelope_of(patch, lessons[1].loads))
+        envelopes.append(envelope_of(patch, example_sets[1].loads))
     models, scores, left_out, distance_left_out = {}, [], {}, {}
     for name in wanted:
         with stage(f"learn {name}"):
             model = Learned(
                 data.anatomy,
-                parts_of(name, rooms[0], lessons[0]),
+                parts_of(name, inputs[0], example_sets[0]),
                 envelopes[0],
                 training={"learner": name, **data.provenance},
                 ball=data.ball,
             )
         with stage("score"):
-            solves = rooms[0].told(name, lessons[0])
+            solves = inputs[0].solve_counts(name, example_sets[0])
             scores.append(score(name, model, test, truth[split.test], nodes, solves))
             held_out = errors(model, test, truth[split.test], nodes).max(axis=1)
             model, off = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
@@ -192,7 +192,7 @@ def train(
                 distance_left_out[name] = distance_coverage(bounded, test, distances.distance[split.test])
         if apart.any():
             with stage(f"learn {name}"):
-                parts = parts_of(name, rooms[1], lessons[1])
+                parts = parts_of(name, inputs[1], example_sets[1])
                 models[name] = replace(models[name], parts=parts, envelope=envelopes[1])
                 if model.tip is not None and model.tip.correction is not None:
                     models[name] = with_correction(models[name], patch, distances.rows(chosen[1]))
@@ -213,7 +213,7 @@ def train(
         split,
         motion,
         int(apart.sum()),
-        len(lessons[-1].loads.point),
+        len(example_sets[-1].loads.point),
         left_out,
         distance_left_out,
     )
