@@ -239,5 +239,5 @@ def test_stored_series_answer_alike(trained, data, box, tmp_path):
 def test_series_need_a_tissue(data):
     untold = replace(data, provenance={})
     assert not set(EXPANDED) & set(learners_for(untold)) and set(EXPANDED) < set(learners_for(data))
-    with pytest.raises(InputError, match="what tissue"):
+    with pytest.raises(InputError, match="does not state its tissue"):
         train(untold, ["series"])
