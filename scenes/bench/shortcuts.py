@@ -90,19 +90,20 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
     for element in ("smoothed", "p1"):
         name = f"{some} palpation loads together, {element}"
         yield Work("nonlinear elimination near the opening", name, Step.NEAR, batches, pushed, element=element)
-    name = "a palpation load from rest, live"
-    yield Work("nonlinear elimination of a patch", name, Step.PATCH, single, pushed, live=True)
     name = "a palpation load from rest, quadratic"
     yield Work("nonlinear elimination, clamped", name, Step.CLAMPED, single, pushed, element="p2")
     yield Work("L-BFGS before Newton", "a palpation load from rest", Step.LBFGS, single, pushed)
     for scene, step, shortcut in (
+        ("press", Step.PATCH, "nonlinear elimination of a patch"),
         ("palpate", Step.CONTACT, "contact solved apart"),
         ("press", None, "curvature of the last frame"),
         ("press", Step.FRAME, "frame as one captured graph"),
     ):
         played = find_scene(scene)
-        effects, times = played.effects_on(anatomy), played.times[: runs + 1].tolist()
-        frames = [played.loads(site, played.path(time), time) for time in times]
+        effects, first = played.effects_on(anatomy), len(played.times) // 3  # the tool has arrived
+        frames = [
+            played.loads(site, played.path(time), time) for time in played.times[first : first + runs + 1].tolist()
+        ]
         yield Work(shortcut, f"frames of `{scene}`", step, frames, effects, LIVE, live=True, follows=True)
 
 
