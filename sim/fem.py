@@ -71,7 +71,8 @@ class Fem:
     element
         One of `space.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
     live
-        Loads will be asked for one at a time: on the CPU it takes a second more to set up, and each load half as long.
+        Loads will be asked for one at a time. With linear tetrahedra on the CPU it takes a second more to set up, and
+        each load two thirds as long.
     avoid
         Solvers that are not tried, as where one is measured or doubted. Newton-CG always is.
 

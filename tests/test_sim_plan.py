@@ -39,6 +39,7 @@ def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accura
         ({}, LAST, LAST, (Step.NEAR, *LAST)),
         ({"element": "smoothed"}, LAST, LAST, (Step.NEAR, *LAST)),
         ({"live": True}, (Step.PATCH, *LAST), LAST, (Step.NEAR, *LAST)),
+        ({"element": "smoothed", "live": True}, LAST, LAST, (Step.NEAR, *LAST)),
         ({"element": "p2"}, (Step.CLAMPED, *LAST), LAST, LAST),
         ({"element": "p2", "live": True}, (Step.CLAMPED, *LAST), LAST, LAST),
         ({**WIDE, "live": True}, LAST, LAST, LAST),

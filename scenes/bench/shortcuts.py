@@ -99,12 +99,14 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
         ("press", None, "curvature of the last frame"),
         ("press", Step.FRAME, "frame as one captured graph"),
     ):
+        element = "p1" if step is Step.PATCH else None
         played = find_scene(scene)
         effects, first = played.effects_on(anatomy), len(played.times) // 3  # the tool has arrived
         frames = [
             played.loads(site, played.path(time), time) for time in played.times[first : first + runs + 1].tolist()
         ]
-        yield Work(shortcut, f"frames of `{scene}`", step, frames, effects, LIVE, live=True, follows=True)
+        name = f"frames of `{scene}`, {element or 'smoothed'}"
+        yield Work(shortcut, name, step, frames, effects, LIVE, element, live=True, follows=True)
 
 
 def tried(fem: Fem, step: Step | None) -> bool:

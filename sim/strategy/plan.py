@@ -136,8 +136,8 @@ def plan_for(
     if elastic and not cuda:
         if space.element == "p2" and isinstance(preconditioner, TwoLevel):
             single = Step.CLAMPED
-        elif live and small and isinstance(preconditioner, Factor):
-            single = Step.PATCH
+        elif live and small and space.element == "p1" and isinstance(preconditioner, Factor):
+            single = Step.PATCH  # of smoothed elements a patch takes longer to solve than it spares the whole
     contact = None
     if problem.barriers:
         # The model of contact knows one barrier, and needs a preconditioner that is alike at every state.
