@@ -28,7 +28,7 @@ def scene():
 class Silent:
     """A referee that has nothing to say, and no finite elements to prepare."""
 
-    truth, failure = None, None
+    truth, failure, plan = None, None, ()
 
     def __init__(self, theatre, scene):
         pass

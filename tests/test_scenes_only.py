@@ -36,7 +36,7 @@ def cost(modules: str = "", kernels: str = "", classes: str = "") -> Cost:
 TOOLS = cost(
     "contact.barrier contact.reduced contact.tool_contact contact.tool_kernels contact.tool_path",
     "contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction",
-    "Contact Reduced",
+    "Contact Reduced Touch",
 )
 # A new effect adds one line.
 OF_EFFECT = {
@@ -60,7 +60,7 @@ OF_EFFECT = {
     "SkullContact": cost(
         "contact.barrier contact.skull_contact contact.skull_surface",
         "contact.skull_contact:add_gradient",
-        "Bone Skull",
+        "Bone BoneSettings Skull SkullBarrier",
     ),
 }
 OF_LAW = {
