@@ -86,8 +86,8 @@ def compile_problem(
     Raises
     ------
     InputError
-        Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not held;
-        an effect of the caller's own that makes no term, or one of a name that is taken.
+        Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not held. An
+        effect of the caller's own that makes no term, or one of a name that is taken.
     """
     effects = tuple(effects)
     for effect in effects:

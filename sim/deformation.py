@@ -88,11 +88,11 @@ class Deformation:
         (B,): the volume that passes out through the closed skull, as a share of what the opening takes in and gives
         out. NaN from a deformer that does not know, as a live frame on a card or a trained model.
     bond
-        (B,): the largest traction of a `Bonded` skull, as a share of what the bond bears: above 1 it would tear, and
-        the answer is no longer one of its law. NaN where nothing is bonded, or from a deformer as above.
+        (B,): the largest traction of a `Bonded` skull, as a share of what the bond bears. Above 1 the bond would tear,
+        and the answer is no longer one of its law. NaN where nothing is bonded, or from a deformer as above.
     bound
-        (2, B) [m]: with probability 0.95, and 0.99, no tumour vertex is farther off what the deformer was taught; NaN
-        from one that promises nothing.
+        (2, B) [m]: with probability 0.95, and 0.99, no tumour vertex is farther off what the deformer was trained on;
+        NaN from one that promises nothing.
     source
         Who answered, in words: finite elements of which kind and tissue, or what learned from them.
     """

@@ -75,14 +75,14 @@ class NodalForce:
 class Gravity:
     """Tissue weighs less under the cerebrospinal fluid than above it; `Posture` loads say how the head lies now.
 
-    The scan shows a body in equilibrium with its weight then, so that only the change since acts: the weight as a
-    `Posture` has it less the weight in the scan, as dead forces in the rest configuration. Tissue above the level
-    weighs density x g, under it (density - csf_density) x g: Archimedes' body force, which is the fluid's pressure on
-    the tissue but for how much that squeezes it.
+    The scan shows a body in equilibrium with its weight then, so that only the change since acts. What acts is the
+    weight as a `Posture` has it less the weight in the scan, as dead forces in the rest configuration. Tissue above the
+    level weighs density x g, under it (density - csf_density) x g. The latter is Archimedes' body force, which is the
+    fluid's pressure on the tissue but for how much that squeezes it.
 
-    Left out: tissue that moves through the level, densities of tumour and oedema, fluid that does not surround the
-    tissue (ventricles, cysts), tissue that loses water or is cut out, and the gap that opens where the brain sinks away
-    from the skull: with `Bonded` and `Slide` it stays on it.
+    Left out are tissue that moves through the level, densities of tumour and oedema, and fluid that does not surround
+    the tissue (ventricles, cysts). So is tissue that loses water or is cut out. So is the gap that opens where the
+    brain sinks away from the skull: with `Bonded` and `Slide` it stays on it.
 
     Parameters
     ----------
@@ -120,9 +120,9 @@ class Gravity:
 class Inertia:
     """Tissue keeps its velocity: answers follow one another in time, one step of backward Euler each.
 
-    The step is the time of the loads less the time of the start, at which the nodes stood where the start has them,
-    with the velocities of its memory; at rest without one. Where no time passes the body and the tools that touch
-    it stay as they are, whatever acts. Backward Euler is of first order in the step and damps what swings faster than
+    The step is the time of the loads less the time of the start. At that time the nodes stood where the start has them,
+    with the velocities of its memory; at rest without one. Where no time passes the body and the tools that touch it
+    stay as they are, whatever acts. Backward Euler is of first order in the step and damps what swings faster than
     that: energy does not grow, and one long step is statics.
 
     Parameters
@@ -228,7 +228,7 @@ class Pulsation:
 
     By the same share at every point, without delay; where the skull is open it bulges. As it was in the scan at t = 0.
     With the default amplitudes and tissue the template's cortex in an opening of 50 mm moves by up to half a millimetre
-    from peak to peak, as is observed; that is half a millilitre of blood each. The more tissue gives in volume the less
+    from peak to peak, as is observed. That is half a millilitre of blood each. The more tissue gives in volume the less
     it bulges.
 
     Parameters

@@ -150,8 +150,8 @@ class Fem:
         Raises
         ------
         InputError
-            Loads that no effect answers, or that do not touch the body; a start that does not fit; memory that would
-            not; a vertex that the mesh does not have.
+            Loads that no effect answers, or that do not touch the body; a start that does not fit. Memory that does not
+            fit; a vertex that the mesh does not have.
         """
         check_causes(self.effects, loads)
         at = None if at is None else self._vertices(at)
@@ -230,8 +230,8 @@ class Fem:
     ) -> tuple[Deformation, np.ndarray, np.ndarray]:
         """One step towards equilibrium from somebody's answers at every vertex, as `newton_correction.step_from`.
 
-        The answers after it, at every vertex; the relative residual (B,) before it; and what is still missing
-        (B, n, 3) [m] at vertices `at` (n,), as the rest stiffness has it.
+        The answers after it, at every vertex, and the relative residual (B,) before it. The third is what is still
+        missing (B, n, 3) [m] at vertices `at` (n,), as the rest stiffness has it.
 
         Raises
         ------
@@ -282,8 +282,8 @@ class Fem:
         Raises
         ------
         InputError
-            As `deform`; loads that prescribe motion, which no force is in proportion to, or do not come in such groups;
-            a solver in float32, whose round-off would be taken for the higher orders.
+            As `deform`; loads that prescribe motion, which no force is in proportion to, or do not come in such groups.
+            A solver in float32, whose round-off would be taken for the higher orders.
         """
         check_causes(self.effects, loads)
         if not self.problem.plain:

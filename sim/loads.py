@@ -55,9 +55,9 @@ class Prescribed:
 class Posture:
     """How the head lies and how high its fluid stands now; the effect `Gravity` knows how they were in the scan.
 
-    direction (B, 3), which way gravity pulls in the mesh's frame, of any length but none; csf_level (B,) [m] above the
-    origin, against the direction; share (B,) of the change of weight since the scan that acts. In the scan's own
-    posture no force acts, and half a load is half of the change, which no posture between the two would be.
+    direction (B, 3) is which way gravity pulls in the mesh's frame, of any length but none. csf_level (B,) [m] is above
+    the origin, against the direction. share (B,) is that of the change of weight since the scan that acts. In the
+    scan's own posture no force acts, and half a load is half of the change, which no posture between the two would be.
     """
 
     direction: np.ndarray
@@ -138,7 +138,7 @@ class Loads:
     Raises
     ------
     InputError
-        Neither cause nor time, a kind but `Pushed` twice, what is no cause, rows that do not agree; what are no real,
+        Neither cause nor time, a kind but `Pushed` twice, what is no cause, rows that do not agree. What are no real,
         finite numbers of the shapes that the causes name; radii of footprints outside 0.1 to 100 mm.
     """
 

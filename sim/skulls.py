@@ -10,7 +10,7 @@ from .errors import InputError
 class Bonded:
     """The meninges bind the brain to the skull: nodes with a normal in `Anatomy.slide_normal` do not move.
 
-    The limit of an elastic layer. In the default brain one with 0.1 kPa of shear per mm moves the tumour 2 % more; what
+    The limit of an elastic layer. In the default brain one with 0.1 kPa of shear per mm moves the tumour 2 % more. What
     was measured is stiffer (11 MPa per mm under compression: Mazumder et al. 2013, Acta Bioeng. Biomech. 15(2):3-11).
     It holds as long as the traction stays below the bond's strength: `Deformation.bond` tells how near it comes.
     `Slide` and `SkullContact`, without friction, are its brackets.
@@ -49,8 +49,8 @@ class Slide:
 class SkullContact:
     """The skull holds the brain on its side without friction, and lets go of it: where `Slide` would keep it on.
 
-    Nodes with a normal in `Anatomy.slide_normal` stay on their side of a wall across it that bends as the normals round
-    them do, `gap` [m] above where they are at rest; they feel it in the last tenth of a millimetre. Nodes of the
+    Nodes with a normal in `Anatomy.slide_normal` stay on their side of a wall across it, `gap` [m] above where they are
+    at rest. The wall bends as the normals round them do; they feel it in the last tenth of a millimetre. Nodes of the
     craniotomy rise in it freely, but meet bone beyond its edge, which is as round as the mesh is coarse there. The body
     needs what `Held` holds: bone alone only bars its way.
 

@@ -71,7 +71,7 @@ JOBS = {
 }
 """Libraries with several jobs: these files, at least, must import them."""
 PAGES = sorted(name.relative_to(HOUSE).as_posix() for name in (*HOUSE.glob("*.md"), *HOUSE.glob("docs/*.md")))
-PLAIN = ("ar", "scenes")
+PLAIN = ("ar", "scenes", "sim", "surrogate")
 """Packages whose docstrings and messages are held to plain English."""
 OURS = re.compile(r"\b(?:(?:un)?taught|teach(?:es|ing)?|told|vicinit(?:y|ies)|lanes?|rungs?)\b", re.IGNORECASE)
 """Words of our own, for which the field has others: trained, given or stated, local problem, columns, steps."""

@@ -72,7 +72,7 @@ def test_training_prints_every_figure_and_writes_every_model(folder, box, capsys
     assert main(["train", str(folder / "data.h5"), "--out", str(folder / "table.npz"), "--learners", "linear"]) == 0
     printed = capsys.readouterr().out
     assert "wins" not in printed and "linear: " in printed and "10 % of the nominal loads of palpation" in printed
-    assert "worst vertex of a load" in printed and "model in NumPy" in printed
+    assert "a load's worst vertex" in printed and "NumPy model" in printed
 
 
 def test_the_same_command_again_solves_nothing(folder, capsys):

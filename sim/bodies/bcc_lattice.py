@@ -1,8 +1,9 @@
 """A graded body-centred cubic lattice of tetrahedra: what `isosurface_stuffing` carves bodies from.
 
 A 2:1 balanced octree, filled with tetrahedra as in Labelle & Shewchuk 2007, "Isosurface Stuffing: Fast Tetrahedral
-Meshes with Good Dihedral Angles", section 3: between cells of one size the BCC tetrahedra (dihedral angles 60 and 90
-degrees), between cells of two sizes pyramids split along the diagonal through the larger face's middle (at least 45).
+Meshes with Good Dihedral Angles", section 3. Between cells of one size lie the BCC tetrahedra (dihedral angles 60 and
+90 degrees). Between cells of two sizes lie pyramids, split along the diagonal through the larger face's middle (at
+least 45).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Lattice:
     """Tetrahedra that fill a box.
 
     nodes (V, 3) [m]; tets (T, 4), positively oriented; centre (V,) bool: the node is the middle of a cell, not a
-    corner (an edge that joins the two kinds is a short one, any other a long one).
+    corner. An edge that joins the two kinds is a short one, any other a long one.
     """
 
     nodes: np.ndarray

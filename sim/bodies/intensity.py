@@ -15,7 +15,7 @@ from .nifti import read_volume
 
 HEADER = 348  # bytes of NIfTI
 SIGNED = b"sulcus: intensities beside a mesh"
-"""By which what was written here is told from a user's own scan."""
+"""By which what was written here is distinguished from a user's own scan."""
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ def largest_piece(tets: np.ndarray) -> np.ndarray:
 def clean(tets: np.ndarray) -> np.ndarray:
     """Which tetrahedra (T,) to keep so that they are one piece whose surface is a 2-manifold.
 
-    Where the surface touches itself, at an edge with more than two triangles or a node with more than one fan of
-    them, the tetrahedra behind the triangles are taken away, but for those behind the node's largest fan.
+    The surface touches itself at an edge with more than two triangles, or at a node with more than one fan of them. The
+    tetrahedra behind these triangles are taken away, but for those behind the node's largest fan.
     """
     keep = np.ones(len(tets), bool)
     while True:

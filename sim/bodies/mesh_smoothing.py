@@ -71,9 +71,9 @@ def fitted(
 ) -> np.ndarray:
     """Nodes (V, 3) [m], of which those `movable` (V,) moved so that the closed surface of triangles (S, 3) fits best.
 
-    With its nodes on a curved surface a triangle lies on the hollow side. Each node moves by the mean deviation of
-    its triangles: a deviation that vanishes at the corners of a triangle and is quadratic between them has 3/4 of
-    its middle's value as mean. A `volume` [m^3] to be enclosed shifts all of them alike by what is then missing.
+    With its nodes on a curved surface a triangle lies on the hollow side. Each node moves by the mean deviation of its
+    triangles. A deviation that vanishes at the corners of a triangle and is quadratic between them has 3/4 of its
+    middle's value as mean. A `volume` [m^3] to be enclosed shifts all of them alike by what is then missing.
     """
     on = np.unique(triangles)
     on = on[movable[on]]
@@ -113,8 +113,8 @@ def _middles_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tuple[np.nda
 def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection, settings: Smoothing = Smoothing()) -> np.ndarray:
     """Nodes (V, 3) [m] moved until every dihedral angle is good, or no bad one can be raised further.
 
-    Each round a set of nodes of bad tetrahedra, no two in one tetrahedron, tries 26 steps each and takes the one that
-    makes the angles round it fall least short of that.
+    In each round a set of nodes of bad tetrahedra, no two in one tetrahedron, tries 26 steps each. Each node takes the
+    step that makes the angles round it fall least short of that.
     """
     nodes, good = nodes.copy(), settings.good_sine
     order = np.argsort(tets, axis=None, kind="stable")

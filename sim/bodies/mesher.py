@@ -93,7 +93,7 @@ def mesh_solids(solids: Solids, count: int, settings: Meshing = Meshing()) -> Te
     Raises
     ------
     InputError
-        A solid that so few nodes cannot show, with a number that can, if one of up to 2.5 times as many does; a count
+        A solid that so few nodes cannot show, with a number that can, if one of up to 2.5 times as many does. A count
         that the search for a lattice size does not reach.
     """
     mesh = _meshed(solids, count, settings)

@@ -132,8 +132,8 @@ def read_anatomy(path: str | Path) -> Anatomy:
     Raises
     ------
     InputError
-        As `read_mesh`; a mesh that lacks `held`, `slide_normal` or `craniotomy`, or has numbers there that are none;
-        a body that is too small or too large for one in metres.
+        As `read_mesh`; a mesh that lacks `held`, `slide_normal` or `craniotomy`, or has numbers there that are none. A
+        body that is too small or too large for one in metres.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "the body measures", MeshWarning)  # it is refused instead

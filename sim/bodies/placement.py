@@ -56,7 +56,7 @@ class Piece:
 def side_of(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings: Placement = Placement()) -> str:
     """Words for a place (3,) [m] in a brain's box `low` to `high` (3,), RAS: "left anterior superior" and the like.
 
-    Left and right are told but for a midline strip; of the other axes, the outer thirds.
+    Left and right are stated but for a midline strip; of the other axes, the outer thirds.
     """
     share = (np.asarray(point) - low) / (high - low)
     words = []

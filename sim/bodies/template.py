@@ -217,7 +217,7 @@ def _placed(tumour: Tumour, site: np.ndarray, inward: np.ndarray) -> Lobed:
 
 
 def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:
-    """The tumour round a `middle` (3,) [m], told its shape at unit scale and its scale [m]."""
+    """The tumour round a `middle` (3,) [m], given its shape at unit scale and its scale [m]."""
     rng, lobes = np.random.default_rng(tumour.seed), tumour.lobes
     directions = rng.normal(size=(lobes.count if tumour.shape == "lobed" else 0, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

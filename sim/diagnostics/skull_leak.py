@@ -18,9 +18,9 @@ WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 def surface_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """The integral (N, 3) [m^2] of N_i n over outward triangles (S, 3) or, quadratic and perhaps curved, (S, 6).
 
-    With N_i a shape function of nodes (N, 3) [m] and n the outward normal it is the integral of grad N_i over the body,
-    and the sum of its products with displacements is the volume that the surface sweeps (Engelman, Sani, Gresho 1982,
-    Int. J. Numer. Methods Fluids 2:225-238).
+    With N_i a shape function of nodes (N, 3) [m] and n the outward normal it is the integral of grad N_i over the body.
+    The sum of its products with displacements is the volume that the surface sweeps. Source: Engelman, Sani, Gresho
+    1982, Int. J. Numer. Methods Fluids 2:225-238.
     """
     out = np.zeros_like(nodes)
     for at, weight in zip(POINTS, WEIGHTS, strict=True):

@@ -20,11 +20,11 @@ EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)
 class Elements:
     """T elements of at most n nodes with q quadrature points.
 
-    table (T, n) node numbers; gradient (T, q, n, 3) of the shape functions in the rest configuration [1/m];
-    weight (T, q) rest volume of each quadrature point [m^3]; nodes, how many nodes the discretisation has;
-    owner (T,) the mesh's tetrahedron whose tissue each element has; marks (T, k) vertices and labels that tell each
-    from all others, whatever is cut from the mesh; size (T,) how many of the n places a row uses, the first ones;
-    None: all.
+    table (T, n) are node numbers. gradient (T, q, n, 3) is that of the shape functions in the rest configuration [1/m].
+    weight (T, q) is the rest volume of each quadrature point [m^3]. nodes is how many nodes the discretisation has.
+    owner (T,) is the mesh's tetrahedron whose tissue each element has. marks (T, k) are vertices and labels that
+    distinguish each from all others, whatever is cut from the mesh. size (T,) is how many of the n places a row uses,
+    the first ones; None: all.
     """
 
     table: np.ndarray

@@ -1,7 +1,8 @@
 """A round tool on a triangulated surface: how its weight falls on the mesh's vertices.
 
-The traction w(s) = sqrt(1 - s^2), s = |x - c| / r, is that of a flat punch's smooth counterpart (Hertz), integrated
-over triangles subdivided until they are small against the footprint: force and moment do not depend on the mesh.
+The traction w(s) = sqrt(1 - s^2), s = |x - c| / r, is that of a flat punch's smooth counterpart (Hertz). It is
+integrated over triangles subdivided until they are small against the footprint: force and moment do not depend on the
+mesh.
 """
 
 from dataclasses import dataclass

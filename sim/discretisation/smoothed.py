@@ -2,8 +2,8 @@
 
 Selective edge- and node-based smoothing, "ES/NS-FEM-T4": Onishi, Amaya 2014, Int. J. Numer. Meth. Eng. 99:354-371,
 after Liu, Nguyen-Thoi 2010, "Smoothed Finite Element Methods". The displacement gradient is averaged over the elements
-round an edge, each lending a sixth of its volume, and this average resists a change of shape; averaged over the
-elements round a node, a quarter of each, it resists a change of volume.
+round an edge, each lending a sixth of its volume, and this average resists a change of shape. The average over the
+elements round a node, a quarter of each, resists a change of volume.
 """
 
 from __future__ import annotations

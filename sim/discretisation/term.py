@@ -18,10 +18,10 @@ from ..loads import Loads
 class Cases:
     """The load cases of a batch: what acts, since when, and what each term remembers of the past.
 
-    loads, B rows; start_time (B,) [s]; memory, by term name: arrays with B rows, as `Term.end` returned them;
-    displacement (B, N, 3) [m] of the element's nodes at the start, or None: at rest; share (B,) of the way from where
-    they were that tools have gone, 1 if None; anew (B,) bool, whose descent begins at rest, where nothing is touched
-    yet, none if None; warm, what an earlier answer left to make this one faster, rows (B, ...).
+    loads have B rows; start_time is (B,) [s]. memory is, by term name, arrays with B rows, as `Term.end` returned them.
+    displacement (B, N, 3) [m] is that of the element's nodes at the start, or None: at rest. share (B,) is that of the
+    way from where they were that tools have gone, 1 if None. anew (B,) bool says whose descent begins at rest, where
+    nothing is touched yet; none if None. warm is what an earlier answer left to make this one faster, rows (B, ...).
     """
 
     loads: Loads

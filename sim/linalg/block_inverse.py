@@ -1,7 +1,7 @@
 """Symmetric positive definite matrices inverted and eliminated on CUDA: in place, half of them, in blocks.
 
-An exchange of the first unknowns of a symmetric matrix with their right-hand sides makes [[-A^-1, A^-1 B^T],
-[B A^-1, C - B A^-1 B^T]] of [[A, B^T], [B, C]]: Goodnight 1979, "A tutorial on the SWEEP operator", Am. Stat.
+The first unknowns of a symmetric matrix [[A, B^T], [B, C]] are exchanged with their right-hand sides. This makes
+[[-A^-1, A^-1 B^T], [B A^-1, C - B A^-1 B^T]] of it. Goodnight 1979, "A tutorial on the SWEEP operator", Am. Stat.
 33:149-158. Of all unknowns it leaves the inverse, in n^3 operations and 4 n^2 bytes of double precision, where a
 library's factor and inverse stand beside each other. Uses torch, as `dense_inverse` does.
 """

@@ -1,10 +1,10 @@
 """CUDA's preconditioner for meshes of a few thousand nodes: the inverse rest stiffness as one dense matrix.
 
 One matrix product serves a whole batch of load cases, where triangular solves would leave the card idle. In single
-precision the inverse is kept in half precision, which the card's tensor cores multiply at their full rate: scaled to a
-unit diagonal, and each column to unit length, its numbers fit half precision's range, and its eleven bits spoil no
-stiff mode (bfloat16's eight do, at nu = 0.49). The only file of this room that uses torch, for its matrix product; it
-is imported by its arm in `preconditioner` alone.
+precision the inverse is kept in half precision, which the card's tensor cores multiply at their full rate. Scaled to a
+unit diagonal, and each column to unit length, its numbers fit half precision's range. Its eleven bits spoil no stiff
+mode (bfloat16's eight do, at nu = 0.49). The only file of this room that uses torch, for its matrix product; it is
+imported by its arm in `preconditioner` alone.
 """
 
 from dataclasses import dataclass

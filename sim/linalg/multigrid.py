@@ -1,6 +1,6 @@
 """Levels: Chebyshev smoothing on the rest stiffness, and a coarse solver for what varies slowly.
 
-For quadratic tetrahedra the coarse motions are those of linear ones on the same corners (p-multigrid): Sundar, Stadler,
+For quadratic tetrahedra the coarse motions are those of linear ones on the same corners (p-multigrid). Sundar, Stadler,
 Biros 2015, "Comparison of multigrid algorithms for high-order continuous finite element discretizations", Numer. Linear
 Algebra Appl. 22:664-680. The smoother is Chebyshev's polynomial of block Jacobi: Adams et al. 2003, J. Comput. Phys.
 188:593-610. A coarse solver may have two levels itself (`sim/linalg/amg.py`).

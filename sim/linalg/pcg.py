@@ -1,8 +1,8 @@
 """Preconditioned conjugate gradients on a batch of columns, and the preconditioners.
 
 Steihaug 1983, "The conjugate gradient method and trust regions in large scale optimization", SIAM J. Numer. Anal.
-20:626-637: where the curvature is negative, or the solution leaves a ball in the preconditioner's norm, the iteration
-stops; what it has is a descent direction, and the shorter it is, the more like the preconditioned gradient.
+20:626-637. Where the curvature is negative, or the solution leaves a ball in the preconditioner's norm, the iteration
+stops. What it has is a descent direction, and the shorter it is, the more like the preconditioned gradient.
 """
 
 from dataclasses import dataclass

@@ -54,8 +54,8 @@ def choose_preconditioner(
     """The rest stiffness, inverted (CUDA) or factorised where that pays; two levels where it has too many entries.
 
     Algebraic multigrid where even the coarse level does not fit; block Jacobi where nothing is free to move.
-    `unsmoothed` assembles the rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh, over a step in time
-    [s], as `step` is what the stiffness is taken over.
+    `unsmoothed` assembles the rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh. It does so over a
+    step in time [s], as `step` is what the stiffness is taken over.
 
     Raises
     ------

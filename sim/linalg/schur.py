@@ -37,8 +37,8 @@ class Condensing:
 class Condensation:
     """What a part of a body feels of the rest.
 
-    rows (m,) of the part's 3n that touch the rest; stiffness (m, m) [N/m] of the rest there; follow (3N, m): how the
-    whole body's rows move when these do, zero in the part itself.
+    rows (m,) are those of the part's 3n that touch the rest. stiffness (m, m) [N/m] is that of the rest there. follow
+    (3N, m) is how the whole body's rows move when these do, zero in the part itself.
     """
 
     rows: np.ndarray

@@ -188,8 +188,8 @@ def _divided(
 ) -> list[list[int]]:
     """Whole subtrees of groups in so many parts, and in a last one what is above them; each in its order.
 
-    The heaviest subtree is opened, its top left to the last part, as long as that shortens the whole: the last part and
-    the longest of the others, one after the other.
+    The heaviest subtree is opened, its top left to the last part, as long as that shortens the whole. The whole is the
+    last part and the longest of the others, one after the other.
     """
     owner = np.zeros(len(weight), int)
     for number, (own, _) in enumerate(groups):

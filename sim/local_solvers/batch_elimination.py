@@ -6,10 +6,10 @@ with the rest stiffness, then solves the near part in its surroundings, as stiff
 Gendre, Allix, Gosselet, Comte 2009, "Non-intrusive and exact global/local techniques for structural problems with local
 plasticity", Comput. Mech. 44:233-245. The outer loop is that of nonlinear elimination (`outer_loop.py`).
 
-With C the inverse of the rest stiffness, r the gradient at u, and e = -C r the linear correction, the near part finds x
-of n(u + x) - n(u) + F x = (n' + F) e there: n are its internal forces, n' and F the stiffness of its own and that of
-the far part, condensed, at rest. The far part takes e + H (x - e): H is how it follows the rows that both share. Were n
-linear, x would be e.
+C is the inverse of the rest stiffness, r the gradient at u, and e = -C r the linear correction. The near part finds x
+of n(u + x) - n(u) + F x = (n' + F) e there. Here n are its internal forces, n' and F the stiffness of its own and that
+of the far part, condensed, at rest. The far part takes e + H (x - e): H is how it follows the rows that both share.
+Were n linear, x would be e.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Nonlinear elimination without an inverse: what a load strains much is in equilibrium before the body around it moves.
 
 Where the rest stiffness is known only nearly (levels), the surroundings of a part cannot be condensed. So the part of
-the body near a load, held at its rim (`clamped_part.py`), is brought to equilibrium by itself, and L-BFGS minimises
-what is left, a function of the body around it, whose curvature the rest stiffness knows well.
+the body near a load, held at its rim (`clamped_part.py`), is brought to equilibrium by itself. L-BFGS minimises what is
+left, a function of the body around it, whose curvature the rest stiffness knows well.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class ClampedSize:
         What the linear answer strains more than this, the most strained tetrahedra first, of at most this share of all;
         and all tetrahedra that touch these.
     left, added
-        Where a cycle leaves more than this share of the free force, and so many nodes have most of what is beyond the
-        part, these and what touches them are added to it.
+        A cycle may leave more than this share of the free force, and so many nodes may have most of what is beyond the
+        part. Then these and what touches them are added to it.
     cuts
         Most of one step.
     """

@@ -5,9 +5,9 @@ functions", SIAM J. Optim. 24:1420-1443). Each step minimises
 
     s'(u) x + x . B x / 2 + c(u + x),
 
-with s the potential of all that is smooth, B the rest stiffness and what L-BFGS has learnt since, and c the barrier
-of tools, which is no model. c depends on the few nodes that tools can touch, and all else follows them: with H = B^-1,
-x = -H (s'(u) + f), with the tools' forces f on them as `contact_forces` finds them.
+with s the potential of all that is smooth, B the rest stiffness and what L-BFGS has learnt since, and c the barrier of
+tools, which is no model. c depends on the few nodes that tools can touch, and all else follows them. With H = B^-1 they
+move by x = -H (s'(u) + f), with the tools' forces f on them as `contact_forces` finds them.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ With C (3n, 3n) the compliance of the model at these nodes and w0 where they wou
     (w - w0) . C^-1 (w - w0) / 2 + c(w) + d |w - v|^2 / 2 over the touched,
 
 c the barrier of tools and d a drag from where they are, v. It is found by Newton's method for the forces f that tools
-exert, w = w0 - C f: these are none but at touched nodes, and so C is never inverted. It is told where nodes go under
+exert, w = w0 - C f: these are none but at touched nodes, and so C is never inverted. It is given where nodes go under
 forces that are nearly right, w1 = w0 - C f1: of differences little is rounded away.
 """
 

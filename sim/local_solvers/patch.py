@@ -1,7 +1,7 @@
 """A patch of tissue that a load strains far from its rest stiffness, in equilibrium with a body that keeps its own.
 
-With C the inverse of the body's rest stiffness at the patch's nodes, e the motion that the rest stiffness alone would
-give there, n the internal forces of the patch's elements and K their rest stiffness, the patch moves by
+C is the inverse of the body's rest stiffness at the patch's nodes, and e the motion that the rest stiffness alone would
+give there. With n the internal forces of the patch's elements and K their rest stiffness, the patch moves by
 
     x = e + C q(x),    q(x) = n(u) + K x - n(u + x):
 
@@ -67,7 +67,7 @@ class Patch:
         """A share s, and the forces f (m,) [N] by which the body moves s e + C f, at u (m,) and e (m,) [m].
 
         The share is as much of e as no element forbids. The forces are q but for the gradient, whose 2-norm is at most
-        `force` [N]: C q would amplify what that leaves by how much stiffer than at rest the elements have become.
+        `force` [N]. C q would amplify what that leaves by how much stiffer than at rest the elements have become.
         """
         pairs = no_pairs(len(e), "float64")
         forces = changes = np.zeros((0, len(e)), e.dtype)  # C^-1 s of the pairs' steps s, and C^-1 w of their w = C y

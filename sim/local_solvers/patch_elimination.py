@@ -1,8 +1,8 @@
 """Nonlinear elimination of the few hundred nodes that one load strains most: its patch is settled, the body follows.
 
 Far from rest are only the nodes close to a tool. Each cycle corrects the body with its rest stiffness, brings the patch
-to equilibrium beside it (`patch.py`), and lets the body follow the forces that this takes: two to five looks at all of
-it instead of five to twenty. `batch_elimination.py` does so for batches, with one part for all loads.
+to equilibrium beside it (`patch.py`), and lets the body follow the forces that this takes. It takes two to five looks
+at all of it instead of five to twenty. `batch_elimination.py` does so for batches, with one part for all loads.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     H = H0 + [S, H0 Y] M [S, H0 Y]',    M = [[R^-T (D + Y' H0 Y) R^-1, -R^-T], [-R^-1, 0]],
 
-with steps S and changes Y of the gradient as columns, R the upper triangle of S' Y and D its diagonal: Byrd, Nocedal,
+with steps S and changes Y of the gradient as columns, R the upper triangle of S' Y and D its diagonal. Byrd, Nocedal,
 Schnabel 1994, "Representations of quasi-Newton matrices and their use in limited memory methods", Math. Program.
 63:129-156, theorem 2.2.
 """

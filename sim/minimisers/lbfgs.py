@@ -101,11 +101,11 @@ class Lbfgs:
         """Minimise the potential of the batch that the problem has begun, from start (3N, b) [m], in `most` iterations.
 
         The start satisfies the constraints, and no footprint is moved. A column ends at its tolerance (b,), relative as
-        `Problem.residual` has it, or where the free gradient's 2-norm is at most force (b,) [N]. `learnt` is
-        what an earlier descent of the same problem found out, near here it is hoped, if any; None: this one teaches
-        nothing either. The descent stops where at most the share `stragglers` of all columns is still on its way.
-        `ahead` is what is known of the start: the free gradient and, preconditioned, the same (3N, b).
-        Every u is the last accepted state of its column.
+        `Problem.residual` has it, or where the free gradient's 2-norm is at most force (b,) [N]. `learnt` is what an
+        earlier descent of the same problem found out, near here it is hoped, if any; None: the next one learns nothing
+        from this one either. The descent stops where at most the share `stragglers` of all columns is still on its way.
+        `ahead` is what is known of the start: the free gradient and, preconditioned, the same (3N, b). Every u is the
+        last accepted state of its column.
         """
         device, count = self._problem.device, start.shape[1]
         u, place = wp.clone(start), np.arange(count)

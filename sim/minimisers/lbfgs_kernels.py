@@ -2,7 +2,7 @@
 
 Every pair (s, y) of a column, a step and the change of the gradient along it, is kept as s and w = M^-1 y, with M^-1
 the preconditioner. The two loops of Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4 then need inner
-products with s and w alone, and the direction is a sum of these: one pass over the pairs for each.
+products with s and w alone, and the direction is a sum of these. That is one pass over the pairs for each.
 """
 
 from dataclasses import dataclass

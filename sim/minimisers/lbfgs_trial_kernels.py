@@ -20,7 +20,7 @@ EACH, EACH_ON_CPU = 2, 1024
 
 @dataclass(frozen=True)
 class Spread:
-    """How threads share rows, or nodes: `lanes` neighbours take neighbouring ones in turn, `each` of them so many."""
+    """How threads share rows, or nodes: a group takes neighbouring ones in turn, `each` of its threads so many."""
 
     lanes: int
     each: int
@@ -39,7 +39,7 @@ def spread_of(device: Device, columns: int) -> Spread:
 
 @wp.func
 def first_of(thread: int, lanes: int, each: int):
-    """The first of the rows that a thread takes, `lanes` apart."""
+    """The first of the rows that a thread takes; the others follow at steps of one group of neighbours."""
     return thread // lanes * lanes * each + thread % lanes
 
 

@@ -24,7 +24,7 @@ class Direction:
 
 
 class Descent(Protocol):
-    """Where to go next, for b load cases at once; it remembers what a batch has taught it."""
+    """Where to go next, for b load cases at once; it remembers what it has learnt from a batch."""
 
     def begin(self) -> None:
         """Forget: another batch begins."""

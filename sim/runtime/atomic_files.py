@@ -93,7 +93,7 @@ def written_stream(path: str | Path, suffix: str) -> Iterator[Stream]:
 
 
 class Stream:
-    """A binary file whose first failure to write is kept in `failure`, and told when all is done."""
+    """A binary file whose first failure to write is kept in `failure`, and stated when all is done."""
 
     def __init__(self, raw: BinaryIO) -> None:
         self.failure: OSError | None = None
@@ -203,7 +203,7 @@ def _sweep(path: Path, stale: float) -> None:
 
 
 def _alive(process: int) -> bool:
-    """Whether a process of this number runs; where that cannot be told, it may."""
+    """Whether a process of this number runs; where that cannot be found out, it may."""
     if os.name != "posix" or process == os.getpid():
         return True
     try:

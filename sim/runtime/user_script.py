@@ -1,4 +1,4 @@
-"""A user's own Python file: run as it stands, with the rights of whoever runs it, and told of in one sentence."""
+"""A user's own Python file: run as it stands, with the rights of whoever runs it; a failure is stated in a sentence."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """One frame of a live tool on the device: a push, its footprint, and L-BFGS from where the last frame ended.
 
-Everything stands in fixed arrays, so that CUDA replays the frame as one captured graph: a few numbers go up, the answer
+Everything stands in fixed arrays, so that CUDA replays the frame as one captured graph. A few numbers go up, the answer
 comes down, and what lies between, the state that it starts from included, stays.
 """
 

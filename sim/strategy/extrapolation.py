@@ -1,8 +1,8 @@
 """Where pushes go on to: a frame starts from its last answer, moved on along the way from the one before that.
 
 Between neighbouring loads the answer is nearly linear in them. Loads q, p with the answers v, u are followed by p' from
-u + a (u - v), a = (p' - p) . (p - q) / |p - q|^2: as far as the load goes on the way that it came; nothing where it
-stands still or turns aside, and back on that way where it returns.
+u + a (u - v), a = (p' - p) . (p - q) / |p - q|^2. This goes as far as the load goes on the way that it came. It is
+nothing where the load stands still or turns aside, and back on that way where it returns.
 """
 
 from __future__ import annotations

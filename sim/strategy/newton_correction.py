@@ -1,7 +1,7 @@
 """One step towards equilibrium from states that somebody else made, and what is still missing after it.
 
 Near a tool a prediction is far from equilibrium, and a linear solve from there misleads. So what a load strains most is
-first settled by itself, beside the rest (one cycle of nonlinear elimination); then K(u) d = -g is solved for the rest
+first settled by itself, beside the rest (one cycle of nonlinear elimination). Then K(u) d = -g is solved for the rest
 of the error, and gone along as far as the line search allows.
 """
 

@@ -39,8 +39,8 @@ NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
 class Answer:
     """u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, shares of the load reached, inverted tets.
 
-    The linear iterations of the batch; what of the curvature the next frame may know; where tools move,
-    shares (B,) of their way at which they are, and (B,) bool whose way began at rest.
+    The linear iterations of the batch; what of the curvature the next frame may know. Where tools move, shares (B,) of
+    their way at which they are, and (B,) bool whose way began at rest.
     """
 
     u: wp.array
@@ -134,9 +134,9 @@ class Strategy:
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
         """The equilibria of B cases, each from the first of its guesses (3N, B) [m] that will do; from rest without.
 
-        A start that lies inside out is left alone, and so is a state that does to which a start led: a body turned
-        over or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing.
-        Where nothing acts it stays at rest: the answer is exactly zero.
+        A start that lies inside out is left alone, and so is a state that does to which a start led. A body turned over
+        or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing. Where
+        nothing acts it stays at rest: the answer is exactly zero.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
@@ -344,8 +344,8 @@ class Strategy:
     ) -> Answer:
         """From start (3N, b), cases at growing shares: the equilibrium at the largest share found.
 
-        `aimed` makes cases at shares (b,); the `first` step is so long, and none longer than tools may go at once:
-        those that are as long do not count among the `most`. Outcomes are good where the share is 1; on the way
+        `aimed` makes cases at shares (b,); the `first` step is so long, and none longer than tools may go at once.
+        Those that are as long do not count among the `most`. Outcomes are good where the share is 1; on the way
         round-off will do.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)

@@ -106,7 +106,7 @@ def parts_under(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tetrahedra that together are what lies under a plane, none of them inside another.
 
     height (n, 4) [m] of the corners of n tetrahedra above the plane, which has one to three of them below zero. The
-    tetrahedron (m,) that each part belongs to, and the corner coordinates (m, 4, 4) of each part's own corners: the
+    tetrahedron (m,) that each part belongs to, and the corner coordinates (m, 4, 4) of each part's own corners. The
     part has |determinant| of the whole's volume, which changes continuously as the plane moves.
     """
     order = np.argsort(height, axis=1)

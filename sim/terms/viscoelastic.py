@@ -12,9 +12,9 @@ law parts shape from volume, as Ogden's, psi(F) - psi(J^(1/3) I) is psi(Fb), and
 others psi(Fb) must not be taken away from psi(F): it outgrows it where tissue is crushed, which then collapses.
 
 The stable neo-Hookean law is finite where J = 0, and Cb is not: whatever pulls on Cb makes it collapse. It is parted in
-its own way (`own_split`): mu relaxes and K does not, the step's potential is psi - (1 - f) psi_shape + C : A / 2,
-and S pulls on C = F^T F, as in finite linear viscoelasticity (Christensen 1980, "A Nonlinear Theory of Viscoelasticity
-for Application to Elastomers", J. Appl. Mech. 47:762-768).
+its own way (`own_split`): mu relaxes and K does not. The step's potential is psi - (1 - f) psi_shape + C : A / 2, and S
+pulls on C = F^T F, as in finite linear viscoelasticity. Source: Christensen 1980, "A Nonlinear Theory of
+Viscoelasticity for Application to Elastomers", J. Appl. Mech. 47:762-768.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,9 @@
 """Data sets: loads, the displacement of every vertex, and where they come from. HDF5, SI units, RAS.
 
 Layout: `anatomy/` the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/`, each with `displacement`
-(n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` belongs to `loads/`; `unit/` holds
-the small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, y and z in turn;
-of data of poses there is none. What each array is, is written beside it (`array_meanings`).
+(n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` belongs to `loads/`. `unit/` holds
+the small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, y and z in turn.
+Data of poses have none. What each array is, is written beside it (`array_meanings`).
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ SECTORS, UPRIGHT = 8, 10.0
 class Sectors(Split):
     """Sectors of tangential direction left out.
 
-    As `Split`, but `centres` are unit directions (k, 3), `radius` is half the width of a sector [rad], `disc` is the
-    number of the sector that a load's force lies in, and `share` a part of the circle.
+    As `Split`, but `centres` are unit directions (k, 3), and `radius` is half the width of a sector [rad]. `disc` is
+    the number of the sector that a load's force lies in, and `share` a part of the circle.
     """
 
     def covers(self, points: np.ndarray) -> np.ndarray:

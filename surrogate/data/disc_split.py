@@ -64,7 +64,7 @@ def leave_discs_out(points: np.ndarray, patch: Patch) -> Split:
     """Discs of 6 mm radius round load points (B, 3) [m] far from each other: at least 6, and 15 % of the patch.
 
     No disc beyond the sixth is taken if it would leave fewer than half of the loads to learn from. At a small
-    craniotomy, where six discs take more than half, the discs shrink, as far as that helps: six of the few positions of
+    craniotomy, where six discs take more than half, the discs shrink, as far as that helps. Six of the few positions of
     the preset `seed` are more than half in any case.
 
     Raises

@@ -35,7 +35,7 @@ def shared_out(weights: np.ndarray, pushed: Pushed) -> np.ndarray:
 def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Point [m], unit direction, force [N] and footprint radius [m]: (B, 8).
 
-    The published 13 features describe the load as one node sees it (its distance, its angles); a model of all nodes at
+    The published 13 features describe the load as one node sees it (its distance, its angles). A model of all nodes at
     once needs the load alone, because the basis knows where the nodes are.
     """
     magnitude, direction = directions(pushed)

@@ -129,7 +129,7 @@ def simulate(
 ) -> Solved:
     """Answer every load, and the unit forces on the open cortex unless the loads are poses, into an HDF5 file.
 
-    Batches go to `PATH.partial` (`journal`), where a kill at any moment loses one at most: the same call goes on with
+    Batches go to `PATH.partial` (`journal`), where a kill at any moment loses one at most. The same call goes on with
     the same batches, so that the result has the same bytes but for its date. What is damaged there is solved anew. The
     HDF5 file is written last, and whole. More loads of the same draw extend a finished file, and what is damaged in a
     finished file is solved anew.

@@ -121,7 +121,7 @@ def refused_words(preset: str) -> str:
     share = refused_share(preset)
     return (
         f"{100.0 * share:.0f} % of the nominal loads of {preset} (its forces on its radii) have a pressure or depth "
-        "that surgery has not: they are not drawn, and lie outside the training range."
+        "that surgery has not. They are not drawn, and lie outside the training range."
         if share > 0.0
         else ""
     )
@@ -212,8 +212,8 @@ def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
     near = np.flatnonzero((distance >= 20e-3) & (distance <= 28e-3) & inside)
     if not len(near):
         raise InputError(
-            f"the open cortex is {1e3 * distance.min():.1f}-{1e3 * distance.max():.1f} mm from the tumour's centre; "
-            f"no node at 20-28 mm lies {1e3 * PUBLISHED_FOOTPRINT:g} mm inside its rim: make the anatomy with --preset "
+            f"the open cortex is {1e3 * distance.min():.1f}-{1e3 * distance.max():.1f} mm from the tumour's centre. "
+            f"No node at 20-28 mm lies {1e3 * PUBLISHED_FOOTPRINT:g} mm inside its rim: make the anatomy with --preset "
             "seed, or choose another --preset here."
         )
     near = near[spread(patch.points[near], POSITIONS)]

@@ -1,10 +1,10 @@
 """The error of a prediction, estimated by the finite elements of the same mesh without a full solve.
 
-The state where one step of the finite elements leads (`sim/strategy/newton_correction.py`) is so much nearer to
-equilibrium than the prediction that their distance is the prediction's error: Ainsworth, Oden 1997, "A posteriori error
-estimation in finite element analysis", Comput. Methods Appl. Mech. Eng. 142:1-88, call the ratio of the two the
-effectivity. What is left after the step, as the rest stiffness has it, says how far that holds; where too much is left,
-up to two more steps follow.
+The state where one step of the finite elements leads (`sim/strategy/newton_correction.py`) is much nearer to
+equilibrium than the prediction. It is so much nearer that their distance is the prediction's error. The ratio of the
+two is called the effectivity: Ainsworth, Oden 1997, "A posteriori error estimation in finite element analysis", Comput.
+Methods Appl. Mech. Eng. 142:1-88. What is left after the step, as the rest stiffness has it, says how far that holds;
+where too much is left, up to two more steps follow.
 """
 
 from __future__ import annotations
@@ -125,5 +125,5 @@ def _check(vertices: int, tumour: np.ndarray, loads: Loads, prediction: Deformat
     if prediction.nodes.max(initial=-1) >= vertices or not np.isin(tumour, prediction.nodes).all():
         raise InputError(
             f"the prediction, of {len(prediction.nodes)} vertices, is of another mesh than the finite elements, which "
-            f"have {vertices}, {len(tumour)} of them a tumour's: take the anatomy that the model was trained on."
+            f"have {vertices}, {len(tumour)} of them a tumour's. Take the anatomy that the model was trained on."
         )

@@ -122,8 +122,8 @@ def winner(scores: Sequence[Score]) -> Score:
 def table(scores: Sequence[Score], motion_mm: float) -> str:
     """The scores for people, then the winner of several, then the solves that learners were given, if known."""
     head = (
-        "          mm, all vertices                | mm, worst vertex of a load | % of motion                 "
-        "| us, model in NumPy\n"
+        "          mm, all vertices                | mm, a load's worst vertex  | % of motion                 "
+        "| us, NumPy model\n"
         "learner      mean     p95   p99.9     max |    mean     p95   p99.9    |   mean    p95  p99.9    max "
         "|      | us, answer with bound"
     )

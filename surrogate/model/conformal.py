@@ -1,8 +1,9 @@
 """How far a prediction may be from the finite elements: split conformal bounds with a scale for each load.
 
 Lei, G'Sell, Rinaldo, Tibshirani, Wasserman 2018, "Distribution-free predictive inference for regression", J. Am. Stat.
-Assoc. 113:1094-1111, section 5.2; by classes as in Vovk, Lindsay, Nouretdinov, Gammerman 2003, "Mondrian confidence
-machine": every class of force has quantiles of its own, so that weak loads do not vouch for strong ones.
+Assoc. 113:1094-1111, section 5.2. The quantiles are by classes as in Vovk, Lindsay, Nouretdinov, Gammerman 2003,
+"Mondrian confidence machine". Every class of force has quantiles of its own, so that weak loads do not vouch for strong
+ones.
 """
 
 from __future__ import annotations

@@ -62,8 +62,8 @@ class Part:
 class Learned:
     """A sum of parts, as a `Deformer`.
 
-    Every part predicts the response to one newton, which is multiplied by the force: no force, no motion, and a weak
-    load is answered as exactly, in proportion, as a strong one.
+    Every part predicts the response to one newton, which is multiplied by the force. No force gives no motion, and a
+    weak load is answered as exactly, in proportion, as a strong one.
 
     Parameters
     ----------
@@ -177,8 +177,8 @@ class Learned:
         Raises
         ------
         InputError
-            Loads of another kind, or that do not touch the open cortex, or are more than `FARTHEST` times as strong
-            or as wide as any of the training; a start with other rows; a vertex in `at` that the model does not know.
+            Loads of another kind, or that do not touch the open cortex, or are more than `FARTHEST` times as strong or
+            as wide as any of the training. A start with other rows; a vertex in `at` that the model does not know.
         """
         check_loads(loads)
         if start is not None and not isinstance(start, Deformation):

@@ -55,7 +55,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
     Raises
     ------
     InputError
-        No model, models of different anatomies, a name that does not end in .npz, a folder that cannot be written, a
+        No model, models of different anatomies, a name that does not end in .npz, or a folder that cannot be written. A
         state that is more than arrays of numbers or text, or a regressor that nobody registered.
     """
     digests = {model.anatomy.digest for model in models.values()}
@@ -134,7 +134,7 @@ def _kind(name: str) -> type[Fitted]:
     own = find_own(name)
     if own is None:
         raise InputError(
-            f"a model here was made by the learner {name!r}, which is not this package's own: name the file that "
+            f"a model here was made by the learner {name!r}, which is not this package's own. Name the file that "
             "registers it by --plugin, or install the package that brings it."
         )
     return own.regressor

@@ -71,8 +71,8 @@ class Envelope:
     def excess(self, pushed: Pushed, known: Measured) -> np.ndarray:
         """How far outside each load lies (B,), in shares of the training range; zero inside.
 
-        The largest of: millimetres beyond the reach or over the rim, radians beyond the angle, and the shares by which
-        force, radius and force over radius are too large or too small.
+        The largest of three: millimetres beyond the reach or over the rim, radians beyond the angle, and shares. The
+        shares are those by which force, radius and force over radius are too large or too small.
         """
         magnitude, angle, overhang = known
         beyond = np.stack(

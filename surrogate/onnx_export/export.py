@@ -45,15 +45,15 @@ TEXT = (
 def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     """The graph of a model: of the tumour, or of all that it knows.
 
-    Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has
-    them. Where an answer stands on a compliance table, that of the cortex always, also `weight` (B, m): the share of
-    the force that each of the nodes `pressed` (m,) of the open cortex bears, as `footprint_weights` of
+    Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has them.
+    Where an answer stands on a compliance table, that of the cortex always, also `weight` (B, m). It is the share of
+    the force that each of the nodes `pressed` (m,) of the open cortex bears. `footprint_weights` of
     `sim.discretisation.footprint` integrates it over `Patch`: no operator of a graph could.
 
     Outputs, as `Learned.deform` answers: `displacement` (B, n, 3) [m] of the mesh vertices `nodes` (n,), which lie at
-    `rest` (n, 3) [m]; `bound` (B, 2) [m] of the tumour, at the metadata's levels, NaN where nothing was calibrated;
-    `excess` (B,), that of `Envelope`; and `extrapolated` (B,), whether it is more than zero. All in single precision,
-    but in between in the precision that the model has.
+    `rest` (n, 3) [m]. `bound` (B, 2) [m] of the tumour, at the metadata's levels, is NaN where nothing was calibrated.
+    Then come `excess` (B,), that of `Envelope`; and `extrapolated` (B,), whether it is more than zero. All in single
+    precision, but in between in the precision that the model has.
 
     Raises
     ------

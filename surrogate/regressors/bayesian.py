@@ -20,11 +20,12 @@ NO_ERROR = 1e-20
 class Bayesian:
     """One network of tanh units for each output; the evidence decides how much its weights are held back.
 
-    Foresee, Hagan 1997, "Gauss-Newton approximation to Bayesian learning", ICNN 3:1930-1935: beta E_D + alpha E_W is
-    lowered, E_D and E_W half the sums of squared errors and weights, alpha and beta set anew before every step. Made
-    after the description of MATLAB's `trainbr`, which Tonutti, Gras, Yang 2017 used: features and outputs scaled to
-    [-1, 1], first weights by Nguyen and Widrow's rule, the same damping, at most 1,000 steps. It differs in that a
-    network also ends when a step gains less than `gain` of its objective, and in that all rows are trained on.
+    Foresee, Hagan 1997, "Gauss-Newton approximation to Bayesian learning", ICNN 3:1930-1935. beta E_D + alpha E_W is
+    lowered, with E_D and E_W half the sums of squared errors and weights. alpha and beta are set anew before every
+    step. Made after the description of MATLAB's `trainbr`, which Tonutti, Gras, Yang 2017 used. It has features and
+    outputs scaled to [-1, 1], first weights by Nguyen and Widrow's rule, the same damping, at most 1,000 steps. It
+    differs in that a network also ends when a step gains less than `gain` of its objective, and in that all rows are
+    trained on.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ class Gp:
     """Matern 5/2 kernel with a length for each feature; all outputs share it and the noise.
 
     Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equations 2.25, 2.26, 4.17, 5.9. The
-    hyperparameters maximise the likelihood of at most `rows` rows, of the `strongest` outputs; every row is conditioned
+    hyperparameters maximise the likelihood of at most `rows` rows, of the `strongest` outputs. Every row is conditioned
     on, up to `most`, beyond which a random subset stands for the data.
 
     Parameters

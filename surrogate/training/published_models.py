@@ -96,8 +96,9 @@ def sites_of(anatomy: Anatomy, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def thirteen(sites: np.ndarray, centroid: np.ndarray, pushed: Pushed) -> np.ndarray:
     """The published features of B loads as seen from `sites` (k, 3) [m]: (k, B, 13).
 
-    Force [N] (3), its direction angles [rad] (3), distances from point to site and to `centroid` (3,) [m], angle [rad]
-    between force and the way to the site, and the axis (3) and angle [rad] of the rotation from one to the other.
+    Force [N] (3), its direction angles [rad] (3), and distances from point to site and to `centroid` (3,) [m]. Then the
+    angle [rad] between force and the way to the site, and the axis (3) and angle [rad] of the rotation from one to the
+    other.
     """
     _, direction = directions(pushed)
     way = sites[:, None] - pushed.point

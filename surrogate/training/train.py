@@ -47,10 +47,10 @@ class Trained:
     """Models by learner, how they scored on the discs left out, and what those were.
 
     `motion` is the mean displacement [m] of the tumour over the held-out loads. `calibrated` counts the loads that
-    calibrated the models' bounds, `taught` the training loads. `left_out` gives by learner how often bounds held on
-    the discs left out, where nothing is promised. These are bounds of the scored model, from loads outside the discs:
-    one in three fits the scale, the others the quantiles. `distance_left_out` gives the same for the distance from tip
-    to tumour.
+    calibrated the models' bounds, and the field after it counts the training loads. `left_out` gives by learner how
+    often bounds held on the discs left out, where nothing is promised. These are bounds of the scored model, from loads
+    outside the discs: one in three fits the scale, the others the quantiles. `distance_left_out` gives the same for the
+    distance from tip to tumour.
     """
 
     models: dict[str, Learned]
@@ -123,7 +123,7 @@ def train(
     Raises
     ------
     InputError
-        Unknown learners, or such as loads of the data's kind do not train, nothing to train on, data with other causes
+        Unknown learners, or such as loads of the data's kind do not train; nothing to train on. Data with other causes
         than `Pushed` or the `Touching` of a ball, an anatomy without tumour, too few loads, or unit responses that did
         not converge.
     """

@@ -2,8 +2,8 @@
 
     h = g - n . u - u . H u / 2,    r = r_0 + e . u,    d = |max((h + R, r + R), 0)| - R,
 
-under the bone and inside its opening: with the normal n and its change H along the skull a brain that turns slides
-along the skull, and not off its planes; with the way e into the opening, open cortex rises in it, and not beyond its
+under the bone and inside its opening. With the normal n and its change H along the skull, a brain that turns slides
+along the skull, and not off its planes. With the way e into the opening, open cortex rises in it, and not beyond its
 edge, of radius R.
 """
 

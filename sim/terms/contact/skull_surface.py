@@ -135,7 +135,7 @@ def bend_of(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BON
     """How unit normals (k, 3) at points (k, 3) [m] of a wall change along it: (k, 3, 3) [1/m], symmetric.
 
     The least-squares fit of n_j - n_i = H (x_j - x_i) to the nearest points whose normals face the same way, along the
-    wall alone; where the wall is hollow (a negative curvature) it counts as flat.
+    wall alone. Where the wall is hollow (a negative curvature) it counts as flat.
     """
     count = min(settings.neighbours, len(points))
     near = KDTree(points).query(points, count)[1].reshape(len(points), count)

@@ -36,8 +36,8 @@ def inverse_transpose(H: Any):
 class Split:
     """Of a law with coefficients k, at a displacement gradient H and along a change D of it.
 
-    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], E the strain that a stress A [Pa] works on; stress and
-    stress_change(H, D, ...): its derivatives; overstress(H, k) -> S [Pa]: on that strain, the stress of shape.
+    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], E the strain that a stress A [Pa] works on. stress and
+    stress_change(H, D, ...): its derivatives. overstress(H, k) -> S [Pa]: on that strain, the stress of shape.
     """
 
     energy: wp.Function

@@ -3,7 +3,7 @@
     psi = sum_i c_i / m_i^2 (l1^m_i + l2^m_i + l3^m_i - 3) + K/2 (ln J)^2,  l_k = J^(-1/3) lambda_k
 
 Ogden 1972, Proc. R. Soc. Lond. A 326:565-584, in the uncoupled form of FEBio's theory manual. All is written in the
-eigenvalues e_k of Green's strain, lambda_k^2 = 1 + 2 e_k, and the logarithms y_k = ln l_k, which sum to zero: nothing
+eigenvalues e_k of Green's strain, lambda_k^2 = 1 + 2 e_k, and the logarithms y_k = ln l_k, which sum to zero. Nothing
 cancels at small strain, and equal stretches are no special case. Coefficients: (K, c_1, m_1, c_2, m_2, ...).
 """
 
