@@ -16,7 +16,7 @@ from ..discretisation.problem import Problem
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from ..minimisers.residual import Judge, State, judge_of
-from ..runtime.columns import gathered, scattered
+from ..runtime.columns import scattered
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def eliminated(
         # Forces that explode lower the relative residual.
         done = sane & (now.free <= first[live]) & (now.relative <= tolerance[live])
         better = done | (sane & (now.free <= np.fmin(first, least)[live]))
-        scattered(device, gathered(device, now.u, np.flatnonzero(better)), live[better], result)
+        scattered(device, now.u, live[better], result, np.flatnonzero(better))
         least[live[better]], residual[live[better]] = now.free[better], now.relative[better]
         steps[live[sane]], status[live[done]] = number, DONE
         halved = now.free <= 0.5 * mark[live]

@@ -17,7 +17,7 @@ from ..arguments import all_finite
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
 from ..linalg.pcg import Preconditioner
-from ..runtime.columns import EXACT, WIDTHS, gathered, scattered
+from ..runtime.columns import EXACT, WIDTHS, scattered
 from .lbfgs_kernels import LEFT, LIVE, PAIRS
 from .lbfgs_state import Workspace, ground_of
 
@@ -129,7 +129,7 @@ class Lbfgs:
             if last or (count > TAUGHT and self._width(left) <= self._schedule.smaller * workspace.width):
                 leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
                 there = place[leave]
-                scattered(device, gathered(device, workspace.columns["u"], leave), there, u)
+                scattered(device, workspace.columns["u"], there, u, leave)
                 status[there], steps[there], residual[there] = (
                     workspace.columns[name].numpy()[leave] for name in ("status", "steps", "residual")
                 )

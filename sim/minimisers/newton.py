@@ -90,7 +90,7 @@ def find_equilibrium(
         leave = done | bad | failed
         last = leave.all() or step == accuracy.outer
         for state, columns in ((u, ~bad & (leave | last)), (before, bad)):
-            scattered(device, gathered(device, state, np.flatnonzero(columns)), live[columns], result)
+            scattered(device, state, live[columns], result, np.flatnonzero(columns))
         if last:
             break
         if leave.any():

@@ -122,13 +122,14 @@ def moving_kernels_of(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
     @forward_kernel(module="unique")
     def scatter(
         x: wp.array2d(dtype=dtype),
+        some: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         # outputs
         out: wp.array2d(dtype=dtype),
     ):
-        """out_r,columns(c) = x_rc."""
+        """out_r,columns(c) = x_r,some(c)."""
         r, c = wp.tid()
-        out[r, columns[c]] = x[r, c]
+        out[r, columns[c]] = x[r, some[c]]
 
     return gather, scatter
 
@@ -196,10 +197,12 @@ def gathered(device: Device, x: wp.array, columns: np.ndarray | wp.array, out: w
     return out
 
 
-def scattered(device: Device, x: wp.array, columns: np.ndarray | wp.array, out: wp.array) -> None:
-    """Copy x (..., k) to some columns (k,) of out (..., b)."""
+def scattered(device: Device, x: wp.array, columns: np.ndarray, out: wp.array, some: np.ndarray | None = None) -> None:
+    """Copy x (..., k), or `some` (k,) columns of it, to some columns (k,) of out (..., b)."""
     _, scatter = moving_kernels_of(x.dtype)
-    device.launch(scatter, _flat(x).shape, [_flat(x), _index(device, columns)], [_flat(out)])
+    some = np.arange(x.shape[-1]) if some is None else some
+    inputs = [_flat(x), _index(device, some), _index(device, columns)]
+    device.launch(scatter, (_flat(x).shape[0], len(some)), inputs, [_flat(out)])
 
 
 def unstacked(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:

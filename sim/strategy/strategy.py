@@ -309,7 +309,7 @@ class Strategy:
         outcome = failed.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
         none = np.flatnonzero(found.reached <= failed.reached[index])
-        scattered(device, gathered(device, failed.u, index[none]), none, found.u)
+        scattered(device, failed.u, none, found.u, index[none])
         found.residual[none], found.reached[none] = failed.residual[index[none]], failed.reached[index[none]]
         return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
@@ -373,7 +373,7 @@ class Strategy:
             iterations[live] += found.iterations
             gaps[live] *= np.where(good, 1.0, self.gaps.wider)
             step[live] *= np.where(good, np.clip(lets / np.maximum(found.iterations, 1), 0.5, 2.0), self.stepping.cut)
-            scattered(device, gathered(device, found.u, np.flatnonzero(good)), live[good], u)
+            scattered(device, found.u, live[good], u, np.flatnonzero(good))
             reached[live[good]], residual[live[good]] = aim[good], found.residual[good]
             outcome[live] = found.outcome
         short = np.flatnonzero(reached < 1.0)
