@@ -207,18 +207,28 @@ class Barrier(Term, Protocol):
 
 
 class Reduction(Protocol):
-    """A Barrier of one column on the n nodes that can be touched: a function of where they go, w (3n,) [m]."""
+    """A Barrier of b columns on the n nodes that can be touched: a function of where they go, w (3n, b) [m].
 
-    def slope(self, w: np.ndarray) -> np.ndarray:
-        """Its gradient (3n,) [N]."""
+    Arrays are those of `views.library`, float64.
+    """
+
+    def keep(self, columns: np.ndarray) -> None:
+        """Keep these columns (k,), in this order."""
         ...
 
-    def curvature(self, w: np.ndarray, some: np.ndarray, definite: bool) -> np.ndarray:
-        """Its curvature (3a, 3a) [N/m] between `some` (a,) of the n nodes; positive semi-definite if `definite`."""
+    def slope(self, w: Any) -> Any:
+        """Its gradient (3n, b) [N]."""
         ...
 
-    def longest_step(self, w: np.ndarray, dw: np.ndarray) -> float:
-        """The longest fraction, at most 1, of dw (3n,) [m] that stays inside the domain."""
+    def curvature(self, w: Any, place: Any, size: int, definite: np.ndarray) -> Any:
+        """Its curvature (b, 3 size, 3 size) [N/m] between the nodes that have a `place` (n, b) >= 0 in their column.
+
+        Positive semi-definite where it is to be `definite` (b,).
+        """
+        ...
+
+    def longest_step(self, w: Any, dw: Any) -> np.ndarray:
+        """The longest fraction (b,), at most 1, of dw (3n, b) [m] that stays inside the domain."""
         ...
 
 
@@ -231,8 +241,11 @@ class Local(Barrier, Protocol):
         """These nodes (n,), ascending."""
         ...
 
-    def reduced(self) -> Reduction | None:
-        """On these nodes alone, of a batch of one column, as it stands now; None where there is nothing to touch."""
+    def reduced(self, columns: np.ndarray) -> Reduction | None:
+        """On these nodes alone, in some columns (k,), as it stands now; None where there is nothing to touch.
+
+        There is one: it is as whoever asked last wanted it.
+        """
         ...
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from ..discretisation.problem import Problem
+from ..runtime.views import like, on_host, placed, view
 from .pcg import Preconditioner
 
 
@@ -30,7 +32,7 @@ class Columns:
 
 
 class Compliance:
-    """H (3N, 3N) [m/N], as a preconditioner does it, and its columns at some nodes.
+    """H (3N, 3N) [m/N], as a preconditioner does it, and its columns at n nodes: arrays of `views.library`.
 
     Parameters
     ----------
@@ -47,51 +49,52 @@ class Compliance:
     def __init__(
         self, problem: Problem, preconditioner: Preconditioner, nodes: np.ndarray, columns: Columns = Columns()
     ):
-        self._problem, self._preconditioner, self._nodes = problem, preconditioner, nodes
+        device = problem.device
+        self._problem, self._preconditioner = problem, preconditioner
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
-        self._size = columns.block
-        size = 3 * self._size * problem.rows * np.dtype(problem.device.precision).itemsize
+        self._width = 3 * columns.block
+        self._between = view(replace(device, precision="float64").zeros(len(self.rows), len(self.rows)))
+        self._known = np.zeros(-(-len(nodes) // columns.block), bool)
+        size = self._width * problem.rows * np.dtype(device.precision).itemsize
         self._block = lru_cache(max(columns.fewest_blocks, columns.most_bytes // size))(self._columns)
 
-    def answered(self, force: np.ndarray) -> np.ndarray:
+    def answered(self, force: Any) -> Any:
         """H force: motions (3N, b) [m] under forces (3N, b) [N]."""
         device, constraint = self._problem.device, self._problem.constraint
-        pull, out = device.array(force), device.zeros(*force.shape)
+        pull, out = device.zeros(*force.shape), device.zeros(*force.shape)
+        view(pull)[:] = force
         constraint.project_nodes(pull)
         self._preconditioner.apply(pull, np.ones(force.shape[1], bool), out)
         constraint.project_nodes(out)
-        return out.numpy()
+        return view(out)
 
-    def spread(self, force: np.ndarray) -> np.ndarray:
-        """Motion (3N,) [m] of all nodes under a force (3n,) [N] on these n."""
-        out = np.zeros(self._problem.rows, self._problem.device.precision)
-        for node, own in _acting(force):
-            out += own.astype(out.dtype) @ self._block(node // self._size)[0][node % self._size]
+    def spread(self, force: Any) -> Any:
+        """Motion (3N, b) [m] of all nodes under forces (3n, b) [N] on these n."""
+        out = view(self._problem.device.zeros(self._problem.rows, force.shape[1]))
+        force = like(out, force)
+        for block in self._acting(on_host((force != 0.0).any(1))):
+            out += self._block(block) @ force[self._rows(block)]
         return out
 
-    def moved(self, force: np.ndarray) -> np.ndarray:
-        """Motion (3n,) [m] of these n nodes alone."""
-        out = np.zeros(len(force))
-        for node, own in _acting(force):
-            out += own @ self._block(node // self._size)[1][node % self._size]
-        return out
+    def between(self, acting: np.ndarray) -> Any:
+        """H (3n, 3n) [m/N] between these n nodes: at least its columns at those that are `acting` (n,) bool."""
+        for block in self._acting(np.repeat(acting, 3)):
+            if not self._known[block]:
+                self._block(block)
+        return self._between
 
-    def between(self, some: np.ndarray) -> np.ndarray:
-        """H (3a, 3a) [m/N] between `some` (a,) of the n nodes."""
-        rows = (3 * some[:, None] + np.arange(3)).ravel()
-        places = (divmod(node, self._size) for node in some.tolist())
-        return np.concatenate([self._block(block)[1][place][:, rows] for block, place in places])
+    def _acting(self, rows: np.ndarray) -> list[int]:
+        """The blocks that some rows (3n,) bool are in."""
+        return np.unique(np.flatnonzero(rows) // self._width).tolist()
 
-    def _columns(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of a block's k nodes, (k, 3, 3N), and at the n nodes in double precision (k, 3, 3n)."""
-        rows = self.rows[3 * self._size * number : 3 * self._size * (number + 1)]
-        unit = np.zeros((self._problem.rows, 3 * self._size))
-        unit[rows, np.arange(len(rows))] = 1.0
-        whole = np.ascontiguousarray(self.answered(unit).T).reshape(self._size, 3, -1)
-        return whole, whole[:, :, self.rows].astype(np.float64)
+    def _rows(self, block: int) -> slice:
+        return slice(self._width * block, self._width * (block + 1))
 
-
-def _acting(force: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    """The numbers of the nodes at which a force (3n,) acts, and what (3,) acts there."""
-    own = force.reshape(-1, 3)
-    return [(node, own[node]) for node in np.flatnonzero(own.any(axis=1)).tolist()]
+    def _columns(self, block: int) -> Any:
+        """(3N, k) [m/N], and what stands of them between the nodes, in double precision."""
+        own = self._rows(block)
+        unit = np.zeros((self._problem.rows, self._width))
+        unit[self.rows[own], np.arange(len(self.rows[own]))] = 1.0
+        whole = self.answered(placed(self._problem.device, unit))[:, : len(self.rows[own])]
+        self._between[:, own], self._known[block] = whole[self.rows], True
+        return whole

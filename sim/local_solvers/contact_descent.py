@@ -14,22 +14,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import warp as wp
-from scipy.linalg import LinAlgError
 
 from ..discretisation.problem import Problem
 from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
-from ..minimisers.compact_lbfgs import Pairs, no_pairs
+from ..minimisers.compact_lbfgs import PairsOfColumns
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from ..minimisers.line_search import goes_too_far, kept_of
-from ..minimisers.residual import relative
-from ..runtime.threads import one_thread
-from .contact_forces import Softness, settled
+from ..minimisers.residual import Judge, judge_of, relative
+from ..runtime.views import doubled, from_view, in_order, on_host, placed, view
+from .contact_forces import BENT, FORCES, ForceLimits, Softness, settled
 
 
 @dataclass(frozen=True)
@@ -38,25 +38,30 @@ class ContactLimits:
 
     Parameters
     ----------
-    cuts
-        Most of one step.
     forcing, enough
         Tools' forces are exact to this share of the whole residual, or of the tolerance.
     left, long
         A step does well that leaves so much of the free force, and is not cut shorter than this.
-    patience, shortest
-        After so many in a row that do not, and after one that is cut to less than this, Newton goes on.
+    patience
+        After so many in a row that do not, Newton goes on.
+    shortest
+        A step that is cut to less than this is not taken if what was learnt may have misled it.
+    least
+        A step so short is taken as it is.
+    felt
+        [J] A step that is worth less teaches nothing but round-off.
     drag, growth, times
         The first drag that is tried where one is wanted, by how much it grows and shrinks, and how often it grows.
     """
 
-    cuts: int = 8
     forcing: float = 0.03
     enough: float = 0.1
     left: float = 0.6
     long: float = 0.5
-    patience: int = 3
+    patience: int = 10
     shortest: float = 0.1
+    least: float = 1e-3
+    felt: float = 1e-60
     drag: float = 0.3
     growth: float = 3.0
     times: int = 5
@@ -64,28 +69,77 @@ class ContactLimits:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """u (3N,) [m]; the free gradients (3N,) [N] of all that is smooth, and of all; its 2-norm, and its scale."""
+    """u (3N, b) [m]; free gradients (3N, b) [N] of all that is smooth, and of all; 2-norms (b,), and scales (b,)."""
 
-    u: np.ndarray
-    smooth: np.ndarray
-    whole: np.ndarray
-    free: float
-    scale: float
-
-    @property
-    def relative(self) -> float:
-        """The relative residual."""
-        return float(relative(np.asarray(self.free), np.asarray(self.scale)))
+    u: Any
+    smooth: Any
+    whole: Any
+    free: np.ndarray
+    scale: np.ndarray
 
     @property
-    def finite(self) -> bool:
-        """Whether it is a state at all: forces that overflow have no scale."""
-        return bool(np.isfinite(self.free) and np.isfinite(self.scale))
+    def relative(self) -> np.ndarray:
+        """The relative residuals (b,)."""
+        return relative(self.free, self.scale)
+
+    @property
+    def finite(self) -> np.ndarray:
+        """(b,) bool: whether each is a state at all. Forces that overflow have no scale."""
+        return np.isfinite(self.free) & np.isfinite(self.scale)
+
+    def rows(self, stay: np.ndarray) -> State:
+        """Some of the columns (k,)."""
+        parts = (self.u[:, stay], self.smooth[:, stay], self.whole[:, stay])
+        return State(*parts, self.free[stay], self.scale[stay])
+
+    def put(self, columns: np.ndarray, other: State) -> None:
+        """Write some columns (k,) of another state over these."""
+        for mine, its in ((self.u, other.u), (self.smooth, other.smooth), (self.whole, other.whole)):
+            mine[:, columns] = its[:, columns]
+        self.free[columns], self.scale[columns] = other.free[columns], other.scale[columns]
+
+
+@dataclass(eq=False)
+class Batch:
+    """Columns on their way. Arrays (.., b) last; each column aims, tries, and is cut, by itself.
+
+    judge, now
+        What measures them, and where they are.
+    pairs
+        What they have learnt.
+    force, rest
+        (3n, b) [N] the tools' as the model has them; (3N, b) [m] what the body at rest answers what is out of balance
+        under these.
+    x, length, promised
+        (3N, b) [m] the direction, and (b,) the step along it that is tried; what it promises.
+    drag, slow, steps
+        (b,).
+    """
+
+    judge: Judge
+    now: State
+    pairs: PairsOfColumns
+    force: Any
+    rest: Any
+    x: Any
+    length: np.ndarray
+    promised: np.ndarray
+    drag: np.ndarray
+    slow: np.ndarray
+    steps: np.ndarray
+
+    def keep(self, stay: np.ndarray) -> None:
+        """Keep these columns (k,)."""
+        self.judge, self.now = self.judge.rows(stay), self.now.rows(stay)
+        self.pairs.keep(stay)
+        self.force, self.rest, self.x = self.force[:, stay], self.rest[:, stay], self.x[:, stay]
+        for name in ("length", "promised", "drag", "slow", "steps"):
+            setattr(self, name, getattr(self, name)[stay])
 
 
 @dataclass(frozen=True, eq=False)
 class ContactDescent:
-    """A descent for single loads on a problem with one `Local` barrier, whose constraints stay closed.
+    """A descent for a problem with one `Local` barrier, whose constraints stay closed.
 
     problem
         What is minimised.
@@ -108,113 +162,166 @@ class ContactDescent:
         return Compliance(self.problem, self.preconditioner, self.barrier.touchable)
 
     def descend(self, start: wp.array, tolerance: np.ndarray, most: int) -> Descended:
-        """As `Lbfgs.descend`, of one column, in at most `most` steps; nothing is learnt."""
-        pairs = no_pairs(self.problem.rows, self.problem.device.precision)
-        now = self._judged(start.numpy()[:, 0].astype(np.float64))
-        status, step, drag, slow = LIVE if now.finite else BROKEN, 0, 0.0, 0
-        # Threads of BLAS wait for one another, ages where something else runs on their cores.
-        with one_thread():
-            force = self._felt(now)
-            rest = self._answered(now.smooth + self._everywhere(force))
-            while status == LIVE:
-                if now.relative <= tolerance[0]:
-                    status = DONE
-                if status == DONE or step >= most or slow >= self.limits.patience:
-                    break
-                exact = max(self.limits.forcing * min(now.relative, 1.0), self.limits.enough * tolerance[0])
-                aim = self._aimed(now, force, rest, pairs, exact, drag)
-                if aim is None:
-                    break
-                before, (force, drag) = force, aim
-                rest = rest + self.compliance.spread(force - before)
-                t, new = self._searched(now, -rest - pairs.motion(pairs.weights(now.smooth + self._everywhere(force))))
-                if not new.finite:
-                    break
-                step += 1
-                well = t > self.limits.long and new.free <= self.limits.left * now.free
-                slow = self.limits.patience if t < self.limits.shortest else 0 if well else slow + 1
-                if well:
-                    drag = drag / self.limits.growth if drag >= self.limits.drag else 0.0
-                elif t < self.limits.long or new.free > now.free:
-                    drag = max(self.limits.drag, self.limits.growth * drag)
-                if new.relative > tolerance[0]:
-                    moved, change = new.u - now.u, new.smooth - now.smooth
-                    way = self._answered(change)
-                    rest = rest + way
-                    if moved @ change > 0.0:
-                        pairs = pairs.and_one(moved, change, way)
-                now = new
-        u = self.problem.device.array(now.u[:, None])
-        return Descended(u, np.array([status]), np.array([step]), np.array([now.relative]), {})
+        """As `Lbfgs.descend`, in at most `most` steps of each column; nothing is learnt."""
+        count, device, limits = start.shape[1], self.problem.device, self.limits
+        result, live = wp.clone(start), np.arange(count)
+        status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
+        with in_order(device):
+            batch = self._begun(start)
+            ready = np.ones(count, bool)
+            while True:
+                done = ready & (batch.now.relative <= tolerance[live])
+                over = done | (ready & ((batch.slow >= limits.patience) | (batch.steps >= most) | ~batch.now.finite))
+                if (ready & ~over).any():
+                    over |= ~self._aimed(batch, ready & ~over, tolerance[live])
+                if over.any():
+                    leave, stay = np.flatnonzero(over), np.flatnonzero(~over)
+                    there = live[leave]
+                    view(result)[:, there] = batch.now.u[:, leave]
+                    status[there] = np.where(done, DONE, np.where(batch.now.finite, LIVE, BROKEN))[leave]
+                    steps[there], residual[there] = batch.steps[leave], batch.now.relative[leave]
+                    if not len(stay):
+                        return Descended(result, status, steps, residual, {})
+                    batch.keep(stay)
+                    live = live[stay]
+                ready = self._tried(batch, tolerance[live])
 
-    def _aimed(
-        self, now: State, force: np.ndarray, rest: np.ndarray, pairs: Pairs, tolerance: float, drag: float
-    ) -> tuple[np.ndarray, float] | None:
-        """The tools' forces (3n,) where the model is in equilibrium, and the drag that this takes.
+    def _begun(self, start: wp.array) -> Batch:
+        judge, count = judge_of(self.problem, start), start.shape[1]
+        now = self._judged(judge, view(start) + 0.0)
+        force, none = self._felt(now), np.zeros(count)
+        pairs = PairsOfColumns(self.problem.device, self.problem.rows, count)
+        rest = self._answered(now.smooth, force)
+        numbers = np.zeros((2, count), int)
+        return Batch(judge, now, pairs, force, rest, 0.0 * rest, none, none, none.copy(), *numbers)
 
-        `rest` (3N,) [m] is what the body at rest answers the smooth gradient and a `force` (3n,) with. None where no
-        drag makes the model convex.
+    def _aimed(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
+        """Give the columns that are `wanted` (b,) bool a direction; which columns (b,) have one, or had one before.
+
+        A column whose model has no equilibrium forgets what it has learnt. Then one will do in which it is not convex.
         """
-        barrier, rows = self.barrier.reduced(), self.compliance.rows
-        if barrier is None:
-            return np.zeros_like(force), drag
-        free = now.u - rest - pairs.motion(pairs.weights(now.smooth + self._everywhere(force)))
-        soft = Softness(self.compliance, pairs)
-        for _ in range(self.limits.times):
-            try:
-                found = settled(barrier, soft, now.u[rows], free[rows], force, tolerance, drag)
-            except LinAlgError:  # steps so small that what is learnt from them is round-off
-                return None
-            if found is not None:
-                return found, drag
-            drag = max(self.limits.drag, self.limits.growth * drag)
-        return None
-
-    def _felt(self, now: State) -> np.ndarray:
-        """Forces (3n,) that balance all that is smooth, where tools touch."""
-        barrier, rows = self.barrier.reduced(), self.compliance.rows
-        if barrier is None:
-            return np.zeros(len(rows))
-        touched = barrier.slope(now.u[rows]).reshape(-1, 3).any(axis=1)
-        return np.where(np.repeat(touched, 3), -now.smooth[rows], 0.0)
-
-    def _everywhere(self, force: np.ndarray) -> np.ndarray:
-        """A force (3n,) on the touchable nodes as one (3N,) on all."""
-        whole = np.zeros(self.problem.rows)
-        whole[self.compliance.rows] = force
-        return whole
-
-    def _searched(self, now: State, x: np.ndarray) -> tuple[float, State]:
-        """How far along a step x (3N,) the energy still falls, or about so, and the state there."""
-        device = self.problem.device
-        t = float(self.problem.longest_step(device.array(now.u[:, None]), device.array(x[:, None]))[0])
-        promised = -float(now.whole @ x)
-        new = self._judged(now.u + t * x)
-        for _ in range(self.limits.cuts):
-            ahead = float(new.whole @ x) if new.finite else np.inf
-            if not goes_too_far(ahead, promised):
+        now = batch.now
+        force, found = self._forces(batch, wanted, tolerance, FORCES)
+        for limits in (FORCES, BENT):
+            if found.all():
                 break
-            t *= kept_of(ahead, promised)
-            new = self._judged(now.u + t * x)
-        return t, new
+            missing = ~found
+            batch.pairs.forget(np.flatnonzero(missing))
+            batch.drag = np.where(found, batch.drag, 0.0)
+            again, found = self._forces(batch, missing, tolerance, limits)
+            force[:, missing] = again[:, missing]
+        some = np.flatnonzero(wanted & found)
+        batch.rest[:, some] += self.compliance.spread((force - batch.force)[:, some])
+        batch.force[:, some] = force[:, some]
+        batch.x[:, some] = -batch.rest[:, some]
+        if batch.pairs.most:
+            learnt = batch.pairs.of(some)
+            batch.x[:, some] -= learnt.motion(learnt.weights(self._pull(now.smooth, force)[:, some]))
+        device = self.problem.device
+        longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.x))
+        batch.length = np.where(wanted, longest, batch.length)
+        batch.promised = np.where(wanted, -_dots(now.whole, batch.x), batch.promised)
+        return found
 
-    def _answered(self, force: np.ndarray) -> np.ndarray:
-        """How the body at rest moves (3N,) [m] under a force (3N,) [N]."""
-        return self.compliance.answered(force[:, None])[:, 0].astype(np.float64)
+    def _forces(
+        self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray, most: ForceLimits
+    ) -> tuple[Any, np.ndarray]:
+        """The tools' forces (3n, b) where the model is in equilibrium, of the columns that are `wanted` (b,) bool.
 
-    def _judged(self, u: np.ndarray) -> State:
-        """The state u (3N,), as `Problem.residual` measures it."""
+        The drag is raised as often as that takes. The second, (b,) bool, is false where it has none.
+        """
+        limits, rows, now = self.limits, self.compliance.rows, batch.now
+        force, missing = batch.force + 0.0, np.flatnonzero(wanted)
+        exact = np.maximum(limits.forcing * np.minimum(now.relative, 1.0), limits.enough * tolerance)
+        for _ in range(limits.times):
+            barrier = self.barrier.reduced(missing)
+            if barrier is None or not len(missing):
+                missing = missing[:0]
+                break
+            soft, free = Softness(self.compliance, self.problem.device), now.u[rows] - batch.rest[rows]
+            free, here, known = free[:, missing], doubled(now.u[rows][:, missing]), batch.force[:, missing]
+            if batch.pairs.most:
+                learnt = batch.pairs.of(missing)
+                own = doubled(learnt.sw[:, :, rows])
+                soft = Softness(self.compliance, self.problem.device, own, doubled(learnt.middle))
+                free = free - (learnt.weights(self._pull(now.smooth, batch.force)[:, missing]).mT @ own)[:, 0].T
+            one, solved = settled(barrier, soft, here, doubled(free), known, exact[missing], batch.drag[missing], most)
+            force[:, missing[solved]] = one[:, solved]
+            missing = missing[~solved]
+            batch.drag[missing] = self._harder(batch.drag[missing])
+        found = np.ones(len(wanted), bool)
+        found[missing] = False
+        return force, found
+
+    def _harder(self, drag: np.ndarray) -> np.ndarray:
+        return np.maximum(self.limits.drag, self.limits.growth * drag)
+
+    def _tried(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
+        """Try every column's step; which columns (b,) want another direction.
+
+        They have taken it, as the energy still falls there, or about so. Or hardly anything is left of it after cuts:
+        then they have not moved, and forget what has misled them.
+        """
+        limits, now, t = self.limits, batch.now, batch.length
+        new = self._judged(batch.judge, now.u + placed(self.problem.device, t.astype(now.u.dtype)) * batch.x)
+        ahead = np.where(new.finite, _dots(new.whole, batch.x), np.inf)
+        far = goes_too_far(ahead, batch.promised) & (t > limits.least)
+        batch.length = np.where(far, t * kept_of(ahead, batch.promised), t)
+        misled = far & (batch.length < limits.shortest) & (batch.pairs.count > 0)
+        taken, well = np.flatnonzero(~far), (t > limits.long) & (new.free <= limits.left * now.free)
+        eased = np.where(batch.drag >= limits.drag, batch.drag / limits.growth, 0.0)
+        worse = (t < limits.long) | (new.free > now.free)
+        drag = np.where(~far & well, eased, np.where(misled | (~far & worse), self._harder(batch.drag), batch.drag))
+        batch.drag, batch.steps = drag, batch.steps + (misled | ~far)
+        batch.slow = np.where(~far & well, 0, batch.slow + (misled | ~far))
+        batch.pairs.forget(np.flatnonzero(misled))
+        if len(taken):
+            self._learn(batch, new, taken)
+            now.put(taken, new)
+        return misled | ~far
+
+    def _learn(self, batch: Batch, new: State, taken: np.ndarray) -> None:
+        """From steps that some columns (k,) have taken to a new state."""
+        now = batch.now
+        moved, change = new.u[:, taken] - now.u[:, taken], new.smooth[:, taken] - now.smooth[:, taken]
+        rest = self._answered(new.smooth[:, taken], batch.force[:, taken])
+        way = rest - batch.rest[:, taken]
+        batch.rest[:, taken] = rest
+        some = np.flatnonzero((_dots(moved, change) > self.limits.felt) & new.finite[taken])
+        if len(some):
+            batch.pairs.learn(taken[some], moved[:, some], change[:, some], way[:, some])
+
+    def _felt(self, now: State) -> Any:
+        """Forces (3n, b) that balance all that is smooth, where tools touch."""
+        barrier, rows = self.barrier.reduced(np.arange(len(now.free))), self.compliance.rows
+        own = doubled(now.smooth[rows])
+        if barrier is None:
+            return 0.0 * own
+        slope = barrier.slope(doubled(now.u[rows]))
+        touched = (slope != 0.0).reshape(-1, 3, slope.shape[1]).any(1)
+        return -own * touched.repeat(3, 0)
+
+    def _pull(self, smooth: Any, force: Any) -> Any:
+        """Smooth gradients (3N, b) and forces (3n, b) on the touchable nodes, together (3N, b)."""
+        out = smooth + 0.0
+        out[self.compliance.rows] += force
+        return out
+
+    def _judged(self, judge: Judge, u: Any) -> State:
+        """The states u (3N, b), as `Problem.residual` measures them."""
         problem, device = self.problem, self.problem.device
-        place, parts, scale = device.array(u[:, None]), np.zeros((problem.rows, 2)), 0.0
-        for term in problem.terms:
-            own = device.zeros(problem.rows, 1)
-            term.add_gradient(place, own)
-            force = own.numpy()[:, 0]
-            parts[:, int(term is self.barrier)] += force
-            scale = max(scale, float(np.linalg.norm(force)))
-        both = device.array(parts)
-        problem.constraint.project_nodes(both)
-        free = both.numpy().astype(np.float64)
-        smooth, whole = free[:, 0], free.sum(axis=1)
-        size, all_of_it = float(np.linalg.norm(whole)), float(np.linalg.norm(parts.sum(axis=1)))
-        return State(u, smooth, whole, size, max(scale, np.sqrt(max(all_of_it**2 - size**2, 0.0))))
+        place, pressed = device.zeros(*u.shape), device.zeros(*u.shape)
+        view(place)[:] = u
+        found = judge(place)
+        self.barrier.add_gradient(place, pressed)
+        problem.constraint.project_nodes(pressed)
+        whole = view(found.g)
+        return State(view(place), whole - view(pressed), whole, found.free, found.scale)
+
+    def _answered(self, smooth: Any, force: Any) -> Any:
+        """How the body at rest moves (3N, b) [m] under what is out of balance."""
+        return self.compliance.answered(self._pull(smooth, force))
+
+
+def _dots(x: Any, y: Any) -> np.ndarray:
+    return on_host((x * y).sum(0)).astype(np.float64)

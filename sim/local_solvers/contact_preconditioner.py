@@ -48,7 +48,9 @@ class ContactPreconditioner:
             if 0 < len(nodes) <= FORCES.most:
                 # Threads of BLAS wait for one another, ages where something else runs on their cores.
                 with one_thread():
-                    whole = np.eye(len(curvature)) + curvature @ self._compliance.between(nodes)
+                    rows = (3 * nodes[:, None] + np.arange(3)).ravel()
+                    own = self._compliance.between(np.isin(np.arange(len(self._compliance.rows) // 3), nodes))
+                    whole = np.eye(len(curvature)) + curvature @ own[np.ix_(rows, rows)]
                     self._felt = nodes, curvature, lu_factor(whole)
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
@@ -60,4 +62,4 @@ class ContactPreconditioner:
             own = z[self._compliance.rows, 0].reshape(-1, 3)[nodes].ravel()
             with one_thread():
                 force[nodes] = lu_solve(whole, curvature @ own).reshape(-1, 3)
-                out.assign(z - self._compliance.spread(force.ravel())[:, None])
+                out.assign(z - self._compliance.spread(force.reshape(-1, 1)))

@@ -11,9 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from ..runtime.device import Device
+from ..runtime.views import like, on_host, placed, view
 from .lbfgs_kernels import PAIRS
 
 
@@ -29,9 +32,7 @@ class Pairs:
     @cached_property
     def middle(self) -> np.ndarray:
         """M (2m, 2m)."""
-        inverse = np.linalg.inv(np.triu(self.sy))
-        corner = inverse.T @ (np.diag(np.diag(self.sy)) + self.yw) @ inverse
-        return np.block([[corner, -inverse.T], [-inverse, np.zeros_like(inverse)]])
+        return middle_of(self.sy, self.yw)
 
     def weights(self, force: np.ndarray) -> np.ndarray:
         """M [S, W]' force (2m,), of a force (3N,)."""
@@ -42,10 +43,6 @@ class Pairs:
         """[S, W] weights (3N,)."""
         some, others = np.split(weights.astype(self.s.dtype), 2)
         return some @ self.s + others @ self.w
-
-    def at(self, rows: np.ndarray) -> np.ndarray:
-        """[S, W]' (2m, k) at some of the 3N rows (k,)."""
-        return np.concatenate([self.s[:, rows], self.w[:, rows]]).astype(np.float64)
 
     def and_one(self, s: np.ndarray, y: np.ndarray, w: np.ndarray) -> Pairs:
         """With a newer pair (3N,), and the oldest forgotten where there are too many."""
@@ -62,3 +59,83 @@ class Pairs:
 def no_pairs(rows: int, kind: str) -> Pairs:
     """Nothing learnt yet of a column of `rows`, kept as numbers of a `kind`."""
     return Pairs(*np.zeros((2, 0, rows), kind), *np.zeros((2, 0, 0)))
+
+
+def middle_of(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
+    """M (..., 2m, 2m) of products s_i . y_j and y_i . w_j (..., m, m), oldest first; pairs of zeros count nothing."""
+    upper, eye = np.triu(sy), np.eye(sy.shape[-1])
+    own = np.diagonal(upper, axis1=-2, axis2=-1)[..., None] * eye
+    inverse = np.linalg.inv(upper + np.where(own == 0.0, eye, 0.0))
+    corner = inverse.mT @ (own + yw) @ inverse
+    return np.block([[corner, -inverse.mT], [-inverse, np.zeros_like(inverse)]])
+
+
+class PairsOfColumns:
+    """The same for the b columns of a batch, each with pairs of its own, where the batch lives.
+
+    Parameters
+    ----------
+    device
+        Where that is.
+    rows, columns
+        3N and b.
+    """
+
+    def __init__(self, device: Device, rows: int, columns: int):
+        self._device = device
+        # Steps and w, and in host's numbers their products; pair i of a column stands in place i modulo PAIRS.
+        self._sw = view(device.zeros(columns * 2 * PAIRS, rows)).reshape(columns, 2 * PAIRS, rows)
+        self._sy, self._yw = np.zeros((2, columns, PAIRS, PAIRS))
+        self.count = np.zeros(columns, int)
+
+    def keep(self, columns: np.ndarray) -> None:
+        """Keep these columns (k,): the others have left the batch."""
+        self._sw = self._sw[columns]
+        self._sy, self._yw, self.count = self._sy[columns], self._yw[columns], self.count[columns]
+
+    def forget(self, columns: np.ndarray) -> None:
+        """Of some columns (k,) nothing is known any more."""
+        self._sw[columns], self._sy[columns], self._yw[columns], self.count[columns] = 0.0, 0.0, 0.0, 0
+
+    @property
+    def most(self) -> int:
+        """How many pairs the column with the most of them has."""
+        return min(int(self.count.max(initial=0)), PAIRS)
+
+    def of(self, columns: np.ndarray) -> Learnt:
+        """What some columns (k,) have learnt."""
+        order = (self.count[columns, None] + np.arange(PAIRS)) % PAIRS  # oldest first
+        both = np.concatenate([order, PAIRS + order], axis=1)
+        place = columns[:, None, None], order[:, :, None], order[:, None, :]
+        middle = np.empty((len(columns), 2 * PAIRS, 2 * PAIRS))
+        found = middle_of(self._sy[place], self._yw[place])
+        middle[np.arange(len(columns))[:, None, None], both[:, :, None], both[:, None, :]] = found
+        return Learnt(self._sw[columns], placed(self._device, middle.astype(self._device.precision)))
+
+    def learn(self, columns: np.ndarray, s: Any, y: Any, w: Any) -> None:
+        """A newer pair of some columns (k,): s, y and w (3N, k); the oldest is forgotten where there are too many."""
+        place = self.count[columns] % PAIRS
+        self._sw[columns, place], self._sw[columns, PAIRS + place] = s.T, w.T
+        # y . H0 y' = y' . H0 y: what the new change is worth along old ones, and old changes along the new step.
+        change = like(self._sw, y.T[:, :, None])
+        worth = on_host(self._sw[columns] @ change)[:, :, 0].astype(np.float64)
+        self._sy[columns, place] = 0.0
+        self._sy[columns, :, place] = worth[:, :PAIRS]
+        self._yw[columns, :, place] = self._yw[columns, place] = worth[:, PAIRS:]
+        self.count[columns] += 1
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """[S, W]' (k, 2m, 3N) and M (k, 2m, 2m) of k columns."""
+
+    sw: Any
+    middle: Any
+
+    def weights(self, force: Any) -> Any:
+        """M [S, W]' force (k, 2m, 1), of forces (3N, k) [N]."""
+        return self.middle @ (self.sw @ force.T[:, :, None])
+
+    def motion(self, weights: Any) -> Any:
+        """[S, W] weights (3N, k) [m]."""
+        return (weights.mT @ self.sw)[:, 0].T

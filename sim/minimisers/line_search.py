@@ -6,6 +6,7 @@ Energies are not compared: in single precision their differences drown in round-
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -36,15 +37,17 @@ class Search:
     shortest: float = 1e-8
 
 
-def goes_too_far(ahead: float, promised: float) -> bool:
-    """Whether the slope `ahead` of a step, which promised so much decrease, has risen too far; or is no number."""
-    return not ahead <= OVERSHOOT * abs(promised)
+def goes_too_far(ahead: Any, promised: Any) -> Any:
+    """Whether the slopes `ahead` of steps, which promised so much decrease, have risen too far; or are no numbers."""
+    return ~(np.asarray(ahead) <= OVERSHOOT * np.abs(promised))
 
 
-def kept_of(ahead: float, promised: float) -> float:
-    """The share of a step that went too far to be tried next: where the line through both slopes is zero."""
-    kept = promised / (promised + ahead) if promised > 0.0 and np.isfinite(ahead) else KEPT
-    return float(np.clip(kept, LEAST_KEPT, MOST_KEPT))
+def kept_of(ahead: Any, promised: Any) -> Any:
+    """The shares of steps that went too far to be tried next: where the line through both slopes is zero."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        kept = np.divide(promised, np.add(promised, ahead))
+    known = np.greater(promised, 0.0) & np.isfinite(ahead)
+    return np.clip(np.where(known, kept, KEPT), LEAST_KEPT, MOST_KEPT)
 
 
 def search(problem: Problem, u: wp.array, direction: Direction, settings: Search = Search()) -> np.ndarray:

@@ -54,7 +54,7 @@ class Plan:
     many, single
         What is tried first of `WORTH` loads or more, and of one; None: nothing is solved by itself.
     contact
-        What is tried first of one load whose tools are moved by pose; None where no tool is.
+        What is tried first of loads whose tools are moved by pose; None where no tool is.
     quick
         Whether L-BFGS is tried before Newton-CG.
     frames
@@ -93,8 +93,8 @@ class Plan:
         if self.frames:
             lines.append(f"A load that follows another is {Step.FRAME.value}.")
         if self.contact:
-            lines.append(f"Tools are moved by pose. A single load begins with {self.contact.value}.")
-            lines.append(f"{Step.NEWTON.value} takes what that leaves, and all batches.")
+            lines.append(f"Tools are moved by pose. Every load begins with {self.contact.value}.")
+            lines.append(f"{Step.NEWTON.value} takes what that leaves, load by load.")
         elif not self.quick:
             lines.append(f"Every load is solved by {Step.NEWTON.value}, in at most {self.outer} iterations.")
         else:

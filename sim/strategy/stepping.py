@@ -50,7 +50,7 @@ class Gaps:
     closing: float = 4.0
     tolerance: float = 0.05
     wider: float = 16.0
-    alone: int = 16
+    alone: int = 60
     nearly: float = 0.1
 
 

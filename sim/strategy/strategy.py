@@ -243,24 +243,28 @@ class Strategy:
         return replace(answer, learnt=taught)
 
     def _touching(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
-        """Of cases whose tools have gone so many times their gap: what touches and what gives apart, then Newton."""
-        problem, touch = self.problem, self._proximal
+        """Of cases whose tools have gone so many times their gap: what touches and what gives apart, then Newton.
+
+        Newton has them one by one: the preconditioner of a single one knows what it touches.
+        """
+        problem, touch, device = self.problem, self._proximal, self.problem.device
         problem.begin(cases)
-        if touch is None or len(cases.loads) > 1 or problem.constraint.imposes or problem.gap(start)[1].any():
+        if touch is None or problem.constraint.imposes or problem.gap(start)[1].any():
             return self._closed(cases, start, outer, gaps)
-        start = self._rested(start)
-        found = touch.descend(start, np.array([self.accuracy.tolerance]), min(self.gaps.alone, outer))
-        if found.status[0] == DONE:
-            outcome = np.full(1, Outcome.CONVERGED, object)
-            return self._answer(found.u, outcome, found.steps, found.residual, 0)
-        spent = found.steps
-        if found.residual[0] <= self.gaps.nearly:
-            answer = self._thorough(found.u, min(self.gaps.alone, outer))
-            spent = spent + answer.iterations
-            if answer.good.all():
-                return replace(answer, iterations=spent)
-        closed = self._closed(cases, start, outer, gaps)
-        return replace(closed, iterations=closed.iterations + spent)
+        start, count, few = self._rested(start), len(cases.loads), min(self.gaps.alone, outer)
+        found = touch.descend(start, np.full(count, self.accuracy.tolerance), few)
+        outcome = np.full(count, Outcome.BUDGET, object)
+        outcome[found.status == DONE] = Outcome.CONVERGED
+        answer = self._answer(found.u, outcome, found.steps, found.residual, 0)
+        for row in np.flatnonzero(~answer.good):
+            here = np.array([row])
+            one = cases.rows(here)
+            if found.residual[row] <= self.gaps.nearly:
+                problem.begin(one)
+                answer.put(here, self._thorough(gathered(device, found.u, here), few), device)
+            if not answer.good[row]:
+                answer.put(here, self._closed(one, gathered(device, start, here), outer, gaps), device)
+        return answer
 
     def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
         """Newton, of cases whose tools have gone so many times their gap: it is opened first, and closed step by step.

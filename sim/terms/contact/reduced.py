@@ -1,26 +1,23 @@
-"""The barrier of tools on the nodes that they can touch, of one column, on the host in double precision.
-
-What is solved with it is small: arrays travel no farther than from NumPy to a kernel on the CPU.
-"""
+"""The barrier of tools on the nodes that they can touch, in double precision."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from functools import lru_cache
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
 from ...discretisation.term import Term
 from ...runtime.device import Device
-
-HOST = Device("cpu", "float64")
+from ...runtime.views import view
 
 
 class Dense(Term, Protocol):
     """A Term that few nodes feel, so that its curvature is a small dense matrix."""
 
-    def add_matrix(self, u: wp.array, place: wp.array, definite: bool, out: wp.array) -> None:
-        """Add K(u) of one column, u (3N, 1), to out (3n, 3n), float64, between nodes of a `place` (N,), not -1."""
+    def add_matrix(self, u: wp.array, definite: wp.array, place: wp.array, out: wp.array) -> None:
+        """Add K(u) of b columns, u (3N, b), to out (b, 3m, 3m), float64, between nodes of a `place` (N, b), not -1."""
         ...
 
 
@@ -30,35 +27,47 @@ class Reduced:
     Parameters
     ----------
     term
-        The barrier of these n nodes alone, on the `HOST`.
+        The barrier of these n nodes alone, in double precision.
     count
         n.
+    device
+        Where it lives.
     """
 
-    def __init__(self, term: Dense, count: int):
-        self._term = term
-        # Arrays of Warp and the same numbers as NumPy's: to make either anew takes as long as a launch.
-        self._at, self._way, self._force = (HOST.zeros(3 * count, 1) for _ in range(3))
-        self._place, self._bound = wp.zeros(count, dtype=wp.int32, device="cpu"), HOST.zeros(1)
-        self._w, self._dw, self._f = (array.numpy()[:, 0] for array in (self._at, self._way, self._force))
-        self._numbers, self._longest = self._place.numpy(), self._bound.numpy()
+    def __init__(self, term: Dense, count: int, device: Device):
+        self._term, self._count, self._device = term, count, device
+        # To make an array takes as long as a launch.
+        self._arrays = lru_cache(2)(self._made)
 
-    def slope(self, w: np.ndarray) -> np.ndarray:
+    def keep(self, columns: np.ndarray) -> None:
+        """As `Reduction.keep`."""
+        self._term.keep(columns)
+
+    def slope(self, w: Any) -> Any:
         """As `Reduction.slope`."""
-        self._w[:], self._f[:] = w, 0.0
-        self._term.add_gradient(self._at, self._force)
-        return self._f.copy()
+        at, force = self._arrays(w.shape[1])[:2]
+        view(at)[:] = w
+        force.zero_()
+        self._term.add_gradient(at, force)
+        return view(force) + 0.0  # a copy
 
-    def curvature(self, w: np.ndarray, some: np.ndarray, definite: bool) -> np.ndarray:
+    def curvature(self, w: Any, place: Any, size: int, definite: np.ndarray) -> Any:
         """As `Reduction.curvature`."""
-        self._w[:], self._numbers[:] = w, -1
-        self._numbers[some] = np.arange(len(some))
-        out = wp.zeros((3 * len(some), 3 * len(some)), dtype=wp.float64, device="cpu")
-        self._term.add_matrix(self._at, self._place, definite, out)
-        return out.numpy()
+        at, _, _, numbers = self._arrays(w.shape[1])
+        view(at)[:], view(numbers)[:] = w, place
+        out = wp.zeros((w.shape[1], 3 * size, 3 * size), dtype=wp.float64, device=self._device.name)
+        self._term.add_matrix(at, self._device.array(definite.astype(np.int32), wp.int32), numbers, out)
+        return view(out)
 
-    def longest_step(self, w: np.ndarray, dw: np.ndarray) -> float:
+    def longest_step(self, w: Any, dw: Any) -> np.ndarray:
         """As `Reduction.longest_step`."""
-        self._w[:], self._dw[:], self._longest[0] = w, dw, 1.0
-        self._term.longest_step(self._at, self._way, self._bound)
-        return float(self._longest[0])
+        at, _, way, _ = self._arrays(w.shape[1])
+        view(at)[:], view(way)[:] = w, dw
+        bound = wp.full(w.shape[1], 1.0, dtype=wp.float64, device=self._device.name)
+        self._term.longest_step(at, way, bound)
+        return bound.numpy()
+
+    def _made(self, columns: int) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+        """Places, forces and motions (3n, b), and numbers (n, b)."""
+        at, force, way = (self._device.zeros(3 * self._count, columns) for _ in range(3))
+        return at, force, way, wp.zeros((self._count, columns), dtype=wp.int32, device=self._device.name)

@@ -1,6 +1,7 @@
 """Frictionless contact of a body's surface with rigid tools that are moved by pose."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -15,7 +16,7 @@ from ...geometry.surface import areas, edge_lengths, enclosed
 from ...loads import Retracted, Touching
 from ...runtime.device import Device
 from ...tools import Tool, cores_of, distances_to
-from .reduced import HOST, Reduced
+from .reduced import Reduced
 from .tool_kernels import BULGE, Scale, Surface, Tools, kernels_of
 from .tool_path import TOUCH, Touch, Way, approach
 
@@ -159,9 +160,9 @@ class Contact:
         """No point of the surface passes through a tool."""
         self._launch(self._kernels.bound_step, [u, du], out, u.shape[1])
 
-    def add_matrix(self, u: wp.array, place: wp.array, definite: bool, out: wp.array) -> None:
+    def add_matrix(self, u: wp.array, definite: wp.array, place: wp.array, out: wp.array) -> None:
         """As `Dense.add_matrix`."""
-        self._launch(self._kernels.add_matrix, [u, int(definite), place], out, 1)
+        self._launch(self._kernels.add_matrix, [u, definite, place], out, u.shape[1])
 
     @cached_property
     def touchable(self) -> np.ndarray:
@@ -172,29 +173,30 @@ class Contact:
     def _alone(self) -> "tuple[Contact, Reduced]":
         """The same on the touchable nodes alone, and as a function of where these go."""
         nodes, own = self._whole[0][self.touchable], np.searchsorted(self.touchable, self._triangles)
-        corners = own[:, :3]
+        corners, exact = own[:, :3], replace(self._device, precision="float64")
         term = Contact(
-            self.name, self._shapes, self._way, nodes, own, corners, self._asked, self._shear, HOST, self._touch
+            self.name, self._shapes, self._way, nodes, own, corners, self._asked, self._shear, exact, self._touch
         )
-        return term, Reduced(term, len(nodes))
+        return term, Reduced(term, len(nodes), exact)
 
-    def reduced(self) -> Reduced | None:
-        """Of a batch of one column, with the tools and the gap as they are now; None where no tool is."""
+    def reduced(self, columns: np.ndarray) -> Reduced | None:
+        """As `Local.reduced`."""
         if self._pose is None:
             return None
         term, reduced = self._alone
-        term._stand(self._pose)
+        term._stand(self._pose[columns])
         term._scale = self._scale
         return reduced
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
         """As `Local.pressed`."""
-        barrier = self.reduced()
+        barrier = self.reduced(np.zeros(1, int))
         if barrier is None:
             return np.zeros(0, int), np.zeros((0, 0))
-        w = self._at[0].numpy().reshape(-1, 3)[self.touchable].ravel()
-        nodes = np.flatnonzero(barrier.slope(w).reshape(-1, 3).any(axis=1))
-        return nodes, barrier.curvature(w, nodes, True)
+        w = self._at[0].numpy().reshape(-1, 3)[self.touchable].reshape(-1, 1).astype(np.float64)
+        felt = barrier.slope(w).reshape(-1, 3).any(axis=1)
+        place = np.where(felt, felt.cumsum() - 1, -1)[:, None]
+        return np.flatnonzero(felt), barrier.curvature(w, place, int(felt.sum()), np.ones(1, bool))[0]
 
     def reaction(self, u: wp.array) -> np.ndarray:
         """(b, tools, 6): force [N] and moment [N m] about its origin that each tool exerts at u (3N, b) [m]."""

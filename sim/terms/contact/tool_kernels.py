@@ -266,15 +266,15 @@ def kernels_of(device: Device, size: int) -> Kernels:
     @forward_kernel(module="unique")
     def add_matrix(
         u: wp.array2d(dtype=scalar),
-        definite: int,
-        place: wp.array(dtype=wp.int32),
+        definite: wp.array(dtype=wp.int32),
+        place: wp.array2d(dtype=wp.int32),
         surface: Surface,
         tools: Tools,
         scale: Scale,
         # outputs
-        out: wp.array2d(dtype=wp.float64),
+        out: wp.array3d(dtype=wp.float64),
     ):
-        """K_ab += sum over points of w k H N_a N_b, of one column, between the nodes that have a place."""
+        """K_ab += sum over points of w k H N_a N_b, of each column, between the nodes that have a place in it."""
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
@@ -284,15 +284,16 @@ def kernels_of(device: Device, size: int) -> Kernels:
                         N = shape_of(i, j, n)
                         touch = touch_of(N * at, tools, k, c)
                         if touch.distance < scale.gap:
-                            H = weight * curvature_at(touch, scale.gap, definite)
+                            H = weight * curvature_at(touch, scale.gap, definite[c])
                             for a in range(size):
+                                first = 3 * place[surface.table[s, a], c]
                                 for b in range(size):
-                                    first, second = 3 * place[surface.table[s, a]], 3 * place[surface.table[s, b]]
+                                    second = 3 * place[surface.table[s, b], c]
                                     if first >= 0 and second >= 0:
                                         for row in range(3):
                                             for column in range(3):
                                                 share = N[a] * N[b] * H[row, column]
-                                                wp.atomic_add(out, first + row, second + column, share)
+                                                wp.atomic_add(out, c, first + row, second + column, share)
 
     @forward_kernel(module="unique")
     def add_reaction(

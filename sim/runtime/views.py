@@ -1,0 +1,69 @@
+"""Arrays of Warp as arrays of the library that is at home where they live: NumPy on the CPU, torch on a card."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .device import Device
+from .threads import one_thread
+
+
+def library(device: Device) -> Any:
+    """It: `linalg.solve` and the arrays' own methods mean the same in both."""
+    if device.on_cuda:
+        import torch
+
+        return torch
+    return np
+
+
+def view(array: wp.array) -> Any:
+    """The same numbers, not a copy of them."""
+    return wp.to_torch(array) if array.device.is_cuda else array.numpy()
+
+
+def from_view(device: Device, values: Any) -> wp.array:
+    """Warp's array of the same numbers."""
+    values = values if device.on_cuda else np.ascontiguousarray(values)
+    return wp.from_torch(values.contiguous()) if device.on_cuda else wp.array(values, device=device.name, copy=False)
+
+
+def doubled(values: Any) -> Any:
+    """The same in double precision."""
+    return values.astype(np.float64) if isinstance(values, np.ndarray) else values.double()
+
+
+def like(other: Any, values: Any) -> Any:
+    """The same in another array's precision."""
+    return values.astype(other.dtype) if isinstance(values, np.ndarray) else values.to(other.dtype)
+
+
+def placed(device: Device, values: np.ndarray) -> Any:
+    """The library's array with the same numbers; on the CPU they are these themselves."""
+    return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values
+
+
+def on_host(values: Any) -> np.ndarray:
+    """Either library's numbers as NumPy's."""
+    return values if isinstance(values, np.ndarray) else values.cpu().numpy()
+
+
+@contextmanager
+def in_order(device: Device) -> Iterator[None]:
+    """While in it the library's work takes turns with Warp's, and its BLAS keeps to one thread on the CPU.
+
+    Threads of BLAS wait for one another, ages where something else runs on their cores.
+    """
+    if device.on_cuda:
+        import torch
+
+        with torch.cuda.stream(wp.stream_to_torch(device.name)):
+            yield
+    else:
+        with one_thread():
+            yield
