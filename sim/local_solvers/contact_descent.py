@@ -49,7 +49,7 @@ class ContactLimits:
     least
         A step so short is taken as it is.
     felt
-        [J] A step that is worth less teaches nothing but round-off.
+        [J] A step that is worth less is round-off, and nothing is learnt from it.
     drag, growth, times
         The first drag that is tried where one is wanted, by how much it grows and shrinks, and how often it grows.
     """
