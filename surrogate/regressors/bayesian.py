@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
 
-from .protocol import filled
+from .protocol import Stored
 
 # The damping of MATLAB's `trainbr`: the first, its factors after a good and a bad step, and where a network ends.
 DAMPING, DOWN, UP, MOST_DAMPING = 5e-3, 0.1, 10.0, 1e10
@@ -17,7 +16,7 @@ NO_ERROR = 1e-20
 
 
 @dataclass(eq=False)
-class Bayesian:
+class Bayesian(Stored):
     """One network of tanh units for each output; the evidence decides how much its weights are held back.
 
     Foresee, Hagan 1997, "Gauss-Newton approximation to Bayesian learning", ICNN 3:1930-1935. beta E_D + alpha E_W is
@@ -39,6 +38,8 @@ class Bayesian:
         Of the first weights.
     """
 
+    kept = ("middle", "half", "offset", "scale", "weights")
+    """Ranges of features and outputs, and the weights (r, P)."""
     hidden: int = 4
     steps: int = 1000
     gain: float = 1e-5
@@ -72,15 +73,6 @@ class Bayesian:
         """Coefficients (B, r) float32 of features (B, f)."""
         outputs = forward(self.weights_, (X - self.middle_) / self.half_)[1].T
         return (outputs * self.scale_ + self.offset_).astype(np.float32)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Ranges of features and outputs, and the weights (r, P)."""
-        return {name: getattr(self, f"{name}_") for name in ("middle", "half", "offset", "scale", "weights")}
-
-    @classmethod
-    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`."""
-        return filled(cls(), state)
 
 
 class Expansion(NamedTuple):

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Self
 
 import numpy as np
 
+from .protocol import Stored
 
-class Linear:
+
+class Linear(Stored):
     """Y = X C without intercept, C of least norm among the least-squares solutions.
 
     Trained with unit responses at the nodes it is the exact compliance table; with any other rows, its least-squares
     estimate.
     """
 
-    compliance_: np.ndarray
+    kept = ("compliance",)
+    """Its shape is (f, r)."""
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Learn C (f, r) from rows X (n, f), Y (n, r)."""
@@ -25,14 +27,3 @@ class Linear:
     def predict(self, X: np.ndarray) -> np.ndarray:
         """X C (B, r) float32."""
         return X.astype(np.float32) @ self.compliance_
-
-    def state(self) -> dict[str, np.ndarray]:
-        """`compliance` (f, r)."""
-        return {"compliance": self.compliance_}
-
-    @classmethod
-    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`."""
-        model = cls()
-        model.compliance_ = state["compliance"]
-        return model

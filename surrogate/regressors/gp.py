@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -15,7 +14,7 @@ from scipy.spatial.distance import cdist
 from sim.runtime.threads import one_thread
 
 from ..array_functions import squared_distances
-from .protocol import filled, standardisation
+from .protocol import Stored, standardisation
 
 # Lengths in standard deviations of a feature, and noise against the variance of an output.
 LENGTHS, NOISE = (0.05, 1e3), (1e-8, 1.0)
@@ -23,7 +22,7 @@ START_LENGTH, START_NOISE = 3.0, 1e-4
 
 
 @dataclass(eq=False)
-class Gp:
+class Gp(Stored):
     """Matern 5/2 kernel with a length for each feature; all outputs share it and the noise.
 
     Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equations 2.25, 2.26, 4.17, 5.9. The
@@ -40,6 +39,8 @@ class Gp:
         Of the subsets.
     """
 
+    kept = ("mean", "deviation", "offset", "length", "noise", "seen", "dual")
+    """Standardisation, lengths (f,), noise, the rows seen (n, f) in lengths, and their dual coefficients (n, r)."""
     rows: int = 600
     most: int = 4000
     strongest: int = 20
@@ -83,16 +84,6 @@ class Gp:
         near = matern(self._distance(X))
         known = solve_triangular(self._factor[0], near.T, lower=True, check_finite=False)
         return np.sqrt(np.maximum(1.0 - np.einsum("nb,nb->b", known, known), 0.0) + self.noise_)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Standardisation, lengths (f,), noise, the rows seen (n, f) in lengths, and their dual coefficients (n, r)."""
-        names = ("mean", "deviation", "offset", "length", "noise", "seen", "dual")
-        return {name: np.asarray(getattr(self, f"{name}_")) for name in names}
-
-    @classmethod
-    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`."""
-        return filled(cls(), state)
 
     def _distance(self, X: np.ndarray) -> np.ndarray:
         return np.sqrt(squared_distances((X - self.mean_) / (self.deviation_ * self.length_), self.seen_))

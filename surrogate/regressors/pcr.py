@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from .protocol import filled
+from .protocol import Stored
 
 # A component smaller than this against the largest is rounding.
 RANK = 1e-9
 
 
 @dataclass(eq=False)
-class Pcr:
+class Pcr(Stored):
     """Least squares on the principal components of the features, with intercept.
 
     Jolliffe 2002, "Principal Component Analysis", chapter 8. The features are taken as they are: give such as share one
@@ -28,6 +27,8 @@ class Pcr:
         Of the variance, in (0, 1].
     """
 
+    kept = ("mean", "map", "offset")
+    """Mean of the features (f,), map (f, r), offset (r,)."""
     share: float = 0.999
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
@@ -44,12 +45,3 @@ class Pcr:
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of features (B, f)."""
         return ((X - self.mean_) @ self.map_ + self.offset_).astype(np.float32)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Mean of the features (f,), map (f, r), offset (r,)."""
-        return {name: getattr(self, f"{name}_") for name in ("mean", "map", "offset")}
-
-    @classmethod
-    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`."""
-        return filled(cls(), state)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol, Self, TypeVar
+from typing import ClassVar, Protocol, Self
 
 import numpy as np
 
@@ -47,11 +47,19 @@ def standardisation(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return X.mean(axis=0), np.where(deviation > 1e-9 * np.abs(X).max(axis=0), deviation, 1.0)
 
 
-R = TypeVar("R", bound=Regressor)
+class Stored:
+    """A regressor whose state is its attributes of the names in `kept`, each with an underscore behind."""
 
+    kept: ClassVar[tuple[str, ...]]
 
-def filled(model: R, state: Mapping[str, np.ndarray]) -> R:
-    """The model with each array of `state` as the attribute of that name and an underscore."""
-    for name, array in state.items():
-        setattr(model, f"{name}_", array)
-    return model
+    def state(self) -> dict[str, np.ndarray]:
+        """What is stored: an array for each name in `kept`."""
+        return {name: np.asarray(getattr(self, f"{name}_")) for name in self.kept}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """From `state`."""
+        model = cls()
+        for name, array in state.items():
+            setattr(model, f"{name}_", array)
+        return model

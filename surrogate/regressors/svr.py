@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from ..array_functions import squared_distances
-from .protocol import filled, standardisation
+from .protocol import Stored, standardisation
 
 
 @dataclass(eq=False)
-class Svr:
+class Svr(Stored):
     """Gaussian kernel exp(-gamma |x - x'|^2), gamma = 1 / f, of standardised features.
 
     By default C = iqr(y) / 1.349 and epsilon = iqr(y) / 13.49 per output. These are MATLAB's defaults, which Tonutti,
@@ -27,14 +26,10 @@ class Svr:
         C and epsilon, in quartile ranges of the output.
     """
 
+    kept = ("mean", "deviation", "support", "dual", "intercept")
+    """Standardisation, support vectors (s, f), dual coefficients (s, r), intercepts (r,)."""
     penalty: float = 1.0 / 1.349
     tube: float = 1.0 / 13.49
-
-    mean_: np.ndarray = field(init=False, repr=False)
-    deviation_: np.ndarray = field(init=False, repr=False)
-    support_: np.ndarray = field(init=False, repr=False)
-    dual_: np.ndarray = field(init=False, repr=False)
-    intercept_: np.ndarray = field(init=False, repr=False)
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Learn from rows X (n, f), Y (n, r)."""
@@ -67,12 +62,3 @@ class Svr:
         """Coefficients (B, r) float32 of features (B, f)."""
         squared = squared_distances((X - self.mean_) / self.deviation_, self.support_)
         return (np.exp(squared / -len(self.mean_)) @ self.dual_ + self.intercept_).astype(np.float32)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Standardisation, support vectors (s, f), dual coefficients (s, r), intercepts (r,)."""
-        return {name: getattr(self, f"{name}_") for name in ("mean", "deviation", "support", "dual", "intercept")}
-
-    @classmethod
-    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`."""
-        return filled(cls(), state)
