@@ -112,7 +112,7 @@ class Stage:
         """The closed part of the brain's surface, at rest."""
         mesh, craniotomy = self.anatomy.mesh, self.anatomy.craniotomy
         vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
-        return Layer("brain", CORTEX, mesh.nodes[vertices], triangles.reshape(-1, 3), CORTEX_COLOUR)
+        return Layer("brain", CORTEX, mesh.nodes[vertices], triangles, CORTEX_COLOUR)
 
     def layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
         """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
@@ -135,8 +135,7 @@ class Stage:
 
     @cached_property
     def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
-        vertices, triangles = np.unique(self.anatomy.tumour_surface, return_inverse=True)
-        return vertices, triangles.reshape(-1, 3)
+        return np.unique(self.anatomy.tumour_surface, return_inverse=True)
 
     @cached_property
     def _cortex(self) -> Cortex:
@@ -151,7 +150,6 @@ class Stage:
     def _dressed(self, surface: np.ndarray) -> Cortex:
         """Triangles (S, 3) of the mesh's surface that wear the scan."""
         vertices, triangles = np.unique(surface, return_inverse=True)
-        triangles = triangles.reshape(-1, 3)
         at = self.anatomy.mesh.nodes[vertices]
         return Cortex(vertices, triangles, at - READ_BELOW * vertex_normals(at, triangles), self._solid)
 

@@ -33,7 +33,6 @@ def debulked(anatomy: Anatomy) -> Anatomy:
     inside = inside[np.cumsum(volume[inside]) <= SHARE * volume.sum()]
     left = np.setdiff1d(np.arange(len(mesh.tets)), tumour[inside])
     used, table = np.unique(mesh.table[left], return_inverse=True)
-    table = table.reshape(len(left), -1)
     middles = None if mesh.middles is None else table[:, 4:]
     body = TetMesh(mesh.nodes[used], table[:, :4], mesh.region[left], middles)
     return Anatomy(body, anatomy.held[used], anatomy.slide_normal[used], anatomy.craniotomy[used])

@@ -66,7 +66,7 @@ def graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, levels: i
     corners_of_tets = np.concatenate(cells)
     keys, tets = np.unique(_key(corners_of_tets, span), return_inverse=True)
     whole = np.stack(np.unravel_index(keys, span), axis=1)
-    return Lattice(origin + unit * whole, tets.reshape(-1, 4), ~np.isin(keys, known))
+    return Lattice(origin + unit * whole, tets, ~np.isin(keys, known))
 
 
 def _octree(

@@ -101,7 +101,7 @@ def is_sidecar(path: str | Path) -> bool:
 
 
 def read_intensity(path: str | Path) -> Intensity:
-    """Read what `write_intensity` wrote.
+    """Read a volume of grey values: what `write_intensity` wrote, or a patient's scan.
 
     Raises
     ------

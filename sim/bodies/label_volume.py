@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import InputError
-from .intensity import Intensity
+from .intensity import read_intensity
 from .nifti import read_volume
 from .placement import Piece, site_over
 from .signed_distance import Blur, mask_field
@@ -85,10 +85,6 @@ def volume_subject(
     inside = _inside(path, solid, marked, voxel, notes, settings)
     cortex, interface = rim(solid, volume.affine), rim(inside, volume.affine)
     pieces = _pieces(inside, volume.affine)
-    intensity = None
-    if t1 is not None:
-        grey = read_volume(t1)
-        intensity = Intensity(grey.values, grey.affine)
     return Subject(
         brain=mask_field(solid, volume.affine, settings.blur),
         tumour=mask_field(_extended(inside, solid, settings.extension), volume.affine, settings.blur),
@@ -96,7 +92,7 @@ def volume_subject(
         interface=interface,
         tumour_volume=float(inside.sum() * voxel),
         site=site_over(cortex, pieces[0].centre),
-        intensity=intensity,
+        intensity=None if t1 is None else read_intensity(t1),
         notes=tuple(notes),
         pieces=pieces,
     )

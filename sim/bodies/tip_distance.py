@@ -52,13 +52,11 @@ class TipGauge:
     @cached_property
     def _open(self) -> tuple[np.ndarray, np.ndarray]:
         """Mesh vertices (m,) of the open cortex, and its triangles (S, 3) of them."""
-        nodes, triangles = np.unique(self.anatomy.open_surface, return_inverse=True)
-        return nodes, triangles.reshape(-1, 3)
+        return np.unique(self.anatomy.open_surface, return_inverse=True)
 
     @cached_property
     def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
-        nodes, triangles = np.unique(self.anatomy.tumour_surface, return_inverse=True)
-        return nodes, triangles.reshape(-1, 3)
+        return np.unique(self.anatomy.tumour_surface, return_inverse=True)
 
     def distances(
         self,

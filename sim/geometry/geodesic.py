@@ -21,7 +21,6 @@ def distances(
     size = np.linalg.norm(nodes[triangles] - nodes[np.roll(triangles, 1, axis=1)], axis=2).max()
     near = np.linalg.norm(nodes[triangles] - source, axis=2).min(axis=1) <= limit + size
     used, local = np.unique(triangles[near], return_inverse=True)
-    local = local.reshape(-1, 3)
     points, corners = _with_steiner_points(nodes[used], local, steiner)
 
     links = corners[:, np.array([(i, j) for i in range(3 + 3 * steiner) for j in range(i)])].reshape(-1, 2)

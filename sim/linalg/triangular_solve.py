@@ -65,23 +65,13 @@ DOWN = """
 
 
 @cache
-def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
-    """The sweeps up and down of a device's scalar type, over columns."""
+def kernel_of(device: Device, code: str) -> wp.Kernel:
+    """The sweep `UP`, which eliminates, or `DOWN`, which substitutes back, in each row of xs (b, n), front by front."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
 
-    @wp.func_native(UP.replace("real", real))
-    def climb(
-        column: int,
-        fronts: wp.array2d(dtype=wp.int64),
-        border: wp.array(dtype=wp.int32),
-        panel: wp.array(dtype=scalar),
-        work: wp.array2d(dtype=scalar),
-        xs: wp.array2d(dtype=scalar),
-    ): ...
-
-    @wp.func_native(DOWN.replace("real", real))
-    def descend(
+    @wp.func_native(code.replace("real", real))
+    def sweep_row(
         column: int,
         fronts: wp.array2d(dtype=wp.int64),
         border: wp.array(dtype=wp.int32),
@@ -91,7 +81,7 @@ def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
     ): ...
 
     @forward_kernel(module="unique")
-    def up(
+    def sweep(
         fronts: wp.array2d(dtype=wp.int64),
         border: wp.array(dtype=wp.int32),
         panel: wp.array(dtype=scalar),
@@ -99,22 +89,10 @@ def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
         work: wp.array2d(dtype=scalar),
         xs: wp.array2d(dtype=scalar),
     ):
-        """Eliminate front by front in each row of xs (b, n)."""
-        climb(wp.tid(), fronts, border, panel, work, xs)
+        """Sweep one row of xs."""
+        sweep_row(wp.tid(), fronts, border, panel, work, xs)
 
-    @forward_kernel(module="unique")
-    def down(
-        fronts: wp.array2d(dtype=wp.int64),
-        border: wp.array(dtype=wp.int32),
-        panel: wp.array(dtype=scalar),
-        # outputs
-        work: wp.array2d(dtype=scalar),
-        xs: wp.array2d(dtype=scalar),
-    ):
-        """Substitute back in each row of xs (b, n)."""
-        descend(wp.tid(), fronts, border, panel, work, xs)
-
-    return up, down
+    return sweep
 
 
 ADD = """
@@ -180,7 +158,7 @@ class Sweep:
         columns, parts = x.shape[1], len(self._lower)
         rows = self._device.zeros(parts, columns, len(x))
         work = self._device.zeros(parts, columns, self._longest)
-        values, (up, down) = rows.numpy(), kernels_of(self._device)
+        values, (up, down) = rows.numpy(), (kernel_of(self._device, code) for code in (UP, DOWN))
 
         def sweep(kernel: wp.Kernel, fronts: wp.array, part: int) -> None:
             inputs = [fronts, self._border, self._panel]

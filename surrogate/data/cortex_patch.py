@@ -105,7 +105,7 @@ def open_patch(anatomy: Anatomy) -> Patch:
     if not len(anatomy.open_surface):
         raise InputError("the anatomy has no open cortex for a tool to touch: make one with a wider --craniotomy.")
     nodes, triangles = np.unique(anatomy.open_surface, return_inverse=True)
-    return Patch(nodes, triangles.reshape(-1, 3), anatomy.mesh.nodes[nodes])
+    return Patch(nodes, triangles, anatomy.mesh.nodes[nodes])
 
 
 def nearest(points: np.ndarray, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

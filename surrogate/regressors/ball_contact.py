@@ -109,7 +109,7 @@ class Contact:
             self.triangles[distances(corners, nearest_shares(corners, middle), middle)[0] < REACH * radius],
             return_inverse=True,
         )
-        rows, table = (3 * nodes[:, None] + np.arange(3)).ravel(), table.reshape(-1, 3)
+        rows = (3 * nodes[:, None] + np.arange(3)).ravel()
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
         own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
         least = LEAST * np.einsum("nii->", own) / max(3 * len(nodes), 1)

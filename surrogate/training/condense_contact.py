@@ -30,7 +30,7 @@ def condensed(fem: Fem, parts: list[np.ndarray]) -> tuple[Contact, list[Basis]]:
     rows = 3 * len(nodes)
     contact = Contact(
         fem.anatomy.mesh.nodes[nodes],
-        triangles.reshape(-1, 3),
+        triangles,
         compliance.reshape(rows, rows),
         coefficients,
         np.repeat([[1.0], [0.0]], coefficients.shape[1], axis=1),
