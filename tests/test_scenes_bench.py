@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import make_box
 
-from scenes.bench import stages
+from scenes.bench import stages, stopwatch
 from scenes.bench.elements import Press, Row, limits, rows
 from scenes.bench.robustness import SETS, Record, Trial, records, shares, tallies
 from scenes.cli import main
@@ -27,13 +27,13 @@ def anatomy():
 def test_medians_leave_the_warm_up_aside(monkeypatch):
     """By a clock of its own: calls take 100 s while they warm up, and 1, 2, ... 20 s afterwards."""
     now, calls = [0.0], []
-    monkeypatch.setattr(stages.clock, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: now[0])
 
     def work(run):
         now[0] += 100.0 if len(calls) < stages.WARM_UP else run + 1.0
         calls.append(run)
 
-    row = stages.timed("it", "ms", 1e3, 20, "how", work)
+    row = stages.figure("it", "ms", 1e3, 20, "how", work)
     assert calls[stages.WARM_UP :] == list(range(20)) and set(calls) == set(range(20))
     assert (row.median, row.p95, row.runs) == (pytest.approx(10.5e3), pytest.approx(19.05e3), 20)
 

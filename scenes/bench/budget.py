@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time as clock
-
 import numpy as np
 
 from surrogate.evaluation.choose import Offer
@@ -12,6 +10,7 @@ from surrogate.model.learned import Learned
 from ..play.deformers import Theatre
 from ..script.scene import Scene
 from .live import PROMISED
+from .stopwatch import timed
 
 # Frames that are timed, after one that is not.
 TIMED = 24
@@ -29,8 +28,7 @@ def offers(theatre: Theatre, scene: Scene) -> list[Offer]:
         if np.isnan(error_mm):
             continue
         for load in loads:
-            begun = clock.perf_counter()
-            last = deformer.deform(load, start=None if learnt else last)
-            seconds.append(clock.perf_counter() - begun)
+            last, spent = timed(deformer.deform, load, start=None if learnt else last)
+            seconds.append(spent)
         made.append(Offer(name, error_mm, 1e3 * float(np.median(seconds[1:]))))
     return made

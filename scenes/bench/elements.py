@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time as clock
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +15,8 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, push
 from sim.material import Material
+
+from .stopwatch import timed
 
 # Fine enough that what is left is the mesh's error, and within reach of float64 at any Poisson's ratio.
 ACCURACY = Accuracy(tolerance=1e-5)
@@ -96,18 +97,14 @@ def _loads(anatomy: Anatomy, press: Press) -> Loads:
 def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, device: str) -> Row:
     mesh = anatomy.mesh
     effects = pushed_effects(anatomy, Material(press.law, press.young, poisson))
-    begun = clock.perf_counter()
-    fem = Fem(anatomy, effects, ACCURACY, device, element=element)
-    made = clock.perf_counter()
+    fem, set_up = timed(Fem, anatomy, effects, ACCURACY, device, element=element)
     loads = _loads(anatomy, press)
     fem.deform(loads.scaled(1e-3))  # kernels are compiled or loaded at their first launch
-    ready = clock.perf_counter()
-    answer = fem.deform(loads)
-    solved = clock.perf_counter()
+    answer, seconds = timed(fem.deform, loads)
     inside = mesh.region == TUMOUR_LABEL
     mean = answer.displacement[0][mesh.tets[inside]].mean(axis=1)
     motion = np.linalg.norm(np.average(mean, axis=0, weights=mesh.volumes[inside]))
     return Row(
-        poisson, element, len(mesh.nodes), fem.space.count, 1e3 * float(motion), made - begun, solved - ready,
+        poisson, element, len(mesh.nodes), fem.space.count, 1e3 * float(motion), set_up, seconds,
         int(answer.iterations[0]), answer.outcome[0].good,
     )  # fmt: skip

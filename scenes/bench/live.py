@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import time as clock
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import warp as wp
 
 from sim.accuracy import LIVE, Accuracy
 from sim.deformation import Deformation
@@ -20,6 +18,7 @@ from ..script.scene import Scene
 from ..script.site import Site
 from ..script.tool import Probe
 from ..script.tool_paths import wander
+from .stopwatch import timed
 
 SPEED = 20e-3
 # Frames before the first that counts: the tool arrives, and kernels are loaded.
@@ -91,11 +90,7 @@ def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:
     """Each frame in turn, from the last one's answer; the device is waited for at each reading."""
     last = None
     for number, load in enumerate(loads):
-        wp.synchronize()
-        begun = clock.perf_counter()
-        last = fem.deform(load, start=last)
-        wp.synchronize()
-        seconds = clock.perf_counter() - begun
+        last, seconds = timed(fem.deform, load, start=last)
         if number >= WARM_UP:
             yield Frame(load, replace(last, memory={}, warm={}), seconds)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import time as clock
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -19,6 +18,8 @@ from sim.fem import Fem
 from sim.loads import Loads, Pushed
 from sim.runtime.outside_files import read_as
 from surrogate.data.tool_loads import BRUTAL, TOOLS, draw
+
+from .stopwatch import timed
 
 SETS = (*TOOLS, "seed", BRUTAL.name)
 # One load in so many has its residual computed again in double precision.
@@ -73,14 +74,12 @@ def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iter
         for start in range(first // trial.batch * trial.batch, len(loads), trial.batch):
             index = np.arange(start, min(start + trial.batch, len(loads)))
             some = loads.rows(index)
-            begun = clock.perf_counter()
-            answer = fem.deform(some)
-            seconds = (clock.perf_counter() - begun) / len(index)
+            answer, seconds = timed(fem.deform, some)
             again = np.full(len(index), np.nan)
             chosen = np.flatnonzero(index % CHECKED == 0)
             if len(chosen):
                 again[chosen] = double.residual(some.rows(chosen), answer.rows(chosen))
-            yield _written(preset, index, some, answer, again, seconds)[max(first - start, 0) :]
+            yield _written(preset, index, some, answer, again, seconds / len(index))[max(first - start, 0) :]
 
 
 def _written(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import resource
 import threading
-import time as clock
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -30,6 +29,7 @@ from sim.runtime.outside_files import read_as
 from surrogate.data.tool_loads import draw
 
 from .loglog_chart import Curve, Panel
+from .stopwatch import timed
 
 # Batches are solved until so many loads, or so many seconds, are spent.
 LOADS, PATIENCE = 12, 60.0
@@ -78,19 +78,15 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
     """Solve palpation loads on one mesh, to 1e-4 in single precision, in this process."""
     anatomy = read_anatomy(trial.mesh(size))
     with watched_card(trial.device) as card:
-        begun = clock.perf_counter()
-        fem = Fem(anatomy, pushed_effects(anatomy, BRAIN), TRAIN, trial.device, batch, trial.element)
-        wp.synchronize()
-        made = clock.perf_counter() - begun
+        effects = pushed_effects(anatomy, BRAIN)
+        fem, made = timed(Fem, anatomy, effects, TRAIN, trial.device, batch, trial.element)
         loads = draw("palpation", anatomy, max(LOADS, batch) + 1, SEED)
         fem.deform(loads.rows(np.array([-1])).scaled(1e-3))  # kernels are compiled or loaded at their first launch
-        seconds, outer, good, spent = [], [], 0, 0.0
-        while spent < PATIENCE and len(outer) + batch <= max(LOADS, batch):
+        seconds, outer, good = [], [], 0
+        while sum(seconds) < PATIENCE and len(outer) + batch <= max(LOADS, batch):
             some = loads.rows(np.arange(len(outer), len(outer) + batch))
-            begun = clock.perf_counter()
-            answer = fem.deform(some)
-            seconds.append(clock.perf_counter() - begun)
-            spent += seconds[-1]
+            answer, spent = timed(fem.deform, some)
+            seconds.append(spent)
             outer += list(answer.iterations)
             good += sum(outcome.good for outcome in answer.outcome)
     return Row(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time as clock
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,6 +17,7 @@ from surrogate.data.tool_loads import draw
 
 from ..script.scene import find_scene
 from ..script.site import Site
+from .stopwatch import timed
 
 SEED = 4
 BATCH, BATCH_ON_CUDA = 32, 2048
@@ -138,8 +138,7 @@ def _timed(fem: Fem, work: Work, warm: bool) -> Iterator[float]:
     """Seconds of each load."""
     last = None
     for loads in work.loads:
-        begun = clock.perf_counter()
-        answer = fem.deform(loads, last)
-        yield clock.perf_counter() - begun
+        answer, seconds = timed(fem.deform, loads, last)
+        yield seconds
         if work.follows and all(outcome.good for outcome in answer.outcome):
             last = answer if warm else replace(answer, warm={})

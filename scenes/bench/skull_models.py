@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time as clock
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +15,8 @@ from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
 from sim.tearing import TEARING, Tearing, torn
+
+from .stopwatch import timed
 
 # A bond that lets go where it bears too much, and one that bears nothing: the skull presses only, without a gap.
 TORN = {"tearing": Bonded(), "pressing": Bonded(1e-6, 1e-6)}
@@ -87,13 +88,10 @@ def _answered(
     """Answers, which of them are good (B,), and seconds a load: set-up left out, but for what tears, which needs it."""
     if skull in TORN:
         effects = [TORN[skull] if isinstance(one, Bonded) else one for one in pushed_effects(anatomy, tissue)]
-        begun = clock.perf_counter()
-        each = (loads.rows(np.array([row])) for row in range(len(loads)))
-        found = [torn(anatomy, effects, load, TRAIN, device, tearing=tearing) for load in each]
-        good = np.array([one.rested and one.answer.outcome[0].good for one in found])
-        return joined([one.answer for one in found]), good, (clock.perf_counter() - begun) / len(loads)
+        each = [loads.rows(np.array([row])) for row in range(len(loads))]
+        found = [timed(torn, anatomy, effects, load, TRAIN, device, tearing=tearing) for load in each]
+        good = np.array([one.rested and one.answer.outcome[0].good for one, _ in found])
+        return joined([one.answer for one, _ in found]), good, float(np.mean([seconds for _, seconds in found]))
     fem = Fem(anatomy, pushed_effects(anatomy, tissue, skull), TRAIN, device)
-    begun = clock.perf_counter()
-    answer = fem.deform(loads)
-    seconds = (clock.perf_counter() - begun) / len(loads)
-    return answer, np.array([outcome.good for outcome in answer.outcome]), seconds
+    answer, seconds = timed(fem.deform, loads)
+    return answer, np.array([outcome.good for outcome in answer.outcome]), seconds / len(loads)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import time as clock
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import date
@@ -21,6 +20,7 @@ from surrogate.data.tool_loads import draw
 
 from ..play.deformers import Theatre
 from ..play.player import Player
+from .stopwatch import timed
 
 WARM_UP = 3
 
@@ -37,16 +37,9 @@ class Row:
     note: str
 
 
-def timed(name: str, unit: str, scale: float, runs: int, note: str, work: Callable[[int], object]) -> Row:
+def figure(name: str, unit: str, scale: float, runs: int, note: str, work: Callable[[int], object]) -> Row:
     """Run `work(i)` and report seconds x scale."""
-    seconds = []
-    for run in range(-WARM_UP, runs):
-        wp.synchronize()
-        begun = clock.perf_counter()
-        work(run % runs)
-        wp.synchronize()
-        if run >= 0:
-            seconds.append(clock.perf_counter() - begun)
+    seconds = [timed(work, run % runs)[1] for run in range(-WARM_UP, runs)][WARM_UP:]
     return Row(name, scale * float(np.median(seconds)), scale * float(np.percentile(seconds, 95)), unit, runs, note)
 
 
@@ -68,20 +61,17 @@ def rows(
     loads = draw("palpation", theatre.anatomy, solves, seed=20)
     single = [loads.rows(np.array([row])) for row in range(len(loads))]
 
-    begun = clock.perf_counter()
-    fem = theatre.fem(scene, TRAIN, batch)
-    fem.deform(single[0])
-    seconds = clock.perf_counter() - begun
+    fem, seconds = timed(theatre.fem, scene, TRAIN, batch)
+    seconds += timed(fem.deform, single[0])[1]
     made(fem)
     yield Row("FEM set-up", seconds, None, "s", 1, f"compile or load kernels, factorise; {size}")
-    begun = clock.perf_counter()
-    answers = fem.deform(loads)
-    each = 1e3 * (clock.perf_counter() - begun) / len(loads)
+    answers, seconds = timed(fem.deform, loads)
+    each = 1e3 * seconds / len(loads)
     good = sum(outcome.good for outcome in answers.outcome)
     note = f"{good} of {len(loads)} converged to {TRAIN.tolerance:g}; palpation loads, batches of {batch}"
     yield Row("FEM, a load in a batch", each, None, "ms", len(loads), note)
     runs = min(20, len(single))
-    yield timed(
+    yield figure(
         "FEM, a single load", "ms", 1e3, runs, f"from rest, to {TRAIN.tolerance:g}", lambda i: fem.deform(single[i])
     )
 
@@ -93,18 +83,13 @@ def rows(
     )  # fmt: skip
 
     for name, model in theatre.models.items():
-        row = timed(
-            name,
-            "us",
-            1e6,
-            200,
-            f"one load, all {len(nodes)} tumour nodes",
+        yield figure(
+            name, "us", 1e6, 200, f"one load, all {len(nodes)} tumour nodes",
             lambda i, model=model: model.deform(single[i % len(single)], at=nodes),
-        )
-        yield row
+        )  # fmt: skip
     times = scene.times
     size = f"{scene.viewpoint.width} x {scene.viewpoint.height}"
-    yield timed(
+    yield figure(
         "frame", "ms", 1e3, len(times), f"deform ({deformer}), render {size}, composite: {scene.name}",
         lambda i: player.draw(i, float(times[i]), scene.path(float(times[i]))),
     )  # fmt: skip

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import warp as wp
 
 from sim.accuracy import REFERENCE, TRAIN
 from sim.anatomy import Anatomy
@@ -18,6 +16,7 @@ from sim.material import Material
 from surrogate.data.tool_loads import TOOLS, draw
 
 from .robustness import CHECKED, Trial
+from .stopwatch import timed
 
 SEED = 0
 # However few the loads, so many have their residual computed again in double precision.
@@ -45,7 +44,7 @@ class Row:
     steps_median, steps_p99
         Outer steps of a load.
     seconds
-        Of each repeat: all loads solved, the tumour's vertices fetched, outcomes counted.
+        Of each repeat: all loads solved, the tumour's vertices fetched.
     draw_seconds
         Of drawing the loads, apart.
     checked, double
@@ -108,9 +107,7 @@ def drawn(anatomy: Anatomy, presets: Sequence[str], count: int) -> dict[str, Dra
     out = {}
     for preset in presets:
         draw(preset, anatomy, 1, SEED)  # the cortex is measured at the first draw
-        begun = clock.perf_counter()
-        loads = draw(preset, anatomy, count, SEED)
-        out[preset] = Drawn(loads, clock.perf_counter() - begun)
+        out[preset] = Drawn(*timed(draw, preset, anatomy, count, SEED))
     return out
 
 
@@ -127,10 +124,7 @@ def rows(
         As `Fem`.
     """
     trial = replace(trial, effects=pushed_effects(trial.anatomy, material))
-    begun = clock.perf_counter()
-    fem = trial.fem(TRAIN)
-    wp.synchronize()
-    set_up = clock.perf_counter() - begun
+    fem, set_up = timed(trial.fem, TRAIN)
     # Judged on the host whatever the device: other kernels and other arithmetic than those that are measured.
     judge = replace(trial, device="cpu", batch=CHECKED).fem(REFERENCE)
     for preset, some in sets.items():
@@ -140,12 +134,9 @@ def rows(
         seconds, converged = [], []
         steps = np.zeros(0)
         for _ in range(repeats):
-            wp.synchronize()
-            begun = clock.perf_counter()
-            answer = fem.deform(loads, at=trial.anatomy.tumour_nodes)
+            answer, spent = timed(fem.deform, loads, at=trial.anatomy.tumour_nodes)
             converged.append(sum(outcome.good for outcome in answer.outcome))
-            wp.synchronize()
-            seconds.append(clock.perf_counter() - begun)
+            seconds.append(spent)
             steps = answer.iterations
             done()
         again = _double(fem, judge, loads)

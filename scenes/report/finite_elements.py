@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time as clock
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from sim.geometry.locate import locate
 from sim.loads import Loads, Pushed
 from sim.material import Material, Tissue
 
+from ..bench.stopwatch import timed
 from .adaptation import debulked
 from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, of_times
 from .study import Study
@@ -61,17 +61,14 @@ def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
         What `Fem` refuses; a law that the data's tissue has no constants for.
     """
     body, own = body_of(study, spec.mesh), study.anatomy
-    begun = clock.perf_counter()
-    fem = _fem(study, spec, body)
-    set_up = clock.perf_counter() - begun
+    fem, set_up = timed(_fem, study, spec, body)
     loads = study.played if spec.mesh == OWN else onto(body, study.played)
     located = locate(body.mesh, own.mesh.nodes[own.tumour_nodes])
     fem.deform(loads.rows(np.array([0])))  # kernels are compiled or loaded at their first launch
     fields, good, seconds = [], [], []
     for row in range(len(loads)):
-        begun = clock.perf_counter()
-        answer = fem.deform(loads.rows(np.array([row])))
-        seconds.append(clock.perf_counter() - begun)
+        answer, spent = timed(fem.deform, loads.rows(np.array([row])))
+        seconds.append(spent)
         fields.append(located.read(answer.displacement)[0])
         good.append(answer.outcome[0].good)
     field = np.array(fields)
@@ -92,9 +89,7 @@ def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
 def _adapt(study: Study, spec: Elements, load: Loads) -> float:
     """Seconds from the debulked body to its first answer; kernels are there already."""
     body = debulked(body_of(study, spec.mesh))
-    begun = clock.perf_counter()
-    _fem(study, spec, body).deform(load)
-    return clock.perf_counter() - begun
+    return timed(lambda: _fem(study, spec, body).deform(load))[1]
 
 
 def _fem(study: Study, spec: Elements, body: Anatomy) -> Fem:

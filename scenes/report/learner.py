@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time as clock
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from surrogate.evaluation.solve_counts import Told
 from surrogate.training.published_models import MACHINES, published_model, published_nodes
 from surrogate.training.train import train
 
+from ..bench.stopwatch import timed
 from .adaptation import debulked_study, simulating_seconds
 from .artefact_time import series_seconds
 from .reference import beyond_of
@@ -56,9 +56,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         return _held(model, study.converged.rows(rows), truth[rows], nodes)
 
     discs, sectors = study.discs, leave_sectors_out(study.pushed, study.patch)
-    begun = clock.perf_counter()
-    model, told = _taught(study, spec, discs, truth)
-    learning = clock.perf_counter() - begun
+    (model, told), learning = timed(_taught, study, spec, discs, truth)
     order = np.flatnonzero(discs.taught)
     curve = []
     for count in counts(len(order)):
@@ -125,10 +123,9 @@ def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]
     after = debulked_study(study)
     nodes = spec.vertices(after.anatomy)
     truth = after.answers[:, np.isin(after.anatomy.tumour_nodes, nodes)]
-    begun = clock.perf_counter()
-    model, _ = _taught(after, spec, after.discs, truth)
-    seconds += clock.perf_counter() - begun + series_seconds(after, spec.name)
+    (model, _), learning = timed(_taught, after, spec, after.discs, truth)
     rows = np.flatnonzero(after.discs.test)
+    seconds += learning + series_seconds(after, spec.name)
     return seconds, _held(model, after.converged.rows(rows), truth[rows], nodes)[0]
 
 
