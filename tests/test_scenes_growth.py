@@ -50,11 +50,11 @@ def test_what_is_measured_is_not_measured_again(folder, tmp_path, monkeypatch, c
     assert [row["batch"] for row in captured["rows"]] == [1, 2]
     assert read_png(out).std() > 5.0
     monkeypatch.undo()
-    assert len((folder / "growth.jsonl").read_text().splitlines()) == 3
+    assert len((folder / "growth.csv").read_text().splitlines()) == 4
     assert main([*words, "--out", str(out)]) == 0
     assert main([*words, "--element", "p2", "--out", str(out)]) == 2
     assert "another trial" in capsys.readouterr().err
-    (folder / "growth.jsonl").write_text((folder / "growth.jsonl").read_text()[:-9])
+    (folder / "growth.csv").write_text((folder / "growth.csv").read_text()[:-9])
     assert main([*words, "--out", str(out)]) == 2
     assert "not whole" in capsys.readouterr().err
 

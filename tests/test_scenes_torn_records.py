@@ -1,11 +1,10 @@
 """Records that grow line by line: a line cut short, or a file of another kind, is a sentence; no number is guessed."""
 
-import json
-
 import pytest
 
-from scenes.bench.robustness import Record, append_records, read_records
-from scenes.bench.scaling import read_rows
+from scenes.bench.csv_tables import append_rows, read_rows
+from scenes.bench.robustness import Record
+from scenes.bench.scaling import Row
 from scenes.report.artefact_time import note_seconds, noted_seconds
 from sim.errors import InputError
 
@@ -14,31 +13,31 @@ RECORDS = [Record("mixed", number, 1.5, 0.006, "CONVERGED", 4, 1e-5, 1e-5, 12.75
 
 def test_a_number_cut_short_is_not_read(tmp_path):
     path = tmp_path / "loads.csv"
-    append_records(path, "this trial", RECORDS)
-    assert read_records(path, "this trial") == RECORDS
+    append_rows(path, "this trial", RECORDS)
+    assert read_rows(path, "this trial", Record) == RECORDS
     whole = path.read_bytes()
     path.write_bytes(whole[:-3])  # 12.7 would be a number too
     with pytest.raises(InputError, match="last line is not whole: remove that line"):
-        read_records(path, "this trial")
+        read_rows(path, "this trial", Record)
     path.write_bytes(whole.replace(b"CONVERGED,4", b"CONVERGED,four", 1))
     with pytest.raises(InputError, match="line 3 is not whole"):
-        read_records(path, "this trial")
+        read_rows(path, "this trial", Record)
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00binary", b"", b"\n\n", b"[" * 10**5])
 def test_files_of_another_kind_are_sentences(tmp_path, content):
     path = tmp_path / "record"
     path.write_bytes(content)
-    for read in (read_records, read_rows):
+    for kind in (Record, Row):
         with pytest.raises(InputError, match=r"[cC]hoose another --out"):
-            read(path, "this trial")
+            read_rows(path, "this trial", kind)
 
 
 def test_a_row_that_is_none_is_named(tmp_path):
-    path = tmp_path / "growth.jsonl"
-    path.write_text(json.dumps("this trial") + "\n" + "[" * 10**5 + "\n")
-    with pytest.raises(InputError, match="line 2 is not whole"):
-        read_rows(path, "this trial")
+    path = tmp_path / "growth.csv"
+    path.write_text("# this trial\nsize,asked\n" + "[" * 10**5 + "\n")
+    with pytest.raises(InputError, match="line 3 is not whole"):
+        read_rows(path, "this trial", Row)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"seconds": "many"}', b"\xff"])

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,10 +11,8 @@ from sim.accuracy import REFERENCE, TRAIN, Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Outcome
 from sim.effects import Effect
-from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
-from sim.runtime.outside_files import read_as
 from surrogate.data.tool_loads import BRUTAL, TOOLS, draw
 
 from .stopwatch import timed
@@ -136,41 +132,3 @@ def tallies(found: Sequence[Record]) -> list[Tally]:
             )
         )  # fmt: skip
     return out
-
-
-def read_records(path: Path, stated: str) -> list[Record]:
-    """The records of an earlier run of the same trial; none if there is no file.
-
-    Raises
-    ------
-    InputError
-        A file of another trial, or that is no record.
-    """
-    if not path.exists():
-        return []
-    types = {item.name: {"str": str, "int": int, "float": float}[str(item.type)] for item in fields(Record)}
-    remedy = "Choose another --out, or remove it."
-    with read_as(path, "the record of a trial", remedy), open(path, newline="") as file:
-        first, *written = file.read().splitlines(keepends=True) or [""]
-        if first.strip() != f"# {stated}":
-            raise InputError(f"{path}: holds another trial, or none: choose another --out, or remove it.")
-        if written and not written[-1].endswith("\n"):  # its last number may be cut short
-            raise InputError(f"{path}: its last line is not whole: remove that line.")
-        records, lines = [], csv.DictReader(written)
-        for row in lines:
-            try:
-                records.append(Record(**{name: types[name](row[name]) for name in types}))
-            except (KeyError, TypeError, ValueError) as error:
-                raise InputError(f"{path}: its line {lines.line_num + 1} is not whole: remove that line.") from error
-        return records
-
-
-def append_records(path: Path, stated: str, found: Sequence[Record]) -> None:
-    """Add records to a file, which begins with what is tried."""
-    begin = not path.exists()
-    with open(path, "a", newline="") as file:
-        writer = csv.DictWriter(file, [item.name for item in fields(Record)])
-        if begin:
-            file.write(f"# {stated}\n")
-            writer.writeheader()
-        writer.writerows(asdict(record) for record in found)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import resource
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
@@ -25,7 +24,6 @@ from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN
-from sim.runtime.outside_files import read_as
 from surrogate.data.tool_loads import draw
 
 from .loglog_chart import Curve, Panel
@@ -118,38 +116,6 @@ def rows(trial: Trial, sizes: Sequence[int], batches: Sequence[int], done: Seque
                         f"{size} nodes with --batch {batch}: the process was ended, for want of memory most likely; "
                         "leave this size out, or give a smaller batch."
                     ) from None
-
-
-def read_rows(path: Path, stated: str) -> list[Row]:
-    """The rows of an earlier run of the same trial; none if there is no file.
-
-    Raises
-    ------
-    InputError
-        A file of another trial, or that is no record.
-    """
-    if not path.exists():
-        return []
-    with read_as(path, "the record of a trial", "Choose another --out, or remove it."):
-        first, *lines = path.read_text().splitlines() or [""]
-        if first != json.dumps(stated):
-            raise InputError(f"{path}: holds another trial, or none: choose another --out, or remove it.")
-        rows = []
-        for number, line in enumerate(lines, start=2):
-            try:
-                rows.append(Row(**json.loads(line)))
-            except (TypeError, ValueError, RecursionError) as error:
-                raise InputError(f"{path}: its line {number} is not whole: remove that line.") from error
-        return rows
-
-
-def append_row(path: Path, stated: str, row: Row) -> None:
-    """Add a row to a file, which begins with what is measured."""
-    begin = not path.exists()
-    with open(path, "a") as file:
-        if begin:
-            file.write(json.dumps(stated) + "\n")
-        file.write(json.dumps(asdict(row)) + "\n")
 
 
 def panels(found: Sequence[Row]) -> tuple[Panel, ...]:

@@ -43,8 +43,9 @@ def run(args: argparse.Namespace) -> int:
     from sim.bodies.subject import MeshPlan
     from sim.runtime.device import find_device
 
+    from ..bench.csv_tables import append_rows, read_rows
     from ..bench.loglog_chart import drawn
-    from ..bench.scaling import Trial, append_row, panels, read_rows, rows
+    from ..bench.scaling import Row, Trial, panels, rows
     from ..bench.stages import machine
 
     if min(args.batch) < 1:
@@ -53,15 +54,15 @@ def run(args: argparse.Namespace) -> int:
         MeshPlan(size)
     find_device(args.device, "float32")
     out = claimed(args.out, ".png", "a picture of sulcus", args.force)
-    where, record = machine(args.device), out.with_suffix(".jsonl")
+    where, record = machine(args.device), out.with_suffix(".csv")
     trial = Trial(args.element, args.device, out.parent)
     stated = f"{where.split(';')[0]}, {args.device} {args.element}"
-    found = [row for row in read_rows(record, stated) if row.size in args.sizes and row.asked in args.batch]
+    found = [row for row in read_rows(record, stated, Row) if row.size in args.sizes and row.asked in args.batch]
     table = sys.stderr if args.json else sys.stdout
     print(where, file=table)
     with tqdm(total=len(args.sizes) * len(args.batch), initial=len(found), unit="row", file=sys.stderr) as bar:
         for row in rows(trial, args.sizes, args.batch, tuple(found)):
-            append_row(record, stated, row)
+            append_rows(record, stated, [row])
             found.append(row)
             bar.update()
     found.sort(key=lambda row: (row.nodes, row.batch))

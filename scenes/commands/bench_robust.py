@@ -40,7 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
-    from ..bench.robustness import Trial, append_records, read_records, records, tallies
+    from ..bench.csv_tables import append_rows, read_rows
+    from ..bench.robustness import Record, Trial, records, tallies
     from ..bench.stages import machine
 
     if args.count < 2 or args.batch < 1:
@@ -51,13 +52,13 @@ def run(args: argparse.Namespace) -> int:
     stated = f"{anatomy.digest} {effects!r} {args.element} count {args.count} seed {args.seed}"
     if args.out:
         check_output(args.out, ".csv")
-    found = read_records(args.out, stated) if args.out else []
+    found = read_rows(args.out, stated, Record) if args.out else []
     with tqdm(total=args.count, initial=len(found), unit="load", file=sys.stderr) as bar:
         for some in records(trial, args.count, args.seed, tuple(found)):
             found += some
             bar.update(len(some))
             if args.out:
-                append_records(args.out, stated, some)
+                append_rows(args.out, stated, some)
     sets = tallies(found)
     where = machine(args.device)
     if args.json:

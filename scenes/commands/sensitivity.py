@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,6 @@ from tqdm import tqdm
 
 from sim.discretisation.space import ELEMENTS
 from sim.errors import InputError
-from sim.runtime.atomic_files import written_whole
 from surrogate.data.tool_loads import PRESETS, draw
 
 from .outputs import add_force, claimed
@@ -78,6 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve them all; 1 if one did not converge."""
+    from ..bench.csv_tables import write_table
     from ..bench.sensitivity import Study, rows
     from ..bench.sensitivity_variants import Body, variants
     from ..bench.stages import machine
@@ -112,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
             bar.update()
     table = [_flat(row) for row in found]
     if args.out:
-        _write(args.out, table)
+        write_table(args.out, table)
     failed = sum(row.force.failed + row.motion.failed for row in found)
     if args.json:
         stated = {"preset": args.preset, "loads": len(loads), "seed": args.seed, "default": asdict(body)}
@@ -130,6 +129,7 @@ def _factorial(args: argparse.Namespace) -> int:
 
     from ar.screen import write_png
 
+    from ..bench.csv_tables import write_table
     from ..bench.factorial import LEVELS, cells, panels, shares
     from ..bench.loglog_chart import drawn
 
@@ -142,7 +142,7 @@ def _factorial(args: argparse.Namespace) -> int:
     failed = sum(not np.isfinite(value) for cell in found for value in (cell.force, cell.motion))
     parts = {what: shares(found, what) for what in ("force", "motion")}
     if args.out:
-        _write(args.out, table)
+        write_table(args.out, table)
         write_png(picture, drawn(panels(found)))
     if args.json:
         print(json.dumps(_finite({"failed": failed, "shares": parts, "rows": table}), allow_nan=False))
@@ -156,13 +156,6 @@ def _factorial(args: argparse.Namespace) -> int:
     if failed:
         print(f"{failed} solves did not converge: they are in no figure.")
     return 1 if failed else 0
-
-
-def _write(out: Path, table: Sequence[Mapping[str, Any]]) -> None:
-    with written_whole(out, ".csv") as partial, open(partial, "w", newline="") as file:
-        writer = csv.DictWriter(file, table[0])
-        writer.writeheader()
-        writer.writerows(table)
 
 
 def _opening(study: Study, preset: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
@@ -15,6 +14,7 @@ from ar.screen import write_png
 from sim.runtime.atomic_files import written_whole
 from surrogate.evaluation.score import FEWEST_FOR_P999
 
+from ..bench.csv_tables import write_table
 from .plots import against_solves, against_time, front, learners_against_time
 from .row import Figures, Row
 
@@ -81,7 +81,7 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
             if picture is not None:
                 write_png(folder / f"{section.name}-{kind}.png", picture)
                 plots.append(folder / f"{section.name}-{kind}.png")
-        _write_csv(folder / f"{section.name}.csv", section.rows)
+        write_table(folder / f"{section.name}.csv", [dict(_flat(asdict(row))) for row in section.rows])
         bodies.append(_section(section, folder, plots))
     with written_whole(folder / "report.json", ".json") as partial:
         partial.write_text(json.dumps({"machine": machine, "sections": [asdict(section) for section in sections]}))
@@ -234,17 +234,8 @@ def _picture(path: Path, words: str) -> str:
     return f'<img alt="{escape(words)}" src="data:image/png;base64,{data}">'
 
 
-def _write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """One line a row; a number inside others is named by the way to it, as in reference.mm.mean."""
-    lines = [dict(_flat(asdict(row))) for row in rows]
-    names = dict.fromkeys(name for line in lines for name in line)
-    with written_whole(path, ".csv") as partial, partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(names))
-        writer.writeheader()
-        writer.writerows(lines)
-
-
 def _flat(value: Any, name: str = "") -> Iterable[tuple[str, Any]]:
+    """Numbers and texts; one inside others is named by the way to it, as in reference.mm.mean."""
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else None
     if inside is None:
         yield name, value
