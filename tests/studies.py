@@ -1,6 +1,12 @@
 """A small report's study: palpation of a box, of which two loads are played."""
 
+import json
+from dataclasses import asdict
+
+import msgspec
+
 from scenes.report.reference import solve_beyond, solve_reference
+from scenes.report.row import Row
 from scenes.report.study import Study
 from sim.accuracy import TRAIN
 from sim.effects import NodalForce, pushed_effects
@@ -25,3 +31,8 @@ def study_of(folder, box, count):
     solve_reference(study, nothing)
     solve_beyond(study, nothing)
     return study
+
+
+def read_back(row):
+    """A row as a report keeps it and reads it again."""
+    return msgspec.convert(json.loads(json.dumps(asdict(row))), Row)

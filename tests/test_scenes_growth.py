@@ -8,7 +8,7 @@ import pytest
 
 from ar.screen import read_png
 from scenes.bench import scaling
-from scenes.bench.scaling import Row, Trial, measured, panels, rows
+from scenes.bench.scaling import Row, Trial, measured, panels, rows, template_mesh
 from scenes.cli import main
 from sim.errors import InputError
 
@@ -19,7 +19,7 @@ ROW = Row(2000, 1, 1977, 8987, "sparse factor", 1, 1.0, 0.05, 8.0, 12, 12, 0.3, 
 def folder(tmp_path_factory):
     """Where the smallest template's mesh is kept."""
     folder = tmp_path_factory.mktemp("growth")
-    Trial("p1", "cpu", folder).mesh(2000)
+    template_mesh(folder, 2000)
     return folder
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import make_box
 from poison import poisoned
-from studies import TISSUE, nothing, study_of
+from studies import TISSUE, nothing, read_back, study_of
 
 from ar.screen import read_png
 from scenes.bench.process_memory import peak_memory
@@ -23,7 +23,7 @@ from scenes.report.learner import Learner, counts, measure_learner
 from scenes.report.measure import measured
 from scenes.report.page import Section, write_report
 from scenes.report.reference import Truth, beyond_of, reference_of, solve_reference
-from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, row_from_json, row_to_json
+from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference
 from scenes.report.rows import every, learners, rows, star
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import pushed_effects
@@ -168,7 +168,7 @@ def test_rows_say_what_they_are(found, box):
     assert (fem.timed, fem.p99, learner.timed) == (2, None, 30) and fem.median > learner.median > 0.0
     assert published.reference.values == 2 * len(published_nodes(box)) and published.picture is None
     assert learner.adapt is None and fem.adapt > 0.0 and learner.curve[-1] == (learner.taught, learner.teacher["discs"])
-    assert row_from_json(row_to_json(learner)) == learner
+    assert read_back(learner) == learner
     assert 0.05 < peak_memory() < 50.0
 
 

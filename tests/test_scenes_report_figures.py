@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import make_box
+from studies import read_back
 
 from scenes.cli import main
 from scenes.commands import report as command
 from scenes.report.page import Section, write_report
 from scenes.report.plots import against_time, front
-from scenes.report.row import Row, figures_of, of_times, row_from_json, row_to_json
+from scenes.report.row import Row, figures_of, of_times
 from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset
 
@@ -66,7 +67,7 @@ def test_every_figure_stands_under_its_head(tmp_path):
     assert (
         "<summary>FEM</summary><ul><li>First this.<li>Then &lt;that&gt;.</ul>" in (tmp_path / "index.html").read_text()
     )
-    assert row_from_json(row_to_json(solved)).plan == solved.plan
+    assert read_back(solved).plan == solved.plan
     write_report(tmp_path, "a machine", [Section("data", (), (row,))])
     assert "Which solvers" not in (tmp_path / "index.html").read_text()
     tables = [

@@ -8,18 +8,17 @@ from itertools import combinations, product
 
 import numpy as np
 
-from sim.accuracy import TRAIN
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
-from sim.effects import Elasticity, ToolDisplacement, pushed_effects
 from sim.fem import Fem
 from sim.loads import Loads, push, stacked
 from sim.material import BRAIN
 
 from .loglog_chart import Curve, Panel
-from .sensitivity import moved_alike
+from .sensitivity import Study, moved_alike
+from .sensitivity_variants import Body
 
 Levels = Mapping[str, Sequence[str | float]]
 LEVELS: Levels = {
@@ -56,20 +55,19 @@ def cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> I
         cortex = open_cortex(anatomy)
         places = [cortex.place(*place) for place in PLACES]
         forces = stacked([push(place.point, FORCE * place.inward, FOOTPRINT) for place in places])
-        default = _fem(anatomy, DEFAULT, device).deform(forces)
+        study = Study(anatomy, forces, _body(DEFAULT), device=device)
+        default = study.fem(study.body).deform(forces)
         motions = moved_alike(anatomy, forces, default)
         for combination in product(*(levels[name] for name in DEFAULT)):
             chosen = dict(zip(DEFAULT, combination, strict=True))
-            fem = _fem(anatomy, chosen, device)
+            fem = study.fem(_body(chosen))
             moved = [_motion(fem, anatomy, loads) for loads in (forces, motions)]
             yield Cell({"opening [mm]": opening, "depth [mm]": depth, **chosen}, *moved)
 
 
-def _fem(anatomy: Anatomy, chosen: Mapping[str, str | float], device: str) -> Fem:
+def _body(chosen: Mapping[str, str | float]) -> Body:
     tissue = replace(BRAIN, poisson=float(chosen["nu"]))
-    tumour = replace(tissue, young=float(chosen["tumour's stiffness"]) * tissue.young)
-    _, *others = pushed_effects(anatomy, tissue, str(chosen["skull"]))
-    return Fem(anatomy, (Elasticity(tissue, {TUMOUR_LABEL: tumour}), *others, ToolDisplacement()), TRAIN, device)
+    return Body(tissue, float(chosen["tumour's stiffness"]), str(chosen["skull"]))
 
 
 def _motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:

@@ -64,17 +64,18 @@ class Trial:
     device: str
     folder: Path
 
-    def mesh(self, size: int) -> Path:
-        """The template's brain of about `size` nodes; made if it is not there."""
-        path = self.folder / f"template_{size}.vtu"
-        if not path.exists():
-            write_anatomy(path, make_anatomy(template_subject(Tumour()), MeshPlan(size)))
-        return path
+
+def template_mesh(folder: Path, size: int) -> Path:
+    """The template's brain of about `size` nodes; made if it is not there."""
+    path = folder / f"template_{size}.vtu"
+    if not path.exists():
+        write_anatomy(path, make_anatomy(template_subject(Tumour()), MeshPlan(size)))
+    return path
 
 
 def measured(trial: Trial, size: int, batch: int) -> Row:
     """Solve palpation loads on one mesh, to 1e-4 in single precision, in this process."""
-    anatomy = read_anatomy(trial.mesh(size))
+    anatomy = read_anatomy(template_mesh(trial.folder, size))
     with watched_card(trial.device) as card:
         effects = pushed_effects(anatomy, BRAIN)
         fem, made = timed(Fem, anatomy, effects, TRAIN, trial.device, batch, trial.element)
@@ -107,7 +108,7 @@ def rows(trial: Trial, sizes: Sequence[int], batches: Sequence[int], done: Seque
         for batch in batches:
             if (size, batch) in known:
                 continue
-            trial.mesh(size)
+            template_mesh(trial.folder, size)
             with ProcessPoolExecutor(1, get_context("spawn")) as pool:
                 try:
                     yield pool.submit(measured, trial, size, batch).result()

@@ -42,17 +42,8 @@ def run(args: argparse.Namespace) -> int:
     motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())
     if args.json:
         rows = [{**asdict(row), "seconds": spent} for row, spent in zip(scores, seconds, strict=True)]
-        print(
-            json.dumps(
-                {
-                    "rows": rows,
-                    "motion_mm": motion,
-                    "loads": len(loads),
-                    "positions": len(sites),
-                    "vertices": len(nodes),
-                }
-            )
-        )
+        sizes = {"loads": len(loads), "positions": len(sites), "vertices": len(nodes)}
+        print(json.dumps({"rows": rows, "motion_mm": motion, **sizes}))
         return 0
     print(f"{len(loads)} loads, each answered without its position, at {len(nodes)} vertices of the tumour:")
     print(table(scores, motion))

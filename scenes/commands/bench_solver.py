@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,7 @@ from sim.errors import InputError
 from sim.runtime.device import find_device
 
 from ..script.shipped_files import template_path
+from .json_line import json_line
 
 if TYPE_CHECKING:
     from ..bench.peers import Row
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
                 _print(rows, table)
                 found.append({**size, "tolerance": tolerance, "rows": [_plain(row) for row in rows]})
     if args.json:
-        print(json.dumps({"machine": where, "threads": args.threads, "meshes": found}))
+        print(json_line({"machine": where, "threads": args.threads, "meshes": found}))
     return 0 if all(answer["good"] for mesh in found for answer in mesh["rows"][0]["answers"]) else 1
 
 
@@ -133,17 +133,5 @@ def _figure(value: float, form: str) -> str:
 
 
 def _plain(row: Row) -> dict[str, Any]:
-    """As JSON has it: what is not finite is null."""
-    answers = [
-        {"good": one.good, "reason": one.reason}
-        | {name: _finite(getattr(one, name)) for name in ("seconds", "residual", "apart")}
-        for one in row.answers
-    ]
-    figures = {name: _finite(getattr(row, name)) for name in ("tolerance", "first", "first_ratio", "further", "ratio")}
-    firsts = [_finite(seconds) for seconds in row.firsts]
-    named = {"engine": row.engine, "setting": row.setting, "missing": row.missing}
-    return named | figures | {"firsts": firsts, "answers": answers}
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    answers = [{**asdict(answer), "good": answer.good} for answer in row.answers]
+    return {**asdict(row), "first": row.first, "further": row.further, "answers": answers}

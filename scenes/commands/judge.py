@@ -63,17 +63,8 @@ def run(args: argparse.Namespace) -> int:
     preset = "" if data.ball is not None else data.provenance.get("preset", "")
     if args.json:
         told, of_tip = ({name: asdict(found) for name, found in held.items()} for held in (promised, ranged))
-        print(
-            json.dumps(
-                {
-                    "scores": [asdict(row) for row in scores],
-                    "coverage": told,
-                    "distance_coverage": of_tip,
-                    "motion_mm": motion,
-                    "nominal_refused": refused_share(preset),
-                }
-            )
-        )
+        figures = {"scores": [asdict(row) for row in scores], "coverage": told, "distance_coverage": of_tip}
+        print(json.dumps({**figures, "motion_mm": motion, "nominal_refused": refused_share(preset)}))
     else:
         print(f"{len(loads)} loads, against the finite elements that answered them:\n{table(scores, motion)}")
         if refused_words(preset):

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ from sim.discretisation.space import ELEMENTS
 from sim.errors import InputError
 from surrogate.data.tool_loads import PRESETS, draw
 
+from .json_line import json_line
 from .outputs import add_force, claimed
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         stated = {"preset": args.preset, "loads": len(loads), "seed": args.seed, "default": asdict(body)}
         surrogate = _stated(model) if model else None
         whole = {"machine": where, **stated, "failed": failed, "surrogate": surrogate, "rows": table}
-        print(json.dumps(_finite(whole), allow_nan=False))
+        print(json_line(whole))
     else:
         print("\n".join([*_bound(model), NOTE, *_remarks(study, args.beside, model, failed)]))
     return 1 if failed else 0
@@ -145,7 +145,7 @@ def _factorial(args: argparse.Namespace) -> int:
         write_table(args.out, table)
         write_png(picture, drawn(panels(found)))
     if args.json:
-        print(json.dumps(_finite({"failed": failed, "shares": parts, "rows": table}), allow_nan=False))
+        print(json_line({"failed": failed, "shares": parts, "rows": table}))
         return 1 if failed else 0
     print("Of the variance of the motion's logarithm, known force and known motion of the tool:")
     for name, share in parts["force"].items():
@@ -219,12 +219,3 @@ def _flat(row: Row) -> dict[str, Any]:
     sides = {"force": row.force, "motion": row.motion}
     figures = {f"{side} {name}": value for side, change in sides.items() for name, value in asdict(change).items()}
     return {"what": variant.what, "default": variant.default, "now": variant.now, **figures}
-
-
-def _finite(value: Any) -> Any:
-    """The same without numbers that JSON does not have."""
-    if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 
@@ -18,6 +17,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Cause, Loads, Nodal, Prescribed
 
+from .json_line import json_line
 from .outputs import add_force, claimed
 from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, regions_of, tissue_of
 
@@ -86,9 +86,7 @@ def run(args: argparse.Namespace) -> int:
     deformation = fem.deform(loads, start_of(file, args.mesh, UNITS[args.unit]))
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
-    outcome, residual = deformation.outcome[0], float(deformation.residual[0])
-    reached, inverted = float(deformation.reached[0]), int(deformation.inverted[0])
-    leaked, bond = float(deformation.leaked[0]), float(deformation.bond[0])
+    outcome, reached, inverted = deformation.outcome[0], float(deformation.reached[0]), int(deformation.inverted[0])
     if reached < 1.0:
         what = f"in equilibrium under {reached:.1%} of the load" if reached else "the last state, in no equilibrium"
         print(f"{args.mesh}: {outcome.value}; what is written is {what}", file=sys.stderr)
@@ -98,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         "outcome": outcome.name.lower(),
         "message": outcome.value,
         "iterations": int(deformation.iterations[0]),
-        "residual": residual if np.isfinite(residual) else None,  # JSON knows no infinity
+        "residual": float(deformation.residual[0]),
         "load_fraction": reached,
         "element": fem.space.element,
         "tissue": str(effects[0]),
@@ -106,12 +104,12 @@ def run(args: argparse.Namespace) -> int:
         "nodes": fem.space.count,
         "seconds": round(seconds, 4),
         "inverted_tetrahedra": inverted,
-        "leaked": leaked if np.isfinite(leaked) else None,
-        "bond": bond if np.isfinite(bond) else None,
+        "leaked": float(deformation.leaked[0]),
+        "bond": float(deformation.bond[0]),
         "largest_displacement_mm": round(1e3 * float(np.linalg.norm(deformation.displacement[0], axis=1).max()), 6),
         "out": str(out),
     }
-    print(json.dumps({**report, "plan": plan} if plan else report))
+    print(json_line({**report, "plan": plan} if plan else report))
     return 0 if outcome.good else 1
 
 

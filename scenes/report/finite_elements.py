@@ -8,10 +8,8 @@ import numpy as np
 
 from sim.accuracy import FLOOR, Accuracy, Precision
 from sim.anatomy import Anatomy
-from sim.bodies.meshfile import read_anatomy, write_anatomy
+from sim.bodies.meshfile import read_anatomy
 from sim.bodies.refine import refined
-from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
 from sim.discretisation.footprint import nearest_on
 from sim.effects import pushed_effects
 from sim.errors import InputError
@@ -20,6 +18,7 @@ from sim.geometry.locate import locate
 from sim.loads import Loads, Pushed
 from sim.material import Material, Tissue
 
+from ..bench.scaling import template_mesh
 from ..bench.stopwatch import timed
 from .adaptation import debulked
 from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, Row, against_reference, of_times
@@ -112,10 +111,7 @@ def body_of(study: Study, mesh: str) -> Anatomy:
         return study.anatomy
     if mesh == HALVED:
         return refined(study.anatomy)
-    path = study.folder / "meshes" / f"template_{mesh}.vtu"
-    if not path.exists():
-        write_anatomy(path, make_anatomy(template_subject(Tumour()), MeshPlan(int(mesh))))
-    return read_anatomy(path)
+    return read_anatomy(template_mesh(study.folder / "meshes", int(mesh)))
 
 
 def tissue_of(tissue: Tissue, law: str | None) -> Tissue:

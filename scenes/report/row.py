@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -184,26 +183,3 @@ class Row:
     curve: tuple[tuple[int, Figures], ...] = ()
     plan: tuple[str, ...] = ()
     picture: str | None = None
-
-
-def row_to_json(row: Row) -> str:
-    """Text that `row_from_json` reads."""
-    return json.dumps(asdict(row))
-
-
-def row_from_json(text: str) -> Row:
-    """The row that `row_to_json` wrote."""
-    stored: dict[str, Any] = json.loads(text)
-    for name in ("reference", "adapted"):
-        stored[name] = _figures(stored[name])
-    stored["teacher"] = {name: _figures(each) for name, each in stored["teacher"].items()}
-    stored["plan"] = tuple(stored.get("plan", ()))
-    stored["curve"] = tuple((taught, _figures(each)) for taught, each in stored["curve"])
-    return Row(**stored)
-
-
-def _figures(stored: dict[str, Any] | None) -> Figures | None:
-    if stored is None:
-        return None
-    spreads = {name: Spread(**stored[name]) for name in ("mm", "worst", "percent")}
-    return Figures(**{**stored, **spreads, "tenths": tuple(Tenth(**each) for each in stored["tenths"])})

@@ -11,6 +11,7 @@ from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from sim.accuracy import FLOOR, Precision
@@ -23,7 +24,7 @@ from surrogate.training.train import LEARNERS
 from .finite_elements import HALVED, OWN, STANDARD, Elements
 from .learner import Learner
 from .measure import FAMILY, Spec, measured
-from .row import Row, row_from_json, row_to_json
+from .row import Row
 from .study import Study
 
 ELEMENTS = ("p1", "smoothed", "p2")
@@ -87,7 +88,7 @@ def rows(study: Study, specs: Sequence[Spec], run: Run = apart) -> Iterator[Row]
             kept = run(study, spec, study.folder / "pictures" / f"{stem}.png")
             if kept.state == "measured":
                 with written_whole(path, ".json") as partial:
-                    partial.write_text(json.dumps({"digest": digest, "row": json.loads(row_to_json(kept))}))
+                    partial.write_text(json.dumps({"digest": digest, "row": asdict(kept)}))
         yield kept
 
 
@@ -105,6 +106,6 @@ def _kept(path: Path, digest: str) -> Row | None:
     """The row in a file, if it is there, whole, and of the same inputs."""
     try:
         stored = json.loads(path.read_text())
-        return row_from_json(json.dumps(stored["row"])) if stored["digest"] == digest else None
+        return msgspec.convert(stored["row"], Row) if stored["digest"] == digest else None
     except (OSError, ValueError, LookupError, TypeError):
         return None
