@@ -28,7 +28,7 @@ from surrogate.model.learned import only_pushed
 from surrogate.model.store import load, save
 from surrogate.model.tip_distance import TipModel
 from surrogate.model.training_range import measured
-from surrogate.training.tip_distance import CLASS, calibrated_distance, distance_errors, measured_distances
+from surrogate.training.tip_distance import CLASS, Measured, calibrated_distance, distance_errors
 from surrogate.training.train import train
 
 
@@ -139,7 +139,7 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
     def known(count, seed):
         loads = draw("palpation", pretender.anatomy, count, seed)
         answer = pretender.deform(loads)
-        return measured_distances(gauge, loads, answer.displacement, answer.nodes, None)
+        return Measured(loads, gauge.distances(loads, answer.displacement, answer.nodes))
 
     def features(some):
         pushed = model.asked(some.loads)

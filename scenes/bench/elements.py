@@ -101,10 +101,15 @@ def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, devi
     loads = _loads(anatomy, press)
     fem.deform(loads.scaled(1e-3))  # kernels are compiled or loaded at their first launch
     answer, seconds = timed(fem.deform, loads)
-    inside = mesh.region == TUMOUR_LABEL
-    mean = answer.displacement[0][mesh.tets[inside]].mean(axis=1)
-    motion = np.linalg.norm(np.average(mean, axis=0, weights=mesh.volumes[inside]))
+    motion = np.linalg.norm(tumour_motion(anatomy, answer.displacement)[0])
     return Row(
         poisson, element, len(mesh.nodes), fem.space.count, 1e3 * float(motion), set_up, seconds,
         int(answer.iterations[0]), answer.outcome[0].good,
     )  # fmt: skip
+
+
+def tumour_motion(anatomy: Anatomy, displacement: np.ndarray) -> np.ndarray:
+    """Mean motion (B, 3) [m] of the tumour by volume, of displacements (B, V, 3) [m]."""
+    mesh = anatomy.mesh
+    inside = mesh.region == TUMOUR_LABEL
+    return np.average(displacement[:, mesh.tets[inside]].mean(axis=2), axis=1, weights=mesh.volumes[inside])

@@ -168,8 +168,7 @@ def case_of(anatomy: Anatomy, loads: int, seed: int, tolerance: float = TOLERANC
         An anatomy without open cortex, or fewer loads than one.
     """
     held = np.asarray((anatomy.held | (anatomy.slide_normal != 0.0)).any(axis=1))
-    pushed = draw("palpation", anatomy, loads, seed).of(Pushed)
-    assert pushed is not None
+    (pushed,) = draw("palpation", anatomy, loads, seed).every(Pushed)
     mesh = anatomy.mesh
     weights = footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
     force = weights[:, :, None] * pushed.force[:, None, :]

@@ -81,8 +81,7 @@ def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iter
 def _written(
     preset: str, index: np.ndarray, loads: Loads, answer: Deformation, again: np.ndarray, seconds: float
 ) -> list[Record]:
-    pushed = loads.of(Pushed)
-    assert pushed is not None
+    (pushed,) = loads.every(Pushed)
     force = np.linalg.norm(pushed.force, axis=1)
     return [
         Record(

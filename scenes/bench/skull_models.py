@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.accuracy import TRAIN
-from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.anatomy import Anatomy
 from sim.deformation import Deformation, joined
 from sim.effects import Bonded, pushed_effects
 from sim.fem import Fem
@@ -16,6 +16,7 @@ from sim.loads import Loads
 from sim.material import Material
 from sim.tearing import TEARING, Tearing, torn
 
+from .elements import tumour_motion
 from .stopwatch import timed
 
 # A bond that lets go where it bears too much, and one that bears nothing: the skull presses only, without a gap.
@@ -71,10 +72,7 @@ def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device
     answer, good, seconds = _answered(anatomy, skull, tissue, loads, device, tearing)
     if not good.any():
         return Row(skull, poisson, len(mesh.nodes), float("nan"), None, None, seconds, len(good))
-    inside = mesh.region == TUMOUR_LABEL
-    moved = np.average(
-        answer.displacement[good][:, mesh.tets[inside]].mean(axis=2), axis=1, weights=mesh.volumes[inside]
-    )
+    moved = tumour_motion(anatomy, answer.displacement[good])
     leaked, bond = (float(values[good].max()) for values in (answer.leaked, answer.bond))
     return Row(
         skull, poisson, len(mesh.nodes), 1e3 * float(np.linalg.norm(moved, axis=1).mean()),

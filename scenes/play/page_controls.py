@@ -84,44 +84,24 @@ def hand(
     assert scene.tool is not None
     room = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
     sides = bearings(scene.viewpoint.camera(site).T_camera_world[:3, :3])
-    right, up = sides["right"], sides["top"]
-    place = "the bone stops the tool at the rim of the opening"
-    tilt = "which way the tool pushes, against straight inwards"
-    return [
-        Choice("tool", (SCRIPT, HAND), SCRIPT, give, hint=HANDS),
-        strength(scene, wish, take),
+    stops = "the bone stops the tool at the rim of the opening"
+    against = "which way the tool pushes, against straight inwards"
+    ways = (("right", "x", sides["right"]), ("up", "y", sides["top"]))
+    places = (
         Slider(
-            "place right [mm]",
-            -room,
-            room,
-            0.5,
-            0.0,
-            lambda value: take(x=1e-3 * value),
-            f"right, to {right} [mm]",
-            place,
-        ),
-        Slider("place up [mm]", -room, room, 0.5, 0.0, lambda value: take(y=1e-3 * value), f"up, to {up} [mm]", place),
+            f"place {way} [mm]", -room, room, 0.5, 0.0, lambda value, axis=axis: take(**{axis: 1e-3 * value}),
+            f"{way}, to {side} [mm]", stops,
+        )
+        for way, axis, side in ways
+    )  # fmt: skip
+    tilts = (
         Slider(
-            "direction right [deg]",
-            -MOST_TILT,
-            MOST_TILT,
-            1.0,
-            0.0,
-            lambda value: take(right=np.radians(value)),
-            f"tilt right, to {right} [deg]",
-            tilt,
-        ),
-        Slider(
-            "direction up [deg]",
-            -MOST_TILT,
-            MOST_TILT,
-            1.0,
-            0.0,
-            lambda value: take(up=np.radians(value)),
-            f"tilt up, to {up} [deg]",
-            tilt,
-        ),
-    ]
+            f"direction {way} [deg]", -MOST_TILT, MOST_TILT, 1.0, 0.0,
+            lambda value, way=way: take(**{way: np.radians(value)}), f"tilt {way}, to {side} [deg]", against,
+        )
+        for way, _, side in ways
+    )  # fmt: skip
+    return [Choice("tool", (SCRIPT, HAND), SCRIPT, give, hint=HANDS), strength(scene, wish, take), *places, *tilts]
 
 
 def strength(scene: Scene, wish: Wish, take: Callable[..., None]) -> Slider:

@@ -235,14 +235,12 @@ def annotate(over: Picture, number: int, remark: str) -> None:
     lay(over.colour, over.taken, [f"frame {number}"], (width, height))
 
 
-def labelled(frame: Frame, name: str, error: float | None = None) -> np.ndarray:
-    """The shown picture (H, W, 3) with a panel: deformer, what acts, milliseconds by stage, and error [m] if known."""
+def labelled(frame: Frame, name: str) -> np.ndarray:
+    """The shown picture (H, W, 3) with a panel: deformer, what acts, and milliseconds by stage."""
     stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
     acts = told(frame.loads, frame.deformation)
     lines = [frame.deformation.source or name, f"t {frame.time:.2f} s   tumour moved {1e3 * frame.moved:.2f} mm"]
     lines += [*([acts] if acts else []), f"ms: {stages}"]
-    if error is not None:
-        lines.append(f"error against FEM: {1e3 * error:.3f} mm (frame {frame.number})")
     if not frame.deformation.outcome[0].good:
         lines.append(frame.deformation.outcome[0].value)
     return panel(frame.shown, lines)

@@ -131,7 +131,6 @@ def tissue_of(tissue: Tissue, law: str | None) -> Tissue:
 
 def onto(body: Anatomy, loads: Loads) -> Loads:
     """The same pushes at the nearest points of another mesh's open cortex."""
-    pushed = loads.of(Pushed)
-    assert pushed is not None
+    (pushed,) = loads.every(Pushed)
     corners = body.mesh.nodes[body.open_surface]
     return Loads((replace(pushed, point=np.array([nearest_on(corners, point) for point in pushed.point])),), loads.time)

@@ -40,8 +40,7 @@ def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
     there[study.drawn] += truth.displacement[worst]
     predicted = there.copy()
     predicted[anatomy.tumour_nodes] = anatomy.mesh.nodes[anatomy.tumour_nodes] + answer[worst]
-    pushed = study.played.of(Pushed)
-    assert pushed is not None
+    (pushed,) = study.played.every(Pushed)
     site = site_of(anatomy)
     scan = read_intensity(sidecar(template_path())) if study.of_template else None
     middle = there[anatomy.tumour_nodes].mean(axis=0)

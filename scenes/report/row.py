@@ -84,8 +84,7 @@ def figures_of(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> Fi
 
 def figures_between(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> Figures | None:
     """Figures of `answer` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
-    pushed = loads.of(Pushed)
-    assert pushed is not None
+    (pushed,) = loads.every(Pushed)
     return figures_of(np.linalg.norm(answer - truth, axis=2), truth, directions(pushed)[0])
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.surface import areas
 from ..geometry.tetmesh import EDGES, FACES
 from .signed_distance import Field, onto_level
 
@@ -106,8 +107,7 @@ def enclosed_volume(nodes: np.ndarray, triangles: np.ndarray) -> float:
 
 def _middles_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     corners = nodes[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return corners.mean(axis=1), 0.5 * np.linalg.norm(normal, axis=1)
+    return corners.mean(axis=1), areas(corners)
 
 
 def improved(nodes: np.ndarray, tets: np.ndarray, project: Projection, settings: Smoothing = Smoothing()) -> np.ndarray:

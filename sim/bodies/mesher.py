@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from ..anatomy import BRAIN_LABEL, TUMOUR_LABEL
 from ..errors import InputError
+from ..geometry.surface import areas
 from ..geometry.tetmesh import TetMesh, faces_once
 from .bcc_lattice import graded_lattice
 from .isosurface_stuffing import Pieces, Stuffing, cut, whole
@@ -208,6 +209,6 @@ def surface_errors(nodes: np.ndarray, triangles: np.ndarray, field: Field) -> tu
     """Distances (15 S,) [m] from points spread over triangles (S, 3) to a field's surface, and their shares of area."""
     spread = np.array([(i, j, 12 - i - j) for i in range(1, 12, 2) for j in range(1, 12 - i, 2)]) / 12.0
     corners = nodes[triangles]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = areas(corners)
     points = np.einsum("pk,tki->tpi", spread, corners).reshape(-1, 3)
     return np.abs(field(points)), np.repeat(area / area.sum() / len(spread), len(spread))

@@ -36,7 +36,8 @@ def refined(anatomy: Anatomy) -> Anatomy:
     shortest = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2).argmin(axis=1)
     around = ROUND[shortest]
     inner = [np.column_stack([DIAGONALS[shortest], around[:, k], around[:, (k + 1) % 4]]) for k in range(4)]
-    children = np.concatenate([table[:, CORNERS], np.stack([_picked(table, one) for one in inner], axis=1)], axis=1)
+    cut = np.stack([np.take_along_axis(table, one, axis=1) for one in inner], axis=1)
+    children = np.concatenate([table[:, CORNERS], cut], axis=1)
     tets, _ = oriented(nodes, children.reshape(-1, 4))
     held, normal = space.held(anatomy.held), space.sliding(anatomy.slide_normal, anatomy.held)
     craniotomy = np.zeros(space.count, bool)
@@ -45,7 +46,3 @@ def refined(anatomy: Anatomy) -> Anatomy:
     craniotomy[: len(mesh.nodes)] = anatomy.craniotomy
     free = ~held.any(axis=1) & (normal == 0.0).all(axis=1)
     return Anatomy(TetMesh(nodes, tets, np.repeat(mesh.region, 8)), held, normal, craniotomy & free)
-
-
-def _picked(table: np.ndarray, places: np.ndarray) -> np.ndarray:
-    return np.take_along_axis(table, places, axis=1)

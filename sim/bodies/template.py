@@ -166,7 +166,9 @@ def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
     brain, cortex = mask_field(mask, affine), rim(mask, affine)
     if tumour.middle is None:
         site, inward = _site(brain, cortex, tumour.site, head.smooth)
-        shape = _placed(tumour, site, inward)
+        shape = _round(
+            tumour, lambda unit, scale: site + (tumour.cover + scale * unit.radius(-inward[None])[0]) * inward
+        )
     else:
         shape = _round(tumour, lambda unit, scale: np.array(tumour.middle))
         site = site_over(cortex, shape.middle)
@@ -209,11 +211,6 @@ def _site(brain: Field, cortex: np.ndarray, name: str, smooth: float) -> tuple[n
     near = cortex[np.linalg.norm(cortex - site, axis=1) <= 3.0 * smooth]
     normal = np.linalg.eigh(np.cov(near.T))[1][:, 0]
     return site, -normal * np.sign(normal @ outward)
-
-
-def _placed(tumour: Tumour, site: np.ndarray, inward: np.ndarray) -> Lobed:
-    """The tumour with its cap `cover` under `site` (3,), seen along `inward` (3,)."""
-    return _round(tumour, lambda unit, scale: site + (tumour.cover + scale * unit.radius(-inward[None])[0]) * inward)
 
 
 def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:

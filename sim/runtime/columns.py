@@ -20,13 +20,16 @@ CHUNK = 64
 
 @dataclass(frozen=True)
 class Kernels:
-    """Column arithmetic of one scalar type."""
+    """Column arithmetic of one scalar type, and what moves rows."""
 
     dot: wp.Kernel
     dot_alone: wp.Kernel
     combine: wp.Kernel
     add_multiple: wp.Kernel
     unstack: wp.Kernel
+    take: wp.Kernel
+    put: wp.Kernel
+    add: wp.Kernel
 
 
 @cache
@@ -101,7 +104,40 @@ def kernels_of(device: Device) -> Kernels:
         for k in range(3):
             out[c, n, k] = wp.float64(x[3 * nodes[n] + k, c])
 
-    return Kernels(dot, dot_alone, combine, add_multiple, unstack)
+    @forward_kernel(module="unique")
+    def take(
+        x: wp.array2d(dtype=scalar),
+        rows: wp.array(dtype=wp.int32),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_ic = x_rows(i)c."""
+        i, c = wp.tid()
+        out[i, c] = x[rows[i], c]
+
+    @forward_kernel(module="unique")
+    def put(
+        x: wp.array2d(dtype=scalar),
+        rows: wp.array(dtype=wp.int32),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_rows(i)c = x_ic."""
+        i, c = wp.tid()
+        out[rows[i], c] = x[i, c]
+
+    @forward_kernel(module="unique")
+    def add(
+        x: wp.array2d(dtype=scalar),
+        rows: wp.array(dtype=wp.int32),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_rows(i)c += x_ic."""
+        i, c = wp.tid()
+        out[rows[i], c] += x[i, c]
+
+    return Kernels(dot, dot_alone, combine, add_multiple, unstack, take, put, add)
 
 
 @cache
@@ -221,72 +257,22 @@ def _flat(x: wp.array) -> wp.array:
     return x.reshape((int(np.prod(x.shape[:-1])), x.shape[-1]))
 
 
-@dataclass(frozen=True)
-class RowKernels:
-    """What moves rows of one scalar type."""
-
-    take: wp.Kernel
-    put: wp.Kernel
-    add: wp.Kernel
-
-
-@cache
-def row_kernels_of(device: Device) -> RowKernels:
-    """Kernels of a device's scalar type."""
-    scalar = device.scalar
-
-    @forward_kernel(module="unique")
-    def take(
-        x: wp.array2d(dtype=scalar),
-        rows: wp.array(dtype=wp.int32),
-        # outputs
-        out: wp.array2d(dtype=scalar),
-    ):
-        """out_ic = x_rows(i)c."""
-        i, c = wp.tid()
-        out[i, c] = x[rows[i], c]
-
-    @forward_kernel(module="unique")
-    def put(
-        x: wp.array2d(dtype=scalar),
-        rows: wp.array(dtype=wp.int32),
-        # outputs
-        out: wp.array2d(dtype=scalar),
-    ):
-        """out_rows(i)c = x_ic."""
-        i, c = wp.tid()
-        out[rows[i], c] = x[i, c]
-
-    @forward_kernel(module="unique")
-    def add(
-        x: wp.array2d(dtype=scalar),
-        rows: wp.array(dtype=wp.int32),
-        # outputs
-        out: wp.array2d(dtype=scalar),
-    ):
-        """out_rows(i)c += x_ic."""
-        i, c = wp.tid()
-        out[rows[i], c] += x[i, c]
-
-    return RowKernels(take, put, add)
-
-
 def rows_taken(device: Device, x: wp.array, rows: wp.array, out: wp.array | None = None) -> wp.array:
     """A copy (m, b) of some rows of x (n, b); in `out`, if it is given."""
     if out is None:
         out = wp.empty((len(rows), x.shape[1]), dtype=x.dtype, device=device.name)
-    device.launch(row_kernels_of(device).take, (len(rows), x.shape[1]), [x, rows], [out])
+    device.launch(kernels_of(device).take, (len(rows), x.shape[1]), [x, rows], [out])
     return out
 
 
 def put_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
     """Copy x (m, b) to some rows of out (n, b)."""
-    device.launch(row_kernels_of(device).put, x.shape, [x, rows], [out])
+    device.launch(kernels_of(device).put, x.shape, [x, rows], [out])
 
 
 def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
     """Add x (m, b) to some rows of out (n, b), each of them once."""
-    device.launch(row_kernels_of(device).add, x.shape, [x, rows], [out])
+    device.launch(kernels_of(device).add, x.shape, [x, rows], [out])
 
 
 @wp.func_native(

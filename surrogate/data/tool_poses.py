@@ -43,8 +43,7 @@ def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, radius: flo
         As `draw` and `ball_of`.
     """
     ball, patch = ball_of(preset, radius), open_patch(anatomy)
-    pushed = draw(preset, anatomy, count, seed).of(Pushed)
-    assert pushed is not None
+    (pushed,) = draw(preset, anatomy, count, seed).every(Pushed)
     deepest = min(DEEP * ball.radius, TOOLS[preset].depth)
     share = np.random.Generator(np.random.Philox(key=seed)).random(count)
     depth = SHALLOW * ball.radius + (deepest - SHALLOW * ball.radius) * share

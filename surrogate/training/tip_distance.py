@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.bodies.tip_distance import TipGauge
 from sim.loads import Loads
 
 from ..data.cortex_patch import Patch
@@ -30,13 +29,6 @@ class Measured:
     def rows(self, index: np.ndarray | slice) -> Measured:
         """Some of them: numbers, a slice, or (B,) bool."""
         return Measured(self.loads.rows(index), self.distance[index])
-
-
-def measured_distances(
-    gauge: TipGauge, loads: Loads, displacement: np.ndarray, nodes: np.ndarray, ball: float | None
-) -> Measured:
-    """Measure what the finite elements answered loads with: displacement (B, n, 3) [m] of vertices (n,)."""
-    return Measured(loads, gauge.distances(loads, displacement, nodes, ball))
 
 
 def distance_errors(model: Learned, known: Measured) -> np.ndarray:

@@ -30,7 +30,6 @@ from .tip_distance import (
     calibrated_distance,
     corrected_if_better,
     distance_errors,
-    measured_distances,
     with_correction,
 )
 
@@ -151,7 +150,7 @@ def train(
         cortex = data.displacement(shared.cortex)[data.good]
         at = np.concatenate([nodes, shared.cortex])
         both = np.concatenate([truth, cortex], axis=1)
-        distances = measured_distances(tip_gauge(data.anatomy), loads, both, at, data.ball)
+        distances = Measured(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.ball))
 
     def examples(rows: np.ndarray) -> Examples:
         return Examples(_rows(pushed, rows), truth[rows], cortex[rows])
