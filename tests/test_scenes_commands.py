@@ -119,20 +119,20 @@ ALL = [
 ]
 DEFORMER = (["--anatomy", "box.vtu", "--deformer", "oracle"], "'oracle' here: choose one of linear, svr, fem")
 OWN = [
-    ("render", ["--every", "0"], "--every 0"),
-    ("render", ["--every", "-3"], "--every -3"),
+    ("render", ["--every", "0"], "--every is 0"),
+    ("render", ["--every", "-3"], "--every is -3"),
     ("render", ["--film", "film.avi"], ".mp4"),
     ("render", ["--film", "box.vtu/film.mp4"], "folder"),
     ("render", ["--out", "box.vtu"], "is a file"),
     ("render", ["--out", "box.vtu/frames"], "cannot be written"),
     ("collect", ["--out", "press.txt"], ".h5"),
     ("collect", ["--out", "box.vtu/press.h5"], "folder"),
-    ("check", ["--every", "0"], "--every 0"),
+    ("check", ["--every", "0"], "--every is 0"),
     ("demo", ["--port", "70000"], "70000 is no port"),
     ("demo", ["--port", "-1"], "-1 is no port"),
     ("demo", ["--host", "no.such.host.invalid"], "no.such.host.invalid"),
     ("demo", ["--seconds", "nan"], "--seconds nan"),
-    ("bench", ["--batch", "0"], "--batch 0"),
+    ("bench", ["--batch", "0"], "--batch is 0"),
     ("bench", ["--solves", "0"], "count"),
 ]
 CASES = [

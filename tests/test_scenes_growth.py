@@ -79,7 +79,7 @@ def test_the_switch_is_marked_between_the_sizes_beside_it():
     ("words", "reason"),
     [
         (["--sizes", "3"], "3 nodes"),
-        (["--batch", "0"], "--batch 0"),
+        (["--batch", "0"], "--batch is 0"),
         (["--device", "abacus"], "abacus"),
         (["--out", "growth.txt"], ".png"),
     ],

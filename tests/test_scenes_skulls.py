@@ -71,7 +71,7 @@ def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkey
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"), [(["--loads", "0"], "--loads 0: give a whole"), (["--device", "tpu"], "no device")]
+    ("words", "reason"), [(["--loads", "0"], "--loads is 0: give a whole"), (["--device", "tpu"], "no device")]
 )
 def test_what_cannot_be_measured_is_a_sentence(brain, capsys, words, reason):
     assert main(["bench", "skull", brain[0], *words]) == 2

@@ -93,9 +93,9 @@ def test_one_in_a_hundred_is_checked_and_every_solve_is_told(box, monkeypatch):
 @pytest.mark.parametrize(
     ("more", "reason"),
     [
-        (["--count", "0"], "--count 0"),
-        (["--batch", "0"], "--batch 0"),
-        (["--repeats", "0"], "--repeats 0"),
+        (["--count", "0"], "--count is 0"),
+        (["--batch", "0"], "--batch is 0"),
+        (["--repeats", "0"], "--repeats is 0"),
         (["--poisson", "0.5"], "Poisson"),
         (["--device", "abacus"], "abacus"),
         (["--anatomy", "none.vtu"], "no such file"),

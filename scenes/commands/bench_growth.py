@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from sim.arguments import at_least
 from sim.discretisation.space import ELEMENTS, RECOMMENDED
-from sim.errors import InputError
 
 from .outputs import add_force, claimed
 
@@ -48,8 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from ..bench.scaling import Row, Trial, panels, rows
     from ..bench.stages import machine
 
-    if min(args.batch) < 1:
-        raise InputError(f"--batch {min(args.batch)} solves nothing: give whole numbers from 1 up.")
+    at_least("--batch", min(args.batch), 1)
     for size in args.sizes:
         MeshPlan(size)
     find_device(args.device, "float32")

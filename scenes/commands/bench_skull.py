@@ -8,11 +8,11 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from sim.arguments import at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, template_subject
 from sim.effects import SKULLS
-from sim.errors import InputError
 from surrogate.data.tool_loads import PRESETS, draw
 
 
@@ -39,8 +39,7 @@ def run(args: argparse.Namespace) -> int:
     from ..bench.skull_models import rows
     from ..bench.stages import machine
 
-    if args.loads < 1:
-        raise InputError(f"--loads {args.loads}: give a whole number from 1 up.")
+    at_least("--loads", args.loads, 1)
     plans = [MeshPlan(count) for count in args.nodes]
     bodies = [read_anatomy(path) for path in args.anatomies]
     bodies = bodies or [make_anatomy(template_subject(Tumour()), plan) for plan in plans]

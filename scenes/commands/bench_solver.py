@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
+from sim.arguments import at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 from sim.runtime.device import find_device
@@ -67,11 +68,12 @@ def run(args: argparse.Namespace) -> int:
     from ..bench.peers import LEAST, LIVE, OWN, PEERS, case_of, compare, judge_of
     from ..bench.stages import machine
 
-    if args.loads < 2 or args.starts < 1 or args.threads < 1:
-        raise InputError(
-            f"--loads {args.loads} --starts {args.starts} --threads {args.threads} compares nothing: give "
-            "--loads >= 2, --starts >= 1, --threads >= 1."
-        )
+    for name, value, least in (
+        ("--loads", args.loads, 2),
+        ("--starts", args.starts, 1),
+        ("--threads", args.threads, 1),
+    ):
+        at_least(name, value, least)
     if wrong := [tolerance for tolerance in args.tolerance if not LEAST <= tolerance < 1.0]:
         raise InputError(f"--tolerance {wrong[0]:g} cannot be judged: give numbers from {LEAST:g} to below 1.")
     find_device(args.device, "float64")

@@ -7,6 +7,7 @@ import json
 import sys
 from dataclasses import asdict
 
+from sim.arguments import at_least
 from sim.errors import InputError
 
 from .demo import add_theatre, deformer_name, scene_asked
@@ -32,8 +33,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.deformers import open_theatre, plan_of
     from ..script.scene import SCENES, find_scene
 
-    if args.batch < 1:
-        raise InputError(f"--batch {args.batch} solves nothing: give a whole number from 1 up.")
+    at_least("--batch", args.batch, 1)
     try:
         scene = scene_asked(args, args.scene)
     except InputError as error:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from sim.accuracy import TRAIN
+from sim.arguments import at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.discretisation.space import ELEMENTS, RECOMMENDED
-from sim.errors import InputError
 from sim.material import LAWS, Material
 from surrogate.data.tool_loads import PRESETS
 
@@ -64,10 +64,8 @@ def run(args: argparse.Namespace) -> int:
     on_cuda = find_device(args.device, TRAIN.precision).on_cuda
     count = args.count if args.count is not None else (CUDA_COUNT if on_cuda else CPU_COUNT)
     batch = args.batch if args.batch is not None else (count if on_cuda else CPU_BATCH)
-    if min(count, batch, args.repeats) < 1:
-        raise InputError(
-            f"--count {count} --batch {batch} --repeats {args.repeats} measures nothing: give whole numbers from 1 up."
-        )
+    for name, value in (("--count", count), ("--batch", batch), ("--repeats", args.repeats)):
+        at_least(name, value, 1)
     materials = [Material(law, YOUNG, poisson) for law in args.laws for poisson in args.poisson]
     anatomy = read_anatomy(args.anatomy or template_path())
     trial = Trial(anatomy, (), args.element, args.device, batch)

@@ -11,6 +11,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, TextIO
 
 from sim.accuracy import TRAIN
+from sim.arguments import at_least
 from sim.errors import InputError
 
 from .demo import add_theatre, deformer_name, scene_asked
@@ -43,8 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.reference import truth_of
     from ..script.scene import SCENES
 
-    if args.every < 1:
-        raise InputError(f"--every {args.every}: give a whole number from 1 up.")
+    at_least("--every", args.every, 1)
     scenes = [scene_asked(args, name) for name in args.scenes or SCENES]
     theatre = open_theatre(args.anatomy, args.model, args.device)
     rows, table = [], sys.stderr if args.json else sys.stdout

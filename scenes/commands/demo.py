@@ -18,12 +18,17 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
 
 
-def add_theatre(parser: argparse.ArgumentParser) -> None:
-    """Declare which anatomy and models play: shared by every command that plays a scene."""
+def add_bodies(parser: argparse.ArgumentParser) -> None:
+    """Declare which anatomy and models there are."""
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
     parser.add_argument(
         "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
     )
+
+
+def add_theatre(parser: argparse.ArgumentParser) -> None:
+    """Declare who plays, on which anatomy: shared by every command that plays a scene."""
+    add_bodies(parser)
     parser.add_argument(
         "--deformer", help="linear, ann, svr, ... or fem; auto: by budget (default: the trained one of least error)"
     )

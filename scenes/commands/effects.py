@@ -8,7 +8,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from sim.errors import InputError
+from sim.arguments import at_least
 
 from .demo import scene_asked
 from .tissue_options import add_element_argument, add_tissue_arguments
@@ -34,8 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.deformers import open_theatre
     from ..play.effect_ablation import rows
 
-    if args.every < 1:
-        raise InputError(f"--every {args.every}: give a whole number from 1 up.")
+    at_least("--every", args.every, 1)
     scene = scene_asked(args, args.scene)
     theatre = open_theatre(args.anatomy, device=args.device)
     table = sys.stderr if args.json else sys.stdout

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ar.screen import Film, read_png, write_film
+from sim.arguments import at_least
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
@@ -41,8 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.player import labelled
 
     scene = scene_asked(args, args.scene)
-    if args.every < 1:
-        raise InputError(f"--every {args.every}: give a whole number from 1 up.")
+    at_least("--every", args.every, 1)
     claimed_folder(args.out, "frames")
     if args.film is not None:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):

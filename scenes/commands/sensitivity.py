@@ -16,6 +16,7 @@ from sim.discretisation.space import ELEMENTS
 from sim.errors import InputError
 from surrogate.data.tool_loads import PRESETS, draw
 
+from .demo import add_bodies
 from .json_line import json_line
 from .outputs import add_force, claimed
 
@@ -45,10 +46,7 @@ LOCKING = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
-    parser.add_argument(
-        "--model", type=Path, help="MODEL.npz made by `sulcus train` (default: MESH.model.npz beside the anatomy)"
-    )
+    add_bodies(parser)
     parser.add_argument(
         "--element", choices=ELEMENTS,
         help="element of the mesh (default smoothed: linear tetrahedra lock as nu nears 0.5; p2 where the mesh brings "

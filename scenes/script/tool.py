@@ -68,7 +68,7 @@ class Probe:
         shaft.apply_translation([0.0, 0.0, self.radius + 0.5 * self.length])
         grip = trimesh.creation.capsule(0.6 * self.length, 2.2 * self.shaft, count=(16, 24))
         grip.apply_translation([0.0, 0.0, self.radius + 0.55 * self.length])
-        return _joined([ball, shaft, grip])
+        return ball + shaft + grip
 
     @property
     def shape(self) -> Ball:
@@ -127,7 +127,7 @@ class Blade:
         blade = trimesh.convex.convex_hull((corners[:, None] + ball).reshape(-1, 3))
         arm = trimesh.creation.box([0.5 * self.width, 2.0 * self.edge, self.arm])
         arm.apply_translation([0.0, 0.5 * self.length - self.edge, 0.5 * self.arm])
-        return _joined([blade, arm])
+        return blade + arm
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
         """T_world_tool (4, 4): the middle of its face at `tip` (3,) [m], facing `inward` (3,), wide along `aside`."""
@@ -135,10 +135,3 @@ class Blade:
         T[:3, :3] = np.column_stack([aside, np.cross(-inward, aside), -inward])
         T[:3, 3] = tip
         return T
-
-
-def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh of several, as they are."""
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
-    return trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), process=False)
