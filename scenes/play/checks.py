@@ -9,6 +9,7 @@ import numpy as np
 
 from ar.camera import Camera, project_cv2
 from ar.hud import FINE, WHITE, millimetres
+from ar.layer import Layer
 from ar.overlay import DOUBTFUL, GAUGE, ink_of, iou, silhouette
 from ar.raycast import raycast
 from ar.refind import outline_gap, stands
@@ -23,7 +24,7 @@ from .stage import TOOL, TUMOUR_COLOUR
 STEPS = 24
 SAMPLES = np.array([(i, j, STEPS - i - j) for i in range(STEPS + 1) for j in range(STEPS + 1 - i)]) / STEPS
 
-NOWHERE = 0.0, np.inf, np.inf
+NOWHERE = 0.0, np.inf, np.inf, np.inf
 """How far off a tumour is whose place is no number: overlap, distance [m], distance in the picture [pixel]."""
 
 
@@ -105,8 +106,7 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
     ]
     finite = [_finite(frame) for frame in frames]
     misses = [_miss(player, camera, frame, truth, row) if finite[row] else NOWHERE for row, frame in enumerate(frames)]
-    overlap, error, pixels = zip(*misses, strict=True)
-    drawn = [_drawn(player, camera, frame, truth, row) if finite[row] else np.inf for row, frame in enumerate(frames)]
+    overlap, error, pixels, drawn = zip(*misses, strict=True)
     return Figures(
         overlap=min(overlap),
         error_mm=1e3 * max(error),
@@ -139,8 +139,8 @@ def _finite(frame: Frame) -> bool:
     return bool(np.isfinite(frame.picture.depth).all() and np.isfinite(frame.deformation.displacement).all())
 
 
-def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, float, float]:
-    """Overlap, mean distance [m] and largest distance in the picture [pixel] between a frame and the truth."""
+def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
+    """Between a frame and the truth: overlap, mean distance [m], largest in the picture [pixel], and the outline's."""
     stage = player.stage.at(frame.loads)
     shown = stage.tumour(player.positions(frame.deformation))
     true = stage.tumour(player.positions(truth, row))
@@ -150,13 +150,13 @@ def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row:
     off = frame.deformation.at(nodes).displacement[0] - truth.at(nodes).displacement[row]
     ours = frame.camera.project(shown.vertices)[0]
     pixels = np.linalg.norm(ours - project_cv2(camera, shown.vertices), axis=1).max()
+    mean = float(np.linalg.norm(off, axis=1).mean())
     # Not a number: behind the camera.
-    return overlap, float(np.linalg.norm(off, axis=1).mean()), np.inf if np.isnan(pixels) else float(pixels)
+    return overlap, mean, np.inf if np.isnan(pixels) else float(pixels), _drawn(camera, frame, true)
 
 
-def _drawn(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> float:
+def _drawn(camera: Camera, frame: Frame, true: Layer) -> float:
     """How far the outline in a frame's picture is from where the finite elements have it [pixel]."""
-    true = player.stage.at(frame.loads).tumour(player.positions(truth, row))
     mask = raycast(camera, true.vertices, true.triangles).mask
     ink = ink_of(DOUBTFUL if frame.doubt else TUMOUR_COLOUR)
     words = (frame.shown == np.asarray(WHITE, np.uint8)).all(axis=2)

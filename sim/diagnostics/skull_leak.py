@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ..anatomy import Anatomy
+from ..discretisation.element import quadratic_shapes
 from ..discretisation.space import Discretisation
 from ..runtime.device import Device, forward_kernel
 
@@ -24,13 +25,12 @@ def surface_vectors(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """
     out = np.zeros_like(nodes)
     for at, weight in zip(POINTS, WEIGHTS, strict=True):
-        a, b, c = at
         shape, slope = at, np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
         if triangles.shape[1] == 6:  # corners, then the middles of the edges between corners 0 and 1, 1 and 2, 2 and 0
-            shape = np.array([a * (2 * a - 1), b * (2 * b - 1), c * (2 * c - 1), 4 * a * b, 4 * b * c, 4 * c * a])
-            d = np.array([4 * a - 1, 4 * b - 1, 4 * c - 1])[:, None] * slope
-            ends = [(0, 1), (1, 2), (2, 0)]
-            slope = np.vstack([d, [4.0 * (at[i] * slope[j] + at[j] * slope[i]) for i, j in ends]])
+            i, j = ends = np.array([(0, 1, 2), (1, 2, 0)])
+            shape = quadratic_shapes(at, ends.T)
+            middles = 4.0 * (at[i, None] * slope[j] + at[j, None] * slope[i])
+            slope = np.vstack([(4.0 * at - 1.0)[:, None] * slope, middles])
         tangents = np.einsum("ski,kd->sdi", nodes[triangles], slope)
         normal = 0.5 * weight * np.cross(tangents[:, 0], tangents[:, 1])
         for k, share in enumerate(shape):
