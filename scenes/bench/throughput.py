@@ -23,12 +23,8 @@ SEED = 0
 LEAST_CHECKED = 4
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """Loads of one preset, and the seconds that drawing them took."""
-
-    loads: Loads
-    seconds: float
+# Loads of one preset, and the seconds that drawing them took.
+Drawn = tuple[Loads, float]
 
 
 @dataclass(frozen=True)
@@ -107,7 +103,7 @@ def drawn(anatomy: Anatomy, presets: Sequence[str], count: int) -> dict[str, Dra
     out = {}
     for preset in presets:
         draw(preset, anatomy, 1, SEED)  # the cortex is measured at the first draw
-        out[preset] = Drawn(*timed(draw, preset, anatomy, count, SEED))
+        out[preset] = timed(draw, preset, anatomy, count, SEED)
     return out
 
 
@@ -127,8 +123,7 @@ def rows(
     fem, set_up = timed(trial.fem, TRAIN)
     # Judged on the host whatever the device: other kernels and other arithmetic than those that are measured.
     judge = replace(trial, device="cpu", batch=CHECKED).fem(REFERENCE)
-    for preset, some in sets.items():
-        loads = some.loads
+    for preset, (loads, drawing) in sets.items():
         fem.deform(loads.rows(slice(trial.batch)), at=trial.anatomy.tumour_nodes)
         done()
         seconds, converged = [], []
@@ -144,7 +139,7 @@ def rows(
         yield Row(
             material.law, material.poisson, trial.element, fem.space.count, fem.plan.preconditioner, set_up, preset,
             len(loads), min(converged), float(np.median(steps)), float(np.percentile(steps, 99)), tuple(seconds),
-            some.seconds, len(again), float(again.max()),
+            drawing, len(again), float(again.max()),
         )  # fmt: skip
 
 

@@ -120,10 +120,6 @@ def _names(path: Path) -> set[bytes]:
     return set(re.findall(rb'Name="([^"]*)"', content)) if b"<VTKFile" in content[:HEAD] else set()
 
 
-def _is_anatomy(path: Path) -> bool:
-    return {b"region", b"held", b"slide_normal", b"craniotomy"} <= _names(path)
-
-
 def _is_solution(path: Path) -> bool:
     names = _names(path)
     return {b"region", b"displacement"} <= names and not names & {b"fixed", b"force", b"prescribed", b"held"}
@@ -153,14 +149,6 @@ def model_header(path: Path) -> dict:
         return dict(json.loads(str(file["header"])))
 
 
-def _is_model(path: Path) -> bool:
-    return str(model_header(path)["format"]).startswith("sulcus model")
-
-
-def _is_graph(path: Path) -> bool:
-    return b"sulcus onnx" in path.read_bytes()
-
-
 def _begins(words: bytes) -> Callable[[Path], bool]:
     return lambda path: words in path.read_bytes()[:HEAD]
 
@@ -184,13 +172,13 @@ def _is_scan(path: Path) -> bool:
 
 
 KINDS: dict[str, Callable[[Path], bool]] = {
-    "an anatomy of sulcus": _is_anatomy,
+    "an anatomy of sulcus": lambda path: {b"region", b"held", b"slide_normal", b"craniotomy"} <= _names(path),
     "a scan that sulcus put beside an anatomy": _is_scan,
     "a result of `sulcus solve`": _is_solution,
     "a data set of `sulcus simulate`": _hdf5("sulcus data"),
     "an episode of `sulcus collect`": _hdf5("sulcus episode"),
-    "a model of `sulcus train`": _is_model,
-    "a graph of `sulcus export`": _is_graph,
+    "a model of `sulcus train`": lambda path: str(model_header(path)["format"]).startswith("sulcus model"),
+    "a graph of `sulcus export`": lambda path: b"sulcus onnx" in path.read_bytes(),
     "a table of `sulcus sensitivity`": _begins(b"what,default,now,"),
     "a table of `sulcus sensitivity --factorial`": _begins(b"opening [mm],depth [mm],"),
     "a page of `sulcus report`": _begins(b"<title>What accuracy costs in time</title>"),

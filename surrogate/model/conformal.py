@@ -9,7 +9,6 @@ ones.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -129,15 +128,10 @@ def _standard(features: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> 
 
 def _monomials(x: np.ndarray) -> np.ndarray:
     """1, x_i and x_i x_j of (B, f): (B, t)."""
-    first, second = _pairs(x.shape[1])
+    first, second = np.triu_indices(x.shape[1])
     return np.concatenate([np.ones_like(x[:, :1]), x, x[:, first] * x[:, second]], axis=1)
 
 
 def _used(count: int, curved: int) -> np.ndarray:
     """Which monomials (t,) bool are fitted: 1, x_i of the load, and x_i x_j of the first `curved` features."""
-    return np.concatenate([[True], np.arange(count) < LOAD, _pairs(count)[1] < curved])
-
-
-def _pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
-    pairs = np.array(list(combinations_with_replacement(range(count), 2)))
-    return pairs[:, 0], pairs[:, 1]
+    return np.concatenate([[True], np.arange(count) < LOAD, np.triu_indices(count)[1] < curved])
