@@ -9,7 +9,6 @@ from theatres import short, sinking, small, theatre_of
 
 from ar.page_parts import Choice, Fold, Slider
 from scenes.play.deformers import plan_of
-from scenes.play.load_stamp import stamp
 from scenes.play.page_controls import clocked, controls
 from scenes.play.page_referee import Truth
 from scenes.play.page_requests import Wish
@@ -24,6 +23,7 @@ from sim.accuracy import LIVE
 from sim.deformation import Outcome, guess
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.material import Material
+from surrogate.data.dataset import digest_of_loads
 
 
 @pytest.fixture(scope="module")
@@ -84,14 +84,14 @@ class TestVerdict:
         assert verdict_words(None, True, "waits") == '<p class="stale">waits</p>'
 
 
-class TestStamp:
+class TestDigestOfLoads:
     def test_it_is_of_the_load_and_not_of_the_frame(self, theatre):
         scene, site = short(), theatre.site
-        one = stamp(scene.loads(site, Touch(force=0.2), 0.1))
-        assert one == stamp(scene.loads(site, Touch(force=0.2), 0.1))
+        one = digest_of_loads(scene.loads(site, Touch(force=0.2), 0.1))
+        assert one == digest_of_loads(scene.loads(site, Touch(force=0.2), 0.1))
         others = [Touch(force=0.21), Touch(force=0.2, x=0.004), Touch(force=0.2, tilt=(0.3, 0.0))]
-        assert one not in {stamp(scene.loads(site, touch, 0.1)) for touch in others}
-        assert one != stamp(scene.loads(site, Touch(force=0.2), 0.2))
+        assert one not in {digest_of_loads(scene.loads(site, touch, 0.1)) for touch in others}
+        assert one != digest_of_loads(scene.loads(site, Touch(force=0.2), 0.2))
 
 
 class TestWords:

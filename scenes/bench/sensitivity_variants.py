@@ -54,7 +54,7 @@ class Variant:
 
 
 def variants(anatomy: Anatomy, body: Body, elements: Sequence[str] = ()) -> list[Variant]:
-    """The tool's uncertainty, the tissue's, the skull's, and other `elements`.""" ""
+    """The tool's uncertainty, the tissue's, the skull's, and other `elements`."""
     tissue = body.tissue
     young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
     changed = [

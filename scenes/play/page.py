@@ -17,12 +17,12 @@ from ar.page_parts import Body, Playback, Sign, Viewpoint
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.loads import Loads
+from surrogate.data.dataset import digest_of_loads
 
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
 from .deformers import Theatre, plan_of
 from .effect_ablation import without
-from .load_stamp import stamp
 from .page_controls import PLAN, clocked, controls
 from .page_referee import Referee, Truth
 from .page_requests import HAND, SCRIPT, Wish
@@ -199,7 +199,7 @@ class Demo:
         player, hand = session.player, touch or session.player.touch(number)
         loads, took = player.loads(number, touch), clock.perf_counter() - begun
         now.asked, now.style, now.own = asked, style, None
-        now.load = stamp(self._whole(number, touch) if off else loads)
+        now.load = digest_of_loads(self._whole(number, touch) if off else loads)
         now.frame = frame = replace(player, style=style).drawn(number, hand, loads, answer, took)
         self.wish.go_on(number, len(scene.times))
         if name == "fem" and not off:
@@ -237,14 +237,14 @@ class Demo:
         _, name, _, off = now.asked
         name = "fem" if off else name
         truth = now.own or self.referee.truth
-        fresh = truth is not None and stamp(truth.loads) == now.load
+        fresh = truth is not None and digest_of_loads(truth.loads) == now.load
         whole = self._session(name).player
         if truth is not None and (truth is not now.truth or now.by != (name, off)):
             self._wire(truth, whole)
             if not off:
                 now.judged = judge(truth, whole, name == "fem")
                 if now.judged.mean is not None:
-                    self.tally.missed(name, stamp(truth.loads), now.judged.mean)
+                    self.tally.missed(name, digest_of_loads(truth.loads), now.judged.mean)
             now.truth, now.by = truth, (name, off)
         if now.stale is not (not fresh):
             now.stale = not fresh
