@@ -159,7 +159,7 @@ def judge_of(case: Case) -> Judge:
     return Judge(fem, np.where((found.residual <= FINEST)[:, None, None], found.displacement, np.nan))
 
 
-def case_of(anatomy: Anatomy, loads: int, seed: int, tolerance: float = TOLERANCE) -> Case:
+def case_of(anatomy: Anatomy, loads: int, seed: int) -> Case:
     """A case that all engines can express: sliding nodes are held, pushes are forces at nodes.
 
     Raises
@@ -172,7 +172,7 @@ def case_of(anatomy: Anatomy, loads: int, seed: int, tolerance: float = TOLERANC
     mesh = anatomy.mesh
     weights = footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
     force = weights[:, :, None] * pushed.force[:, None, :]
-    return Case(mesh.nodes, mesh.tets, held, TISSUE.young, TISSUE.poisson, *TISSUE.lame, force, tolerance)
+    return Case(mesh.nodes, mesh.tets, held, TISSUE.young, TISSUE.poisson, *TISSUE.lame, force, TOLERANCE)
 
 
 def compare(

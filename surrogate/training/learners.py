@@ -42,15 +42,16 @@ POSED = ("gp", "ann", "svr")
 def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part, ...]:
     """The summands of one learner, trained on examples: for the tumour, and for the cortex beside it."""
     known = inputs.expansion
+    trained = partial(_trained, known.patch, examples.loads)
     if name in EXPANDED:
         tumour, more = inputs.series
         cortex = () if more is None else (*known.cortex_table, more)
         if name == "series":
             return (tumour, *cortex)
-        learnt = _trained(("tool", Remainder), (tumour,), tumour.basis, known.patch, examples.loads, examples.tumour)
+        learnt = trained(("tool", Remainder), (tumour,), tumour.basis, examples.tumour)
         if more is None:
             return (tumour, learnt)
-        left = _trained(("tool", Remainder), cortex, more.basis, known.patch, examples.loads, examples.cortex)
+        left = trained(("tool", Remainder), cortex, more.basis, examples.cortex)
         return (tumour, learnt, *cortex, left)
     if name == "linear":
         return (inputs.table, *known.cortex_table)
@@ -58,19 +59,12 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part,
         contact, left = _touched(known, examples)
         if name == "contact":
             return (contact,)
-        return (
-            contact,
-            *(_trained(LEARNT["gp"], (), nodes, known.patch, examples.loads, rest) for nodes, rest in left),
-        )
+        return (contact, *(trained(LEARNT["gp"], (), nodes, rest) for nodes, rest in left))
     if known.data.ball is not None:
         both = ((known.tumour, examples.tumour), (known.cortex, examples.cortex))
-        return tuple(
-            _trained(_learnt(name), (), nodes, known.patch, examples.loads, truth)
-            for nodes, truth in both
-            if len(nodes)
-        )
+        return tuple(trained(_learnt(name), (), nodes, truth) for nodes, truth in both if len(nodes))
     before = (inputs.table,) if name == "residual" else ()
-    learnt = _trained(_learnt(name), before, known.tumour, known.patch, examples.loads, examples.tumour)
+    learnt = trained(_learnt(name), before, known.tumour, examples.tumour)
     return (*before, learnt, *known.cortex_table)
 
 
@@ -96,11 +90,11 @@ def _touched(known: Expansion, examples: Examples) -> tuple[Part, list[tuple[np.
 
 
 def _trained(
+    patch: Patch,
+    loads: Pushed,
     kind: tuple[str, Callable[[], Teachable]],
     before: tuple[Part, ...],
     on: Basis | np.ndarray,
-    patch: Patch,
-    loads: Pushed,
     truth: np.ndarray,
 ) -> Part:
     """A part for what those `before` leave of `truth` (B, n, 3) [m]: `on` a basis, or on vertices (n,)."""
