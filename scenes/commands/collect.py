@@ -43,5 +43,6 @@ def run(args: argparse.Namespace) -> int:
             bar.set_description("finite elements")
 
         report = collect(out, theatre, player, name, drawn, bar.update)
-    print(json.dumps(report) if args.json else f"{report['frames']} frames by {name} in {out}; FEM: {report['fem']}")
+    said = f"{report['frames']} frames by {name}, written to {out}; FEM: {report['fem']}"
+    print(json.dumps(report) if args.json else said)
     return 0

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     report |= {"out": str(args.out), "film": film}
     beside = "" if film is None else f", film {film}"
     unanswered = f"; answers that did not converge or are extrapolated: {bad}" if bad else ""
-    said = f"{len(written)} frame{'s' * (len(written) != 1)} by {who} in {args.out}{beside}{unanswered}"
+    said = f"{len(written)} frame{'s' * (len(written) != 1)} by {who}, written to {args.out}{beside}{unanswered}"
     print(json.dumps(report) if args.json else said)
     return 1 if bad else 0
 
