@@ -21,7 +21,7 @@ FINE, ROW, NARROW = 0.45, 18, 0.25
 SIGN = 0.6
 # The patient's sides along the axes of RAS, and against them.
 SIDES = ("RL", "AP", "SI")
-# A direction's second letter is told where it is more than so much of it.
+# A direction's second letter is shown where it is more than so much of it.
 OBLIQUE = 0.38
 
 

@@ -30,13 +30,13 @@ simulate("gel.h5", fem, loads, {"what": "a block of gel, pressed in the middle o
 data = read_dataset("gel.h5")
 motion = 1e3 * data.displacement(gel.tumour_nodes).mean(axis=1)  # (loads, 3) [mm]
 pairs = TensorDataset(torch.tensor(10.0 * forces, dtype=torch.float32), torch.tensor(motion))
-taught, fresh = torch.utils.data.random_split(pairs, [36, 12], torch.Generator().manual_seed(0))
+training, fresh = torch.utils.data.random_split(pairs, [36, 12], torch.Generator().manual_seed(0))
 
 torch.manual_seed(0)
 layer = torch.nn.Linear(3, 3, bias=False)
 adam = torch.optim.Adam(layer.parameters(), lr=0.02)
 for _ in range(150):
-    for force, moved in DataLoader(taught, batch_size=12, shuffle=True):
+    for force, moved in DataLoader(training, batch_size=12, shuffle=True):
         adam.zero_grad()
         torch.nn.functional.mse_loss(layer(force), moved).backward()
         adam.step()

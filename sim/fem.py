@@ -29,7 +29,7 @@ from .errors import InputError
 from .linalg.preconditioner import choose_preconditioner
 from .linalg.rest_solver import Resting
 from .loads import Displaced, Loads, Nodal, Pushed
-from .minimisers.lbfgs import TAUGHT
+from .minimisers.lbfgs import CARRIED
 from .minimisers.power_series import Reading, factors, taylor, terms_of
 from .minimisers.residual import shortfall
 from .runtime.columns import unstacked
@@ -307,8 +307,8 @@ class Fem:
                 some = loads.rows(slice(first * sizes, (first + groups) * sizes))
                 self.problem.begin(Cases(some, np.zeros(len(some))))
                 forces = taylor(self.problem, self._resting.answer, len(some), sizes, edge, orders)
-                told = [reading.of(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
-                found[first : first + groups] = np.concatenate(told, axis=1)
+                read = [reading.of(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
+                found[first : first + groups] = np.concatenate(read, axis=1)
         return found
 
     def guess(self, loads: Loads, start: Deformation) -> np.ndarray:
@@ -327,7 +327,7 @@ class Fem:
         guesses = () if last is None else (moved_on(cases.loads, last, cases.warm), last)
         found = strategy.solve(cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
-        way = way_of(pushes_of(cases.loads), last, cases.warm) if len(cases.loads) <= TAUGHT else {}
+        way = way_of(pushes_of(cases.loads), last, cases.warm) if len(cases.loads) <= CARRIED else {}
         return self._answered(cases, found, way, at, seconds)
 
     def _answered(

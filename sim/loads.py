@@ -304,8 +304,8 @@ def _repeated(name: str, **given: tuple[object, tuple[int, ...]]) -> dict[str, n
         arrays[key] = array
     counts = {len(array) for array in arrays.values()} - {1}
     if len(counts) > 1:
-        told = ", ".join(f"{key} {len(array)}" for key, array in arrays.items())
-        raise InputError(f"{name} has rows of {told}: give each one row, or one for each load case.")
+        stated = ", ".join(f"{key} {len(array)}" for key, array in arrays.items())
+        raise InputError(f"{name} has rows of {stated}: give each one row, or one for each load case.")
     rows = counts.pop() if counts else 1
     # To broadcast takes longer than all the rest of a push.
     return {

@@ -44,9 +44,9 @@ def docstrings(path: Path) -> Iterator[tuple[str, str]]:
     for node in ast.walk(ast.parse(path.read_text())):
         inside = getattr(node, "body", None)
         for child in inside if isinstance(inside, list) else []:
-            told = child.value if isinstance(child, ast.Expr) else None
-            if isinstance(told, ast.Constant) and isinstance(told.value, str):
-                yield f"{path.name}:{child.lineno}", inspect.cleandoc(told.value)
+            found = child.value if isinstance(child, ast.Expr) else None
+            if isinstance(found, ast.Constant) and isinstance(found.value, str):
+                yield f"{path.name}:{child.lineno}", inspect.cleandoc(found.value)
 
 
 def messages(path: Path) -> Iterator[tuple[str, str]]:

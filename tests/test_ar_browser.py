@@ -1,4 +1,4 @@
-"""The page: served, shared by several visitors, told what they do. A visitor here is a bare web socket."""
+"""The page: served, shared by several visitors, whose actions it hears. A visitor here is a bare web socket."""
 
 import re
 import time
@@ -18,11 +18,11 @@ TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 
 
 @pytest.fixture
-def told() -> dict[str, list]:
+def heard() -> dict[str, list]:
     return {"force": [], "deformer": [], "play": [], "frame": []}
 
 
-def open_page(told: dict[str, list], port: int, host: str = "127.0.0.1") -> Browser:
+def open_page(heard: dict[str, list], port: int, host: str = "127.0.0.1") -> Browser:
     bodies = [
         Body("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
         Body("brain", TRIANGLE, np.array([[0, 1, 2]]), opacity=0.3),
@@ -30,10 +30,10 @@ def open_page(told: dict[str, list], port: int, host: str = "127.0.0.1") -> Brow
     return Browser(
         bodies,
         Viewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
-        Playback(100, told["play"].append, told["frame"].append),
+        Playback(100, heard["play"].append, heard["frame"].append),
         [
-            Choice("deformer", ("FEM", "ANN"), "ANN", told["deformer"].append),
-            Slider("force [N]", 0.0, 1.0, 0.01, 0.2, told["force"].append),
+            Choice("deformer", ("FEM", "ANN"), "ANN", heard["deformer"].append),
+            Slider("force [N]", 0.0, 1.0, 0.01, 0.2, heard["force"].append),
         ],
         host=host,
         port=port,
@@ -43,8 +43,8 @@ def open_page(told: dict[str, list], port: int, host: str = "127.0.0.1") -> Brow
 
 
 @pytest.fixture
-def page(told):
-    page = open_page(told, free_port())
+def page(heard):
+    page = open_page(heard, free_port())
     yield page
     page.close()
 
@@ -54,29 +54,29 @@ def test_the_page_is_served(page):
         assert answer.status == 200 and b"<html" in answer.read().lower()
 
 
-def test_the_address_names_the_host_that_serves(told):
+def test_the_address_names_the_host_that_serves(heard):
     """A page on one interface is not to be found at localhost."""
-    page = open_page(told, free_port(), host="127.0.0.2")
+    page = open_page(heard, free_port(), host="127.0.0.2")
     assert page.address.startswith("http://127.0.0.2:")
     with urllib.request.urlopen(page.address) as answer:
         assert answer.status == 200
     page.close()
 
 
-def test_a_port_that_is_taken_is_left_to_its_owner(page, told):
-    second = open_page(told, int(page.address.rsplit(":", 1)[1]))
+def test_a_port_that_is_taken_is_left_to_its_owner(page, heard):
+    second = open_page(heard, int(page.address.rsplit(":", 1)[1]))
     assert second.address != page.address
     with urllib.request.urlopen(second.address) as answer:
         assert answer.status == 200
     second.close()
 
 
-def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, told):
+def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, heard):
     for number in range(50):
         page.show(number, np.full((48, 64, 3), number, np.uint8), f"frame {number}")
     assert wait_for(lambda: int(page.frame.value) == 49)
     assert (page.shown[1] == 49).all()
-    assert told["frame"] == []
+    assert heard["frame"] == []
 
 
 def test_picture_and_words_travel_as_one(page):
@@ -132,7 +132,7 @@ def test_an_unknown_body_is_an_error_at_once(page):
         page.move("liver", TRIANGLE)
 
 
-def test_several_visitors_see_the_page_and_are_heard(page, told):
+def test_several_visitors_see_the_page_and_are_heard(page, heard):
     wide, narrow = Visitor(page, 1600), Visitor(page, 420)
     assert wait_for(lambda: page.visitors == 2)
     assert wait_for(lambda: wide.received > 0 and narrow.received > 0)
@@ -143,15 +143,15 @@ def test_several_visitors_see_the_page_and_are_heard(page, told):
     wide.set(page.inputs["force [N]"], 0.4)
     narrow.set(page.inputs["deformer"], "FEM")
     narrow.set(page.frame, 31)
-    assert wait_for(lambda: told["force"] == [0.4] and told["deformer"] == ["FEM"] and told["frame"] == [31])
+    assert wait_for(lambda: heard["force"] == [0.4] and heard["deformer"] == ["FEM"] and heard["frame"] == [31])
     wide.wire.close()
     assert wait_for(lambda: page.visitors == 1)
     narrow.wire.close()
 
 
-def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(told, monkeypatch):
+def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(heard, monkeypatch):
     monkeypatch.setattr("ar.browser.PICTURES_PER_SECOND", 2000.0)
-    page = open_page(told, free_port())
+    page = open_page(heard, free_port())
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
     sought = list(range(50, 100)) * 4
@@ -159,29 +159,29 @@ def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(told, monkeyp
         page.show(place % 50, np.zeros((48, 64, 3), np.uint8), "")
         visitor.set(page.frame, number)
         time.sleep(1e-3)
-    assert wait_for(lambda: len(told["frame"]) == len(sought))
-    assert told["frame"] == sought
+    assert wait_for(lambda: len(heard["frame"]) == len(sought))
+    assert heard["frame"] == sought
     visitor.wire.close()
     page.close()
 
 
-def test_the_button_pauses_and_plays(page, told):
+def test_the_button_pauses_and_plays(page, heard):
     visitor = Visitor(page, 900)
     assert wait_for(lambda: page.visitors == 1)
     for wanted in ([False], [False, True]):
         visitor.set(page.button, True)
-        assert wait_for(lambda wanted=wanted: told["play"] == wanted)
+        assert wait_for(lambda wanted=wanted: heard["play"] == wanted)
     visitor.wire.close()
 
 
-def test_scripts_do_not_take_over_from_themselves(page, told):
+def test_scripts_do_not_take_over_from_themselves(page, heard):
     page.put("force [N]", 0.5)
     assert wait_for(lambda: page.inputs["force [N]"].value == 0.5)
     time.sleep(0.2)
-    assert told["force"] == []
+    assert heard["force"] == []
 
 
-def test_the_page_is_filled_anew(page, told):
+def test_the_page_is_filled_anew(page, heard):
     """Another scene: other bodies and controls, nothing of the old ones, and what was on its way to them is dropped."""
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
@@ -190,7 +190,9 @@ def test_the_page_is_filled_anew(page, told):
     hidden: list[bool] = []
     fold = Fold("more", (Toggle("Gravity", True, hidden.append, "gravity and fluid", "off?"),))
     body = Body("blade", TRIANGLE, np.array([[0, 1, 2]]))
-    page.fill([body], Playback(30, told["play"].append, told["frame"].append), [fold], "sulcus: retract", "<p>seen</p>")
+    page.fill(
+        [body], Playback(30, heard["play"].append, heard["frame"].append), [fold], "sulcus: retract", "<p>seen</p>"
+    )
     assert set(page.inputs) == {"Gravity"} and set(page.meshes) == {"blade"} and page.frame.max == 29
     assert "<p>seen</p>" in page.words.content and page.inputs["Gravity"].label == "gravity and fluid"
     with pytest.raises(KeyError):
@@ -198,7 +200,7 @@ def test_the_page_is_filled_anew(page, told):
     visitor.set(old, 0.4)
     visitor.set(page.inputs["Gravity"], False)
     assert wait_for(lambda: hidden == [False])
-    assert told["force"] == []
+    assert heard["force"] == []
     page.show(3, np.full((48, 64, 3), 3, np.uint8), "")
     assert wait_for(lambda: int(page.frame.value) == 3)
     visitor.wire.close()

@@ -24,18 +24,18 @@ PROTOCOL = [f"viser-v{viser.__version__}"]
 
 
 class Page(Browser):
-    """A page that notes what it is told."""
+    """A page that notes what it is sent."""
 
     def __init__(self, host="127.0.0.1", port=None):
-        self.told = []
+        self.heard = []
         super().__init__(
             [],
             Viewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
-            Playback(100, self.told.append, self.told.append),
+            Playback(100, self.heard.append, self.heard.append),
             [
-                Choice("deformer", ("FEM", "ANN"), "ANN", self.told.append),
-                Slider("force [N]", 0.0, 0.4, 0.01, 0.2, self.told.append),
-                Toggle("gravity", True, self.told.append),
+                Choice("deformer", ("FEM", "ANN"), "ANN", self.heard.append),
+                Slider("force [N]", 0.0, 0.4, 0.01, 0.2, self.heard.append),
+                Toggle("gravity", True, self.heard.append),
             ],
             host=host,
             port=free_port() if port is None else port,
@@ -56,7 +56,7 @@ def shared():
 
 @pytest.fixture
 def page(shared):
-    shared.told.clear()
+    shared.heard.clear()
     return shared
 
 
@@ -73,7 +73,7 @@ def still_heard(page, visitor):
     """Whether a visitor's messages arrive, and none before did: they come in order, so all others were dealt with."""
     value = 0.1 if page.inputs["force [N]"].value != 0.1 else 0.2
     visitor.set(page.inputs["force [N]"], value)
-    return wait_for(lambda: value in page.told) and page.told == [value]
+    return wait_for(lambda: value in page.heard) and page.heard == [value]
 
 
 def ask(page, path="/", method="GET", **headers):
@@ -258,11 +258,11 @@ class TestMessages:
         visitor.set(page.frame, 7.0)
         visitor.set(page.inputs["deformer"], "FEM")
         visitor.set(page.inputs["gravity"], False)
-        assert wait_for(lambda: len(page.told) == 6)
-        assert page.told == [0.0, 0.4, 99, 7, "FEM", False] and isinstance(page.told[3], int)
+        assert wait_for(lambda: len(page.heard) == 6)
+        assert page.heard == [0.0, 0.4, 99, 7, "FEM", False] and isinstance(page.heard[3], int)
         visitor.set(page.inputs["deformer"], "ANN")
         visitor.set(page.inputs["gravity"], True)
-        assert wait_for(lambda: len(page.told) == 8)
+        assert wait_for(lambda: len(page.heard) == 8)
 
     def test_only_the_value_of_a_control_can_be_changed(self, page, visitor):
         control = page.inputs["force [N]"]
@@ -333,8 +333,8 @@ class TestMessages:
             for number in range(100000):
                 hostile.set(page.frame, 50 + number % 2)
         assert wait_for(lambda: page.visitors == 1)
-        assert 10 < len(page.told) <= 50 + 20 * (time.monotonic() - begun)
-        page.told.clear()
+        assert 10 < len(page.heard) <= 50 + 20 * (time.monotonic() - begun)
+        page.heard.clear()
         assert still_heard(page, visitor)
 
 

@@ -52,7 +52,7 @@ def test_letters_stand_at_the_edges():
     [
         (12.34e-3, None, "12.3 mm"),
         (12.34e-3, 2.46e-3, "12.3 +- 2.5 mm"),
-        (12.34e-3, 2.41e-3, "12.3 +- 2.5 mm"),  # a bound is not told too small
+        (12.34e-3, 2.41e-3, "12.3 +- 2.5 mm"),  # a bound is not stated too small
         (12.34e-3, 2.4e-3, "12.3 +- 2.4 mm"),
         (12.34e-3, float("nan"), "12.3 mm"),
         (0.0, 1e-6, "0.0 +- 0.1 mm"),  # nothing is known to be without error

@@ -241,7 +241,7 @@ def test_the_arrow_points_to_where_the_tumour_is_now():
 
 
 def test_motion_and_doubt_stand_on_lines_of_their_own():
-    """A margin that nobody knows is not told."""
+    """A margin that nobody knows is not drawn."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     before, now = tumour((0.0, 0.0, -0.02)), tumour((0.003, 0.0, -0.02))
@@ -291,7 +291,7 @@ def test_without_overlay_a_doubt_is_all_that_is_drawn():
     assert rows.min() > 270 and columns.max() < 120
 
 
-def test_what_lines_and_words_cover_is_told():
+def test_what_lines_and_words_cover_is_reported():
     """Every pixel of outline, arrow and number, and no other but a margin round letters."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)

@@ -61,12 +61,12 @@ class Tags(HTMLParser):
         self.feed(page.read_text())
 
     def handle_starttag(self, tag, attrs):
-        told = dict(attrs)
+        given = dict(attrs)
         self.names.add(tag)
-        self.anchors.add(told.get("id"))
+        self.anchors.add(given.get("id"))
         for kinds, found in ((LOADED, self.loaded), (LINKS, self.links)):
-            if told.get(kinds.get(tag, "")):
-                found.add(told[kinds[tag]])
+            if given.get(kinds.get(tag, "")):
+                found.add(given[kinds[tag]])
 
 
 @pytest.fixture(scope="module")
@@ -152,10 +152,10 @@ def test_the_page_of_formats_lists_what_a_model_holds():
         header = json.loads(str(archive["header"]))
     rows = re.findall(r"^\| (`\w+`) \| .*$", FORMATS.partition("\n## Model")[2].partition("\n## ")[0], re.M)
     assert {row.strip("`") for row in rows} == {"header", *header["models"]["series-gp"]}
-    (told,) = re.findall(r"^\| `header` \| JSON: (.*)\|$", FORMATS, re.M)
-    assert set(re.findall(r"`(\w+)`", told)) == set(header)
-    (told,) = re.findall(r"^\| `envelope` \| (.*)\|$", FORMATS, re.M)
-    assert set(re.findall(r"`(\w+)`", told)) == set(header["models"]["series-gp"]["envelope"])
+    (stated,) = re.findall(r"^\| `header` \| JSON: (.*)\|$", FORMATS, re.M)
+    assert set(re.findall(r"`(\w+)`", stated)) == set(header)
+    (stated,) = re.findall(r"^\| `envelope` \| (.*)\|$", FORMATS, re.M)
+    assert set(re.findall(r"`(\w+)`", stated)) == set(header["models"]["series-gp"]["envelope"])
 
 
 def test_each_scene_has_a_picture_and_its_own_words():
@@ -176,8 +176,8 @@ def test_the_motions_of_the_scenes_are_those_that_were_measured():
     assert [row["scene"] for row in known["scenes"]] == list(SCENES)
     anatomy = read_anatomy(template_path())
     for row in known["scenes"]:
-        told = re.search(rf"^## {row['scene']}\n.*?\| ([\d.]+) mm \|$", text, re.MULTILINE | re.DOTALL)[1]
-        assert float(told) == round(row["moved_mm"], len(told.partition(".")[2]))
+        stated = re.search(rf"^## {row['scene']}\n.*?\| ([\d.]+) mm \|$", text, re.MULTILINE | re.DOTALL)[1]
+        assert float(stated) == round(row["moved_mm"], len(stated.partition(".")[2]))
         assert row["effects"] == [type(effect).__name__ for effect in find_scene(row["scene"]).effects_on(anatomy)]
 
 

@@ -77,11 +77,11 @@ def test_the_memory_that_is_printed_is_that_of_arrays(theatre, anatomy, capsys):
     whole = counted(theatre, scene, 60)
     expected = {ALL: whole, "Gravity": whole - counted(theatre, without(scene, Gravity()), 60)}
     cells = {cells[1]: cells[3] for cells in table}
-    told = {row["effect"]: row["held_mb"] for row in json.loads(out)["effects"]}
+    reported = {row["effect"]: row["held_mb"] for row in json.loads(out)["effects"]}
     for name, size in expected.items():
-        assert told[name] == pytest.approx(1e-6 * size, rel=0.05) and size > 20_000
+        assert reported[name] == pytest.approx(1e-6 * size, rel=0.05) and size > 20_000
         assert float(cells[name]) == pytest.approx(1e-6 * size, rel=0.05, abs=0.005)
-    assert {cells[name] for name, held in told.items() if held is None} == {""}
+    assert {cells[name] for name, held in reported.items() if held is None} == {""}
 
 
 def test_the_change_is_that_between_the_answers(theatre):
@@ -112,11 +112,11 @@ def test_bytes_are_those_of_arrays_that_live():
 def test_the_command_tells_rows(theatre, anatomy, capsys):
     assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "60", "--device", "cpu", "--json"]) == 0
     out, error = capsys.readouterr()
-    told = json.loads(out)
+    reported = json.loads(out)
     asked = [type(effect).__name__ for effect in find_scene("brain_shift").effects_on(theatre.anatomy)]
-    assert out.count("\n") == 1 and told["scene"] == "brain_shift"
-    assert [row["effect"] for row in told["effects"]] == [ALL, *asked]
-    found = next(row for row in told["effects"] if row["effect"] == "Gravity")
+    assert out.count("\n") == 1 and reported["scene"] == "brain_shift"
+    assert [row["effect"] for row in reported["effects"]] == [ALL, *asked]
+    found = next(row for row in reported["effects"] if row["effect"] == "Gravity")
     cells = [f"{found[name]:.2f}" for name in ("milliseconds", "held_mb", "tumour_mm", "cortex_mm")]
     assert f"| Gravity | {' | '.join(cells)} |" in error and cells[2] != cells[3]
     assert "| effect | ms a frame | MB on the device | tumour mm | cortex mm |" in error
@@ -127,12 +127,12 @@ def test_the_command_tells_rows(theatre, anatomy, capsys):
 class TestScenes:
     def test_they_are_listed_with_who_can_play_them(self, anatomy, capsys):
         assert main(["scenes", "--anatomy", anatomy, "--device", "cpu", "--json"]) == 0
-        told = {row["scene"]: row for row in json.loads(capsys.readouterr().out)["scenes"]}
-        assert tuple(told) == SCENES
-        for name, row in told.items():
+        reported = {row["scene"]: row for row in json.loads(capsys.readouterr().out)["scenes"]}
+        assert tuple(reported) == SCENES
+        for name, row in reported.items():
             assert row["deformers"] == (["linear", "svr", "fem"] if name in PUSHING else ["fem"])
             assert ("ToolForce" in row["effects"]) == (ToolForce() in find_scene(name).effects)
-        assert "Resection" in told["resection"]["effects"] and "milliseconds" not in told["press"]
+        assert "Resection" in reported["resection"]["effects"] and "milliseconds" not in reported["press"]
 
     def test_pictures_and_a_sheet(self, anatomy, tmp_path, capsys, monkeypatch):
         monkeypatch.setattr("scenes.script.scene.SCENES", ("press", "brain_shift"))

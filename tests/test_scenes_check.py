@@ -73,7 +73,7 @@ def shifted(frame, by):
 
 def test_every_bound_has_its_sentence():
     assert GOOD.broken(Bounds()) == []
-    assert set(SENTENCES) == set(GOOD.row()) - {"leaked", "bond", "doubt"}  # told, and held to nothing
+    assert set(SENTENCES) == set(GOOD.row()) - {"leaked", "bond", "doubt"}  # stated, and held to nothing
     for name, (value, words) in SENTENCES.items():
         (sentence,) = replace(GOOD, **{name: value}).broken(Bounds())
         assert words in sentence
@@ -82,7 +82,7 @@ def test_every_bound_has_its_sentence():
     assert json.loads(json.dumps(GOOD.row())) == GOOD.row()
 
 
-def test_what_passes_the_skull_is_told(play, frames, truth):
+def test_what_passes_the_skull_is_reported(play, frames, truth):
     leaky = replace(truth, leaked=np.linspace(0.0, 0.35, len(truth)))
     assert measure(play, play.camera, frames, leaky).leaked == 0.35
     assert measure(play, play.camera, frames, truth).leaked == truth.leaked.max() < 1e-5
@@ -238,8 +238,8 @@ class TestCommand:
         report = json.loads(out)
         assert out.count("\n") == 1 and report["passed"]
         assert [row["scene"] for row in report["scenes"]] == list(SCENES)
-        told = {row["scene"]: row["deformer"] for row in report["scenes"]}
-        assert told == {name: "linear" if name in PUSHING else "fem" for name in SCENES}
+        played = {row["scene"]: row["deformer"] for row in report["scenes"]}
+        assert played == {name: "linear" if name in PUSHING else "fem" for name in SCENES}
         for row in report["scenes"]:
             assert row["frames"] >= 5 and row["broken"] == [] and row["motion_mm"] > 0.03
         assert err.count("passes") == len(SCENES)

@@ -360,7 +360,7 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
     assert before is not None and (moment.picture != before).any() and asked == []
 
 
-def test_a_long_solve_is_told_while_it_lasts(demo, monkeypatch):
+def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):
     answer, said = Learned.deform, []
     monkeypatch.setattr(demo.browser, "status", said.append)
 

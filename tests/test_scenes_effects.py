@@ -1,4 +1,4 @@
-"""What acts in a scene follows from its effects, and a learnt model answers none that it was not taught."""
+"""What acts in a scene follows from its effects, and a learnt model answers none that it was not trained on."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scenes.builtin.retract import RELAXING
 from scenes.play.checks import measure
 from scenes.play.effect_ablation import without
 from scenes.play.episode import UNITS, collect
-from scenes.play.load_text import told
+from scenes.play.load_text import acting
 from scenes.play.page import Demo
 from scenes.play.player import labelled
 from scenes.play.reference import truth_of
@@ -63,16 +63,16 @@ class TestCauses:
         with pytest.raises(InputError, match="has no tool"):
             replace(short(), tool=None)
 
-    def test_they_are_told_in_words(self, theatre):
+    def test_they_are_reported_in_words(self, theatre):
         both = replace(short(), effects=(*EFFECTS, Gravity(), ToolForce()))
-        words = told(both.loads(theatre.site, Touch(force=0.2), 0.0), STILL)
+        words = acting(both.loads(theatre.site, Touch(force=0.2), 0.0), STILL)
         assert "force 0.20 N" in words and "gravity pulls to the back, fluid up to" in words
-        assert told(Loads((), np.zeros(1)), STILL) == ""
+        assert acting(Loads((), np.zeros(1)), STILL) == ""
         lying = posture(np.array([-3.0, 0.0, 4.0]), -0.012)
         way = "gravity pulls to the crown (0.80) and the left (0.60), fluid up to "
-        assert told(lying, STILL) == way + "-12 mm over the scan's origin"
+        assert acting(lying, STILL) == way + "-12 mm over the scan's origin"
         height = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.04]])  # from -32 to 0 mm against gravity
-        assert told(lying, STILL, height) == way + "62 % of the brain's height"
+        assert acting(lying, STILL, height) == way + "62 % of the brain's height"
 
 
 class TestLying:
@@ -99,7 +99,7 @@ class TestLying:
 
 
 class TestLearnt:
-    def test_it_refuses_effects_that_it_was_not_taught(self, theatre):
+    def test_it_refuses_effects_that_it_was_not_trained_on(self, theatre):
         model = theatre.models["linear"]
         assert refusal(model, short().effects) is None
         why = refusal(model, (*short().effects, Gravity()))
@@ -120,7 +120,7 @@ class TestLearnt:
         with pytest.raises(InputError, match="causes none"):
             model.deform(Loads((), np.zeros(2)))
 
-    def test_its_file_says_what_it_was_taught_under(self, theatre):
+    def test_its_file_says_what_it_was_trained_under(self, theatre):
         model = theatre.models["linear"]
         assert trained_effects(model.training) == {"Elasticity", "Held", "Slide", "ToolForce"}  # its file does not say
         effects = (Elasticity(regions={2: Elasticity().default}), Held(), ToolForce(), NodalForce())  # type: ignore
@@ -139,8 +139,8 @@ class TestLearnt:
         assert why is not None and "never without Slide" in why
 
     def test_models_beside_an_anatomy_do_not_change_its_physics(self, theatre):
-        taught = {"element": "p1", "tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}
-        other = replace(theatre, models={"linear": replace(theatre.models["linear"], training=taught)})
+        training = {"element": "p1", "tissue": tissue_to_json(Material("neo-hookean", 9000.0, 0.3))}
+        other = replace(theatre, models={"linear": replace(theatre.models["linear"], training=training)})
         assert other.fem(short(), LIVE).description == "finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.49)"
         for scene in (short(), sinking()):
             found, alone = (each.fem(scene, LIVE) for each in (other, replace(theatre, models={})))
@@ -217,7 +217,7 @@ class TestSwitches:
         yield demo
         demo.close()
 
-    def test_effects_go_off_and_on_and_the_change_is_told(self, demo, theatre):
+    def test_effects_go_off_and_on_and_the_change_is_reported(self, demo, theatre):
         page, visitor = demo.browser, Visitor(demo.browser, 1200)
         assert {"ToolForce", "Gravity"} < set(page.inputs) and not {"Held", "Elasticity"} & set(page.inputs)
         assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in page.shown[2])

@@ -32,7 +32,7 @@ def helped(words, capsys):
     return capsys.readouterr().out
 
 
-def test_the_version_is_told(capsys):
+def test_the_version_is_reported(capsys):
     assert helped(["--version"], capsys).startswith("sulcus 0.")
 
 

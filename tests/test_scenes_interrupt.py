@@ -74,7 +74,7 @@ def test_at_its_own_end_everything_is_closed():
     assert process.returncode == 0 and "all closed" in out and error == ""
 
 
-def test_what_goes_wrong_is_told_and_handlers_are_given_back():
+def test_what_goes_wrong_is_reported_and_handlers_are_given_back():
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     closed = []
 

@@ -1,4 +1,4 @@
-"""What was taught with an element and a tissue is judged with them, from `sulcus simulate` to the truth of a scene."""
+"""What was trained with an element and a tissue is judged with them, from `sulcus simulate` to the truth of a scene."""
 
 from __future__ import annotations
 
@@ -74,17 +74,17 @@ def test_simulate_takes_quadratic_anatomies_as_they_are(body, tmp_path, capsys) 
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [((), (BRAIN.law, None)), (("--element", "p2", "--material", "corotational"), ("corotational", "p2"))],
 )
-def test_a_patient_hands_tissue_and_element_on(tmp_path, monkeypatch, words, told) -> None:
+def test_a_patient_hands_tissue_and_element_on(tmp_path, monkeypatch, words, expected) -> None:
     steps: list[list[str]] = []
     monkeypatch.setattr("scenes.cli.main", lambda step: steps.append(step) or 0)
     labels = ["labels.nii.gz", "--brain", "1", "--tumour", "2"]
     assert main(["patient", *labels, "--out", str(tmp_path / "me.vtu"), "--device", "cpu", *words]) == 0
     assert [step[0] for step in steps] == ["anatomy", "simulate", "train"]
-    element = [] if told[1] is None else ["--element", told[1]]
-    assert steps[1][steps[1].index("--material") :] == ["--material", told[0], *element]
+    element = [] if expected[1] is None else ["--element", expected[1]]
+    assert steps[1][steps[1].index("--material") :] == ["--material", expected[0], *element]
     assert steps[2][-4:] == ["--learners", "linear,series,series-gp", "--device", "cpu"]
 
 
@@ -96,19 +96,19 @@ def physics(theatre: Theatre, scene: Scene) -> tuple[str, Tissue | None]:
     return fem.space.element, elasticity.default
 
 
-def test_models_are_judged_with_what_they_were_taught(box, body, tmp_path) -> None:
+def test_models_are_judged_with_what_they_were_trained_on(box, body, tmp_path) -> None:
     """Through the model file, and for the truth of frames as for the page's finite elements."""
     words = "--element", "smoothed", "--material", STIFF.law, "--young", "9000", "--poisson", "0.3"
     provenance = read_dataset(simulated(body, tmp_path, *words)).provenance
     models = theatre_of(box).models
-    taught = {name: replace(model, training={"learner": name, **provenance}) for name, model in models.items()}
+    trained = {name: replace(model, training={"learner": name, **provenance}) for name, model in models.items()}
     write_anatomy(tmp_path / "box.vtu", box)
-    save(tmp_path / "box.model.npz", taught)
+    save(tmp_path / "box.model.npz", trained)
     theatre = open_theatre(tmp_path / "box.vtu", device="cpu")
     assert physics(theatre, small()) == ("smoothed", BRAIN)
     assert theatre.names(small()) == ("fem",)
     scene = small().made_of(STIFF, "smoothed")
-    assert physics(theatre, scene) == ("smoothed", STIFF) and theatre.names(scene) == (*taught, "fem")
+    assert physics(theatre, scene) == ("smoothed", STIFF) and theatre.names(scene) == (*trained, "fem")
     loads = [scene.loads(site_of(box), scene.path(1.0), 1.0)]
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Elasticity))
     right = Fem(box, (Elasticity(STIFF), *others), TRAIN, "cpu", element="smoothed").deform(loads[0])

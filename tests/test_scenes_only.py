@@ -1,4 +1,4 @@
-"""Only what a scene asks for is imported, compiled, launched and kept: told by a fresh interpreter for each scene."""
+"""Only what a scene asks for is imported, compiled, launched and kept: seen by a fresh interpreter for each scene."""
 
 from __future__ import annotations
 

@@ -58,15 +58,15 @@ def test_a_command_plays_it(folder, monkeypatch, capsys, words):
     out, err = capsys.readouterr()
     assert done == 0, err
     if "--json" in words:
-        told = json.loads(out)
-        assert (told["scenes"][0] if words[0] == "check" else told)["scene"] == "nod"
+        reported = json.loads(out)
+        assert (reported["scenes"][0] if words[0] == "check" else reported)["scene"] == "nod"
 
 
 def test_what_its_effects_cost_is_measured(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main(["effects", "my_scene.py", "--every", "1", "--anatomy", "box.vtu", "--device", "cpu", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["scene"] == "nod" and "ToolForce" in {row["effect"] for row in told["effects"]}
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["scene"] == "nod" and "ToolForce" in {row["effect"] for row in reported["effects"]}
 
 
 SUCKER = Path(__file__).parents[1] / "examples/sucker.py"

@@ -36,7 +36,7 @@ def answer(outcome: Outcome, bound: float = 1e-3):
 
 
 class TestTrust:
-    def test_a_bound_is_told_of_a_load_inside_the_range(self):
+    def test_a_bound_is_reported_of_a_load_inside_the_range(self):
         said = trust(answer(Outcome.PREDICTED), "svr")
         assert "In 95 of 100 loads" in said and "1.00 mm" in said and "warn" not in said
 
@@ -54,9 +54,9 @@ class TestTrust:
             assert "_" not in said and outcome.name not in said
 
     @pytest.mark.parametrize(("bound", "words"), [(1e-7, "0.01 mm"), (6e-6, "0.01 mm"), (1.231e-3, "1.24 mm")])
-    def test_a_bound_is_not_told_too_small(self, bound, words):
-        told = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
-        assert f"is off by more than {words}." in trust(told, "svr")
+    def test_a_bound_is_not_reported_too_small(self, bound, words):
+        bounded = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
+        assert f"is off by more than {words}." in trust(bounded, "svr")
 
     def test_where_nothing_moves_nothing_is_promised(self):
         still = answer(Outcome.PREDICTED)
@@ -184,7 +184,7 @@ class TestHand:
         assert wish.plays and wish.now()[2] == Touch(depth=1e-3)
 
 
-def test_a_long_wait_is_told_and_a_short_one_is_not():
+def test_a_long_wait_is_reported_and_a_short_one_is_not():
     said: list[str] = []
     busy = Busy(said.append)
     busy.on("a quick load")

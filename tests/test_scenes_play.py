@@ -225,21 +225,21 @@ def test_the_label_is_drawn_above_the_picture(play):
 
 
 def test_the_label_tells_source_time_and_motion(play, monkeypatch):
-    told = []
-    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines: told.extend(lines) or colour)
+    said = []
+    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines: said.extend(lines) or colour)
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     labelled(frame, "linear")
-    assert told[0] == frame.deformation.source
-    assert told[1] == f"t 1.70 s   tumour moved {1e3 * frame.moved:.2f} mm"
+    assert said[0] == frame.deformation.source
+    assert said[1] == f"t 1.70 s   tumour moved {1e3 * frame.moved:.2f} mm"
 
 
 def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
-    told = []
-    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines: told.append(list(lines)) or colour)
+    shown = []
+    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines: shown.append(list(lines)) or colour)
     play = player(theatre, short(), "linear")
     for force in (0.2, 0.6):
         labelled(play.draw(0, 0.0, Touch(force=force)), "linear")
-    within, beyond = told
+    within, beyond = shown
     assert beyond[-1] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
 
 

@@ -84,8 +84,8 @@ class TestEpisode:
     def test_the_distance_is_that_of_the_picture(self, episode):
         _, file, _, frames = episode
         for name in ("distance", "distance_error"):
-            told = [np.nan if getattr(frame, name) is None else getattr(frame, name) for frame in frames]
-            np.testing.assert_allclose(file[name][:], told, rtol=1e-12)
+            expected = [np.nan if getattr(frame, name) is None else getattr(frame, name) for frame in frames]
+            np.testing.assert_allclose(file[name][:], expected, rtol=1e-12)
         assert np.isfinite(file["distance"][:]).all()
 
     def test_every_data_set_has_a_unit(self, episode):
@@ -248,7 +248,7 @@ class TestRender:
         for number, colour in zip((0, 3, 6), shown, strict=True):
             assert np.array_equal(cv2.imread(str(tmp_path / f"frame_{number:04d}.png"))[..., ::-1], colour)
 
-    def test_doubtful_answers_are_told_by_the_exit_code(self, anatomy, tmp_path, monkeypatch, capsys):
+    def test_doubtful_answers_are_reported_by_the_exit_code(self, anatomy, tmp_path, monkeypatch, capsys):
         strong = replace(short(), path=press(0.8, rise=0.1, hold=0.0))
         monkeypatch.setattr("scenes.script.scene.find_scene", lambda name: strong)
         words = ["render", "press", "--anatomy", str(anatomy), "--out", str(tmp_path), "--json"]
@@ -256,7 +256,7 @@ class TestRender:
         assert 2 <= json.loads(capsys.readouterr().out)["not_good"] <= 5
 
 
-def test_an_episode_that_no_file_may_hold_is_told_before_the_work(theatre, tmp_path):
+def test_an_episode_that_no_file_may_hold_is_reported_before_the_work(theatre, tmp_path):
     resource = pytest.importorskip("resource")
     before, play = resource.getrlimit(resource.RLIMIT_FSIZE), player(theatre, short(), "linear")
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))

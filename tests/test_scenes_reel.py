@@ -213,7 +213,7 @@ class TestPages:
         assert all(same(frame.deformation, full[frame.number]) for frame in shown[first])
         assert [frame.number for frame in shown[first][:9]] == [6, 7, 8, 9, 10, 11, 12, 0, 1]
 
-    def test_the_way_is_told(self, pages, monkeypatch):
+    def test_the_way_is_reported(self, pages, monkeypatch):
         said: list[str] = []
         solved: list[str] = []
         monkeypatch.setattr(pages[0].browser, "show", lambda number, picture, words: said.append(words))

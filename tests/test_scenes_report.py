@@ -72,7 +72,7 @@ def figures_by_hand(distance, truth):
 
 
 def test_numbers_are_those_recomputed_by_hand(study, page, box):
-    """Quadratic reference, finite elements, and a learner against its teacher, each from its own source."""
+    """Quadratic reference, finite elements, and a learner against those it was trained on, each from its own source."""
     stored = json.loads((page / "report.json").read_text())["sections"][0]["rows"]
     with open(page / "data.csv") as file:
         lines = list(csv.DictReader(file))
@@ -82,7 +82,7 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
     truth = Fem(box, effects, REFERENCE, "cpu", element="p2").deform(study.played).at(box.tumour_nodes).displacement
     answer = Fem(box, effects, TRAIN, "cpu", element="p1").deform(study.played).at(box.tumour_nodes).displacement
     wanted = figures_by_hand(np.linalg.norm(answer - truth, axis=2), truth)
-    names = ("mean", "p95", "largest")  # of so few loads no percentile of a thousand is told
+    names = ("mean", "p95", "largest")  # of so few loads no percentile of a thousand is reported
     for kind, values in (("mm", wanted[:3]), ("percent", wanted[3:])):
         assert stored[0]["reference"][kind]["p999"] is None and lines[0][f"reference.{kind}.p999"] == ""
         assert np.allclose([stored[0]["reference"][kind][name] for name in names], values, rtol=2e-3)
@@ -94,51 +94,53 @@ def test_numbers_are_those_recomputed_by_hand(study, page, box):
         truth = data.displacement(box.tumour_nodes)[test]
         guess = model.deform(data.loads.rows(np.flatnonzero(test)), at=box.tumour_nodes).displacement
         wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
-        held = stored[2]["teacher"][name]
+        held = stored[2]["own_fem"][name]
         assert np.allclose([held[kind][each] for kind in ("mm", "percent") for each in names], wanted, rtol=1e-5)
         miss = 1e3 * np.linalg.norm(guess - truth, axis=2).max(axis=1)
         worst = [miss.mean(), np.percentile(miss, 95.0), miss.max()]
         assert np.allclose([held["worst"][each] for each in names], worst, rtol=1e-5)
         assert held["loads"] == test.sum() and held["values"] == test.sum() * len(box.tumour_nodes)
-    assert stored[2]["taught"] == study.discs.taught.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
-    # A published learner is told no unit responses.
-    assert stored[3]["taught"] == study.discs.taught.sum() and stored[3]["units"] == stored[3]["series"] == 0
+    assert stored[2]["loads"] == study.discs.train.sum() and stored[2]["units"] == 3 * box.craniotomy.sum()
+    # A published learner is given no unit responses.
+    assert stored[3]["loads"] == study.discs.train.sum() and stored[3]["units"] == stored[3]["series"] == 0
 
 
 @pytest.mark.parametrize("name", ["svr", "published-svr"])
-def test_a_learner_is_held_to_loads_that_it_was_not_taught(study, box, tmp_path, name, monkeypatch):
-    """Fitted here to the taught rows; in the file that the report reads, answers to the discs' loads are wild."""
-    taught, pushed, nodes = study.discs.taught, study.pushed, Learner(name).vertices(box)
+def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, box, tmp_path, name, monkeypatch):
+    """Fitted here to the training rows; in the file that the report reads, answers to the discs' loads are wild."""
+    training, pushed, nodes = study.discs.train, study.pushed, Learner(name).vertices(box)
     truth = study.dataset.displacement(nodes)[study.dataset.good]
     path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
     monkeypatch.setattr("scenes.report.learner.counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner._covered", lambda *known: {})
     with one_thread():
         row, field = measure_learner(replace(study, data=path), Learner(name))
-    lesson = Pushed(pushed.point[taught], pushed.force[taught], pushed.footprint[taught])
+    lesson = Pushed(pushed.point[training], pushed.force[training], pushed.footprint[training])
     if name == "svr":
         size, (every, direction) = directions(lesson)[0], directions(pushed)
-        basis = reduce(nodes, truth[taught] / size[:, None, None], *COARSE)
-        machine = Tuned(SVR).fit(tool_features(study.patch, lesson), basis.encode(truth[taught] / size[:, None, None]))
+        basis = reduce(nodes, truth[training] / size[:, None, None], *COARSE)
+        machine = Tuned(SVR).fit(
+            tool_features(study.patch, lesson), basis.encode(truth[training] / size[:, None, None])
+        )
         within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
         guess = every[:, None, None] * basis.decode(machine.predict(tool_features(study.patch, within)))
     else:
         learnt, asked = (thirteen(*sites_of(box, nodes), each) for each in (lesson, pushed))
-        angles = to_angles(truth[taught].astype(float))
-        told = [Svr().fit(x, angles[:, k]).predict(asked[k]) for k, x in enumerate(learnt)]
-        guess = from_angles(np.stack(told, axis=1).astype(float))
+        angles = to_angles(truth[training].astype(float))
+        predicted = [Svr().fit(x, angles[:, k]).predict(asked[k]) for k, x in enumerate(learnt)]
+        guess = from_angles(np.stack(predicted, axis=1).astype(float))
     played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.played.of(Pushed).point]
     np.testing.assert_allclose(field, guess[played], rtol=1e-3, atol=1e-9)
     wanted = 1e3 * np.linalg.norm(guess[study.discs.test] - wild[nodes], axis=2)
-    mm = row.teacher["discs"].mm
+    mm = row.own_fem["discs"].mm
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
-    assert row.taught == taught.sum()
+    assert row.loads == training.sum()
     if name == "svr":  # of loads that point into the sectors, by a model of those that do not
-        told, sectors = read_dataset(path), leave_sectors_out(pushed, study.patch)
-        asked = told.loads.rows(np.flatnonzero(told.good)[sectors.test])
-        guess = train(told, [name], split=sectors).models[name].deform(asked, at=nodes).displacement
-        wanted = 1e3 * np.linalg.norm(guess - told.displacement(nodes)[told.good][sectors.test], axis=2)
-        mm = row.teacher["sectors"].mm
+        data, sectors = read_dataset(path), leave_sectors_out(pushed, study.patch)
+        asked = data.loads.rows(np.flatnonzero(data.good)[sectors.test])
+        guess = train(data, [name], split=sectors).models[name].deform(asked, at=nodes).displacement
+        wanted = 1e3 * np.linalg.norm(guess - data.displacement(nodes)[data.good][sectors.test], axis=2)
+        mm = row.own_fem["sectors"].mm
         assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
 
 
@@ -149,9 +151,9 @@ def test_what_is_played_lies_in_the_discs_alone(study):
     for pushed in (every, some):
         into = np.linalg.norm(pushed.point[:, None] - split.centres, axis=2).min(axis=1)
         assert into.max() <= split.radius
-        assert not np.isin(pushed.point[:, 0], study.pushed.point[split.taught, 0]).any()
-    taught = np.linalg.norm(study.pushed.point[split.taught][:, None] - split.centres, axis=2).min(axis=1)
-    assert taught.min() > split.radius
+        assert not np.isin(pushed.point[:, 0], study.pushed.point[split.train, 0]).any()
+    training = np.linalg.norm(study.pushed.point[split.train][:, None] - split.centres, axis=2).min(axis=1)
+    assert training.min() > split.radius
     force, size = (np.linalg.norm(each.force, axis=1) for each in (some, every))
     assert list(force) == [size.min(), size.max()]
 
@@ -159,32 +161,32 @@ def test_what_is_played_lies_in_the_discs_alone(study):
 def test_rows_say_what_they_are(found, box):
     fem, law, learner, published = found
     assert (fem.against, law.against, learner.against) == ("error", "model difference", "error")
-    assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.teacher
-    assert set(learner.teacher) == {"discs", "sectors", "beyond"} and learner.flagged["beyond"] == 1.0
+    assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.own_fem
+    assert set(learner.own_fem) == {"discs", "sectors", "beyond"} and learner.flagged["beyond"] == 1.0
     assert (
         set(learner.covered) == {"discs", "beyond"} and max(learner.covered.values()) <= 1.0 and not published.covered
     )
-    assert learner.teacher["beyond"].percent.mean > learner.teacher["discs"].percent.mean
+    assert learner.own_fem["beyond"].percent.mean > learner.own_fem["discs"].percent.mean
     assert (fem.timed, fem.p99, learner.timed) == (2, None, 30) and fem.median > learner.median > 0.0
     assert published.reference.values == 2 * len(published_nodes(box)) and published.picture is None
-    assert learner.adapt is None and fem.adapt > 0.0 and learner.curve[-1] == (learner.taught, learner.teacher["discs"])
+    assert learner.adapt is None and fem.adapt > 0.0 and learner.curve[-1] == (learner.loads, learner.own_fem["discs"])
     assert read_back(learner) == learner
     assert 0.05 < peak_memory() < 50.0
 
 
 def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatch):
     """Made of what is kept, a row has no finite elements to ask; the table's seconds are its own all the same."""
-    told = []
-    tabulate_series(study, lambda done, total: told.append((done, total)))
-    assert told and told[-1][0] == told[-1][1]
+    reported = []
+    tabulate_series(study, lambda done, total: reported.append((done, total)))
+    assert reported and reported[-1][0] == reported[-1][1]
     monkeypatch.setattr("surrogate.training.shared_inputs.Expansion._fem", None)
-    tabulate_series(study, lambda done, total: told.append(None))
-    assert None not in told
+    tabulate_series(study, lambda done, total: reported.append(None))
+    assert None not in reported
     row = measured(replace(study), Learner("series"), tmp_path / "series.png")
     assert row.state == "measured" and row.solving > 0.1 * series_seconds(study, "series") > 0.0
     assert row.series > 19 and row.inside == 0
     assert series_seconds(study, "linear") == 0.0
-    assert row.teacher["discs"].mm.mean < 0.5 * measured(study, SPECS[2], tmp_path / "l.png").teacher["discs"].mm.mean
+    assert row.own_fem["discs"].mm.mean < 0.5 * measured(study, SPECS[2], tmp_path / "l.png").own_fem["discs"].mm.mean
     assert {spec.name for spec in learners()} > set(EXPANDED)
 
 
@@ -229,9 +231,9 @@ def test_a_reference_goes_on_load_by_load(study, monkeypatch):
     lost.unlink()
     solved = []
     monkeypatch.setattr(Fem, "deform", lambda self, loads, *rest: solved.append(len(loads)) or deform(self, loads))
-    told = []
-    solve_reference(study, told.append)
-    assert solved == [1] and told == [1, 1]
+    reported = []
+    solve_reference(study, reported.append)
+    assert solved == [1] and reported == [1, 1]
     assert np.allclose(reference_of(study).displacement, before.displacement, atol=1e-12) and before.good.all()
 
 
@@ -271,11 +273,11 @@ def test_the_page_needs_nothing_but_itself(page, found):
 
 
 def test_what_lies_beyond_is_outside_the_envelope(study):
-    taught = study.converged.rows(np.flatnonzero(study.discs.taught)).of(Pushed)
+    training = study.converged.rows(np.flatnonzero(study.discs.train)).of(Pushed)
     outside = study.outside.of(Pushed)
-    assert not envelope_of(study.patch, taught).holds(study.patch, outside).any()
+    assert not envelope_of(study.patch, training).holds(study.patch, outside).any()
     size = np.linalg.norm(outside.force, axis=1)
-    assert (size[::3] > 1.19 * np.linalg.norm(taught.force, axis=1).max()).all()
+    assert (size[::3] > 1.19 * np.linalg.norm(training.force, axis=1).max()).all()
     assert (study.patch.rim_distance(outside.point[2::3]) < outside.footprint[2::3]).all()
     assert beyond_of(study).displacement.shape == (12, len(study.anatomy.tumour_nodes), 3)
 
@@ -347,12 +349,12 @@ class TestAdapting:
             after.mesh.nodes[after.craniotomy], box.mesh.nodes[box.craniotomy]
         )  # the cavity is inside
 
-    def test_elements_are_set_up_and_learners_taught_anew(self, study, found):
-        told = []
-        simulate_debulked(study, told.append)
-        simulate_debulked(study, told.append)
+    def test_elements_are_set_up_and_learners_trained_anew(self, study, found):
+        reported = []
+        simulate_debulked(study, reported.append)
+        simulate_debulked(study, reported.append)
         rows_in_all = len(study.dataset.loads) + len(study.dataset.unit_good)
-        assert sum(told) == 2 * rows_in_all
+        assert sum(reported) == 2 * rows_in_all
         row = measured(study, Learner("linear"), study.folder / "adapted.png")
         after = debulked_study(study)
         model = train(after.dataset, ["linear"], split=after.discs).models["linear"]

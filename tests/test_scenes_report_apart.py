@@ -34,5 +34,5 @@ def test_no_answer_to_a_load_of_the_discs_reaches_a_row(study, tmp_path, name, m
             found.append(measure_learner(here, Learner(name)))
     (row, field), (wild, again) = found
     assert np.array_equal(field, again)
-    assert wild.teacher["discs"].mm.mean > 1.0 > row.teacher["discs"].mm.mean
-    assert replace(wild.teacher["beyond"], percent=None) == replace(row.teacher["beyond"], percent=None)
+    assert wild.own_fem["discs"].mm.mean > 1.0 > row.own_fem["discs"].mm.mean
+    assert replace(wild.own_fem["beyond"], percent=None) == replace(row.own_fem["beyond"], percent=None)

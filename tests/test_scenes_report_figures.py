@@ -59,8 +59,8 @@ def test_every_figure_stands_under_its_head(tmp_path):
         for name, mean, loads in (("discs", 0.1, 7), ("sectors", 0.2, 8), ("beyond", 0.3, 9))
     }
     shares = {"flagged": {"discs": 0.01, "sectors": 0.02, "beyond": 1.0}, "covered": {"discs": 0.94, "beyond": 0.53}}
-    row = Row("svr", "learnt", reference=one, teacher=sets, **shares, median=1.5, p99=2.5, set_up=3.5, memory=0.25)
-    row = replace(row, taught=600, units=60, series=9000, inside=12, solving=180.0, learning=120.0, timed=1000)
+    row = Row("svr", "learnt", reference=one, own_fem=sets, **shares, median=1.5, p99=2.5, set_up=3.5, memory=0.25)
+    row = replace(row, loads=600, units=60, series=9000, inside=12, solving=180.0, learning=120.0, timed=1000)
     row = replace(row, bare=0.0125, reference=replace(one, worst=replace(one.worst, mean=7.5)))
     solved = replace(row, name="FEM", plan=("First this.", "Then <that>."))
     write_report(tmp_path, "a machine", [Section("data", (), (solved,))])
@@ -74,15 +74,15 @@ def test_every_figure_stands_under_its_head(tmp_path):
         [re.findall("<t[hd]>(.*?)</t[hd]>", line) for line in table.split("</tr>")]
         for table in re.findall("<table>(.*?)</table>", (tmp_path / "index.html").read_text(), re.S)
     ]
-    (heads, cells, *_), (others, *taught, _), *_ = tables
-    told = dict(zip(heads, cells, strict=True))
+    (heads, cells, *_), (others, *learnt, _), *_ = tables
+    stated = dict(zip(heads, cells, strict=True))
     asked = ("median ms", "model in NumPy ms", "set-up s", "memory GiB", "solves", "in discs", "minutes")
-    assert [told[head] for head in asked] == [
+    assert [stated[head] for head in asked] == [
         "1.5", "0.0125", "3.5", "0.25", "600 + 60 unit + 9000 series", "12", "5",
     ]  # fmt: skip
-    assert told["worst vertex mm: mean"] == "7.5"
+    assert stated["worst vertex mm: mean"] == "7.5"
     asked = ("loads of", "loads", "mean mm", "called extrapolated", "within 95 % bound")
-    assert [[line[others.index(head)] for head in asked] for line in taught] == [
+    assert [[line[others.index(head)] for head in asked] for line in learnt] == [
         ["whole discs of cortex left out", "7", "0.1", "1 %", "94 %"],
         ["whole sectors of direction left out", "8", "0.2", "2 %", ""],
         ["beyond the training range", "9", "0.3", "100 %", "53 %"],

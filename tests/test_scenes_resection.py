@@ -14,7 +14,7 @@ from visitor import free_port, wait_for
 from ar.overlay import silhouette
 from scenes.cli import main
 from scenes.play.episode import collect
-from scenes.play.load_text import told
+from scenes.play.load_text import acting
 from scenes.play.page import Demo
 from scenes.script.debulking import Debulking
 from scenes.script.head_posture import drained
@@ -83,7 +83,7 @@ def test_its_effects_and_causes_are_the_body_s(theatre, scene):
     assert [type(effect) for effect in scene.effects_on(theatre.anatomy)][-1] is Resection
     loads = scene.loads(theatre.site, Touch(), 0.12)
     assert [type(cause) for cause in loads.causes] == [Posture, Resected]
-    assert loads.of(Resected).done.tolist() == [2] and "resection: 2 steps done" in told(
+    assert loads.of(Resected).done.tolist() == [2] and "resection: 2 steps done" in acting(
         loads, guess(np.zeros((1, 3, 3)))
     )
     assert theatre.names(scene) == ("fem",)

@@ -191,7 +191,7 @@ def test_a_body_without_tumour_is_refused(anatomy):
         next(rows(Study(whole, draw("palpation", anatomy, 1, 0), Body()), []))
 
 
-def taught(anatomy):
+def trained(anatomy):
     """A model that knows nothing but its bound."""
     patch, nodes = open_patch(anatomy), anatomy.tumour_nodes
     width = 3 * len(patch.nodes)
@@ -207,11 +207,11 @@ def test_the_command(tmp_path, capsys):
     write_anatomy(tmp_path / "box.vtu", body)
     words = ["sensitivity", "--anatomy", str(tmp_path / "box.vtu"), "--count", "2", "--element", "p1"]
     assert main([*words, "--device", "cpu", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    reported = json.loads(capsys.readouterr().out)
     assert main([*words, "--count", "0"]) == 2
     assert "--count >= 1" in capsys.readouterr().err
-    assert told["surrogate"] is None and told["failed"] == 0
-    save(tmp_path / "box.model.npz", {"table": taught(body)})
+    assert reported["surrogate"] is None and reported["failed"] == 0
+    save(tmp_path / "box.model.npz", {"table": trained(body)})
     assert main([*words, "--device", "cpu", "--out", str(tmp_path / "table.csv")]) == 0
     said = capsys.readouterr().out
     for text in (
@@ -224,8 +224,8 @@ def test_the_command(tmp_path, capsys):
     assert max(len(line) for line in said.splitlines() if line.startswith("|")) <= 120
     with open(tmp_path / "table.csv", newline="") as file:
         table = list(csv.DictReader(file))
-    assert [row["what"] for row in told["rows"]] == [row["what"] for row in table]
-    assert float(table[1]["force mean_mm"]) == told["rows"][1]["force mean_mm"] > 0.0
+    assert [row["what"] for row in reported["rows"]] == [row["what"] for row in table]
+    assert float(table[1]["force mean_mm"]) == reported["rows"][1]["force mean_mm"] > 0.0
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def test_what_cannot_be_measured_is_a_sentence(brain, capsys, words, reason):
     assert reason in capsys.readouterr().err
 
 
-def test_what_is_taught_of_a_skull_is_of_that_skull(tmp_path):
+def test_what_is_learnt_of_a_skull_is_of_that_skull(tmp_path):
     """From the command to the finite elements that a learner asks: they slide where the data did."""
     write_anatomy(tmp_path / "brain.vtu", make_anatomy(template_subject(Tumour()), MeshPlan(2000, craniotomy=0.03)))
     for skull, effect in (("slide", Slide()), ("bonded", Bonded())):

@@ -54,7 +54,7 @@ def test_a_load_shown_again_counts_once_and_old_loads_are_forgotten():
     assert tally.rows == [Row("a", 4.0, 1.0, RECENT, None)]
 
 
-def test_an_error_too_small_to_print_is_not_told_as_none():
+def test_an_error_too_small_to_print_is_not_reported_as_none():
     rows = [Row("a", 1.0, 4e-4, 3, None), Row("b", 1.0, 1.234e-3, 3, None)]
     assert "under 0.001 mm off" in table(rows) and "0.001 mm off</td><td>3 loads" in table(rows)
     assert "0.000" not in table(rows)

@@ -82,12 +82,12 @@ def test_the_tools_are_summed_and_no_other_set():
     assert [one.rate for one in together(others)] == [None]
 
 
-def test_one_in_a_hundred_is_checked_and_every_solve_is_told(box, monkeypatch):
+def test_one_in_a_hundred_is_checked_and_every_solve_is_reported(box, monkeypatch):
     monkeypatch.setattr(throughput, "CHECKED", 2)
-    told = []
+    reported = []
     sets = drawn(box, ["bipolar"], 11)
-    (row,) = rows(Trial(box, (), "p1", "cpu", 11), BRAIN, sets, 1, lambda: told.append(1))
-    assert (row.loads, row.checked, len(told)) == (11, 6, 3)
+    (row,) = rows(Trial(box, (), "p1", "cpu", 11), BRAIN, sets, 1, lambda: reported.append(1))
+    assert (row.loads, row.checked, len(reported)) == (11, 6, 3)
 
 
 @pytest.mark.parametrize(

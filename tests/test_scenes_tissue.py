@@ -140,7 +140,7 @@ def test_contradictions_are_exit_code_two_and_write_nothing(tmp_path: Path, caps
     assert not (tmp_path / "out.vtu").exists()
 
 
-def told_of_tissue(capsys: pytest.CaptureFixture, *command: str) -> str:
+def help_on_tissue(capsys: pytest.CaptureFixture, *command: str) -> str:
     """What a command's help says of --material."""
     with pytest.raises(SystemExit):
         main([*command, "--help"])
@@ -149,7 +149,7 @@ def told_of_tissue(capsys: pytest.CaptureFixture, *command: str) -> str:
 
 
 def test_the_help_of_solve_names_every_tissue_with_its_source(capsys: pytest.CaptureFixture) -> None:
-    said = "".join(told_of_tissue(capsys, "solve").split())
+    said = "".join(help_on_tissue(capsys, "solve").split())
     for name, known in MATERIALS.items():
         assert "".join(f"{name} holds for {known.time_scale}. Source: {known.source}".split()) in said
     assert all(law in said for law in LAWS)
@@ -157,7 +157,7 @@ def test_the_help_of_solve_names_every_tissue_with_its_source(capsys: pytest.Cap
 
 @pytest.mark.parametrize("command", ["simulate", "demo", "effects", "bench robust", "bench live"])
 def test_other_helps_name_the_tissues_and_say_where_more_stands(command: str, capsys: pytest.CaptureFixture) -> None:
-    said = told_of_tissue(capsys, *command.split())
+    said = help_on_tissue(capsys, *command.split())
     words = " ".join(said.replace("-\n", "-").split())
     assert len(said.splitlines()) <= 10 and "`sulcus solve --help`" in words
     assert all(name in "".join(said.split()) for name in (*MATERIALS, *LAWS))

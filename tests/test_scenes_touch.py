@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from theatres import player, theatre_of
 
-from scenes.play.load_text import told
+from scenes.play.load_text import acting
 from scenes.play.player import Player
 from scenes.play.reference import truth_of
 from scenes.report.picture import rested
@@ -48,7 +48,7 @@ def palpated(theatre):
     return list(player(theatre, small("palpate"), "fem").frames(10))
 
 
-def untaught(anatomy: Anatomy, scene: Scene) -> Learned:
+def untrained(anatomy: Anatomy, scene: Scene) -> Learned:
     """What linear tissue says to the poses of a scene's ball, as a model that takes any of them."""
     (ball,) = (tool for effect in scene.effects if isinstance(effect, ToolContact) for tool in effect.tools)
     assert isinstance(ball, Ball)
@@ -88,17 +88,17 @@ class TestPalpate:
     def test_the_page_says_what_it_reads(self, palpated):
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
-        assert told(frame.loads, frame.deformation) == f"the tool reads {reads:.2f} N"
+        assert acting(frame.loads, frame.deformation) == f"the tool reads {reads:.2f} N"
 
     def test_what_a_learnt_model_does_not_know_is_not_said(self, palpated):
-        """Taught where a ball is, it answers without the force that it takes."""
+        """Trained on where a ball is, it answers without the force that it takes."""
         frame = palpated[6]
-        assert told(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6)))) == ""
+        assert acting(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6)))) == ""
 
-    def test_linear_contact_plays_it_untaught(self, theatre, palpated):
+    def test_linear_contact_plays_it_untrained(self, theatre, palpated):
         """Nearly as finite elements of softer tissue that stiffens do, on tumour and cortex."""
         scene, anatomy = small("palpate"), theatre.anatomy
-        model = untaught(anatomy, scene)
+        model = untrained(anatomy, scene)
         assert refusal(model, scene.effects) is None
         drawn = Player(player(theatre, scene, "fem").stage, model)
         pressed = [frame for frame in palpated if frame.touch.depth > 1e-3]

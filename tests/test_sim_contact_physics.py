@@ -249,7 +249,7 @@ def test_answers_come_from_their_loads_and_start_alone() -> None:
 
 
 def test_a_stored_answer_goes_on_as_the_answer_itself(tmp_path: Path) -> None:
-    """Displacement, time and memory are all that the next frame is told."""
+    """Displacement, time and memory are all that the next frame is given."""
     fem, way = body((BALL,)), [at(x, 0.03, HEIGHT - 2e-3) for x in (0.02, 0.024, 0.028, 0.032)]
     straight = frames(fem, way)
     np.savez(tmp_path / "frame.npz", displacement=straight[1].displacement, **straight[1].memory)  # pyright: ignore[reportArgumentType]

@@ -51,7 +51,7 @@ def fem(accuracy: Accuracy, element: str = "p1") -> Callable[[], Deformer]:
 
 
 def learned(learner: str) -> Callable[[], Deformer]:
-    """Taught on pushes and pulls all over the top, by the reference."""
+    """Trained on pushes and pulls all over the top, by the reference."""
 
     def build() -> Deformer:
         random = np.random.default_rng(0)
@@ -180,7 +180,7 @@ class TestEveryDeformer:
         given = loads(time=2.5)
         np.testing.assert_array_equal(deformer.deform(given).time, given.times)
 
-    def test_costs_are_told(self, deformer: Deformer) -> None:
+    def test_costs_are_reported(self, deformer: Deformer) -> None:
         cost = deformer.deform(loads()).cost
         assert cost.total > 0.0
         assert min(cost.seconds.values()) >= 0.0

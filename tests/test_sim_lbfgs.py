@@ -192,10 +192,10 @@ def test_what_was_learnt_shortens_the_next_descent(device: Device) -> None:
     solver, tolerance = rest_solver(problem), np.full(3, 1e-6)
     first = Lbfgs(problem, solver).descend(rest, tolerance, 300, {})
     plain = Lbfgs(problem_of(device, total=1.1 * few), solver).descend(first.u, tolerance, 300)
-    taught = Lbfgs(problem_of(device, total=1.1 * few), solver).descend(first.u, tolerance, 300, first.learnt)
-    assert (taught.status == DONE).all()
-    assert taught.steps.sum() < plain.steps.sum()
-    np.testing.assert_allclose(taught.u.numpy(), plain.u.numpy(), atol=1e-4 * np.abs(plain.u.numpy()).max())
+    carried = Lbfgs(problem_of(device, total=1.1 * few), solver).descend(first.u, tolerance, 300, first.learnt)
+    assert (carried.status == DONE).all()
+    assert carried.steps.sum() < plain.steps.sum()
+    np.testing.assert_allclose(carried.u.numpy(), plain.u.numpy(), atol=1e-4 * np.abs(plain.u.numpy()).max())
     assert not descended(problem_of(device)).learnt  # too many columns to have a next frame
 
 

@@ -47,7 +47,7 @@ def test_what_is_said_to_fit_does_and_one_more_does_not(batch: int, count: int, 
             check_fits(ROWS, fitting + 1, count, device, budget=budget)
 
 
-def test_a_mesh_of_which_not_one_load_fits_is_told(tmp_path: Path) -> None:
+def test_a_mesh_of_which_not_one_load_fits_is_reported(tmp_path: Path) -> None:
     budget = group(tmp_path, "1000000", 0, 0)
     with pytest.raises(InputError, match="coarser mesh"):
         check_fits(ROWS, 1, 1, find_device("cpu", "float64"), budget=budget)

@@ -287,14 +287,14 @@ def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, b
     np.testing.assert_allclose(found.u, batch.u[:, rows], atol=1e-6 * np.abs(batch.u).max())
 
 
-def test_a_search_that_fails_twice_is_told(problem: Problem) -> None:
+def test_a_search_that_fails_twice_is_reported(problem: Problem) -> None:
     problem.begin(cases_of())
     found = equilibrium_of(problem, Contrary(problem, True), np.zeros((ROWS, len(TOTAL))), TIGHT)
     assert all(outcome is Outcome.STALLED for outcome in found.outcome)
     assert not found.u.any()
 
 
-def test_a_spent_budget_is_told(problem: Problem) -> None:
+def test_a_spent_budget_is_reported(problem: Problem) -> None:
     found = solve(problem, cases_of(), Accuracy(tolerance=1e-10, outer=1))
     assert found.outcome[-1] is Outcome.BUDGET
     assert found.iterations[-1] == 1
@@ -326,7 +326,7 @@ def test_a_lost_body_comes_back_by_itself(name: str, law: str, precision: Precis
     assert np.abs(found.u).max() <= 1e-6 * 0.1
 
 
-def test_round_off_is_told_and_ends_the_iteration() -> None:
+def test_round_off_is_reported_and_ends_the_iteration() -> None:
     """A core ten thousand times stiffer in single precision: the residual stays above the tolerance; double goes on."""
     core = np.linalg.norm(MESH.nodes[MESH.tets].mean(axis=1) - [0.033, 0.033, 0.07], axis=1) < 0.03
     mesh = TetMesh(MESH.nodes, MESH.tets, core.astype(int))

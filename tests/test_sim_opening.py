@@ -81,7 +81,7 @@ def dragged(body: Anatomy, element: str) -> np.ndarray:
 
 @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
 def test_open_cortex_slides_under_bone_and_not_into_it(element: str) -> None:
-    """Round an edge as round as the mesh; where the opening is not told, it would be in the bone by millimetres."""
+    """Round an edge as round as the mesh; where the opening is not given, it would be in the bone by millimetres."""
     edge = edge_of(MESH.nodes, rim_of(half_open()))
 
     def depth(u: np.ndarray) -> np.ndarray:

@@ -89,7 +89,7 @@ class TestLaw:
             ({"needs_positive_volume": False}, "off by (nan|inf)"),
         ],
     )
-    def test_a_broken_law_is_told_what_is_broken(self, broken, words):
+    def test_a_broken_law_is_refused_with_what_is_broken(self, broken, words):
         own_stress, own_change = YEOH.stress, YEOH.stress_change
 
         @wp.func

@@ -73,13 +73,13 @@ def test_places_are_called_as_clinicians_call_them(place, words):
     assert side_of(np.array(place), LOW, HIGH) == words
 
 
-def test_too_few_nodes_are_told_how_many_would_do():
+def test_too_few_nodes_are_refused_with_how_many_would_do():
     asked = []
 
     def would_do(count):
         asked.append(count)
         return count >= 4000
 
-    told = str(too_intricate(3000, Meshing().more, would_do))
-    assert "too intricate for 3000 nodes: ask for 4800, or smooth" in told and asked == [3800, 4800]
+    message = str(too_intricate(3000, Meshing().more, would_do))
+    assert "too intricate for 3000 nodes: ask for 4800, or smooth" in message and asked == [3800, 4800]
     assert "for 1000 nodes: smooth the labels" in str(too_intricate(1000, Meshing().more, would_do))

@@ -174,7 +174,7 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
-def test_it_is_told_in_sentences(more, said, unsaid):
+def test_it_is_reported_in_sentences(more, said, unsaid):
     lines = planned(**more).explain()
     text = " ".join(lines)
     assert all(line[0].isupper() and line.endswith(".") and len(line.split()) < 32 for line in lines), lines

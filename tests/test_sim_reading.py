@@ -239,7 +239,7 @@ class TestMeshes:
             read_anatomy(path)  # pyright: ignore[reportArgumentType]
 
     @pytest.mark.parametrize("text", ["no xml", "", "<VTKFile type='ImageData'/>", "<VTKFile", "<a/>"])
-    def test_nothing_of_a_library_is_told_or_printed(
+    def test_nothing_of_a_library_is_reported_or_printed(
         self, tmp_path: Path, capfd: pytest.CaptureFixture, text: str
     ) -> None:
         path = tmp_path / "a.vtu"
@@ -359,11 +359,11 @@ class TestWriting:
         assert sorted(tmp_path.iterdir()) == sorted([path, living, other])
 
     @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no such file system")
-    def test_a_folder_that_takes_no_files_is_told_before_the_work(self) -> None:
+    def test_a_folder_that_takes_no_files_is_reported_before_the_work(self) -> None:
         with pytest.raises(InputError, match=r"cannot be written there \(No such file or directory\)"):
             check_output("/proc/a.txt", ".txt")
 
-    def test_a_stream_that_cannot_be_written_is_told_at_the_end(self, tmp_path: Path) -> None:
+    def test_a_stream_that_cannot_be_written_is_reported_at_the_end(self, tmp_path: Path) -> None:
         resource = pytest.importorskip("resource")
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))

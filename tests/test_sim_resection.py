@@ -1,4 +1,4 @@
-"""Tissue that is taken away: what is left answers as if it had always been so, and what came loose goes and is told."""
+"""Tissue that is taken away: what is left answers as if it had always been so; what came loose goes and is reported."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ class TestAcrossCuts:
 class TestWhatComesLoose:
     SLICE = within((0, 0, 1), (3, 3, 2))
 
-    def test_it_goes_too_and_is_told(self) -> None:
+    def test_it_goes_too_and_is_reported(self) -> None:
         """A slice through the box leaves its upper third in the air."""
         _, left = remains(BODY, Resection((self.SLICE,)))
         above = within((0, 0, 2), (3, 3, 4))

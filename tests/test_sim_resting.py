@@ -117,6 +117,6 @@ def test_triangles_without_area_are_edges_or_points():
     assert resting_tip(np.zeros((3, 3)), ONE, np.array([0.0, 3e-3, 0.1]), DOWN, RADIUS)[2] == pytest.approx(-down)
 
 
-def test_a_ball_that_passes_by_is_told():
+def test_a_ball_that_passes_by_is_reported():
     with pytest.raises(InputError, match="passes the surface by"):
         resting_tip(CORNERS, ONE, np.array([0.02, -0.008, 0.1]), DOWN, RADIUS)

@@ -43,8 +43,8 @@ def test_what_is_left_falls_with_the_fourth_power(box, law, element):
     assert terms.shape == (3, 2, len(nodes), 3)
     left = []
     for share in (0.2, 0.1):
-        told = sum(share**order * term for order, term in enumerate(terms, start=1))
-        left.append(np.linalg.norm(told - fem.deform(pushes(share), at=nodes).displacement, axis=(1, 2)))
+        predicted = sum(share**order * term for order, term in enumerate(terms, start=1))
+        left.append(np.linalg.norm(predicted - fem.deform(pushes(share), at=nodes).displacement, axis=(1, 2)))
     assert (np.log2(left[0] / left[1]) > 3.7).all() and (np.log2(left[0] / left[1]) < 4.6).all()
 
 
@@ -84,10 +84,10 @@ def test_several_loads_at_once_have_forms_in_their_sizes(box):
     sizes, left = np.array([[-0.9, 0.3, -0.5], [-0.5, -0.8, 0.2]]), []
     for share in (0.4, 0.2):
         factor = np.concatenate([products(share * sizes, order) for order in (1, 2, 3)])
-        told = np.einsum("tb,tnk->bnk", factor, terms[:, 0])
+        predicted = np.einsum("tb,tnk->bnk", factor, terms[:, 0])
         shares = share * sizes
         nodal = np.einsum("bs,snk->bnk", shares, _nodal(box, point, force, radius))
-        left.append(np.linalg.norm(told - fem.deform(Loads((Nodal(nodal),)), at=nodes).displacement, axis=(1, 2)))
+        left.append(np.linalg.norm(predicted - fem.deform(Loads((Nodal(nodal),)), at=nodes).displacement, axis=(1, 2)))
     assert (np.log2(left[0] / left[1]) > 3.7).all() and (np.log2(left[0] / left[1]) < 4.6).all()
 
 
@@ -104,8 +104,8 @@ def test_in_its_own_direction_a_form_is_the_series_of_one_load(box):
     terms = series(fem, Loads((three,)), 3, nodes, 3)[:, 0]
     single = series(fem, Loads((Pushed(POINT[:1], direction, RADIUS[:1]),)), 3, nodes)[:, 0]
     for order, (rows, wanted) in enumerate(zip(np.split(terms, [3, 9]), single, strict=True), start=1):
-        told = np.einsum("tb,tnk->nk", products(direction, order), rows)
-        assert np.linalg.norm(told - wanted) < 2e-3 * np.linalg.norm(wanted)
+        predicted = np.einsum("tb,tnk->nk", products(direction, order), rows)
+        assert np.linalg.norm(predicted - wanted) < 2e-3 * np.linalg.norm(wanted)
 
 
 @pytest.mark.parametrize("sizes", [1, 2, 3])

@@ -86,10 +86,10 @@ def test_the_file_written_is_the_mesh_in_metres(solve, tmp_path: Path) -> None:
 
 def test_the_solvers_are_explained_where_that_is_asked(solve) -> None:
     data = {"fixed": BASE.astype(float), "force": FORCE}
-    silent, told = solve(data), solve(data, "--explain")
+    silent, explained = solve(data), solve(data, "--explain")
     assert "plan" not in silent.report and "Newton-CG" not in silent.errors
-    assert told.report["plan"] and all(line in told.errors for line in told.report["plan"])
-    np.testing.assert_array_equal(told.displacement, silent.displacement)
+    assert explained.report["plan"] and all(line in explained.errors for line in explained.report["plan"])
+    np.testing.assert_array_equal(explained.displacement, silent.displacement)
 
 
 def test_millimetres_give_the_same_answer(solve) -> None:

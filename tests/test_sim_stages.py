@@ -27,7 +27,7 @@ def test_every_listener_hears_its_own_block() -> None:
     assert list(outer) == ["before", "inside"] and list(inner) == ["inside"]
 
 
-def test_a_stage_that_fails_is_told() -> None:
+def test_a_stage_that_fails_is_reported() -> None:
     with pytest.raises(KeyError), listened() as seconds, stage("lost"):
         raise KeyError
     assert list(seconds) == ["lost"]

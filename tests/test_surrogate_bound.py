@@ -23,15 +23,15 @@ def bound():
 
 def test_fresh_loads_are_covered_in_every_class(bound):
     features, force, error = drawn(20000, 2)
-    told = bound.of(features, force, np.zeros(len(force)))
-    covered = error.max(axis=1) <= told
+    stated = bound.of(features, force, np.zeros(len(force)))
+    covered = error.max(axis=1) <= stated
     for level, row in zip(LEVELS, covered, strict=True):
         assert abs(row.mean() - level) < 0.01
     decile = np.searchsorted(np.quantile(force, np.arange(1, 10) / 10), force)
     assert all(abs(covered[0][decile == k].mean() - 0.95) < 0.045 for k in range(10))
     # Bounds that know nothing of the load would be an error's 95th percentile: five times its median and more.
-    assert np.median(told[0] / error.max(axis=1)) < 4.0
-    assert (told[1] >= told[0]).all()
+    assert np.median(stated[0] / error.max(axis=1)) < 4.0
+    assert (stated[1] >= stated[0]).all()
 
 
 def test_outside_it_grows(bound):
@@ -55,12 +55,12 @@ def test_loads_of_one_force_are_one_class():
     features, _, error = drawn(500, 4)
     bound = fitted_bound((features, error.max(axis=1)), features, np.full(500, 0.2), error)
     assert not len(bound.edges) and bound.quantile.shape == (2, 1)
-    told = bound.of(features, np.full(500, 0.2), np.zeros(500))
-    assert np.mean(error.max(axis=1) <= told[0]) >= 0.95
+    stated = bound.of(features, np.full(500, 0.2), np.zeros(500))
+    assert np.mean(error.max(axis=1) <= stated[0]) >= 0.95
 
 
 def placed(count, seed, discs=None):
-    """As `drawn`, features of a load and a place, the error told by the load alone; places in few discs, if told."""
+    """As `drawn`, features of a load and a place, the error known by the load alone; places in few discs, if asked."""
     random = np.random.default_rng(seed)
     load, place = random.normal(size=(count, 4)), random.uniform(-20.0, 20.0, (count, 3))
     if discs is not None:
@@ -75,11 +75,11 @@ def test_a_scale_seen_in_few_discs_does_not_run_away_between_them(curved):
     features, _, error = placed(400, 5, discs)
     bound = fitted_bound((features, error[:, 0]), *placed(1000, 6), curved=curved)
     features, force, error = placed(5000, 7)
-    told = bound.of(features, force, np.zeros(len(force)))
-    assert abs(np.mean(error[:, 0] <= told[0]) - 0.95) < 0.02
+    stated = bound.of(features, force, np.zeros(len(force)))
+    assert abs(np.mean(error[:, 0] <= stated[0]) - 0.95) < 0.02
     # The 95th percentile of an exponential distribution is three times its mean.
     ideal = 3e-4 * np.exp(1.2 * features[:, 0] - 0.8 * features[:, 1])
-    assert np.quantile(told[0] / ideal, 0.99) < 4.0
+    assert np.quantile(stated[0] / ideal, 0.99) < 4.0
 
 
 @pytest.mark.parametrize("curved", [True, False])

@@ -65,7 +65,7 @@ def test_the_estimate_is_the_error(fem, truth, loads, predicted, box):
     assert found.cost.total > 0.0 and set(found.cost.seconds) >= {"relax", "solve", "search"}
 
 
-def test_what_is_corrected_is_nearer_to_equilibrium_and_what_is_left_is_told(fem, truth, loads, predicted, box):
+def test_what_is_corrected_is_nearer_to_equilibrium_and_what_is_left_is_reported(fem, truth, loads, predicted, box):
     found = certify(fem, loads, predicted)
     tumour = box.tumour_nodes
     off = largest(found.corrected.displacement - truth.displacement, tumour)

@@ -64,10 +64,10 @@ def test_training_prints_every_figure_and_writes_every_model(folder, box, capsys
     assert rows["linear"]["mean_percent"] < 16.0 and rows["series"]["mean_percent"] < rows["linear"]["mean_percent"]
     assert report["winner"] == min(rows.values(), key=lambda row: row["mean_mm"])["name"]
     assert report["discs"] >= 6 and report["share_of_patch"] >= 0.15
-    assert report["taught"] + report["held_out"] + report["calibrated"] == 150
+    assert report["training_loads"] + report["held_out"] + report["calibrated"] == 150
     assert report["nominal_refused"] == pytest.approx(0.10, abs=0.005)
-    solves = {name: row["told"] for name, row in rows.items()}
-    assert {told["loads"] for told in solves.values()} == {report["taught"]}
+    solves = {name: row["solves"] for name, row in rows.items()}
+    assert {count["loads"] for count in solves.values()} == {report["training_loads"]}
     assert solves["series"]["series"] > 0 == solves["svr"]["series"] and solves["series"]["seconds"] > 0.0
     assert main(["train", str(folder / "data.h5"), "--out", str(folder / "table.npz"), "--learners", "linear"]) == 0
     printed = capsys.readouterr().out
@@ -164,8 +164,8 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, box, capsy
     assert main(["train", little, "--out", few, "--learners", "linear", "--json"]) == 0
     capsys.readouterr()
     assert main(["judge", few, fresh]) == 0
-    told = capsys.readouterr().out
-    assert "linear: states no bounds\n" in told and "bounds held for" not in told
+    printed = capsys.readouterr().out
+    assert "linear: states no bounds\n" in printed and "bounds held for" not in printed
     other = str(folder / "other.h5")
     assert main(["simulate", str(folder / "box.vtu"), "--out", other, "--seed", "9", "--young", "6000", *words]) == 0
     assert main(["judge", model, other]) == 2

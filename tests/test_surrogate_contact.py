@@ -67,7 +67,7 @@ def test_the_nearest_place_on_a_triangle_is_nearest() -> None:
 def test_the_ball_enters_no_facet_and_pulls_nothing(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> None:
     """Signorini's conditions: a dense lattice of every facet is outside, and every force goes away from the middle.
 
-    Forces through the middle have no moment about it; those of bent facets alone are at their nodes, which are told
+    Forces through the middle have no moment about it; those of bent facets alone are at their nodes, which are given
     apart by it.
     """
     contact, loads = pressed[0], draw_poses("palpation", box, 30, 2)
@@ -174,15 +174,15 @@ class Stiffening:
 
 
 @pytest.fixture(scope="module")
-def teacher(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> Stiffening:
+def elements(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> Stiffening:
     return Stiffening(box, *pressed)
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory, teacher: Stiffening) -> Dataset:
+def data(tmp_path_factory: pytest.TempPathFactory, elements: Stiffening) -> Dataset:
     path = tmp_path_factory.mktemp("touched") / "data.h5"
-    said = {"ball": repr(BALL.radius), "tissue": tissue_to_json(SOFT), "effects": "as told", "element": "p1"}
-    simulate(path, teacher, draw_poses("palpation", teacher.anatomy, 160, 0), said)
+    said = {"ball": repr(BALL.radius), "tissue": tissue_to_json(SOFT), "effects": "as given", "element": "p1"}
+    simulate(path, elements, draw_poses("palpation", elements.anatomy, 160, 0), said)
     return read_dataset(path)
 
 
@@ -192,7 +192,7 @@ def trained(data: Dataset) -> Trained:
 
 
 def test_contact_learns_how_forces_grow_and_a_process_the_rest(
-    trained: Trained, teacher: Stiffening, box: Anatomy
+    trained: Trained, elements: Stiffening, box: Anatomy
 ) -> None:
     """On discs left out and on fresh poses; and bounds hold about as often as they say."""
     contact, both = (trained.models[name] for name in TOUCHED)
@@ -203,13 +203,13 @@ def test_contact_learns_how_forces_grow_and_a_process_the_rest(
     assert scores["contact"] < 9.0
     assert scores["contact-gp"] < 0.7 * scores["contact"]
     fresh, nodes = draw_poses("palpation", box, 60, 77), box.tumour_nodes
-    truth = teacher.deform(fresh, at=nodes).displacement
+    truth = elements.deform(fresh, at=nodes).displacement
     error, found = errors(both, fresh, truth, nodes), both.deform(fresh, at=nodes)
     assert error.mean() < 0.02 * np.linalg.norm(truth, axis=2).mean()
     assert (error.max(axis=1) <= found.bound[0]).mean() > 0.8
     assert (errors(contact, fresh, truth, nodes).max(axis=1) <= contact.deform(fresh, at=nodes).bound[0]).mean() > 0.8
     cortex = open_patch(box).nodes
-    exact = teacher.deform(fresh, at=cortex).displacement
+    exact = elements.deform(fresh, at=cortex).displacement
     assert np.linalg.norm(both.deform(fresh, at=cortex).displacement - exact) < 0.05 * np.linalg.norm(exact)
 
 

@@ -268,7 +268,7 @@ class TestTraining:
 
 
 class TestRoom:
-    def test_a_full_disk_is_told_before_the_work(self, tmp_path, pretender, loads, monkeypatch):
+    def test_a_full_disk_is_reported_before_the_work(self, tmp_path, pretender, loads, monkeypatch):
         class Stingy:
             free = 1_000_000
 
@@ -332,11 +332,11 @@ def test_a_data_set_explains_itself(tmp_path):
         tissue, element = tissue_from_json(file.attrs["tissue"]), file.attrs["element"]
         tool = file["loads/Pushed"]
         load = push(tool["point"][1], tool["force"][1], tool["footprint"][1])
-        told = file["answers/displacement"][1]
+        stored = file["answers/displacement"][1]
         vertex, response = int(file["unit/node"][4]), file["unit/displacement"][4]
     fem = Fem(anatomy, pushed_effects(anatomy, tissue), device="cpu", element=element)
     again = fem.deform(load).displacement[0]
-    assert np.abs(told).max() > 1e-4 and np.abs(again - told).max() < 1e-3 * np.abs(told).max()
+    assert np.abs(stored).max() > 1e-4 and np.abs(again - stored).max() < 1e-3 * np.abs(stored).max()
     assert response[vertex].argmax() == 1 and response[vertex, 1] > 0.0  # row 4: the second node, along y
 
 

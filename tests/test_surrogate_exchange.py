@@ -62,10 +62,10 @@ def models(block, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def loads(block, models):
-    """Five as they were taught, at corners and edges of triangles, of no force and outside the training range."""
-    taught, patch = models["linear"].envelope, open_patch(block)
+    """Five as they were in training, at corners and edges of triangles, of no force and outside the training range."""
+    training, patch = models["linear"].envelope, open_patch(block)
     corner = patch.points[np.argsort(np.linalg.norm(patch.points, axis=1))[:2]]
-    at, down = taught.points[0], np.array([0.0, 0.0, -0.2])
+    at, down = training.points[0], np.array([0.0, 0.0, -0.2])
     return stacked(
         [
             draw("palpation", block, 5, 99),
@@ -100,7 +100,7 @@ def assert_alike(answer, wanted):
     size = np.abs(wanted.displacement).max(axis=(1, 2))
     assert (np.abs(answer["displacement"] - wanted.displacement).max(axis=(1, 2)) <= MOTION * size).all()
     assert np.allclose(answer["bound"].T, wanted.bound, rtol=BOUND, atol=0.0, equal_nan=True)
-    assert [bool(far) for far in answer["extrapolated"]] == [told is Outcome.EXTRAPOLATED for told in wanted.outcome]
+    assert [bool(far) for far in answer["extrapolated"]] == [found is Outcome.EXTRAPOLATED for found in wanted.outcome]
     assert np.array_equal(answer["extrapolated"], answer["excess"] > 0.0)
 
 

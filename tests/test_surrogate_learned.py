@@ -1,4 +1,4 @@
-"""Learned deformers: what they were taught, what they refuse, how they are scored and stored."""
+"""Learned deformers: what they were trained on, what they refuse, how they are scored and stored."""
 
 import json
 import threading
@@ -50,7 +50,7 @@ def model(request, trained):
 
 @pytest.fixture(scope="module")
 def fresh(box):
-    """Loads that no model saw, drawn like the taught ones."""
+    """Loads that no model saw, drawn like those in training."""
     return draw("palpation", box, 60, 99)
 
 
@@ -84,7 +84,7 @@ def test_learners_are_as_near_as_they_were(trained):
 
 @pytest.fixture(scope="module")
 def scored(trained, data):
-    """The models that were scored: taught outside the discs alone."""
+    """The models that were scored: trained outside the discs alone."""
     return train(data, split=trained.split)
 
 
@@ -93,7 +93,7 @@ def test_no_load_of_a_left_out_disc_is_learnt(trained, scored, data):
     for model in scored.models.values():
         distance = np.linalg.norm(model.envelope.points[:, None] - split.centres, axis=2)
         assert distance.min() > split.radius * (1 - 1e-5)
-        assert len(model.envelope.points) == split.taught.sum()
+        assert len(model.envelope.points) == split.train.sum()
     assert len(split.test) == data.good.sum() < len(data.loads)  # failed cases are neither learnt nor scored
 
 
@@ -105,11 +105,11 @@ def arrays_of(model):
 
 def test_no_answer_to_a_held_out_load_reaches_a_scored_model(trained, scored, data, tmp_path):
     """Bit for bit: wild answers to the loads of the discs and to those apart change scores alone."""
-    wild, _ = poisoned(data.path, tmp_path / "wild.h5", np.flatnonzero(data.good)[~trained.split.taught])
+    wild, _ = poisoned(data.path, tmp_path / "wild.h5", np.flatnonzero(data.good)[~trained.split.train])
     again = train(read_dataset(wild), ["linear", "pcr", "svr"], split=trained.split)
     for row in again.scores:
-        known, taught = scored.models[row.name], again.models[row.name]
-        for before, after in zip(arrays_of(known), arrays_of(taught), strict=True):
+        known, training = scored.models[row.name], again.models[row.name]
+        for before, after in zip(arrays_of(known), arrays_of(training), strict=True):
             assert np.array_equal(before, after), row.name
         assert row.mean_mm > 5.0
 
@@ -128,7 +128,7 @@ def test_no_answer_that_calibrates_reaches_a_model(trained, data, tmp_path):
     assert [row.mean_mm for row in again.scores] == [before[name] for name in again.models]
 
 
-def test_what_is_used_was_taught_the_discs_too(trained, scored, data):
+def test_what_is_used_was_trained_on_the_discs_too(trained, scored, data):
     held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
     truth = data.displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test]
     for name in ("ann", "svr", "gp", "residual"):
@@ -141,7 +141,7 @@ def test_what_is_used_was_taught_the_discs_too(trained, scored, data):
     assert [row.mean_mm for row in trained.scores] == [row.mean_mm for row in scored.scores]
 
 
-def test_bounds_are_calibrated_on_loads_that_nothing_was_taught(trained, data, fresh, pretender):
+def test_bounds_are_calibrated_on_loads_that_nothing_was_trained_on(trained, data, fresh, pretender):
     apart = np.flatnonzero(data.good)[-trained.calibrated :]
     assert (trained.split.disc[-trained.calibrated :] == -2).all()
     for name, model in trained.models.items():
@@ -158,7 +158,7 @@ def test_bounds_are_calibrated_on_loads_that_nothing_was_taught(trained, data, f
         assert np.allclose(field.max(axis=1), answer.bound[0] * model.bounds.profile.max())
 
 
-def test_how_bounds_hold_in_the_discs_left_out_is_told_of_a_model_that_knows_neither(trained, scored, data):
+def test_how_bounds_hold_in_the_discs_left_out_is_reported_of_a_model_that_knows_neither(trained, scored, data):
     """Recomputed: the scored model, bounds from the loads that are apart and outside every disc."""
     good = data.loads.rows(np.flatnonzero(data.good))
     truth = data.displacement(data.anatomy.tumour_nodes)[data.good]
@@ -170,7 +170,7 @@ def test_how_bounds_hold_in_the_discs_left_out_is_told_of_a_model_that_knows_nei
     for name in ("linear", "svr"):
         model = scored.models[name]
 
-        def told(rows, model=model):
+        def rows_of(rows, model=model):
             loads = good.rows(rows)
             known = measured(open_patch(data.anatomy), loads.of(Pushed))
             within = known._replace(magnitude=np.clip(known.magnitude, *model.envelope.force))
@@ -178,15 +178,15 @@ def test_how_bounds_hold_in_the_discs_left_out_is_told_of_a_model_that_knows_nei
             error = np.linalg.norm(answer - truth[rows], axis=2)
             return features_of(loads.of(Pushed), within), known.magnitude, error
 
-        features, _, error = told(beside[::3])
-        bounds = fitted_bound((features, error.max(axis=1)), *told(np.delete(beside, np.s_[::3])))
-        held = told(discs)[2].max(axis=1) <= replace(model, bounds=bounds).deform(good.rows(discs)).bound
+        features, _, error = rows_of(beside[::3])
+        bounds = fitted_bound((features, error.max(axis=1)), *rows_of(np.delete(beside, np.s_[::3])))
+        held = rows_of(discs)[2].max(axis=1) <= replace(model, bounds=bounds).deform(good.rows(discs)).bound
         found = trained.left_out[name]
         assert found.loads == len(discs) and found.held == pytest.approx(held.mean(axis=1))
     assert scored.left_out == {}
 
 
-def test_outside_the_taught_range_bounds_grow(trained):
+def test_outside_the_training_range_bounds_grow(trained):
     model = trained.models["residual"]
     point = model.envelope.points[0]
     here, strong = (model.deform(push(point, [0.0, 0.0, -size], 6e-3)).bound[0, 0] for size in (0.2, 0.8))
@@ -198,7 +198,7 @@ def test_outside_the_taught_range_bounds_grow(trained):
         uncalibrated.margin(uncalibrated.deform(push(point, [0.0, 0.0, -0.1], 6e-3)))
 
 
-def test_at_most_so_many_loads_are_taught(data):
+def test_at_most_so_many_loads_are_trained_on(data):
     some = train(data, ["linear", "svr"], most=40)
     assert len(some.models["svr"].envelope.points) == 40
     assert some.models["svr"].parts[0].regressor.support_.shape[0] <= 40
@@ -251,7 +251,7 @@ def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh
     assert np.allclose(model.motion(model.asked(within), box.tumour_nodes), wanted, atol=1e-5 * np.abs(wanted).max())
 
 
-def test_outside_the_taught_range_is_said(trained, box):
+def test_outside_the_training_range_is_said(trained, box):
     model = trained.models["residual"]
     inside = push(model.envelope.points[0], [0.0, 0.0, -0.2], 6e-3)
     steep = 0.2 * np.array([np.sin(1.3), 0.0, -np.cos(1.3)])
@@ -260,7 +260,7 @@ def test_outside_the_taught_range_is_said(trained, box):
         push(model.envelope.points[0], [0.0, 0.0, -0.8], 6e-3),
         push(model.envelope.points[0], [0.0, 0.0, -0.2], 12e-3),
         push(model.envelope.points[0], [0.0, 0.0, -0.2], 2e-3),
-        # Force and radius were taught, but never so much force on so small a disc.
+        # Force and radius were in training, but never so much force on so small a disc.
         push(model.envelope.points[0], [0.0, 0.0, -model.envelope.force[1]], model.envelope.footprint[0]),
         push(model.envelope.points[0], steep, 6e-3),
         push(model.envelope.points[0], [0.0, 0.0, 0.2], 6e-3),
@@ -312,25 +312,25 @@ def test_threads_that_share_a_model_get_their_own_answers(trained, fresh, name):
     assert all(np.array_equal(answer, wanted[k]) for k, answer in enumerate(sum(zip(*answers, strict=True), ())))
 
 
-def test_an_envelope_reaches_as_far_as_taught_loads_lie_apart(box):
+def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
     patch = open_patch(box)
     points = [[0.0, 0.0, 0.0], [3e-3, 0.0, 0.0], [3e-3, 4e-3, 0.0]]
-    taught = push(points, [[0.0, 0.0, -0.1], [0.0, 0.0, -0.2], [0.0, 0.0, -0.15]], [5e-3, 6e-3, 5e-3]).of(Pushed)
+    training = push(points, [[0.0, 0.0, -0.1], [0.0, 0.0, -0.2], [0.0, 0.0, -0.15]], [5e-3, 6e-3, 5e-3]).of(Pushed)
     held = push([[13e-3, 0.0, 0.0], [0.0, 4e-3, 0.0]], [[0.3, 0.0, -0.9], [0.0, 0.0, -0.9]], [9e-3, 9e-3]).of(Pushed)
-    found = envelope_of(patch, taught)
-    assert found.reach == pytest.approx(4e-3) and np.allclose(found.points, taught.point)
-    alone = Pushed(taught.point[:1], taught.force[:1], taught.footprint[:1])
+    found = envelope_of(patch, training)
+    assert found.reach == pytest.approx(4e-3) and np.allclose(found.points, training.point)
+    alone = Pushed(training.point[:1], training.force[:1], training.footprint[:1])
     assert envelope_of(patch, alone).reach == 0.0
-    overhang = taught.footprint - patch.rim_distance(taught.point)
+    overhang = training.footprint - patch.rim_distance(training.point)
     assert found.overhang == pytest.approx(overhang.max()) and found.angle == pytest.approx(0.0, abs=1e-7)
     assert (found.force, found.footprint) == ((0.1, 0.2), (5e-3, 6e-3))
     assert found.line_force == pytest.approx(0.2 / 6e-3)
-    assert not found.holds(patch, held).any() and found.holds(patch, taught).all()
+    assert not found.holds(patch, held).any() and found.holds(patch, training).all()
 
 
 def test_fresh_loads_lie_inside_the_envelope_and_those_of_left_out_discs_outside(trained, scored, data, fresh):
     inside = [outcome is Outcome.PREDICTED for outcome in trained.models["linear"].deform(fresh).outcome]
-    assert np.mean(inside) > 0.9  # a few exceed the taught extremes, or lie in a gap
+    assert np.mean(inside) > 0.9  # a few exceed the extremes in training, or lie in a gap
     held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
     strange = [outcome is Outcome.EXTRAPOLATED for outcome in scored.models["linear"].deform(held_out).outcome]
     assert np.mean(strange) > 0.3
@@ -390,9 +390,9 @@ def test_bad_training_is_a_sentence(data, pretender, tmp_path):
         few = draw("palpation", pretender.anatomy, 5, 0)
         simulate(tmp_path / "few.h5", pretender, few, {})
         train(read_dataset(tmp_path / "few.h5"), ["linear"])
-    untaught = replace(data, unit_good=~data.unit_good)
+    unsolved = replace(data, unit_good=~data.unit_good)
     with pytest.raises(InputError, match="unit responses did not converge"):
-        train(untaught)
+        train(unsolved)
 
 
 def test_data_without_one_good_case_are_refused(data):

@@ -33,7 +33,7 @@ def scored(data, trained):
 
 def test_nothing_of_held_out_loads_reaches_an_envelope(trained, scored, data):
     """Bit for bit, wherever they lie and however strong they are."""
-    rows = np.flatnonzero(~trained.split.taught)
+    rows = np.flatnonzero(~trained.split.train)
     pushed = data.loads.of(Pushed)
     moved = Pushed(pushed.point.copy(), pushed.force.copy(), pushed.footprint.copy())
     moved.point[rows], moved.force[rows] = np.roll(pushed.point[rows], 1, axis=0), 2.0 * pushed.force[rows]
@@ -43,7 +43,7 @@ def test_nothing_of_held_out_loads_reaches_an_envelope(trained, scored, data):
 
 
 def test_no_unit_response_inside_a_disc_reaches_a_scored_tumour(trained, scored, data, box, tmp_path):
-    """Bit for bit; of the cortex, which is not scored, all are told."""
+    """Bit for bit; of the cortex, which is not scored, all are given."""
     patch = open_patch(box)
     inside = np.flatnonzero(trained.split.covers(patch.points))
     assert 0 < len(inside) < len(patch.points)
@@ -54,7 +54,7 @@ def test_no_unit_response_inside_a_disc_reaches_a_scored_tumour(trained, scored,
     assert np.array_equal(tumour.basis.modes, tumour_again.basis.modes)
     assert np.array_equal(tumour.regressor.compliance_, tumour_again.regressor.compliance_)
     assert not np.array_equal(cortex.basis.modes, cortex_again.basis.modes)
-    # What is interpolated is near what is not told.
+    # What is interpolated is near what is not given.
     every, size = trained.models["linear"].parts[0], np.linalg.norm
-    told = [part.response(np.eye(3 * len(patch.points))[rows]) for part in (tumour, every)]
-    assert 1e-3 * size(told[1]) < size(told[0] - told[1]) < 0.15 * size(told[1])
+    given = [part.response(np.eye(3 * len(patch.points))[rows]) for part in (tumour, every)]
+    assert 1e-3 * size(given[1]) < size(given[0] - given[1]) < 0.15 * size(given[1])

@@ -68,7 +68,7 @@ def test_a_file_brings_one_that_is_trained_stored_and_plays(folder, box, monkeyp
     report = json.loads(capsys.readouterr().out)
     assert {row["name"] for row in report["scores"]} == {"nearest", "linear"}
     assert all(0.0 < row["mean_percent"] < 60.0 for row in report["scores"])
-    taught = load("box.model.npz", box)["nearest"]
+    trained = load("box.model.npz", box)["nearest"]
 
     forget("nearest")
     with pytest.raises(InputError, match=r"made by the learner 'nearest', .* --plugin"):
@@ -76,7 +76,7 @@ def test_a_file_brings_one_that_is_trained_stored_and_plays(folder, box, monkeyp
     run_script("my_learner.py")
     again = load("box.model.npz", box)["nearest"]
     loads = push(box.mesh.nodes[box.craniotomy][:3], np.array([0.0, 0.0, -0.2]), 7e-3)
-    assert np.array_equal(again.deform(loads).displacement, taught.deform(loads).displacement)
+    assert np.array_equal(again.deform(loads).displacement, trained.deform(loads).displacement)
     assert np.abs(again.deform(loads).displacement).max() > 1e-4
 
     forget("nearest")
@@ -160,7 +160,7 @@ def test_a_class_that_lacks_something_is_a_sentence(clean):
         (" * np.nan", r"numbers of shape \(\d+, \d+\): let `predict` give"),
     ],
 )
-def test_answers_that_are_none_are_refused_when_it_is_taught(folder, tmp_path, capsys, change, words, clean):
+def test_answers_that_are_none_are_refused_when_it_is_trained(folder, tmp_path, capsys, change, words, clean):
     path = tmp_path / "wrong.py"
     path.write_text(NEAREST.read_text().replace(".astype(np.float32)", change))
     out = tmp_path / "model.npz"

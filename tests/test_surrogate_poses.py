@@ -1,4 +1,4 @@
-"""Models that are told where the tool is: poses as indentations, how they are drawn, learnt, stored and refused."""
+"""Models that are given where the tool is: poses as indentations, how they are drawn, learnt, stored and refused."""
 
 from __future__ import annotations
 
@@ -137,8 +137,8 @@ class PosedPretender:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory, pretender: Deformer) -> Dataset:
     path = tmp_path_factory.mktemp("poses") / "data.h5"
-    told = simulate(path, PosedPretender(pretender), draw_poses("palpation", pretender.anatomy, 360, 0), SAID)
-    assert (told.loads, told.units) == (360, 0)
+    counted = simulate(path, PosedPretender(pretender), draw_poses("palpation", pretender.anatomy, 360, 0), SAID)
+    assert (counted.loads, counted.units) == (360, 0)
     return read_dataset(path)
 
 
@@ -166,7 +166,7 @@ def test_poses_teach_where_there_is_no_force(
     assert np.linalg.norm(model.deform(fresh, at=cortex).displacement - exact) < 0.2 * np.linalg.norm(exact)
 
 
-def test_deeper_or_elsewhere_than_taught_is_said(trained: Trained, box: Anatomy) -> None:
+def test_deeper_or_elsewhere_than_in_training_is_said(trained: Trained, box: Anatomy) -> None:
     model, patch = trained.models["gp"], open_patch(box)
     middle = patch.points.mean(axis=0, keepdims=True)
     way = patch.normal_near(middle)
@@ -187,7 +187,7 @@ def test_a_stored_model_knows_its_ball(tmp_path: Path, trained: Trained, box: An
 
 
 def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses() -> None:
-    """A data set to judge by is told from the training's own by what is not a vertex of the cortex."""
+    """A data set to judge by is told apart from the training's own by what is not a vertex of the cortex."""
     template = read_anatomy(template_path())
     patch, corners = open_patch(template), template.mesh.nodes
     first, same, other = (

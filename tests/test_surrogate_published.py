@@ -33,7 +33,7 @@ from surrogate.training.published_models import (
     thirteen,
     to_angles,
 )
-from surrogate.training.published_protocol import positions_of, taught_in_turn
+from surrogate.training.published_protocol import positions_of, trained_in_turn
 
 RANDOM = np.random.default_rng(11)
 
@@ -50,7 +50,7 @@ def truth(box, loads, pretender):
 
 @pytest.fixture(scope="module")
 def model(box, loads, truth):
-    return taught_in_turn("published-svr", box, loads, truth)
+    return trained_in_turn("published-svr", box, loads, truth)
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def test_a_position_left_out_is_never_shown(box, loads, truth, monkeypatch):
     monkeypatch.setitem(published_models.MACHINES, "published-svr", Spy)
     pushed, seen = loads.of(Pushed), []
     with threadpool_limits(2, "blas"):
-        model = taught_in_turn("published-svr", box, loads, truth, lambda: seen.append(1))
+        model = trained_in_turn("published-svr", box, loads, truth, lambda: seen.append(1))
     assert 2 <= len(model.positions) <= 11 and len(seen) == len(model.positions) * len(truth[0])
     features = thirteen(*sites_of(box, model.nodes), pushed)
     for site, part in zip(model.positions, model.models, strict=True):
@@ -221,9 +221,9 @@ def test_what_it_does_not_know_is_refused(model, box, loads, truth):
     with pytest.raises(InputError, match=r"no published learner is called 'forest'"):
         published_model("forest", box, loads, truth)
     with pytest.raises(InputError, match=r"have 1 positions"):
-        taught_in_turn("published-ann", box, push([0, 0, 0], [0, 0, -0.1], 6e-3), truth[:1])
+        trained_in_turn("published-ann", box, push([0, 0, 0], [0, 0, -0.1], 6e-3), truth[:1])
     with pytest.raises(InputError, match=r"have 40 positions.*--preset seed"):
-        taught_in_turn("published-ann", box, draw("palpation", box, 40, 0), truth[:40])
+        trained_in_turn("published-ann", box, draw("palpation", box, 40, 0), truth[:40])
 
 
 def test_the_command_scores_them(pretender, loads, tmp_path, capsys):

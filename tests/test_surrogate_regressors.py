@@ -146,14 +146,14 @@ def test_the_process_finds_the_features_that_matter():
 
 
 def test_the_process_knows_how_wrong_it_is():
-    """On functions drawn from the kernel itself, errors have the deviation that is told."""
+    """On functions drawn from the kernel itself, errors have the deviation that is stated."""
     x = np.random.default_rng(8).uniform(-1.0, 1.0, (300, 2))
     covariance = matern(cdist(x / [0.8, 1.5], x / [0.8, 1.5])) + 1e-6 * np.eye(300)
     y = 5.0 * np.linalg.cholesky(covariance) @ np.random.default_rng(9).normal(size=(300, 60))
     model = Gp().fit(x[:150], y[:150])
-    told = 5.0 * model.deviation(x[150:])
-    share = (model.predict(x[150:]) - y[150:]) / told[:, None]
-    deep = told < np.median(told)
+    stated = 5.0 * model.deviation(x[150:])
+    share = (model.predict(x[150:]) - y[150:]) / stated[:, None]
+    deep = stated < np.median(stated)
     assert 0.8 < share[deep].std() < 1.25 and 0.8 < share[~deep].std() < 1.25
     assert np.allclose(model.deviation(1e3 * x), 1.0, atol=1e-2)
     again = Gp.restored(model.state())
@@ -170,7 +170,7 @@ def test_a_subset_stands_for_too_many_rows():
     assert np.abs(few.predict(X) - Y)[:, 0].max() < 0.2 * Y[:, 0].std()
 
 
-def test_outputs_that_do_not_vary_are_told_exactly():
+def test_outputs_that_do_not_vary_are_predicted_exactly():
     X, _ = rows(30, 0)
     assert np.allclose(Gp().fit(X, np.full((30, 2), 3.0)).predict(X + 1.0), 3.0)
 
@@ -200,7 +200,7 @@ def test_tuned_settings_halve_the_error_of_the_published_ones():
     assert np.array_equal(again.predict(asked), Tuned(SVR).fit(X, Y).predict(asked)) and isinstance(again, Svr)
 
 
-def test_settings_are_chosen_on_discs_that_the_inner_fits_are_not_taught():
+def test_settings_are_chosen_on_discs_that_the_inner_fits_are_not_trained_on():
     """One fit for each of the settings without the discs, and one of the best to all."""
     X, Y = nearby(100, 0)
     seen, left_out = [], inner_discs(X[:, :3])

@@ -7,7 +7,7 @@ import pytest
 
 from surrogate.data.tool_loads import draw
 from surrogate.evaluation.score import score, spread, table, winner
-from surrogate.evaluation.solve_counts import Told
+from surrogate.evaluation.solve_counts import SolveCounts
 
 
 @pytest.fixture(scope="module")
@@ -29,17 +29,21 @@ def test_score_sees_a_shift(pretender, box, fresh):
     assert one.mean_mm == pytest.approx(29.5 / len(box.tumour_nodes)) and one.max_mm == pytest.approx(59.0)
 
 
-def test_a_table_says_what_learners_were_told(pretender, box, fresh):
+def test_a_table_says_what_learners_were_given(pretender, box, fresh):
     truth = pretender.deform(fresh, at=box.tumour_nodes).displacement + 1e-4
     rows = [
-        score(name, pretender, fresh, truth, box.tumour_nodes, told)
-        for name, told in (("it", Told(400, 60, 9000, 12, 75.5)), ("dumb", Told(400, 0, 0, 0, None)), ("fem", None))
+        score(name, pretender, fresh, truth, box.tumour_nodes, solves)
+        for name, solves in (
+            ("it", SolveCounts(400, 60, 9000, 12, 75.5)),
+            ("dumb", SolveCounts(400, 0, 0, 0, None)),
+            ("fem", None),
+        )
     ]
     heads, *lines = table(rows, 1.0).splitlines()[-3:]
     assert heads.split() == ["learner", "loads", "unit", "series", "all", "inside", "seconds"]
     assert lines[0].split() == ["it", "400", "60", "9000", "9460", "12", "75.5"]
     assert lines[1].split() == ["dumb", "400", "0", "0", "400", "0", "unknown"]
-    assert "told" not in table(rows[2:], 1.0)
+    assert "solves" not in table(rows[2:], 1.0)
 
 
 def test_a_single_learner_wins_nothing(pretender, box, fresh):
@@ -51,7 +55,7 @@ def test_a_single_learner_wins_nothing(pretender, box, fresh):
     assert "one: 0.1732 mm mean error at a mean motion of 1.000 mm" in alone
 
 
-def test_of_few_loads_no_percentile_of_a_thousand_is_told(pretender, box, fresh):
+def test_of_few_loads_no_percentile_of_a_thousand_is_reported(pretender, box, fresh):
     """A dash stands in its columns, and a line says why; of 1,000 loads it is the percentile."""
     distance = np.random.default_rng(0).uniform(size=(1000, 3))
     few, many = spread(distance[:999]), spread(distance)

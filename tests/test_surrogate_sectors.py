@@ -28,7 +28,7 @@ def test_whole_sectors_are_left_out(box, pushed):
     tilt = np.degrees(np.arccos(-pushed.force[:, 2] / np.linalg.norm(pushed.force, axis=1)))
     off = np.abs((azimuth + 90.0) % 180.0 - 90.0)  # from the nearer of the two opposite directions
     assert np.array_equal(split.test, (off < 22.5) & (tilt > 10.0))
-    assert split.share == 0.25 and set(split.disc) == {-1, 0, 1} and split.taught.sum() + split.test.sum() == 400
+    assert split.share == 0.25 and set(split.disc) == {-1, 0, 1} and split.train.sum() + split.test.sum() == 400
     side = pushed.force[split.test] @ split.centres[0] > 0.0
     assert np.array_equal(split.disc[split.test], np.where(side, 0, 1))
     assert "2 sectors of 45 degrees" in split.summary() and f"{split.test.sum()} loads to test" in split.summary()
@@ -44,9 +44,9 @@ def test_training_sees_what_its_split_allows(box, pretender, tmp_path):
     simulate(tmp_path / "data.h5", pretender, draw("palpation", box, 200, 0), {})
     data = read_dataset(tmp_path / "data.h5")
     split = leave_sectors_out(data.loads.of(Pushed), open_patch(box))
-    order = np.flatnonzero(split.taught)
+    order = np.flatnonzero(split.train)
     fewer = replace(split, disc=np.where(np.isin(np.arange(200), order[50:]), -2, split.disc))
     trained = train(data, ["linear"], split=fewer)
     points = data.loads.of(Pushed).point
     assert np.allclose(trained.models["linear"].envelope.points, points[order[:50]])
-    assert trained.split is fewer and fewer.taught.sum() == 50 and fewer.test.sum() == split.test.sum()
+    assert trained.split is fewer and fewer.train.sum() == 50 and fewer.test.sum() == split.test.sum()

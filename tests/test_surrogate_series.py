@@ -55,12 +55,12 @@ def test_fields_of_second_degree_are_met_between_the_places(patch):
     series = Series(patch.points, triangles, radii, table)
     loads = pushes(patch, 200, 2, (5e-3, 8e-3))
     size, direction = directions(loads)
-    told = series.predict(tool_features(patch, loads))
+    predicted = series.predict(tool_features(patch, loads))
     wanted = direction[:, 0] * (field(loads.point) + np.log(loads.footprint / 5e-3) ** 2)
-    assert np.allclose(told[:, 0], wanted, atol=1e-4 * np.abs(wanted).max())
-    assert np.allclose(told[:, 1], size**2 * direction[:, 2] ** 3, atol=1e-6)
+    assert np.allclose(predicted[:, 0], wanted, atol=1e-4 * np.abs(wanted).max())
+    assert np.allclose(predicted[:, 1], size**2 * direction[:, 2] ** 3, atol=1e-6)
     alone = np.concatenate([series.predict(tool_features(patch, _row(loads, k))) for k in range(5)])
-    assert np.allclose(alone, told[:5], rtol=1e-5, atol=1e-7)
+    assert np.allclose(alone, predicted[:5], rtol=1e-5, atol=1e-7)
 
 
 def test_of_no_loads_there_are_no_responses(patch):
@@ -101,14 +101,14 @@ def test_the_table_is_the_finite_elements_series(box, patch):
     series = Series(patch.points, triangles, radii, table)
     assert heard[-1] == (len(places), len(places))
     size, _ = directions(loads)
-    told = series.predict(tool_features(patch, loads)) * size[:, None]
+    predicted = series.predict(tool_features(patch, loads)) * size[:, None]
     wanted = exact.sum(axis=1)
     # The box's triangles are as long as the tool is wide.
-    assert np.linalg.norm(told - wanted) < 0.02 * np.linalg.norm(wanted)
+    assert np.linalg.norm(predicted - wanted) < 0.02 * np.linalg.norm(wanted)
     linear = exact[:, 0]
-    assert np.linalg.norm(told - wanted) < 0.25 * np.linalg.norm(linear - wanted)
+    assert np.linalg.norm(predicted - wanted) < 0.25 * np.linalg.norm(linear - wanted)
     more = series.from_second_order().predict(tool_features(patch, loads)) * size[:, None]
-    assert np.allclose(more, told - _first_order(series, loads, patch), atol=1e-4 * np.abs(told).max())
+    assert np.allclose(more, predicted - _first_order(series, loads, patch), atol=1e-4 * np.abs(predicted).max())
 
 
 def _first_order(series, loads, patch):
@@ -146,8 +146,8 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, box, patch):
     places = np.array([0, 17, 60, 120, 198])
     point = np.repeat(with_middles(patch)[1][places], 3, axis=0)
     units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
-    told = expansion.on(bases, np.zeros(len(expansion.places), bool))
-    for at, basis, found, orders in zip(nodes, bases, told, (SPANS, SPANS[1:]), strict=True):
+    predicted = expansion.on(bases, np.zeros(len(expansion.places), bool))
+    for at, basis, found, orders in zip(nodes, bases, predicted, (SPANS, SPANS[1:]), strict=True):
         wanted = fem.series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
         for terms in orders:
             miss = np.linalg.norm((found.table[places, 0] - wanted)[:, terms])
@@ -156,7 +156,7 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, box, patch):
 
 def test_a_series_beats_the_table_of_first_order(trained):
     linear, series, learnt = trained.scores
-    # A hundred loads teach the process nothing yet: it must do no harm.
+    # A hundred loads are nothing to the process yet: it must do no harm.
     assert series.mean_mm < 0.2 * linear.mean_mm and learnt.mean_mm < 1.5 * series.mean_mm
 
 
@@ -173,10 +173,10 @@ def test_on_known_cortex_the_process_beats_the_series_by_a_factor_of_two(tmp_pat
     assert learnt.mean_percent < 0.5 * series.mean_percent and learnt.mean_mm < 0.5 * series.mean_mm
 
 
-def test_nothing_inside_the_discs_left_out_is_told_of_the_series(trained, data, box, tmp_path):
-    """Bit for bit: wild answers to all loads that were not taught, and wild series at all places of the discs."""
+def test_nothing_inside_the_discs_left_out_is_known_of_the_series(trained, data, box, tmp_path):
+    """Bit for bit: wild answers to all loads that were not trained on, and wild series at all places of the discs."""
     split = trained.split
-    rows = np.flatnonzero(data.good)[~split.taught]
+    rows = np.flatnonzero(data.good)[~split.train]
     wild = read_dataset(poisoned(data.path, tmp_path / "wild.h5", rows)[0])
     known, again = Expansion(data, "cpu"), Expansion(wild, "cpu")
     inside = split.covers(again.places)
@@ -194,18 +194,18 @@ def test_nothing_inside_the_discs_left_out_is_told_of_the_series(trained, data, 
 
 def test_every_solve_is_counted(trained, data):
     """By hand: 19 terms at each place and radius outside the discs, 3 unit forces a node, and the loads."""
-    linear, series, learnt = (row.told for row in trained.scores)
-    taught, units = int(trained.split.taught.sum()), len(data.unit_good)
+    linear, series, learnt = (row.solves for row in trained.scores)
+    loads_given, units = int(trained.split.train.sum()), len(data.unit_good)
     outside = int((~trained.split.covers(with_middles(open_patch(data.anatomy))[1])).sum())
-    assert (linear.loads, linear.units, linear.series, linear.inside) == (taught, units, 0, 0)
-    assert series == learnt and (series.loads, series.units) == (taught, units)
-    assert series.series == outside * 19 and series.solves == taught + units + outside * 19
+    assert (linear.loads, linear.units, linear.series, linear.inside) == (loads_given, units, 0, 0)
+    assert series == learnt and (series.loads, series.units) == (loads_given, units)
+    assert series.series == outside * 19 and series.total == loads_given + units + outside * 19
     rates = [float(data.provenance[f"seconds a {each}"]) for each in ("load", "unit response")]
-    assert linear.seconds == pytest.approx(taught * rates[0] + units * rates[1]) and min(rates) > 0.0
+    assert linear.seconds == pytest.approx(loads_given * rates[0] + units * rates[1]) and min(rates) > 0.0
     assert series.seconds > linear.seconds
     said = {name: text for name, text in data.provenance.items() if not name.startswith("seconds")}
     silent = train(replace(data, provenance=said), ["linear"])
-    assert silent.scores[0].told == replace(linear, seconds=None)
+    assert silent.scores[0].solves == replace(linear, seconds=None)
 
 
 def test_what_is_left_out_is_interpolated(patch):

@@ -130,9 +130,9 @@ def test_the_bound_holds_as_often_as_it_says(model, fresh):
     # Of 200 loads that calibrate and 300 that judge the share scatters by 0.02.
     assert 0.89 <= found.held[0] <= 0.99 and found.held[1] >= found.held[0]
     # It follows the load: bounds of one size would be the 95th percentile for all.
-    told = model.distance(fresh[0])
-    error = np.abs(told.value - fresh[1])
-    assert np.median(told.bound[0]) < 0.7 * np.quantile(error, 0.95)
+    predicted = model.distance(fresh[0])
+    error = np.abs(predicted.value - fresh[1])
+    assert np.median(predicted.bound[0]) < 0.7 * np.quantile(error, 0.95)
 
 
 def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, gauge):
@@ -151,7 +151,7 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
     assert 0.93 <= found.held[0] <= 0.97 and min(found.tenths) > 0.87 and found.held[1] > 0.975
 
 
-def test_how_its_bound_holds_in_the_discs_left_out_is_told_of_a_model_that_knows_neither(trained, data, gauge):
+def test_how_its_bound_holds_in_the_discs_left_out_is_reported_of_a_model_that_knows_neither(trained, data, gauge):
     """Recomputed: the scored model, a bound from the loads that are apart and outside every disc."""
     good, split = data.loads.rows(np.flatnonzero(data.good)), trained.split
     distance = gauge.distances(good, data.displacement(gauge.nodes)[data.good], gauge.nodes)
@@ -159,17 +159,17 @@ def test_how_its_bound_holds_in_the_discs_left_out_is_told_of_a_model_that_knows
     beside = np.flatnonzero((np.arange(len(good)) >= len(good) - trained.calibrated) & (place > split.radius))
     scored = train(data, ["linear"], split=split).models["linear"]
 
-    def told(rows):
+    def rows_of(rows):
         loads = good.rows(rows)
         known = measured(open_patch(data.anatomy), only_pushed(loads))
         within = known._replace(magnitude=np.clip(known.magnitude, *scored.envelope.force))
         error = np.abs(scored.distance(loads).value - distance[rows])
         return features_of(only_pushed(loads), within), known.magnitude, error[:, None]
 
-    (features, _, error), discs = told(beside[::3]), np.flatnonzero(split.test)
-    bound = fitted_bound((features, error[:, 0]), *told(np.delete(beside, np.s_[::3])), CLASS, curved=False)
+    (features, _, error), discs = rows_of(beside[::3]), np.flatnonzero(split.test)
+    bound = fitted_bound((features, error[:, 0]), *rows_of(np.delete(beside, np.s_[::3])), CLASS, curved=False)
     bounded = replace(scored, tip=replace(scored.tip, bound=bound))
-    held = told(discs)[2][:, 0] <= bounded.distance(good.rows(discs)).bound
+    held = rows_of(discs)[2][:, 0] <= bounded.distance(good.rows(discs)).bound
     found = trained.distance_left_out["linear"]
     assert found.loads == len(discs) and found.held == pytest.approx(held.mean(axis=1))
 
@@ -180,7 +180,7 @@ def test_where_many_loads_calibrate_one_in_three_tells_the_scale(data, monkeypat
     model, good = trained.models["linear"], data.loads.rows(np.flatnonzero(data.good))
     truth = data.displacement(data.anatomy.tumour_nodes)[data.good]
 
-    def told(rows):
+    def rows_of(rows):
         loads = good.rows(rows)
         known = measured(open_patch(data.anatomy), only_pushed(loads))
         within = known._replace(magnitude=np.clip(known.magnitude, *model.envelope.force))
@@ -188,8 +188,8 @@ def test_where_many_loads_calibrate_one_in_three_tells_the_scale(data, monkeypat
         return features_of(only_pushed(loads), within), known.magnitude, np.linalg.norm(answer - truth[rows], axis=2)
 
     apart = np.arange(len(good))[-trained.calibrated :]
-    features, _, error = told(apart[::3])
-    bounds = fitted_bound((features, error.max(axis=1)), *told(np.delete(apart, np.s_[::3])))
+    features, _, error = rows_of(apart[::3])
+    bounds = fitted_bound((features, error.max(axis=1)), *rows_of(np.delete(apart, np.s_[::3])))
     assert model.bounds.weights == pytest.approx(bounds.weights) and model.bounds.quantile == pytest.approx(
         bounds.quantile
     )
@@ -200,7 +200,7 @@ def test_where_many_loads_calibrate_one_in_three_tells_the_scale(data, monkeypat
 def test_the_correction_brings_distances_nearer(model, fresh):
     plain = replace(model, tip=None).distance(fresh[0])
     assert np.isnan(plain.bound).all()
-    off, left = (np.abs(told.value - fresh[1]).mean() for told in (plain, model.distance(fresh[0])))
+    off, left = (np.abs(predicted.value - fresh[1]).mean() for predicted in (plain, model.distance(fresh[0])))
     assert left < 0.5 * off
 
 
@@ -251,24 +251,24 @@ def test_the_models_that_ship_bound_the_distance_of_a_strong_press_within_a_mill
     truth, gauge = theatre.fem(scene, LIVE).deform(loads), tip_gauge(theatre.anatomy)
     apart = gauge.distances(loads, truth.displacement, truth.nodes)
     for name, model in theatre.models.items():
-        told = model.distance(loads)
-        assert abs(told.value - apart) <= told.bound[0] < 1.5e-3, name
+        predicted = model.distance(loads)
+        assert abs(predicted.value - apart) <= predicted.bound[0] < 1.5e-3, name
     assert np.isnan(replace(model, tip=None).distance(loads).bound).all()  # a model of before promises nothing
 
 
 def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender, gauge, fresh):
     loads, tool = fresh[0].rows(slice(2, 3)), Probe()
     answer, truth = model.deform(loads), pretender.deform(loads)
-    told = model.distance(loads)
+    predicted = model.distance(loads)
     apart = gauge.distances(loads, answer.displacement, answer.nodes)[0]
-    assert reading(model, loads, answer, tool, apart) == Reading(told.value[0], told.bound[0, 0])
+    assert reading(model, loads, answer, tool, apart) == Reading(predicted.value[0], predicted.bound[0, 0])
     assert reading(pretender, loads, truth, tool, fresh[1][2]) == Reading(fresh[1][2], None)
     high = gauge.distances(loads, truth.displacement, truth.nodes, lift=2e-3)[0]
     assert drawn_distance(model.anatomy, loads, truth, tool, 2e-3).distance == high > fresh[1][2] + 1e-3
-    assert reading(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(told.value[0] + 2e-3)
+    assert reading(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(predicted.value[0] + 2e-3)
     plain = replace(model, tip=None).distance(loads).value[0]
     outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-    assert reading(model, loads, outside, tool, apart) == Reading(told.value[0], None)
+    assert reading(model, loads, outside, tool, apart) == Reading(predicted.value[0], None)
     assert reading(replace(model, tip=None), loads, answer, tool, apart) == Reading(plain, None)
     assert reading(model, loads, answer, Blade(), apart) is None and reading(model, loads, answer, None, apart) is None
     assert str(Reading(5.53e-3, 0.62e-3)) == "5.5 +- 0.7 mm" and str(Reading(5.53e-3, None)) == "5.5 mm"

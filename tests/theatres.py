@@ -1,4 +1,4 @@
-"""A small theatre: the shared box, taught by finite elements in a second, and short scenes to play in it."""
+"""A small theatre: the shared box, models trained on finite elements in a second, and short scenes to play in it."""
 
 from __future__ import annotations
 

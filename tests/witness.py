@@ -36,7 +36,7 @@ MADE = {"ToolContact": known.ToolContact((Ball(7e-3),)), "Retraction": known.Ret
 HEAVY = ("torch", "sim.linalg.dense_inverse", "pyamg", "sim.linalg.amg", "viser", "sklearn", "onnx")
 
 
-def told(kernel: wp.Kernel) -> str:
+def name_of(kernel: wp.Kernel) -> str:
     """The module whose source a kernel is, and its name."""
     return f"{kernel.func.__module__}:{kernel.func.__name__}"
 
@@ -45,7 +45,7 @@ def listened(launch):
     """`wp.launch` that notes what it launches."""
 
     def noting(kernel, *words, **more):
-        LAUNCHED.add(told(kernel))
+        LAUNCHED.add(name_of(kernel))
         return launch(kernel, *words, **more)
 
     return noting
@@ -86,7 +86,7 @@ def played(scene: Scene) -> dict[str, list[str]]:
     modules = [name for name in sys.modules if name.startswith("sim.terms.") and name not in PACKAGES]
     return {
         "imported": sorted(name.removeprefix("sim.terms.") for name in modules),
-        "compiled": sorted({told(kernel) for kernel in compiled}),
+        "compiled": sorted({name_of(kernel) for kernel in compiled}),
         "launched": sorted(LAUNCHED),
         "living": sorted(living),
         "heavy": sorted(set(HEAVY) & set(sys.modules)),

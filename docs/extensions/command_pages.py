@@ -50,9 +50,9 @@ def _row(action: argparse.Action) -> str | None:
         name = ", ".join(f"`{option} {value}`" if value else f"`{option}`" for option in action.option_strings)
     else:
         name = f"`{value}`"
-    told = (action.help or "") % {**vars(action), "prog": "sulcus"}
+    text = (action.help or "") % {**vars(action), "prog": "sulcus"}
     needed = "**needed** " if action.required and action.option_strings else ""
-    return f"{name}\n: {needed}{_words(told)}" if told else name
+    return f"{name}\n: {needed}{_words(text)}" if text else name
 
 
 def _value(action: argparse.Action) -> str:

@@ -65,10 +65,10 @@ def _entry(package: str, name: str) -> list[str]:
     if inspect.isfunction(found):
         return [f".. autofunction:: {name}", ""]
     value = [f"   :value: {found!r}"] if len(repr(found)) < LONGEST else []
-    return [f".. py:data:: {name}", *value, "", *(f"   {line}" for line in _told(package, name)), ""]
+    return [f".. py:data:: {name}", *value, "", *(f"   {line}" for line in _described(package, name)), ""]
 
 
-def _told(package: str, name: str) -> list[str]:
+def _described(package: str, name: str) -> list[str]:
     """The words below a constant, in the module that the package's stub has it from."""
     stub = ast.parse(Path(str(importlib.import_module(package).__file__)).with_suffix(".pyi").read_text())
     (home,) = (

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from surrogate.data.dataset import read_dataset
 from surrogate.evaluation.score import score, table
 from surrogate.training.published_models import MACHINES, published_nodes
-from surrogate.training.published_protocol import positions_of, taught_in_turn
+from surrogate.training.published_protocol import positions_of, trained_in_turn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
         begun = time.perf_counter()
         total = len(sites) * len(nodes)
         with tqdm(total=total, desc=name, unit="vertex", disable=args.json, file=sys.stderr) as bar:
-            model = taught_in_turn(name, data.anatomy, loads, truth, bar.update)
+            model = trained_in_turn(name, data.anatomy, loads, truth, bar.update)
         seconds.append(time.perf_counter() - begun)
         scores.append(score(name.removeprefix("published-"), model, loads, truth, nodes))
     motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())

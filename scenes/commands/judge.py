@@ -39,10 +39,10 @@ def run(args: argparse.Namespace) -> int:
     truth = data.displacement(nodes)[data.good]
     for name, model in models.items():
         for what in ("tissue", "element"):
-            taught, here = model.training.get(what), data.provenance.get(what)
-            if taught != here:
+            trained, here = model.training.get(what), data.provenance.get(what)
+            if trained != here:
                 raise InputError(
-                    f"{args.data}: its {what} is {here}, but {name} was trained on {taught}: that would judge the "
+                    f"{args.data}: its {what} is {here}, but {name} was trained on {trained}: that would judge the "
                     "difference of two bodies. Simulate with the model's own."
                 )
     for name, model in models.items():
@@ -62,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
     motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())
     preset = "" if data.ball is not None else data.provenance.get("preset", "")
     if args.json:
-        told, of_tip = ({name: asdict(found) for name, found in held.items()} for held in (promised, ranged))
-        figures = {"scores": [asdict(row) for row in scores], "coverage": told, "distance_coverage": of_tip}
+        covered, of_tip = ({name: asdict(found) for name, found in held.items()} for held in (promised, ranged))
+        figures = {"scores": [asdict(row) for row in scores], "coverage": covered, "distance_coverage": of_tip}
         print(json.dumps({**figures, "motion_mm": motion, "nominal_refused": refused_share(preset)}))
     else:
         print(f"{len(loads)} loads, against the finite elements that answered them:\n{table(scores, motion)}")

@@ -81,6 +81,6 @@ def _run(args: argparse.Namespace, theatre: Theatre, scene: Scene, name: str) ->
     """What tells this run's frames from another's: scene, deformer, anatomy and all that changes the pictures."""
     model = theatre.models.get(name)
     about = scene.effects_on(theatre.anatomy), scene.element, scene.tool, scene.viewpoint, scene.accuracy
-    taught = None if model is None else (model.bound, dict(model.training))
-    marks = repr((scene.name, name, theatre.anatomy.digest, about, taught, args.every, args.plain))
+    trained = None if model is None else (model.bound, dict(model.training))
+    marks = repr((scene.name, name, theatre.anatomy.digest, about, trained, args.every, args.plain))
     return f"run {sha256(marks.encode()).hexdigest()[:16]}"

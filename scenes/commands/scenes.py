@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
             claimed(args.out / f"{name}.png", ".png", "a picture of sulcus", args.force)
     theatre = open_theatre(args.anatomy, device=args.device)
     lines = sys.stderr if args.json else sys.stdout
-    told, pictures = [], []
+    rows, pictures = [], []
     drawing = tqdm(total=len(SCENES), unit="scene", leave=False, disable=args.out is None, file=sys.stderr)
     with drawing as bar:
         for name in SCENES:
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
                 known |= {"milliseconds": found.milliseconds, "moved_mm": found.moved_mm, "played_by": best}
                 cost = f"{found.total:.0f} ms a frame by {best}"
                 bar.write(f"  {cost}; the tumour moves by up to {found.moved_mm:.2f} mm", file=lines)
-            told.append(known)
+            rows.append(known)
             bar.update()
     if args.out is not None:
         try:
@@ -67,5 +67,5 @@ def run(args: argparse.Namespace) -> int:
         except OSError as error:
             raise InputError(f"{args.out}: the pictures cannot be written ({why(error)}). {REMEDY}") from error
     if args.json:
-        print(json.dumps({"scenes": told, "out": None if args.out is None else str(args.out)}))
+        print(json.dumps({"scenes": rows, "out": None if args.out is None else str(args.out)}))
     return 0

@@ -192,8 +192,8 @@ def _remarks(study: Study, beside: Sequence[str], model: Learned | None, failed:
     if model is not None and _bound(model):
         stated = _stated(model)
         said.append(
-            f"The surrogate's error is its stated bound on held-out {stated['preset']} loads against its own teacher, "
-            f"finite elements of the kind {stated['element']}; how far off those are, --beside says."
+            f"The surrogate's error is its stated bound on held-out {stated['preset']} loads against its own "
+            f"finite elements, of the kind {stated['element']}. How far off those are, --beside says."
         )
     else:
         said.append("No surrogate's error stands beside: no model with a bound lies beside this anatomy (--model).")
@@ -207,9 +207,9 @@ def _remarks(study: Study, beside: Sequence[str], model: Learned | None, failed:
 
 def _stated(model: Learned) -> dict[str, Any]:
     """What a model says of itself."""
-    taught = model.training
-    about = {name: taught.get(name, "unknown") for name in ("learner", "preset")}
-    return {**about, "element": taught.get("element", "p1"), "bound_mm": 1e3 * model.bound}
+    training = model.training
+    about = {name: training.get(name, "unknown") for name in ("learner", "preset")}
+    return {**about, "element": training.get("element", "p1"), "bound_mm": 1e3 * model.bound}
 
 
 def _flat(row: Row) -> dict[str, Any]:

@@ -111,7 +111,7 @@ def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
                 f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"
                 for name, found in trained.distance_left_out.items()
             ),
-            f"the models written were trained on {trained.taught} loads; {_calibration(trained)}",
+            f"the models written were trained on {trained.training_loads} loads; {_calibration(trained)}",
             f"written: {out}",
         ]
     )
@@ -135,7 +135,7 @@ def _for_machines(trained: Trained, out: str, failed: int, preset: str) -> str:
             "discs": len(split.centres),
             "disc_radius_mm": 1e3 * split.radius,
             "share_of_patch": split.share,
-            "taught": int(split.taught.sum()),
+            "training_loads": int(split.train.sum()),
             "held_out": int(split.test.sum()),
             "calibrated": trained.calibrated,
             "left_out": {name: asdict(found) for name, found in trained.left_out.items()},

@@ -90,8 +90,8 @@ class Figures:
 
     def row(self) -> dict[str, float | bool | str | None]:
         """For machines: JSON knows no infinity, so None is a figure that could not be measured."""
-        told = asdict(self)
-        return {name: value if name == "doubt" or np.isfinite(value) else None for name, value in told.items()}
+        figures = asdict(self)
+        return {name: value if name == "doubt" or np.isfinite(value) else None for name, value in figures.items()}
 
 
 def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Deformation) -> Figures:
@@ -130,8 +130,8 @@ def _doubts(frames: Sequence[Frame], truth: Deformation) -> list[str]:
     """Which frames, drawn or by finite elements, are not answered well, and why."""
     found = []
     for frame, true in zip(frames, truth.outcome, strict=True):
-        told = {"as drawn": frame.deformation.outcome[0], "by the finite elements": true}
-        found += [f"frame {frame.number} {whose}, {one.value}" for whose, one in told.items() if not one.good]
+        outcomes = {"as drawn": frame.deformation.outcome[0], "by the finite elements": true}
+        found += [f"frame {frame.number} {whose}, {one.value}" for whose, one in outcomes.items() if not one.good]
     return found
 
 

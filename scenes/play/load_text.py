@@ -9,8 +9,8 @@ from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touchi
 
 # Parts of the head along the axes of RAS, and against them.
 SIDES = (("right", "left"), ("front", "back"), ("crown", "feet"))
-# Components of a unit vector under this are not told.
-TOLD = 0.05
+# Components of a unit vector under this are not named.
+NAMED = 0.05
 
 
 # What is written into a picture whose answer may not be relied on.
@@ -26,7 +26,7 @@ def doubt_of(outcome: Outcome) -> str:
     return "" if outcome.good else DOUBTS.get(outcome, "not solved to the end: do not rely on it")
 
 
-def told(loads: Loads, answer: Deformation, nodes: np.ndarray | None = None) -> str:
+def acting(loads: Loads, answer: Deformation, nodes: np.ndarray | None = None) -> str:
     """What acts in the first load case, and its tool reads, as one line; empty where time alone goes on.
 
     With the vertices (V, 3) [m] of the brain it is said how much of the brain stands in fluid.
@@ -52,7 +52,7 @@ def _words(cause: Cause, answer: Deformation, nodes: np.ndarray | None) -> str:
 def _way(direction: np.ndarray) -> str:
     """Where a direction (3,) of RAS points, the greatest part first, with its components where there are several."""
     down = direction / np.linalg.norm(direction)
-    axes = [axis for axis in np.argsort(-np.abs(down), kind="stable") if abs(down[axis]) > TOLD]
+    axes = [axis for axis in np.argsort(-np.abs(down), kind="stable") if abs(down[axis]) > NAMED]
     names = [SIDES[axis][int(down[axis] < 0.0)] for axis in axes]
     if len(axes) == 1:
         return names[0]

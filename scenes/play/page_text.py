@@ -15,7 +15,7 @@ from sim.material import Material, Tissue
 from ..script.scene import Scene
 from ..script.site import Site
 from .deformers import Theatre
-from .load_text import told
+from .load_text import acting
 from .page_tally import Row
 from .player import Frame
 from .stage import Stage
@@ -142,7 +142,7 @@ def report(
 ) -> str:
     """What was answered: the distance first, then how far to trust it, what acts, the verdict and the table."""
     left, nodes = stage.at(frame.loads).left, stage.site.anatomy.mesh.nodes
-    acts = told(frame.loads, frame.deformation, nodes) if frame.loads.causes else ""
+    acts = acting(frame.loads, frame.deformation, nodes) if frame.loads.causes else ""
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([acts] if acts else [])]
     facts += [f"tumour moved {1e3 * frame.moved:.2f} mm"]
     parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {read(frame)}</p>']

@@ -45,8 +45,8 @@ def judge(truth: Truth, player: Player, own: bool) -> Judged:
     off = (None, None) if error is None else (float(error.mean()), float(error.max()))
     pushed = truth.loads.every(Pushed)
     lift = lifted(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
-    told = measured(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
-    distance = None if told is None else told.distance
+    gauge = measured(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
+    distance = None if gauge is None else gauge.distance
     return Judged(truth.number, truth.seconds, truth.deformation.outcome[0].good, motion, *off, distance)
 
 

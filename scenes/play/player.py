@@ -25,7 +25,7 @@ from ..script.scene import Scene
 from ..script.site import Site
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, lifted
-from .load_text import doubt_of, told
+from .load_text import acting, doubt_of
 from .stage import TOOL, Stage
 from .tip_reading import reading
 
@@ -180,8 +180,8 @@ class Player:
     def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
         """From the tip to the tumour, and how far off that may be as far as the deformer knows."""
         gauge = gauged(held.tip, tumour)
-        told = None if held.beyond > CARRIED else reading(self.deformer, loads, answer, self.scene.tool, gauge.distance)
-        return gauge if told is None else replace(gauge, read=told.distance, error=told.bound)
+        read = None if held.beyond > CARRIED else reading(self.deformer, loads, answer, self.scene.tool, gauge.distance)
+        return gauge if read is None else replace(gauge, read=read.distance, error=read.bound)
 
     def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
         """How far each vertex of the drawn tumour may be off [m]: what the model promises of this load, if it does."""
@@ -238,7 +238,7 @@ def annotate(over: Picture, number: int, remark: str) -> None:
 def labelled(frame: Frame, name: str) -> np.ndarray:
     """The shown picture (H, W, 3) with a panel: deformer, what acts, and milliseconds by stage."""
     stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-    acts = told(frame.loads, frame.deformation)
+    acts = acting(frame.loads, frame.deformation)
     lines = [frame.deformation.source or name, f"t {frame.time:.2f} s   tumour moved {1e3 * frame.moved:.2f} mm"]
     lines += [*([acts] if acts else []), f"ms: {stages}"]
     if not frame.deformation.outcome[0].good:

@@ -17,7 +17,7 @@ class Busy:
         self._say = say
         self._since: float | None = None
         self._what = ""
-        self._told = False
+        self._shown = False
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="busy", daemon=True)
@@ -33,9 +33,9 @@ class Busy:
         """The work is done."""
         with self._lock:
             self._since = None
-            if self._told:
+            if self._shown:
                 self._say("")
-            self._told = False
+            self._shown = False
 
     def close(self) -> None:
         """Stop watching."""
@@ -48,4 +48,4 @@ class Busy:
                 waited = 0.0 if self._since is None else clock.perf_counter() - self._since
                 if waited >= NOTICED:
                     self._say(f"solving {self._what} ... {waited:.0f} s")
-                    self._told = True
+                    self._shown = True

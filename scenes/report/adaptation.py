@@ -54,11 +54,11 @@ def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
     effects = (*pushed_effects(body, study.tissue), NodalForce())
     begun = clock.perf_counter()
     fem = Fem(body, effects, TRAIN, study.device, None, study.element)
-    told = [0]
+    reported = [0]
 
     def tell(done: int, total: int) -> None:
-        progress(done - told[0])
-        told[0] = done
+        progress(done - reported[0])
+        reported[0] = done
 
     simulate(path, fem, data.loads, data.provenance, fem.batch, tell)
     if whole:

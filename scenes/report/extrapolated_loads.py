@@ -15,15 +15,17 @@ STRONGER, MORE_OBLIQUE, NEARER = (1.2, 1.6), (5.0, 15.0), (0.5, 0.9)
 KINDS = ("stronger", "more oblique", "nearer to the rim")
 
 
-def loads_beyond(patch: Patch, taught: Pushed, like: Pushed, count: int) -> Loads:
+def loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) -> Loads:
     """`count` loads, every third of one of `KINDS`, otherwise as those of `like` are; always the same ones."""
     random = np.random.default_rng(0)
     rows = random.integers(len(like.point), size=count)
     kind = np.arange(count) % len(KINDS)
     size, direction = directions(replace(like, force=like.force[rows]))
     point, footprint = like.point[rows], like.footprint[rows]
-    size = np.where(kind == 0, directions(taught)[0].max() * random.uniform(*STRONGER, count), size)
-    oblique = _tilted(direction, patch.normal_near(point), _angle(patch, taught), random.uniform(*MORE_OBLIQUE, count))
+    size = np.where(kind == 0, directions(training)[0].max() * random.uniform(*STRONGER, count), size)
+    oblique = _tilted(
+        direction, patch.normal_near(point), _angle(patch, training), random.uniform(*MORE_OBLIQUE, count)
+    )
     direction = np.where((kind == 1)[:, None], oblique, direction)
     point = np.where((kind == 2)[:, None], _near_rim(patch, footprint, random), point)
     return Loads((Pushed(point, size[:, None] * direction, footprint),))

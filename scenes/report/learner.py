@@ -13,7 +13,7 @@ from surrogate.data.direction_split import leave_sectors_out
 from surrogate.data.disc_split import Split
 from surrogate.evaluation.coverage import TENTHS, coverage
 from surrogate.evaluation.score import bare_microseconds, single_seconds
-from surrogate.evaluation.solve_counts import Told
+from surrogate.evaluation.solve_counts import SolveCounts
 from surrogate.training.published_models import MACHINES, published_model, published_nodes
 from surrogate.training.train import train
 
@@ -24,7 +24,7 @@ from .reference import beyond_of
 from .row import Figures, Row, against_reference, figures_between, of_times
 from .study import Study
 
-FEWEST_TAUGHT = 64
+FEWEST_LOADS = 64
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         return _held(model, study.converged.rows(rows), truth[rows], nodes)
 
     discs, sectors = study.discs, leave_sectors_out(study.pushed, study.patch)
-    (model, told), learning = timed(_taught, study, spec, discs, truth)
-    order = np.flatnonzero(discs.taught)
+    (model, solves), learning = timed(_trained, study, spec, discs, truth)
+    order = np.flatnonzero(discs.train)
     curve = []
     for count in counts(len(order)):
         left_aside = np.isin(np.arange(len(discs.disc)), order[count:])
         fewer = replace(discs, disc=np.where(left_aside, -2, discs.disc))
-        curve.append((count, judged(_taught(study, spec, fewer, truth)[0], discs)[0]))
-    of_discs, of_sectors = judged(model, discs), judged(_taught(study, spec, sectors, truth)[0], sectors)
+        curve.append((count, judged(_trained(study, spec, fewer, truth)[0], discs)[0]))
+    of_discs, of_sectors = judged(model, discs), judged(_trained(study, spec, sectors, truth)[0], sectors)
     beyond = beyond_of(study)
     outside = study.outside.rows(np.flatnonzero(beyond.good))
     sets = {
@@ -80,15 +80,15 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         spec.name,
         "learnt",
         reference=against_reference(study, field, np.ones(len(field), bool), nodes),
-        teacher={name: figures for name, (figures, _) in sets.items() if figures is not None},
+        own_fem={name: figures for name, (figures, _) in sets.items() if figures is not None},
         flagged={name: share for name, (_, share) in sets.items()},
         covered=covered,
-        taught=told.loads,
-        units=told.units,
-        series=told.series,
-        inside=told.inside,
+        loads=solves.loads,
+        units=solves.units,
+        series=solves.series,
+        inside=solves.inside,
         bare=None if bare is None else 1e-3 * bare,
-        solving=told.seconds,
+        solving=solves.seconds,
         learning=learning,
         adapt=adapt,
         adapted=adapted,
@@ -100,7 +100,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
 
 def counts(most: int) -> list[int]:
     """64, 128, 256, ... below `most`."""
-    return [FEWEST_TAUGHT << k for k in range(20) if FEWEST_TAUGHT << k < most]
+    return [FEWEST_LOADS << k for k in range(20) if FEWEST_LOADS << k < most]
 
 
 def _covered(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) -> dict[str, float]:
@@ -123,22 +123,22 @@ def _adapted(study: Study, spec: Learner) -> tuple[float | None, Figures | None]
     after = debulked_study(study)
     nodes = spec.vertices(after.anatomy)
     truth = after.answers[:, np.isin(after.anatomy.tumour_nodes, nodes)]
-    (model, _), learning = timed(_taught, after, spec, after.discs, truth)
+    (model, _), learning = timed(_trained, after, spec, after.discs, truth)
     rows = np.flatnonzero(after.discs.test)
     seconds += learning + series_seconds(after, spec.name)
     return seconds, _held(model, after.converged.rows(rows), truth[rows], nodes)[0]
 
 
-def _taught(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> tuple[Deformer, Told]:
+def _trained(study: Study, spec: Learner, split: Split, truth: np.ndarray) -> tuple[Deformer, SolveCounts]:
     """A model of the split's training loads, and the solves that it took; truth (B, k, 3) [m] of all that converged."""
     if spec.name not in MACHINES:
         trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
-        told = trained.scores[0].told
-        assert told is not None
-        return trained.models[spec.name], told
-    rows = np.flatnonzero(split.taught)
-    told = Told(len(rows), 0, 0, 0, study.dataset.seconds("load", len(rows)))
-    return published_model(spec.name, study.anatomy, study.converged.rows(rows), truth[rows]), told
+        solves = trained.scores[0].solves
+        assert solves is not None
+        return trained.models[spec.name], solves
+    rows = np.flatnonzero(split.train)
+    solves = SolveCounts(len(rows), 0, 0, 0, study.dataset.seconds("load", len(rows)))
+    return published_model(spec.name, study.anatomy, study.converged.rows(rows), truth[rows]), solves
 
 
 def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> tuple[Figures | None, float]:

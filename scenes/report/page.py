@@ -38,7 +38,7 @@ figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption
 """
 NOTES = (
     "There are two errors, never mixed. The error against the reference says what a row is worth. The error against "
-    "its own teacher, the finite elements that it was trained on, says what learning lost. A row of another law than "
+    "its own finite elements, those that it was trained on, says what learning lost. A row of another law than "
     "the reference's has a model difference instead of an error. The reference's own elements, less exactly solved, "
     "show their tolerance alone and are not drawn.",
     "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
@@ -96,7 +96,7 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
 
 def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
     measured = [row for row in section.rows if row.reference is not None]
-    learnt = [row for row in section.rows if row.teacher]
+    learnt = [row for row in section.rows if row.own_fem]
     about = "".join(f"<p>{escape(sentence)}</p>" for sentence in section.about)
     first, *others = [_picture(plot, plot.stem) for plot in plots] or [""]
     pictures = [
@@ -108,7 +108,7 @@ def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
     return (
         f"<h2>{escape(section.name)}</h2>{first}{about}"
         f"<h3>Against the reference</h3>{_against_reference(section)}"
-        + (f"<h3>Against its own teacher</h3>{_against_teacher(learnt)}{''.join(others)}" if learnt else "")
+        + (f"<h3>Against its own finite elements</h3>{_against_own_fem(learnt)}{''.join(others)}" if learnt else "")
         + f"<h3>By tenths of the force</h3>{_by_force(measured, learnt)}"
         "<h3>Worst cases</h3><p>The tumour as the row has it, and dashed in yellow where the reference has it; a pixel "
         "is about 0.1 mm.</p>"
@@ -138,7 +138,7 @@ def _against_reference(section: Section) -> str:
             lines.append(("pale", (row.name, row.state, *[""] * (len(heads) - 2))))
             continue
         minutes = None if row.learning is None else (row.learning + (row.solving or 0.0)) / 60.0
-        short = "" if row.solving is not None or row.taught is None else " of fitting"
+        short = "" if row.solving is not None or row.loads is None else " of fitting"
         cost = (row.median, row.p99, row.bare, row.set_up, row.memory, row.card)
         cells = (
             row.name, row.against, _count(row), *_spread(row.reference), *map(_text, cost), _solves(row),
@@ -156,7 +156,7 @@ def _adapting(row: Row) -> str:
 
 def _solves(row: Row) -> str:
     """How many solves of finite elements a row was given, by kind."""
-    kinds = ((row.taught, ""), (row.units, " unit"), (row.series, " series"))
+    kinds = ((row.loads, ""), (row.units, " unit"), (row.series, " series"))
     return " + ".join(f"{count}{kind}" for count, kind in kinds if count)
 
 
@@ -165,7 +165,7 @@ def _count(row: Row) -> str:
     return f"{loads}, {row.failed} failed" if row.failed else str(loads)
 
 
-def _against_teacher(rows: Sequence[Row]) -> str:
+def _against_own_fem(rows: Sequence[Row]) -> str:
     heads = (
         "row", "loads of", "loads", *SPREAD_HEADS, "called extrapolated", "within 95 % bound",
     )  # fmt: skip
@@ -181,7 +181,7 @@ def _against_teacher(rows: Sequence[Row]) -> str:
             )
             for row in rows
             for name, words in SETS.items()
-            if (figures := row.teacher.get(name)) is not None
+            if (figures := row.own_fem.get(name)) is not None
         ),
     )
 
@@ -191,9 +191,9 @@ def _share(share: float | None) -> str:
 
 
 def _by_force(measured: Sequence[Row], learnt: Sequence[Row]) -> str:
-    """Of learners those against the teacher, of which there are more."""
+    """Of learners those against their own finite elements, of which there are more."""
     lines = [(row.name, "reference", row.reference) for row in measured]
-    lines += [(row.name, "teacher", row.teacher["discs"]) for row in learnt if "discs" in row.teacher]
+    lines += [(row.name, "own FEM", row.own_fem["discs"]) for row in learnt if "discs" in row.own_fem]
     most = max((len(figures.tenths) for *_, figures in lines if figures), default=0)
     heads = ("mean mm (largest)", "from", *(f"{k + 1}" for k in range(most)))
     table = [

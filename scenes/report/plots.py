@@ -38,10 +38,12 @@ def against_time(rows: Sequence[Row]) -> np.ndarray | None:
 
 def learners_against_time(rows: Sequence[Row]) -> np.ndarray | None:
     """What learning lost against time, (H, W, 3) uint8. None without learners."""
-    places = _places((row, row.teacher.get("discs")) for row in rows)
-    title = "What learning lost, against time: distance from the teacher on left-out discs"
+    places = _places((row, row.own_fem.get("discs")) for row in rows)
+    title = "What learning lost, against time: distance from its own finite elements, left-out discs"
     group = {row.name: row.family for row in rows}
-    return _scatter(title, "mean distance from the teacher at the tumour [mm]", places, group, unbeaten(places))
+    return _scatter(
+        title, "mean distance from its own finite elements at the tumour [mm]", places, group, unbeaten(places)
+    )
 
 
 def against_solves(rows: Sequence[Row]) -> np.ndarray | None:
@@ -49,7 +51,7 @@ def against_solves(rows: Sequence[Row]) -> np.ndarray | None:
     curves = tuple(
         Curve(row.name, tuple((float(count), each.mm.mean) for count, each in row.curve)) for row in rows if row.curve
     )
-    y = "mean distance from the teacher on left-out discs [mm]"
+    y = "mean distance from its own finite elements on left-out discs [mm]"
     return drawn([Panel("Error against solves", "training loads", y, curves, size=SIZE)]) if curves else None
 
 

@@ -1,4 +1,4 @@
-"""What rows are held against: the reference's answers, kept load by load, and the teacher's beyond its own data."""
+"""What rows are held against: the reference's answers, kept load by load, and finite elements beyond the data."""
 
 from __future__ import annotations
 

@@ -117,8 +117,8 @@ class Row:
         `ERROR`; `DIFFERENCE` where its law is another; `TOLERANCE_ALONE` where its elements are the reference's own.
     reference
         Distances from the reference on the played loads.
-    teacher
-        Distances from its own teacher, by set of loads: "discs", "sectors", "beyond".
+    own_fem
+        Distances from the finite elements that it was trained on, by set of loads: "discs", "sectors", "beyond".
     flagged
         Share of each set that it calls extrapolated by itself.
     covered
@@ -135,7 +135,7 @@ class Row:
         Seconds before the first load.
     memory, card
         Of its process, and of the graphics card, at the peak [GiB].
-    taught, units, series
+    loads, units, series
         Solves of finite elements that it was given: loads, unit responses of the open cortex, terms of the series.
     inside
         Those of them inside the discs left out that are about the tumour.
@@ -146,9 +146,9 @@ class Row:
     adapt
         Seconds until it answers again when the tumour is debulked by a fifth: set-up, or solves and fitting, anew.
     adapted
-        Distances from the teacher of the debulked body then, on discs left out; None of finite elements.
+        Distances from the finite elements of the debulked body then, on discs left out; None of finite elements.
     curve
-        Distances from the teacher on the discs, by number of training loads.
+        Distances from the finite elements that it was trained on, on the discs, by number of training loads.
     plan
         Which solvers finite elements try for a load, in sentences.
     picture
@@ -160,7 +160,7 @@ class Row:
     state: str = "measured"
     against: str = ERROR
     reference: Figures | None = None
-    teacher: Mapping[str, Figures] = field(default_factory=dict)
+    own_fem: Mapping[str, Figures] = field(default_factory=dict)
     flagged: Mapping[str, float] = field(default_factory=dict)
     covered: Mapping[str, float] = field(default_factory=dict)
     failed: int = 0
@@ -171,7 +171,7 @@ class Row:
     set_up: float | None = None
     memory: float | None = None
     card: float | None = None
-    taught: int | None = None
+    loads: int | None = None
     units: int | None = None
     series: int | None = None
     inside: int | None = None

@@ -102,10 +102,15 @@ def _digest(study: Study, spec: Spec) -> str:
     return digest_of(np.frombuffer(stated.encode(), np.uint8))
 
 
+FORMER_NAMES = {"teacher": "own_fem", "taught": "loads"}
+"""What files of rows from before called fields."""
+
+
 def _kept(path: Path, digest: str) -> Row | None:
     """The row in a file, if it is there, whole, and of the same inputs."""
     try:
         stored = json.loads(path.read_text())
-        return msgspec.convert(stored["row"], Row) if stored["digest"] == digest else None
+        row = {FORMER_NAMES.get(name, name): value for name, value in stored["row"].items()}
+        return msgspec.convert(row, Row) if stored["digest"] == digest else None
     except (OSError, ValueError, LookupError, TypeError):
         return None

@@ -134,9 +134,9 @@ class Study:
     def outside(self) -> Loads:
         """Loads beyond the training range: stronger, more oblique, nearer to the rim, in equal parts."""
         pushed = self.converged.rows(np.flatnonzero(self.discs.test)).of(Pushed)
-        taught = self.converged.rows(np.flatnonzero(self.discs.taught)).of(Pushed)
-        assert pushed is not None and taught is not None
-        return loads_beyond(self.patch, taught, pushed, self.beyond)
+        training = self.converged.rows(np.flatnonzero(self.discs.train)).of(Pushed)
+        assert pushed is not None and training is not None
+        return loads_beyond(self.patch, training, pushed, self.beyond)
 
     @cached_property
     def digest(self) -> str:

@@ -30,7 +30,7 @@ from sim.effects import (
 from sim.errors import InputError
 from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
 from sim.material import Material, Tissue
-from sim.runtime.user_script import run_script, told
+from sim.runtime.user_script import error_text, run_script
 
 from .debulking import Debulking
 from .head_posture import Lie, supine
@@ -279,7 +279,7 @@ def _own_scene(path: str) -> Scene:
         try:
             touch = found.path(time)
         except Exception as error:
-            raise InputError(told(FilePath(path).absolute(), error)) from error
+            raise InputError(error_text(FilePath(path).absolute(), error)) from error
         if not isinstance(touch, Touch):
             what = type(touch).__name__
             raise InputError(f"{path}: at {time:g} s its path gives a {what}. Make it a scenes.Touch.")

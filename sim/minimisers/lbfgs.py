@@ -25,7 +25,7 @@ from .lbfgs_state import Workspace, ground_of
 # the newest pair and how many there are (b,).
 LEARNT = ("s", "w", "sy", "yw", "head", "known")
 # Learnt curvature travels with the answers of so few load cases: a larger batch has no next frame.
-TAUGHT = EXACT
+CARRIED = EXACT
 
 
 @dataclass(frozen=True)
@@ -110,12 +110,12 @@ class Lbfgs:
         device, count = self._problem.device, start.shape[1]
         u, place = wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
-        teach = learnt is not None and count <= TAUGHT
+        carried = learnt is not None and count <= CARRIED
         if count == 0:
             return Descended(u, status, steps, residual, {})
         workspace, tried = self._workspace(count), 0
         workspace.begin(
-            start, tolerance, np.zeros(count) if force is None else force, (learnt or {}) if count <= TAUGHT else {}
+            start, tolerance, np.zeros(count) if force is None else force, (learnt or {}) if count <= CARRIED else {}
         )
         if ahead is not None:
             workspace.aim(*ahead)
@@ -126,7 +126,7 @@ class Lbfgs:
             now = workspace.columns["status"].numpy()[: len(place)]
             left = int((now == LIVE).sum())
             last = tried >= most or left <= stragglers * count
-            if last or (count > TAUGHT and self._width(left) <= self._schedule.smaller * workspace.width):
+            if last or (count > CARRIED and self._width(left) <= self._schedule.smaller * workspace.width):
                 leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
                 there = place[leave]
                 scattered(device, workspace.columns["u"], there, u, leave)
@@ -134,7 +134,7 @@ class Lbfgs:
                     workspace.columns[name].numpy()[leave] for name in ("status", "steps", "residual")
                 )
                 if last:
-                    learnt = {name: rows_first(workspace.columns[name]) for name in LEARNT} if teach else {}
+                    learnt = {name: rows_first(workspace.columns[name]) for name in LEARNT} if carried else {}
                     return Descended(u, status, steps, residual, learnt)
                 stay = np.flatnonzero(now == LIVE)
                 place, before, workspace = place[stay], workspace, self._workspace(len(stay))

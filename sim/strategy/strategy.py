@@ -211,7 +211,7 @@ class Strategy:
         start = device.zeros(problem.rows, count) if start is None else start
         if problem.barriers:
             return self._moved(cases, start)
-        if problem.paced:  # it would teach the next frame nothing
+        if problem.paced:  # the next frame would gain nothing
             learnt = None
         if Step.LBFGS not in self.plan.steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
@@ -224,7 +224,7 @@ class Strategy:
         answer = Answer(
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
         )
-        taught: Mapping[str, np.ndarray] = {}
+        gained: Mapping[str, np.ndarray] = {}
         left = self.plan.evaluations
         for descent, known in descents:
             found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), left, known)
@@ -232,7 +232,7 @@ class Strategy:
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
             answer.put(index, self._answer(found.u, outcome, found.steps, found.residual, 0), device)
-            taught = found.learnt
+            gained = found.learnt
             index = index[found.left]
             if len(index) == 0:
                 break
@@ -240,7 +240,7 @@ class Strategy:
             start = gathered(device, found.u, found.left)
         else:
             answer.put(index, self._thorough(start, self.accuracy.outer), device)
-        return replace(answer, learnt=taught)
+        return replace(answer, learnt=gained)
 
     def _touching(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
         """Of cases whose tools have gone so many times their gap: what touches and what gives apart, then Newton.

@@ -34,7 +34,7 @@ class Sectors(Split):
         """What was left out, in one line for people (degrees)."""
         return (
             f"{len(self.centres)} sectors of {2.0 * np.degrees(self.radius):g} degrees round the cortex's normal left "
-            f"out: {int(self.test.sum())} loads to test, {int(self.taught.sum())} to learn from"
+            f"out: {int(self.test.sum())} loads to test, {int(self.train.sum())} to train on"
         )
 
 

@@ -44,7 +44,7 @@ class Split:
         return self.disc >= 0
 
     @property
-    def taught(self) -> np.ndarray:
+    def train(self) -> np.ndarray:
         """(B,) bool."""
         return self.disc == -1
 
@@ -56,14 +56,14 @@ class Split:
         """What was left out, in one line for people (mm)."""
         return (
             f"{len(self.centres)} discs of {1e3 * self.radius:g} mm radius ({100 * self.share:.0f} % of the open "
-            f"cortex) left out: {int(self.test.sum())} loads to test, {int(self.taught.sum())} to learn from"
+            f"cortex) left out: {int(self.test.sum())} loads to test, {int(self.train.sum())} to train on"
         )
 
 
 def leave_discs_out(points: np.ndarray, patch: Patch) -> Split:
     """Discs of 6 mm radius round load points (B, 3) [m] far from each other: at least 6, and 15 % of the patch.
 
-    No disc beyond the sixth is taken if it would leave fewer than half of the loads to learn from. At a small
+    No disc beyond the sixth is taken if it would leave fewer than half of the loads to train on. At a small
     craniotomy, where six discs take more than half, the discs shrink, as far as that helps. Six of the few positions of
     the preset `seed` are more than half in any case.
 

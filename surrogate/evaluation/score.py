@@ -14,7 +14,7 @@ from sim.loads import Loads
 from sim.runtime.threads import one_thread
 
 from ..model.learned import Learned
-from .solve_counts import Told
+from .solve_counts import SolveCounts
 
 WARM_UP, TIMED = 20, 200
 # Fewer loads do not determine the greatest of a thousand.
@@ -40,7 +40,7 @@ class Score:
         Median wall time of the whole answer to one load at a time, its bound and limits included, warm-up excluded.
     bare_microseconds
         The same of the model alone in NumPy, which compares learners; None of what is no model of this project.
-    told
+    solves
         The finite-element solves that the deformer was given, where that is known.
     """
 
@@ -58,7 +58,7 @@ class Score:
     worst_p999_mm: float | None
     microseconds: float
     bare_microseconds: float | None = None
-    told: Told | None = None
+    solves: SolveCounts | None = None
 
 
 def errors(deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def errors(deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarra
 
 
 def score(
-    name: str, deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray, told: Told | None = None
+    name: str, deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray, solves: SolveCounts | None = None
 ) -> Score:
     """Hold a deformer to `truth` (B, n, 3) [m] at the vertices `nodes` (n,)."""
     distance = errors(deformer, loads, truth, nodes)
@@ -79,7 +79,7 @@ def score(
         *spread(1e3 * distance.max(axis=1))[:3],
         microseconds(deformer, loads, nodes),
         bare_microseconds(deformer, loads),
-        told,
+        solves,
     )
 
 
@@ -149,13 +149,13 @@ def _known(value: float | None, form: str) -> str:
 
 def _solve_lines(scores: Sequence[Score]) -> list[str]:
     """The solves that each learner was given, as lines."""
-    known = [(row.name, row.told) for row in scores if row.told is not None]
+    known = [(row.name, row.solves) for row in scores if row.solves is not None]
     if not known:
         return []
     rows = [
-        f"{name:<10}{told.loads:7d} {told.units:7d} {told.series:8d} {told.solves:8d} {told.inside:9d}"
-        f" {'unknown' if told.seconds is None else f'{told.seconds:.1f}':>9}"
-        for name, told in known
+        f"{name:<10}{count.loads:7d} {count.units:7d} {count.series:8d} {count.total:8d} {count.inside:9d}"
+        f" {'unknown' if count.seconds is None else f'{count.seconds:.1f}':>9}"
+        for name, count in known
     ]
     return [
         "finite-element solves given to the learners above, their wall time, and how many are of the tumour from "

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Told:
+class SolveCounts:
     """Solves by kind, and their wall time.
 
     Parameters
@@ -30,6 +30,6 @@ class Told:
     seconds: float | None
 
     @property
-    def solves(self) -> int:
+    def total(self) -> int:
         """All of them."""
         return self.loads + self.units + self.series

@@ -65,7 +65,7 @@ def positions_of(loads: Loads) -> np.ndarray:
     return only_pushed(loads).point[np.unique(whole, axis=0, return_index=True)[1]]
 
 
-def taught_in_turn(
+def trained_in_turn(
     name: str,
     anatomy: Anatomy,
     loads: Loads,

@@ -24,7 +24,7 @@ from ..data.dataset import Dataset
 from ..data.disc_split import Split
 from ..data.encode import ENCODERS, Basis, directions, reduce
 from ..data.tool_loads import spread
-from ..evaluation.solve_counts import Told
+from ..evaluation.solve_counts import SolveCounts
 from ..model.applicability import trained_skull
 from ..model.learned import Part, only_pushed
 from ..regressors.ball_contact import Contact
@@ -305,7 +305,7 @@ class SharedInputs:
         left_out = self._left_out(self.expansion.patch.points)
         return self.expansion.compliance(self.expansion.tumour, left_out) if left_out.any() else self.expansion.table
 
-    def solve_counts(self, name: str, examples: Examples) -> Told:
+    def solve_counts(self, name: str, examples: Examples) -> SolveCounts:
         """The solves that a learner of `LEARNERS` or `OF_POSES` is given, a user's own too."""
         known, data, loads = self.expansion, self.expansion.data, len(examples.loads.point)
         units = series = inside = 0
@@ -322,7 +322,7 @@ class SharedInputs:
             series = places * len(known.radii) * TERMS
             seconds.append(known.tabulated.seconds * places / len(known.places))
         total = None if None in seconds else float(sum(filter(None, seconds)))
-        return Told(loads, units, series, inside, total)
+        return SolveCounts(loads, units, series, inside, total)
 
     def _left_out(self, points: np.ndarray) -> np.ndarray:
         return np.zeros(len(points), bool) if self.split is None else self.split.covers(points)

@@ -57,7 +57,7 @@ class Trained:
     split: Split
     motion: float
     calibrated: int
-    taught: int
+    training_loads: int
     left_out: dict[str, Coverage]
     distance_left_out: dict[str, Coverage]
 
@@ -155,7 +155,7 @@ def train(
     def examples(rows: np.ndarray) -> Examples:
         return Examples(_rows(pushed, rows), truth[rows], cortex[rows])
 
-    chosen = [_first(split.taught, most), *([_first(~apart, most)] if apart.any() else [])]
+    chosen = [_first(split.train, most), *([_first(~apart, most)] if apart.any() else [])]
     example_sets = [examples(rows) for rows in chosen]
     inputs = [SharedInputs(each, shared, left) for each, left in zip(example_sets, (split, None), strict=False)]
     test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
