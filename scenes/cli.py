@@ -24,13 +24,13 @@ COMMANDS = {
     "train": "fit surrogate models to a data set, and compare their errors on cortex that was left out",
     "judge": "test models on loads that they have never seen: errors, and whether their bounds hold",
     "export": "write a trained model as an ONNX file, for programs in other languages",
-    "patient": "from a label volume to a brain ready for the scenes: anatomy, simulate, train",
+    "patient": "make all that the scenes need from a label volume: anatomy, data set, models",
     "scenes": "list the built-in scenes: effects, who can play them, pictures and cost",
     "effects": "measure what each effect of a scene costs, and what it changes",
     "demo": "play a scene on a page in the browser",
     "render": "write the frames of a scene as pictures, without display",
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
-    "sensitivity": "how far the tumour's motion changes with tissue, skull, tool and element, one at a time",
+    "sensitivity": "measure how the tumour's motion changes with tissue, skull, tool and element, one at a time",
     "bench": "measure what each stage costs, what each element is worth, how robust and how fast the solver is",
     "report": "measure what accuracy costs in time, for every deformer, as a page",
     "check": "play scenes without display, and fail where a picture is farther off than its stated bounds",
@@ -94,7 +94,11 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
 def add_plugin(parser: argparse.ArgumentParser) -> None:
     """Declare the files that bring learners."""
     parser.add_argument(
-        "--plugin", action="append", default=[], metavar="FILE.py", help="run this file: it brings learners"
+        "--plugin",
+        action="append",
+        default=[],
+        metavar="FILE.py",
+        help="a file with learners of your own; it is run as Python",
     )
 
 

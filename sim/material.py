@@ -331,7 +331,7 @@ class MaterialSet:
 
 
 MATERIALS = {
-    "default": MaterialSet(BRAIN, "seconds", "recommended: `seconds`"),
+    "default": MaterialSet(BRAIN, "seconds", "the same as `seconds`"),
     "seed": MaterialSet(
         Material("neo-hookean", 3330.0, 0.4945),
         "seconds",

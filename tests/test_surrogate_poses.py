@@ -147,7 +147,7 @@ def trained(data: Dataset) -> Trained:
     return train(data, ["gp"])
 
 
-def test_poses_teach_where_there_is_no_force(
+def test_poses_train_where_there_is_no_force(
     data: Dataset, trained: Trained, pretender: Deformer, box: Anatomy
 ) -> None:
     """Fresh poses, as drawn: learnt to a few per cent, and bounds hold about as often as they say."""
@@ -219,7 +219,7 @@ def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(train
     assert "here is none, but ToolContact" in str(refusal(forces, EFFECTS))
 
 
-def test_what_poses_cannot_teach_is_refused(data: Dataset, box: Anatomy) -> None:
+def test_what_poses_cannot_train_is_refused(data: Dataset, box: Anatomy) -> None:
     with pytest.raises(
         InputError, match="poses, of which linear, series cannot be had: choose from contact, contact-gp, gp"
     ):

@@ -50,10 +50,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("--out", required=True, type=Path, metavar="MESH.vtu", help="mesh to write [m, RAS]")
     parser.add_argument(
-        "--nodes", type=int, default=5300, metavar="N", help="nodes wanted, 2000 to 250000 (%(default)s)"
+        "--nodes",
+        type=int,
+        default=5300,
+        metavar="N",
+        help="number of mesh nodes, 2000 to 250000 (default %(default)s)",
     )
-    parser.add_argument("--craniotomy", type=float, metavar="MM", help="diameter along the cortex [mm] (50)")
-    parser.add_argument("--preset", choices=tuple(PRESETS), default="default", help="values of what is not given")
+    parser.add_argument(
+        "--craniotomy", type=float, metavar="MM", help="diameter of the opening along the cortex [mm] (default 50)"
+    )
+    parser.add_argument(
+        "--preset", choices=tuple(PRESETS), default="default", help="values of the options that are not given"
+    )
     add_opening_arguments(parser)
     own = parser.add_argument_group("your own brain")
     own.add_argument("--labels", type=Path, metavar="FILE.nii.gz", help="label volume; without it, the template")
@@ -67,12 +75,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--radius", type=float, metavar="MM", help="radius [mm]; of a ball of equal volume if lobed (12)"
     )
     placed.add_argument("--cover", type=float, metavar="MM", help="depth of its cap under the cortex [mm] (10)")
-    placed.add_argument("--tumour-shape", choices=("sphere", "lobed"), help="its shape (sphere)")
+    placed.add_argument("--tumour-shape", choices=("sphere", "lobed"), help="its shape (default sphere)")
     placed.add_argument("--site", choices=tuple(SITES), help="the cortex that it lies under (central)")
     placed.add_argument(
         "--tumour-at", type=point, metavar="X,Y,Z", help="its middle [mm, RAS], in place of --site and --cover"
     )
-    placed.add_argument("--seed", type=int, default=0, metavar="N", help="another lobed shape for another seed (0)")
+    placed.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random lobed shape (default 0)")
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as one line of JSON")
 

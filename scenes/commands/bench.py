@@ -6,16 +6,16 @@ import argparse
 import importlib
 
 BENCHES = {
-    "stages": "what each stage costs on this machine (this one if none is named)",
+    "stages": "what each stage costs on this machine (the default word)",
     "elements": "how far each element is from the limit of fine meshes, and what it costs",
     "skull": "how far the tumour moves under each skull, on meshes of several sizes, and what passes",
     "robust": "how many of thousands of random loads converge",
     "live": "what a frame of a moving tool takes, warm-started, and how far off it is",
-    "growth": "what a load takes in seconds and memory, the finer the mesh the more, and what preconditions it",
+    "growth": "time and memory that a load takes on finer and finer meshes, and its preconditioner",
     "throughput": "how many loads a second the finite elements solve: one mesh, thousands of loads",
     "published": "how far the published learners are off, one force position left out at a time",
-    "shortcuts": "what each shortcut of the solver is worth, on work that users do",
-    "solver": "the first load on a mesh and a further one, beside other packages",
+    "shortcuts": "how much time each shortcut of the solver saves on typical loads",
+    "solver": "time of the first load on a mesh and of a further one, compared with other packages",
 }
 
 

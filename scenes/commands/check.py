@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scenes", nargs="*", help="which, MY_SCENE.py too (default: all built-in scenes)")
-    parser.add_argument("--every", type=int, default=10, help="check every so many frames (default %(default)s)")
+    parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
+    parser.add_argument("--every", type=int, default=10, help="check one frame in so many (default %(default)s)")
     parser.add_argument(
         "--certify", action="store_true", help="give each frame's error without solving to the end, and correct it"
     )

@@ -30,9 +30,11 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     """Declare who plays, on which anatomy: shared by every command that plays a scene."""
     add_bodies(parser)
     parser.add_argument(
-        "--deformer", help="linear, ann, svr, ... or fem; auto: by budget (default: the trained one of least error)"
+        "--deformer",
+        help="who answers: a trained model (linear, ann, svr, ...), or fem. auto chooses by a budget. Default: the "
+        "model of least error",
     )
-    budget = parser.add_argument_group("a budget, in place of a deformer; the error is what each states")
+    budget = parser.add_argument_group("a budget, in place of --deformer; errors are those that models state")
     budget.add_argument(
         "--within-mm",
         type=float,

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cortex",
         action="store_true",
-        help="the open cortex too, not the tumour alone: then the graph wants the footprint's weights at its nodes",
+        help="the open cortex too, not the tumour alone: then the graph needs the footprint's weights at its nodes",
     )
     add_force(parser)
 

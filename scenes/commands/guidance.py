@@ -62,7 +62,7 @@ next: open report/index.html""",
     "check": """examples:
   sulcus check
   sulcus check press palpate --every 30
-next: sulcus render a scene that fails, and look""",
+next: look at a scene that fails: sulcus render SCENE --out frames""",
 }
 
 

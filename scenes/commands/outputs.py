@@ -19,9 +19,7 @@ HEAD = 1 << 16
 
 def add_force(parser: argparse.ArgumentParser) -> None:
     """Declare --force: shared by every command that writes."""
-    parser.add_argument(
-        "--force", action="store_true", help="replace an existing file even if it is not recognised as one of these"
-    )
+    parser.add_argument("--force", action="store_true", help="replace an existing file even if sulcus did not make it")
 
 
 def claimed(

@@ -29,11 +29,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tumour", required=True, help="labels that are tumour, separated by commas")
     parser.add_argument("--t1", type=Path, help="intensities in the same space, for the camera view")
     parser.add_argument("--out", required=True, type=Path, help="the anatomy, PATIENT.vtu; all else is put beside it")
-    parser.add_argument("--nodes", type=int, default=5300, help="mesh nodes (default %(default)s)")
-    parser.add_argument("--craniotomy", type=float, default=50.0, help="diameter [mm] (default %(default)s)")
+    parser.add_argument("--nodes", type=int, default=5300, help="number of mesh nodes (default %(default)s)")
+    parser.add_argument(
+        "--craniotomy",
+        type=float,
+        default=50.0,
+        help="diameter of the opening along the cortex [mm] (default %(default)s)",
+    )
     add_opening_arguments(parser)
     parser.add_argument("--count", type=int, default=1000, help="loads to simulate (default %(default)s)")
-    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="palpation",
+        help="the tool. mixed: all of them; seed: the published protocol; brutal: far beyond surgery. "
+        "Default: %(default)s",
+    )  # fmt: skip
     parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law (default %(default)s)")
     add_element_argument(parser)
     parser.add_argument(

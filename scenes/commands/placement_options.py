@@ -19,12 +19,13 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
         "--opening-at", type=point, metavar="X,Y,Z",
-        help="centre the craniotomy on the nearest reachable point of the brain's surface [mm, RAS] (over the tumour)",
+        help="centre the craniotomy on the nearest reachable point of the brain's surface [mm, RAS] (default: over the "
+        "tumour)",
     )  # fmt: skip
     place.add_argument(
         "--opening-over", type=piece_or_point, metavar="PIECE|X,Y,Z",
         help="open the skull over a piece of the tumour, by its number (1 is the largest), or over a point inside the "
-        "brain [mm, RAS] (1)",
+        "brain [mm, RAS] (default 1)",
     )  # fmt: skip
 
 

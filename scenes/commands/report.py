@@ -32,10 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size.add_argument(
         "--quick",
         action="store_true",
-        help=f"little data ({QUICK[0]} loads), few loads, one mesh, on which the reference is too",
+        help=f"a small report: {QUICK[0]} simulated loads, few comparisons, one mesh, the reference's too",
     )
     size.add_argument(
-        "--full", action="store_true", help="all laws, elements, meshes, tolerances and precisions with each other"
+        "--full", action="store_true", help="every combination of law, element, mesh, tolerance and precision"
     )
     parser.add_argument(
         "--out", type=Path, default=Path("report"), metavar="DIR", help="folder of the page (default %(default)s)"
@@ -45,7 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--data", nargs="+", type=Path, default=[], metavar="DATA.h5",
         help="data sets of `sulcus simulate`, each with rows of its own (default: one is made, smoothed, palpation)",
     )  # fmt: skip
-    parser.add_argument("--anatomy", metavar="MESH.vtu", help="of the data that is made (default: the template)")
+    parser.add_argument(
+        "--anatomy", metavar="MESH.vtu", help="anatomy to simulate on where no data are given (default: the template)"
+    )
     parser.add_argument(
         "--loads",
         type=int,

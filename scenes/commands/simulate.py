@@ -44,7 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", required=True, metavar="DATA.h5", help="the data set; an unfinished one goes on")
     parser.add_argument("--count", type=int, default=2000, help="loads to draw (default %(default)s)")
-    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="palpation",
+        help="the tool. mixed: all of them; seed: the published protocol; brutal: far beyond surgery. "
+        "Default: %(default)s",
+    )  # fmt: skip
     parser.add_argument(
         "--poses",
         action="store_true",
