@@ -6,7 +6,7 @@ import argparse
 import importlib
 
 BENCHES = {
-    "stages": "what each stage costs on this machine (the default word)",
+    "stages": "what each stage of a frame costs on this machine (also done without a word)",
     "elements": "how far each element is from the limit of fine meshes, and what it costs",
     "skull": "how far the tumour moves under each skull, on meshes of several sizes, and what passes",
     "robust": "how many of thousands of random loads converge",

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
     parser.add_argument("--count", type=int, default=10_000, help="loads, half of them brutal (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
     add_tissue_arguments(parser)
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mesh", nargs="+", type=Path, metavar="MESH.vtu", help="made by `sulcus anatomy` (default: the template)"
     )
     parser.add_argument("--loads", type=int, default=20, help="palpation loads, each from rest (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
     parser.add_argument("--starts", type=int, default=3, help="first answers of each engine (default %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="of every engine (default %(default)s)")
     parser.add_argument("--live", action="store_true", help="ours is set up for many single loads, which takes longer")

@@ -31,8 +31,8 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     parser.add_argument(
         "--deformer",
-        help="who answers: a trained model (linear, ann, svr, ...), or fem. auto chooses by a budget. Default: the "
-        "model of least error",
+        help="who answers: a trained model (linear, ann, svr, ...), or fem. auto: chosen by --within-mm or "
+        "--within-ms. Default: the model of least error",
     )
     budget = parser.add_argument_group("a budget, in place of --deformer; errors are those that models state")
     budget.add_argument(

@@ -15,7 +15,9 @@ from .outputs import add_force, claimed, claimed_folder
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--out", type=Path, help="folder of a picture of each, SCENE.png, and of all, sheet.png; timed")
+    parser.add_argument(
+        "--out", type=Path, help="draw and time each scene: folder for SCENE.png, and for all in sheet.png"
+    )
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
     add_force(parser)

@@ -54,11 +54,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--beside", nargs="+", choices=ELEMENTS, default=[], metavar="ELEMENT",
-        help="a row for each of these elements on the same mesh: what the mesh itself may be wrong by",
+        help="add a row for each of these elements on the same mesh: it shows the error of the mesh itself",
     )  # fmt: skip
     parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
     parser.add_argument("--count", type=int, default=32, help="loads to draw (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument(
         "--factorial", action="store_true",
@@ -66,7 +66,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "place of one change at a time. It takes an hour on two cores. --out gets the table, and a plot beside it "
         "(.png)",
     )  # fmt: skip
-    parser.add_argument("--nodes", type=int, default=5300, help="of the meshes of --factorial (default %(default)s)")
+    parser.add_argument(
+        "--nodes", type=int, default=5300, help="number of nodes of the meshes of --factorial (default %(default)s)"
+    )
     parser.add_argument("--out", type=Path, metavar="TABLE.csv", help="the table, unrounded")
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")

@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--poses",
         action="store_true",
-        help="a rigid ball of the tool's middle radius, moved by pose, instead of a force on its footprint",
+        help="press with a rigid ball of the tool's middle radius, moved by pose, instead of a force on its footprint",
     )
     parser.add_argument(
         "--ball",
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="with --poses: radius of that ball [mm] (in the scene palpate 7)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
     add_tissue_arguments(parser)
     add_element_argument(parser)
     add_skull_argument(parser, ("bonded", "slide"))
