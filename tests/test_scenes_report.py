@@ -219,9 +219,16 @@ def test_only_what_lacks_is_measured_again(study, found, tmp_path):
     list(rows(replace(here, timed=31), SPECS[:1], run))
     assert asked[5:] == ["FEM"]
     kept = tmp_path / "rows" / "data-linear.json"
+    stored = json.loads(kept.read_text())
+    former = {"own_fem": "teacher", "loads": "taught"}
+    row = {former.get(name, name): value for name, value in stored["row"].items()}
+    kept.write_text(json.dumps({**stored, "row": row}))
+    assert tuple(rows(here, SPECS[2:3], run)) == found[2:3] and "teacher" in row and len(asked) == 6
     kept.write_text(kept.read_text()[:-9])
     list(rows(here, SPECS, run))
-    assert asked[6:] == ["FEM", "linear"], "the first file held other inputs, the last was not whole"
+    assert asked[6:] == ["FEM", "linear"], (
+        "the first file held other inputs, the last was not whole; names from before are read"
+    )
 
 
 def test_a_reference_goes_on_load_by_load(study, monkeypatch):
