@@ -71,7 +71,7 @@ def test_every_step_but_newton_is_some_work(site: Site) -> None:
     found = list(works(site, 2, False))
     assert {work.step for work in found} == {None, *Step} - {Step.NEWTON}
     assert all(len(work.loads) == 3 for work in found)
-    assert {len(work.loads[0]) for work in found} == {1, shortcuts.BATCH}
+    assert {len(work.loads[0]) for work in found} == {1, shortcuts.BATCH, shortcuts.POSES}
 
 
 def test_the_command_prints_what_was_measured(

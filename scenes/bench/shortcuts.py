@@ -8,19 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim.accuracy import LIVE, TRAIN, Accuracy
-from sim.effects import Effect, pushed_effects
+from sim.effects import Effect, ToolContact, pushed_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import BRAIN
 from sim.strategy.plan import Step
 from surrogate.data.tool_loads import draw
+from surrogate.data.tool_poses import ball_of, draw_poses
 
 from ..script.scene import find_scene
 from ..script.site import Site
 from .stopwatch import timed
 
 SEED = 4
-BATCH, BATCH_ON_CUDA = 32, 2048
+BATCH, BATCH_ON_CUDA, POSES = 32, 2048, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +94,10 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
     name = "a palpation load from rest, quadratic"
     yield Work("nonlinear elimination, clamped", name, Step.CLAMPED, single, pushed, element="p2")
     yield Work("L-BFGS before Newton", "a palpation load from rest", Step.LBFGS, single, pushed)
+    poses = draw_poses("palpation", anatomy, POSES * (runs + 1), SEED)
+    together = [poses.rows(np.arange(first, first + POSES)) for first in range(0, len(poses), POSES)]
+    tool = (*pushed, ToolContact((ball_of("palpation"),)))
+    yield Work("contact solved apart", f"{POSES} poses of a ball together", Step.CONTACT, together, tool)
     for scene, step, shortcut in (
         ("press", Step.PATCH, "nonlinear elimination of a patch"),
         ("palpate", Step.CONTACT, "contact solved apart"),
