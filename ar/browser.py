@@ -168,12 +168,16 @@ class Browser:
         if colour is not self.shown[1]:
             self.coded = coded(colour)
         if colour is not self.shown[1] or words != self.shown[2]:
-            self.sent += 1
-            self.sight.content = sight(self.sent, self.coded, words)
+            self.put_sight(self.coded, words)
         # Not oftener: a visitor may be moving it.
         if number != self.shown[0]:
             self.assign(self.frame, number)
         self.shown = wanted
+
+    def put_sight(self, code: str, words: str) -> None:
+        """Send a `coded` picture and words, HTML, at once."""
+        self.sent += 1
+        self.sight.content = sight(self.sent, code, words)
 
     def move(self, name: str, vertices: np.ndarray, triangles: np.ndarray | None = None) -> None:
         """Put the vertices (V, 3) [m] of a body in the 3-D view elsewhere; triangles (F, 3) where they are others."""

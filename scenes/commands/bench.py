@@ -11,6 +11,7 @@ BENCHES = {
     "skull": "how far the tumour moves under each skull, on meshes of several sizes, and what passes",
     "robust": "how many of thousands of random loads converge",
     "live": "what a frame of a moving tool takes, warm-started, and how far off it is",
+    "frame": "where the time of a page's frame goes: load, deform, render, composite, encode, send",
     "growth": "time and memory that a load takes on finer and finer meshes, and its preconditioner",
     "throughput": "how many loads a second the finite elements solve: one mesh, thousands of loads",
     "published": "how far the published learners are off, one force position left out at a time",

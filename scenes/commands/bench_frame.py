@@ -1,0 +1,53 @@
+"""`sulcus bench frame`: where the time of a page's frame goes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from contextlib import redirect_stdout
+from dataclasses import asdict, replace
+
+from sim.arguments import at_least
+
+from .demo import add_theatre, deformer_name, scene_asked
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    from ..cli import add_plugin
+
+    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
+    add_theatre(parser)
+    add_plugin(parser)
+    parser.add_argument("--size", default="640x480", metavar="WxH", help="of the picture [pixel] (default %(default)s)")
+    parser.add_argument("--frames", type=int, default=120, help="frames that are timed (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play the scene to a page that nobody looks at."""
+    from tqdm import tqdm
+
+    from ..bench.frame import frames_of, size_of, table
+    from ..bench.stages import machine
+    from ..play.deformers import open_theatre
+
+    at_least("--frames", args.frames, 1)
+    width, height = size_of(args.size)
+    scene = scene_asked(args, args.scene)
+    scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
+    theatre = open_theatre(args.anatomy, args.model, args.device)
+    name = deformer_name(args, theatre, scene)
+    player = theatre.player(name, scene)
+    where = f"{machine(args.device)}; {scene.name} by {name}, {width} x {height}"
+    with redirect_stdout(sys.stderr):  # viser says there where it serves
+        frames = frames_of(player, args.frames)
+        found = table(list(tqdm(frames, "frames", args.frames, unit="frame", file=sys.stderr)))
+    if args.json:
+        print(json.dumps({"machine": where, "rows": [asdict(row) for row in found]}))
+        return 0
+    print(f"{where}\n\n| stage | frames | ms: median | p95 | mean |\n|---|---|---|---|---|")
+    for row in found:
+        print(f"| {row.stage} | {row.frames} | {row.median:.2f} | {row.p95:.2f} | {row.mean:.2f} |")
+    return 0

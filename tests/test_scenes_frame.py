@@ -1,0 +1,57 @@
+"""`sulcus bench frame`: every stage of a page's frame is timed, and the page gets the pictures."""
+
+import json
+
+import pytest
+from theatres import put, short, theatre_of
+
+from ar.browser import Browser
+from scenes.bench import frame
+from scenes.bench.frame import STAGES, WARM_UP, frames_of, size_of, table
+from scenes.cli import main
+from scenes.play.player import Player
+
+
+def test_each_frame_is_drawn_once_in_order_and_sent(box, monkeypatch):
+    drawn, sent, play, put_sight = [], [], Player.drawn, Browser.put_sight
+
+    def seen(player, number, *rest):
+        drawn.append(number)
+        return play(player, number, *rest)
+
+    def heard(page, code, words):
+        sent.append((code, words))
+        put_sight(page, code, words)
+
+    monkeypatch.setattr(Player, "drawn", seen)
+    monkeypatch.setattr(Browser, "put_sight", heard)
+    player = theatre_of(box).player("linear", short())
+    found = list(frames_of(player, 4))
+    assert len(found) == 4 and all(len(row) == len(STAGES) and min(row) > 0.0 for row in found)
+    assert drawn == [number % len(player.scene.times) for number in range(WARM_UP + 4)]
+    pictures = [code for code, _ in sent if code.startswith("data:image/jpeg")]
+    assert len(pictures) == WARM_UP + 4 and len(set(pictures)) > 3
+
+
+def test_a_frame_is_the_sum_of_its_stages():
+    rows = table([(1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (3.0, 2.0, 3.0, 4.0, 5.0, 6.0)])
+    assert [row.stage for row in rows] == [*STAGES, "frame"]
+    assert (rows[0].median, rows[-1].median, rows[-1].mean) == (2000.0, 22000.0, 22000.0)
+    assert rows[-1].p95 == pytest.approx(22900.0)
+
+
+def test_the_command_says_the_size_and_every_stage(box, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(frame, "WARM_UP", 1)
+    words = ["bench", "frame", "--anatomy", str(put(theatre_of(box), tmp_path / "box.vtu")), "--device", "cpu"]
+    words += ["--deformer", "linear", "--size", "160x120", "--frames", "2"]
+    assert main([*words, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert [row["stage"] for row in said["rows"]] == [*STAGES, "frame"] and "160 x 120" in said["machine"]
+    assert main([*words[:-1], "0"]) == 2 and "--frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["640", "0x480", "640x-1", "640x480x3", "9999x10", "axb"])
+def test_what_is_no_size_is_refused(text, capsys):
+    assert main(["bench", "frame", "--size", text]) == 2
+    assert "--size" in capsys.readouterr().err
+    assert size_of("1280X720") == (1280, 720)
