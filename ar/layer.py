@@ -68,6 +68,8 @@ class Layer:
         A solid texture and the material points (V, 3) [m] where it is read (the undeformed vertices).
     casts_shadow
         Whether the lamp throws its shadow.
+    still
+        Whether it never moves: a `Renderer` draws it once for a camera.
 
     Raises
     ------
@@ -85,6 +87,7 @@ class Layer:
     solid: Solid | None = None
     rest: np.ndarray | None = None
     casts_shadow: bool = False
+    still: bool = False
 
     def __post_init__(self) -> None:
         vertices, triangles = checked_mesh(self.vertices, self.triangles)

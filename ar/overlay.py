@@ -78,7 +78,7 @@ def composite(
     doubt: str = "",
     device: str = "cpu",
 ) -> Picture:
-    """The picture with a hidden surface drawn into it; depth, normals and segmentation stay as they are.
+    """The picture with a hidden surface drawn into it; depth and segmentation stay as they are.
 
     Parameters
     ----------

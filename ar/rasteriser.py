@@ -19,7 +19,11 @@ import warp as wp
 from .camera import Camera
 from .parallel import forward_kernel, in_bands, launch_in_bands, run_length
 
-NOTHING = np.uint64(0xFFFFFFFFFFFFFFFF)
+NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
+"""Of a z-buffer where nothing is seen."""
+NEAR = 1e-3
+"""Nothing closer to a camera is drawn [m]."""
+PARTS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,7 @@ class Fragments:
 
 
 def rasterise(
-    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = 1e-3, device: str = "cpu"
+    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu"
 ) -> Fragments:
     """The nearest triangle at every pixel centre.
 
@@ -69,33 +73,68 @@ def rasterise(
     ValueError
         Wrong shapes, indices out of range, vertices that are not finite, or near <= 0.
     """
-    vertices, triangles = checked_mesh(vertices, triangles)
-    if not near > 0.0:
-        raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
+    points, corners, nearest, rows = _drawn(camera, vertices, triangles, near, device)
     shape = camera.height, camera.width
-    homogeneous = camera.in_frame(vertices) @ camera.K.T
-    first, last = rows_reached(homogeneous, near, camera.height)
-    points = wp.array(homogeneous, dtype=wp.vec3d, device=device)
-    corners = wp.array(triangles, dtype=wp.vec3i, device=device, copy=False)
-    nearest = wp.full(shape, value=NOTHING, dtype=wp.uint64, device=device)
     face = wp.full(shape, value=-1, dtype=wp.int32, device=device)
     weights = wp.zeros(shape, dtype=wp.vec3f, device=device)
     depth = wp.zeros(shape, dtype=wp.float32, device=device)
-
-    run, threads = run_length(device), -(-len(triangles) // run_length(device))
-
-    def scan(begin: int, end: int) -> None:
-        inputs = [points, corners, wp.float64(near), first + begin, first + end, run]
-        wp.launch(keep_nearest, threads, inputs, [nearest], device=device)
-
-    wp.load_module(__name__, device=device)
-    in_bands(scan, last - first, device)
-    rows = slice(first, last)
-    found = [nearest[rows], points, corners, first]
+    found = [nearest[0, rows], points, corners, rows.start]
     launch_in_bands(
-        read_nearest, found, [face[rows], weights[rows], depth[rows]], (last - first) * camera.width, device
+        read_nearest, found, [face[rows], weights[rows], depth[rows]], (rows.stop - rows.start) * camera.width, device
     )
     return Fragments(face.numpy(), weights.numpy(), depth.numpy())
+
+
+def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
+    """(H, W) bool: the pixels whose centres a surface covers, seen alone. Arguments and errors as in `rasterise`."""
+    return _drawn(camera, vertices, triangles, NEAR, device)[2].numpy()[0] != np.uint64(NOTHING)
+
+
+def _drawn(
+    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float, device: str
+) -> tuple[wp.array, wp.array, wp.array, slice]:
+    """Homogeneous points (1, V), triangles, z-buffer (1, H, W) of (depth, face), and the rows that may be covered."""
+    vertices, triangles = checked_mesh(vertices, triangles)
+    if not near > 0.0:
+        raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
+    homogeneous = camera.in_frame(vertices) @ camera.K.T
+    rows = slice(*rows_reached(homogeneous, near, camera.height))
+    points = wp.array(homogeneous[None], dtype=wp.vec3d, device=device)
+    corners = wp.array(triangles, dtype=wp.vec3i, device=device, copy=False)
+    nearest = empty_buffer(1, camera.height, camera.width, device)
+    draw(points, corners, 0, rows, nearest, device, near)
+    return points, corners, nearest, rows
+
+
+def empty_buffer(count: int, height: int, width: int, device: str) -> wp.array:
+    """Z-buffers (count, height, width) of (depth, face) that hold nothing."""
+    return wp.full((count, height, width), value=NOTHING, dtype=wp.uint64, device=device)
+
+
+def draw(
+    points: wp.array,
+    triangles: wp.array,
+    since: int,
+    rows: slice,
+    nearest: wp.array,
+    device: str,
+    near: float = NEAR,
+) -> None:
+    """Draw the triangles from number `since` on into z-buffers (B, H, W), in some rows.
+
+    points (B, V) vec3d: homogeneous, in each picture; triangles (F,) vec3i, the same in all pictures.
+    """
+    wp.load_module(__name__, device=device)
+    count, run = triangles.shape[0] - since, run_length(device)
+    # On a card the rows of a triangle are shared by several threads.
+    parts = 1 if device == "cpu" else PARTS
+    size = nearest.shape[0], -(-count // run), parts
+
+    def scan(begin: int, end: int) -> None:
+        inputs = [points, triangles, since, wp.float64(near), rows.start + begin, rows.start + end, parts, run]
+        wp.launch(keep_nearest, size, inputs, [nearest], device=device)
+
+    in_bands(scan, rows.stop - rows.start, device)
 
 
 def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int, int]:
@@ -123,11 +162,33 @@ def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarra
 
 
 @wp.func
-def edge(q: wp.array(dtype=wp.vec3d), i: wp.int32, j: wp.int32) -> wp.vec3d:
-    """q_i x q_j, rounded alike for both neighbours of the edge: exactly edge(i, j) = -edge(j, i)."""
+def depth_of(key: wp.uint64) -> wp.float32:
+    """The depth in an entry of the z-buffer."""
+    return wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
+
+
+@wp.func
+def face_of(key: wp.uint64) -> wp.int32:
+    """The face in an entry of the z-buffer."""
+    return wp.int32(key & wp.uint64(0xFFFFFFFF))
+
+
+@wp.func
+def weights_at(column: wp.int32, row: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3f:
+    """The barycentric weights e / sum e of a triangle's corners at a pixel."""
+    p = wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
+    scale = wp.float64(1.0) / wp.dot(p, wp.cross(b - a, c - a))
+    wb = wp.float32(wp.dot(p, wp.cross(c, a - c)) * scale)
+    wc = wp.float32(wp.dot(p, wp.cross(a, b - a)) * scale)
+    return wp.vec3f(1.0 - wb - wc, wb, wc)
+
+
+@wp.func
+def edge(a: wp.vec3d, b: wp.vec3d, i: wp.int32, j: wp.int32) -> wp.vec3d:
+    """a x b, vertices i and j, rounded alike for both neighbours of the edge: exactly edge(i, j) = -edge(j, i)."""
     if i < j:
-        return wp.cross(q[i], q[j])
-    return -wp.cross(q[j], q[i])
+        return wp.cross(a, b)
+    return -wp.cross(b, a)
 
 
 @wp.func
@@ -162,22 +223,26 @@ def within(slope: wp.float64, offset: wp.float64, span: wp.vec2d) -> wp.vec2d:
 
 @wp.func
 def draw_triangle(
+    picture: wp.int32,
     face: wp.int32,
-    q: wp.array(dtype=wp.vec3d),
+    q: wp.array2d(dtype=wp.vec3d),
     triangles: wp.array(dtype=wp.vec3i),
     near: wp.float64,
     begin: wp.int32,
     end: wp.int32,
-    nearest: wp.array2d(dtype=wp.uint64),
+    part: wp.int32,
+    parts: wp.int32,
+    nearest: wp.array3d(dtype=wp.uint64),
 ):
-    """Keep, at each pixel centre inside triangle `face` in the rows begin .. end - 1, the minimum of (depth, face).
+    """Keep, at each pixel centre inside triangle `face`, the minimum of (depth, face).
 
-    Both fit in 64 bits, because the bits of positive floats sort as the floats do.
+    Only in the rows begin + part, begin + part + parts, ... below end. Both fit in 64 bits, because the bits of
+    positive floats sort as the floats do.
     """
     t = triangles[face]
-    a = q[t[0]]
-    b = q[t[1]]
-    c = q[t[2]]
+    a = q[picture, t[0]]
+    b = q[picture, t[1]]
+    c = q[picture, t[2]]
     normal = wp.cross(b - a, c - a)
     volume = wp.dot(normal, a)
     if volume == wp.float64(0.0):
@@ -192,17 +257,22 @@ def draw_triangle(
     low = wp.vec2d(box[0], box[1]) - slack
     high = wp.vec2d(box[2], box[3]) + slack
     zero = wp.float64(0.0)
-    left = wp.clamp(wp.ceil(low[0]), zero, wp.float64(nearest.shape[1]))
-    right = wp.clamp(wp.floor(high[0]), wp.float64(-1.0), wp.float64(nearest.shape[1] - 1))
+    left = wp.clamp(wp.ceil(low[0]), zero, wp.float64(nearest.shape[2]))
+    right = wp.clamp(wp.floor(high[0]), wp.float64(-1.0), wp.float64(nearest.shape[2] - 1))
     first = wp.int32(wp.clamp(wp.ceil(low[1]), wp.float64(begin), wp.float64(end)))
     stop = wp.int32(wp.clamp(wp.floor(high[1]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
     if left > right or first >= stop:
         return
     side = wp.sign(volume)
-    ea = edge(q, t[1], t[2]) * side
-    eb = edge(q, t[2], t[0]) * side
-    ec = edge(q, t[0], t[1]) * side
-    for row in range(first, stop):
+    ea = edge(b, c, t[1], t[2]) * side
+    eb = edge(c, a, t[2], t[0]) * side
+    ec = edge(a, b, t[0], t[1]) * side
+    # The first row from `first` on that is this part's.
+    ahead = (begin + part - first) % parts
+    if ahead < 0:
+        ahead += parts
+    first += ahead
+    for row in range(first, stop, parts):
         v = wp.float64(row)
         ra = ea[1] * v + ea[2]
         rb = eb[1] * v + eb[2]
@@ -218,24 +288,27 @@ def draw_triangle(
                     z = volume / across
                     if z >= near:
                         bits = wp.uint64(wp.cast(wp.float32(z), wp.uint32))
-                        wp.atomic_min(nearest, row, column, (bits << wp.uint64(32)) | wp.uint64(face))
+                        wp.atomic_min(nearest, picture, row, column, (bits << wp.uint64(32)) | wp.uint64(face))
 
 
 @forward_kernel
 def keep_nearest(
-    q: wp.array(dtype=wp.vec3d),
+    q: wp.array2d(dtype=wp.vec3d),
     triangles: wp.array(dtype=wp.vec3i),
+    since: wp.int32,
     near: wp.float64,
     begin: wp.int32,
     end: wp.int32,
+    parts: wp.int32,
     run: wp.int32,
     # outputs
-    nearest: wp.array2d(dtype=wp.uint64),
+    nearest: wp.array3d(dtype=wp.uint64),
 ):
-    """A run of triangles, each in the rows begin .. end - 1."""
-    start = wp.tid() * run
+    """A run of triangles in one picture, each in a part of the rows begin .. end - 1."""
+    picture, chunk, part = wp.tid()
+    start = since + chunk * run
     for face in range(start, wp.min(start + run, triangles.shape[0])):
-        draw_triangle(face, q, triangles, near, begin, end, nearest)
+        draw_triangle(picture, face, q, triangles, near, begin, end, part, parts, nearest)
 
 
 @forward_kernel
@@ -244,7 +317,7 @@ def read_nearest(
     end: wp.int32,
     run: wp.int32,
     nearest: wp.array2d(dtype=wp.uint64),
-    q: wp.array(dtype=wp.vec3d),
+    q: wp.array2d(dtype=wp.vec3d),
     triangles: wp.array(dtype=wp.vec3i),
     first: wp.int32,
     # outputs
@@ -252,24 +325,15 @@ def read_nearest(
     weights: wp.array2d(dtype=wp.vec3f),
     depth: wp.array2d(dtype=wp.float32),
 ):
-    """Each pixel: the winning face, its barycentric weights e / sum e, its depth; `first` is the arrays' first row."""
+    """Each pixel: the winning face, its barycentric weights, its depth; `first` is the arrays' first row."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         row = index / nearest.shape[1]
         column = index - row * nearest.shape[1]
         key = nearest[row, column]
-        if key != wp.uint64(0xFFFFFFFFFFFFFFFF):
-            winner = wp.int32(key & wp.uint64(0xFFFFFFFF))
+        if key != NOTHING:
+            winner = face_of(key)
             t = triangles[winner]
-            a = q[t[0]]
-            b = q[t[1]]
-            c = q[t[2]]
-            p = wp.vec3d(wp.float64(column), wp.float64(first + row), wp.float64(1.0))
-            eb = wp.dot(p, wp.cross(c, a - c))
-            ec = wp.dot(p, wp.cross(a, b - a))
-            scale = wp.float64(1.0) / wp.dot(p, wp.cross(b - a, c - a))
-            wb = wp.float32(eb * scale)
-            wc = wp.float32(ec * scale)
             face[row, column] = winner
-            weights[row, column] = wp.vec3f(1.0 - wb - wc, wb, wc)
-            depth[row, column] = wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
+            weights[row, column] = weights_at(column, first + row, q[0, t[0]], q[0, t[1]], q[0, t[2]])
+            depth[row, column] = depth_of(key)

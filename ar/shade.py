@@ -1,15 +1,18 @@
-"""What colour a seen point has under the lamp: deferred shading in Warp, one launch per layer."""
+"""What colour a seen point has under the lamp: deferred shading in Warp, one launch for all pictures."""
 
 from __future__ import annotations
 
 import warp as wp
 
 from .parallel import forward_kernel
+from .rasteriser import NOTHING, depth_of, face_of, weights_at
 
 # A caster must be this much nearer to the lamp [m] than what it shades.
 BIAS = wp.constant(0.0002)
 # Half the width of the shadow's soft rim [shadow-map pixel].
 SOFT = wp.constant(3)
+# The shadow map's bounds are kept for squares of so many pixels a side: the filter meets four of them at most.
+TILE = wp.constant(8)
 # Scene-linear light that is white.
 BRIGHTEST = wp.constant(4.0)
 
@@ -35,15 +38,73 @@ class Light:
 
 @wp.struct
 class Look:
-    """A layer's look: its number, highlight, solid texture (transform, dark end, relief [m])."""
+    """A layer's look: its number, highlight, solid texture (first texel, size, transform, dark end, relief [m])."""
 
     id: wp.uint8
     gloss: wp.float32
     shininess: wp.float32
     textured: wp.bool
+    begin: wp.int32
+    size: wp.vec3i
     T_index_world: wp.mat44f
     dark: wp.vec3f
     relief: wp.float32
+
+
+@wp.struct
+class Surfaces:
+    """All layers as one surface, the same in every picture.
+
+    `triangles` (F,) of vertices, `look_of` each, `looks` of the layers; `colours` (V,) scene-linear, `rest` (V,) [m];
+    `texels` (T,) of all solid textures, one after the other: value and gradient.
+    """
+
+    triangles: wp.array(dtype=wp.vec3i)
+    look_of: wp.array(dtype=wp.uint8)
+    looks: wp.array(dtype=Look)
+    colours: wp.array(dtype=wp.vec3f)
+    rest: wp.array(dtype=wp.vec3f)
+    texels: wp.array(dtype=wp.vec4f)
+
+
+@wp.struct
+class Placed:
+    """The surface in each picture (B, V): homogeneous as seen by the camera, and by the lamp, in the world, normals."""
+
+    seen: wp.array2d(dtype=wp.vec3d)
+    lit: wp.array2d(dtype=wp.vec3d)
+    vertices: wp.array2d(dtype=wp.vec3f)
+    normals: wp.array2d(dtype=wp.vec3f)
+
+
+@wp.struct
+class Shadow:
+    """Shadow maps (B, N, N) as z-buffers, and the least and greatest depth of each tile (B, N / TILE, N / TILE)."""
+
+    nearest: wp.array3d(dtype=wp.uint64)
+    bounds: wp.array3d(dtype=wp.vec2f)
+
+
+@wp.struct
+class Still:
+    """What a camera sees of the layers that stand still, in full light (H W): `faces` of them are the first ones.
+
+    `lit` is where the shadow map is read for each pixel. Without such layers `faces` is 0.
+    """
+
+    faces: wp.int32
+    colour: wp.array2d(dtype=wp.uint8)
+    lit: wp.array(dtype=wp.vec3f)
+
+
+@wp.struct
+class Point:
+    """What a pixel sees: the place [m], the unit directions to the viewer and of the normal, the base colour."""
+
+    place: wp.vec3f
+    view: wp.vec3f
+    normal: wp.vec3f
+    base: wp.vec3f
 
 
 @wp.func
@@ -53,66 +114,114 @@ def unit(v: wp.vec3f) -> wp.vec3f:
 
 
 @wp.func
-def blend(w: wp.vec3f, t: wp.vec3i, values: wp.array(dtype=wp.vec3f)) -> wp.vec3f:
-    """The value at barycentric weights w of triangle t."""
-    return w[0] * values[t[0]] + w[1] * values[t[1]] + w[2] * values[t[2]]
+def blend(w: wp.vec3f, a: wp.vec3f, b: wp.vec3f, c: wp.vec3f) -> wp.vec3f:
+    """The value at barycentric weights w of a triangle with these values at its corners."""
+    return w[0] * a + w[1] * b + w[2] * c
 
 
 @wp.func
-def sample(texels: wp.array3d(dtype=wp.vec4f), index: wp.vec3f) -> wp.vec4f:
+def sample(texels: wp.array(dtype=wp.vec4f), begin: wp.int32, size: wp.vec3i, index: wp.vec3f) -> wp.vec4f:
     """Trilinear value (value, gradient) at a voxel index, held to the border outside."""
-    x = wp.clamp(index[0], 0.0, wp.float32(texels.shape[0] - 1))
-    y = wp.clamp(index[1], 0.0, wp.float32(texels.shape[1] - 1))
-    z = wp.clamp(index[2], 0.0, wp.float32(texels.shape[2] - 1))
-    i = wp.min(wp.int32(x), texels.shape[0] - 2)
-    j = wp.min(wp.int32(y), texels.shape[1] - 2)
-    k = wp.min(wp.int32(z), texels.shape[2] - 2)
+    x = wp.clamp(index[0], 0.0, wp.float32(size[0] - 1))
+    y = wp.clamp(index[1], 0.0, wp.float32(size[1] - 1))
+    z = wp.clamp(index[2], 0.0, wp.float32(size[2] - 1))
+    i = wp.min(wp.int32(x), size[0] - 2)
+    j = wp.min(wp.int32(y), size[1] - 2)
+    k = wp.min(wp.int32(z), size[2] - 2)
     a = x - wp.float32(i)
     b = y - wp.float32(j)
     c = z - wp.float32(k)
-    low = (1.0 - b) * ((1.0 - c) * texels[i, j, k] + c * texels[i, j, k + 1]) + b * (
-        (1.0 - c) * texels[i, j + 1, k] + c * texels[i, j + 1, k + 1]
+    low = begin + (i * size[1] + j) * size[2] + k
+    high = low + size[1] * size[2]
+    near = (1.0 - b) * ((1.0 - c) * texels[low] + c * texels[low + 1]) + b * (
+        (1.0 - c) * texels[low + size[2]] + c * texels[low + size[2] + 1]
     )
-    high = (1.0 - b) * ((1.0 - c) * texels[i + 1, j, k] + c * texels[i + 1, j, k + 1]) + b * (
-        (1.0 - c) * texels[i + 1, j + 1, k] + c * texels[i + 1, j + 1, k + 1]
+    far = (1.0 - b) * ((1.0 - c) * texels[high] + c * texels[high + 1]) + b * (
+        (1.0 - c) * texels[high + size[2]] + c * texels[high + size[2] + 1]
     )
-    return (1.0 - a) * low + a * high
+    return (1.0 - a) * near + a * far
 
 
 @wp.func
-def lit(
-    point: wp.vec3f,
-    light: Light,
-    shadow: wp.array2d(dtype=wp.float32),
-    bounds: wp.array2d(dtype=wp.vec2f),
-) -> wp.float32:
+def point_at(
+    picture: wp.int32,
+    winner: wp.int32,
+    column: wp.int32,
+    row: wp.int32,
+    look: Look,
+    surfaces: Surfaces,
+    placed: Placed,
+    eye: wp.vec3f,
+) -> Point:
+    """What a pixel sees of a face."""
+    t = surfaces.triangles[winner]
+    w = weights_at(column, row, placed.seen[picture, t[0]], placed.seen[picture, t[1]], placed.seen[picture, t[2]])
+    a = placed.vertices[picture, t[0]]
+    b = placed.vertices[picture, t[1]]
+    c = placed.vertices[picture, t[2]]
+    out = Point()
+    out.place = blend(w, a, b, c)
+    out.view = unit(eye - out.place)
+    n = unit(blend(w, placed.normals[picture, t[0]], placed.normals[picture, t[1]], placed.normals[picture, t[2]]))
+    # Towards the viewer by the flat side that is seen: near a silhouette the smooth normal may point away.
+    flat = wp.cross(b - a, c - a)
+    if wp.dot(flat, n) * wp.dot(flat, out.view) < 0.0:
+        n = -n
+    out.base = blend(w, surfaces.colours[t[0]], surfaces.colours[t[1]], surfaces.colours[t[2]])
+    if look.textured:
+        x = blend(w, surfaces.rest[t[0]], surfaces.rest[t[1]], surfaces.rest[t[2]])
+        s = sample(surfaces.texels, look.begin, look.size, wp.transform_point(look.T_index_world, x))
+        out.base = wp.cw_mul(out.base, look.dark + (wp.vec3f(1.0) - look.dark) * s[0])
+        slope = wp.vec3f(s[1], s[2], s[3])
+        n = unit(n - look.relief * (slope - wp.dot(slope, n) * n))
+    out.normal = n
+    return out
+
+
+@wp.func
+def read_at(place: wp.vec3f, normal: wp.vec3f, light: Light) -> wp.vec3f:
+    """Where the shadow map is read for a point: column, row, depth [m] (not above 0 behind the lamp)."""
+    above = place + light.offset * normal
+    q = light.P * wp.vec4f(above[0], above[1], above[2], 1.0)
+    if q[2] <= 0.0:
+        return wp.vec3f(0.0)
+    scale = 1.0 / q[2]
+    return wp.vec3f(q[0] * scale, q[1] * scale, q[2])
+
+
+@wp.func
+def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
     """Share of the lamp that reaches a point: percentage-closer filter of the shadow map (Reeves et al. 1987).
 
-    `bounds` holds the least and the greatest depth under the filter and settles most points at once.
+    The least and the greatest depth of the tiles under the filter settle most points at once.
     """
-    q = light.P * wp.vec4f(point[0], point[1], point[2], 1.0)
-    if q[2] <= 0.0:
+    column = wp.int32(at[0] + 0.5)
+    row = wp.int32(at[1] + 0.5)
+    size = shadow.nearest.shape[1]
+    if at[2] <= 0.0 or row < SOFT or column < SOFT or row >= size - SOFT or column >= size - SOFT:
         return 1.0
-    scale = 1.0 / q[2]
-    u = q[0] * scale
-    v = q[1] * scale
-    column = wp.int32(u + 0.5)
-    row = wp.int32(v + 0.5)
-    if row < SOFT or column < SOFT or row >= shadow.shape[0] - SOFT or column >= shadow.shape[1] - SOFT:
+    z = at[2] - BIAS
+    top = (row - SOFT) / TILE
+    left = (column - SOFT) / TILE
+    low = (row + SOFT) / TILE
+    right = (column + SOFT) / TILE
+    first = shadow.bounds[picture, top, left]
+    second = shadow.bounds[picture, top, right]
+    third = shadow.bounds[picture, low, left]
+    fourth = shadow.bounds[picture, low, right]
+    if z <= wp.min(wp.min(first[0], second[0]), wp.min(third[0], fourth[0])):
         return 1.0
-    z = q[2] - BIAS
-    if z <= bounds[row, column][0]:
-        return 1.0
-    if z > bounds[row, column][1]:
+    if z > wp.max(wp.max(first[1], second[1]), wp.max(third[1], fourth[1])):
         return 0.0
     # A box 2 SOFT wide about (u, v): taps at its border count by the part of them inside, so that no steps show.
     reach = wp.float32(SOFT) + 0.5
     hidden = wp.float32(0.0)
     for i in range(row - SOFT, row + SOFT + 1):
         for j in range(column - SOFT, column + SOFT + 1):
-            if z > shadow[i, j]:
-                across = wp.min(reach - wp.abs(wp.float32(i) - v), 1.0)
-                hidden += across * wp.min(reach - wp.abs(wp.float32(j) - u), 1.0)
+            key = shadow.nearest[picture, i, j]
+            if key != NOTHING and z > depth_of(key):
+                across = wp.min(reach - wp.abs(wp.float32(i) - at[1]), 1.0)
+                hidden += across * wp.min(reach - wp.abs(wp.float32(j) - at[0]), 1.0)
     return 1.0 - hidden / wp.float32(4 * SOFT * SOFT)
 
 
@@ -122,73 +231,132 @@ def tone(x: wp.float32, curve: wp.array(dtype=wp.uint8)) -> wp.uint8:
     return curve[wp.int32(wp.min(x * (1.0 / BRIGHTEST), 1.0) * wp.float32(curve.shape[0] - 1))]
 
 
+@wp.func
+def light_on(point: Point, look: Look, light: Light, share: wp.float32) -> wp.vec3f:
+    """Scene-linear light from a point that a share of the lamp reaches.
+
+    It is base (ambient + wrapped Lambert) + Schlick's Fresnel x a Gaussian lobe, inside a lit circle with a soft rim.
+    """
+    ray = unit(light.position - point.place)
+    rim = wp.clamp((-wp.dot(ray, light.axis) - light.outer) * light.steepness, 0.0, 1.0)
+    arriving = share * light.strength * rim * rim * (3.0 - 2.0 * rim)
+    wrapped = wp.max(0.0, (wp.dot(point.normal, ray) + 0.2) * 0.83333)
+    # The lamp sits near the viewer: what faces away from both lies in the wound's shade.
+    ambient = light.ambient * (0.35 + 0.65 * wp.max(0.0, wp.dot(point.normal, point.view)))
+    out = point.base * (ambient + arriving * wrapped)
+    glow = arriving * look.gloss
+    if glow > 0.0:
+        middle = unit(ray + point.view)
+        grazing = 1.0 - wp.max(0.0, wp.dot(point.view, middle))
+        fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing
+        lobe = wp.exp(look.shininess * (wp.dot(point.normal, middle) - 1.0)) * (look.shininess + 8.0) * 0.12
+        out += wp.vec3f(glow * fresnel * lobe)
+    return out
+
+
+@forward_kernel
+def bound(
+    begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    nearest: wp.array3d(dtype=wp.uint64),
+    # outputs
+    bounds: wp.array3d(dtype=wp.vec2f),
+):
+    """The least and greatest depth in each tile of shadow maps, infinite where nothing is."""
+    start = begin + wp.tid() * run
+    for index in range(start, wp.min(start + run, end)):
+        side = bounds.shape[1]
+        picture = index / (side * side)
+        row = (index / side) % side
+        column = index % side
+        least = wp.float32(wp.inf)
+        greatest = wp.float32(0.0)
+        for i in range(row * TILE, (row + 1) * TILE):
+            for j in range(column * TILE, (column + 1) * TILE):
+                key = nearest[picture, i, j]
+                if key == NOTHING:
+                    greatest = wp.float32(wp.inf)
+                else:
+                    least = wp.min(least, depth_of(key))
+                    greatest = wp.max(greatest, depth_of(key))
+        bounds[picture, row, column] = wp.vec2f(least, greatest)
+
+
+@forward_kernel
+def remember(
+    begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    nearest: wp.array3d(dtype=wp.uint64),
+    surfaces: Surfaces,
+    placed: Placed,
+    eyes: wp.array(dtype=wp.vec3f),
+    light: Light,
+    # outputs
+    at: wp.array(dtype=wp.vec3f),
+):
+    """Where the shadow map is read for each pixel of the first picture, flat (H W)."""
+    start = begin + wp.tid() * run
+    for index in range(start, wp.min(start + run, end)):
+        row = index / nearest.shape[2]
+        column = index % nearest.shape[2]
+        key = nearest[0, row, column]
+        if key != NOTHING:
+            winner = face_of(key)
+            look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
+            point = point_at(0, winner, column, row, look, surfaces, placed, eyes[0])
+            at[index] = read_at(point.place, point.normal, light)
+
+
 @forward_kernel
 def shade(
     begin: wp.int32,
     end: wp.int32,
     run: wp.int32,
-    pixels: wp.array(dtype=wp.int32),
-    face: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.vec3f),
-    first: wp.int32,
-    triangles: wp.array(dtype=wp.vec3i),
-    vertices: wp.array(dtype=wp.vec3f),
-    normals: wp.array(dtype=wp.vec3f),
-    colours: wp.array(dtype=wp.vec3f),
-    rest: wp.array(dtype=wp.vec3f),
-    texels: wp.array3d(dtype=wp.vec4f),
-    look: Look,
-    eye: wp.vec3f,
+    nearest: wp.array3d(dtype=wp.uint64),
+    surfaces: Surfaces,
+    placed: Placed,
+    eyes: wp.array(dtype=wp.vec3f),
     light: Light,
-    shadow: wp.array2d(dtype=wp.float32),
-    bounds: wp.array2d(dtype=wp.vec2f),
+    shadow: Shadow,
     curve: wp.array(dtype=wp.uint8),
+    background: wp.array2d(dtype=wp.uint8),
+    still: Still,
     # outputs
-    colour: wp.array2d(dtype=wp.uint8),
-    normal: wp.array(dtype=wp.vec3f),
-    segmentation: wp.array(dtype=wp.uint8),
+    colour: wp.array3d(dtype=wp.uint8),
+    depth: wp.array2d(dtype=wp.float32),
+    segmentation: wp.array2d(dtype=wp.uint8),
 ):
-    """A run of the `pixels` begin .. end - 1, which see this layer (faces from `first` on); pictures are flat, (H W).
-
-    Light = base (ambient + wrapped Lambert) + Schlick's Fresnel x a Gaussian lobe, inside a lit circle with a soft rim.
-    """
+    """A run of the pixels begin .. end - 1 of all pictures, one after the other; pictures are flat, (B, H W)."""
     start = begin + wp.tid() * run
+    size = nearest.shape[1] * nearest.shape[2]
     for index in range(start, wp.min(start + run, end)):
-        pixel = pixels[index]
-        t = triangles[face[pixel] - first]
-        w = weights[pixel]
-        point = blend(w, t, vertices)
-        view = unit(eye - point)
-        n = unit(blend(w, t, normals))
-        # Towards the viewer by the flat side that is seen: near a silhouette the smooth normal may point away.
-        flat = wp.cross(vertices[t[1]] - vertices[t[0]], vertices[t[2]] - vertices[t[0]])
-        if wp.dot(flat, n) * wp.dot(flat, view) < 0.0:
-            n = -n
-        normal[pixel] = n
-        segmentation[pixel] = look.id
-        base = blend(w, t, colours)
-        if look.textured:
-            x = blend(w, t, rest)
-            s = sample(texels, wp.transform_point(look.T_index_world, x))
-            base = wp.cw_mul(base, look.dark + (wp.vec3f(1.0) - look.dark) * s[0])
-            slope = wp.vec3f(s[1], s[2], s[3])
-            n = unit(n - look.relief * (slope - wp.dot(slope, n) * n))
-        ray = unit(light.position - point)
-        rim = wp.clamp((-wp.dot(ray, light.axis) - light.outer) * light.steepness, 0.0, 1.0)
-        arriving = light.strength * rim * rim * (3.0 - 2.0 * rim)
-        if arriving > 0.0:
-            arriving *= lit(point + light.offset * n, light, shadow, bounds)
-        wrapped = wp.max(0.0, (wp.dot(n, ray) + 0.2) * 0.83333)
-        # The lamp sits near the viewer: what faces away from both lies in the wound's shade.
-        ambient = light.ambient * (0.35 + 0.65 * wp.max(0.0, wp.dot(n, view)))
-        out = base * (ambient + arriving * wrapped)
-        glow = arriving * look.gloss
-        if glow > 0.0:
-            middle = unit(ray + view)
-            grazing = 1.0 - wp.max(0.0, wp.dot(view, middle))
-            fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing
-            lobe = wp.exp(look.shininess * (wp.dot(n, middle) - 1.0)) * (look.shininess + 8.0) * 0.12
-            out += wp.vec3f(glow * fresnel * lobe)
-        colour[pixel, 0] = tone(out[0], curve)
-        colour[pixel, 1] = tone(out[1], curve)
-        colour[pixel, 2] = tone(out[2], curve)
+        picture = index / size
+        pixel = index - picture * size
+        row = pixel / nearest.shape[2]
+        column = pixel - row * nearest.shape[2]
+        key = nearest[picture, row, column]
+        if key == NOTHING:
+            depth[picture, pixel] = 0.0
+            segmentation[picture, pixel] = wp.uint8(0)
+            for channel in range(3):
+                colour[picture, pixel, channel] = background[pixel, channel]
+        else:
+            winner = face_of(key)
+            look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
+            depth[picture, pixel] = depth_of(key)
+            segmentation[picture, pixel] = look.id
+            share = wp.float32(1.0)
+            if winner < still.faces:
+                share = lit(picture, still.lit[pixel], shadow)
+            if winner < still.faces and share == 1.0:
+                for channel in range(3):
+                    colour[picture, pixel, channel] = still.colour[pixel, channel]
+            else:
+                point = point_at(picture, winner, column, row, look, surfaces, placed, eyes[picture])
+                if winner >= still.faces:
+                    share = lit(picture, read_at(point.place, point.normal, light), shadow)
+                out = light_on(point, look, light, share)
+                for channel in range(3):
+                    colour[picture, pixel, channel] = tone(out[channel], curve)

@@ -52,7 +52,7 @@ def tumour(centre=(0.0, 0.0, -0.02), radius: float = 0.012) -> Layer:
 LAMP = lamp_beside(camera(), np.zeros(3))
 
 
-def test_a_picture_has_colour_depth_normals_and_segmentation():
+def test_a_picture_has_colour_depth_and_segmentation():
     here = camera()
     picture = render(here, [cortex(), tool()], LAMP)
     assert picture.colour.shape == (150, 200, 3) and picture.colour.dtype == np.uint8
@@ -60,10 +60,8 @@ def test_a_picture_has_colour_depth_normals_and_segmentation():
     row, column = np.round(middle[::-1]).astype(int)
     assert picture.segmentation[row, column] == CORTEX
     assert picture.depth[row, column] == pytest.approx(np.linalg.norm(EYE), rel=1e-2)
-    assert picture.normal[row, column] == pytest.approx([0.0, 0.0, 1.0], abs=1e-5)
     empty = picture.segmentation == 0
     assert (picture.depth[empty] == 0.0).all() and (picture.depth[~empty] > 0.0).all()
-    assert np.linalg.norm(picture.normal[~empty], axis=-1) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_the_nearer_layer_is_seen_in_any_order():
@@ -78,7 +76,6 @@ def test_normals_face_the_camera_whichever_way_the_triangles_turn():
     there = cortex()
     turned = replace(there, triangles=there.triangles[:, ::-1])
     one, other = (render(camera(), [layer], LAMP) for layer in (there, turned))
-    assert np.allclose(one.normal, other.normal, atol=1e-5)
     assert np.abs(one.colour.astype(int) - other.colour).max() <= 1
 
 
@@ -173,7 +170,7 @@ def test_the_overlay_stands_where_the_tumour_is(style):
     assert [np.mean(columns), np.mean(rows)] == pytest.approx(middle, abs=2.0)
     outline = silhouette(here, tumour().vertices, tumour().triangles)
     assert changed[outline].mean() > (0.2 if style == "contour" else 0.95)
-    for same in ("depth", "normal", "segmentation"):
+    for same in ("depth", "segmentation"):
         assert np.array_equal(getattr(picture, same), getattr(drawn, same))
 
 

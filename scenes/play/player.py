@@ -13,7 +13,7 @@ from ar.camera import Camera
 from ar.hud import NARROW, folded, lay, panel
 from ar.layer import Layer
 from ar.overlay import Gauge, Style, composite
-from ar.renderer import Picture, render
+from ar.renderer import Picture
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
 from sim.geometry.ball_at_rest import resting_tip
@@ -160,7 +160,7 @@ class Player:
         positions = self.positions(deformation)
         held = None if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
         stage = self.stage.at(loads)
-        picture = render(self.camera, stage.layers(positions, None if held is None else held.pose), stage.lamp)
+        picture = stage.picture(self.camera, positions, None if held is None else held.pose)
         rendered = clock.perf_counter()
         tumour, rest = (stage.tumour(at) for at in (positions, self.site.anatomy.mesh.nodes))
         doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")

@@ -7,8 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
+from ar.camera import Camera
 from ar.layer import Layer, Solid, vertex_normals
-from ar.renderer import Lamp, lamp_beside
+from ar.renderer import Lamp, Picture, Renderer, lamp_beside
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity
 from sim.discretisation.resected_body import Remains, bodies
@@ -123,6 +124,19 @@ class Stage:
         probe = Layer("tool", TOOL, at, tool.faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
         return [self.visible(positions), self._drape, probe]
 
+    def picture(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None) -> Picture:
+        """What a camera sees of `layers`."""
+        layers = self.layers(positions, pose)
+        count = len(layers)
+        if count not in self._renderers:
+            self._renderers[count] = Renderer(layers, self.lamp)
+        return self._renderers[count].picture(camera, [layer.vertices for layer in layers if not layer.still])
+
+    @cached_property
+    def _renderers(self) -> dict[int, Renderer]:
+        """By the number of layers: with a tool and without."""
+        return {}
+
     def tumour(self, positions: np.ndarray) -> Layer:
         """The tumour's surface at `positions` (V, 3) [m]."""
         vertices, triangles = self._tumour
@@ -176,7 +190,7 @@ class Stage:
         corner = len(points) + np.arange(4 * len(rim)).reshape(-1, 4)  # two upper, two lower, of every edge
         wall = np.concatenate([corner[:, [0, 1, 3]], corner[:, [0, 3, 2]]])
         points = np.concatenate([points, np.concatenate([points[rim], low], axis=1).reshape(-1, 3)])
-        return Layer("drape", DRAPE, points, np.concatenate([triangles, wall]), DRAPE_COLOUR, gloss=0.05)
+        return Layer("drape", DRAPE, points, np.concatenate([triangles, wall]), DRAPE_COLOUR, gloss=0.05, still=True)
 
 
 def clipped(points: np.ndarray, triangles: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

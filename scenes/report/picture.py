@@ -9,7 +9,6 @@ import numpy as np
 from ar.camera import look_at
 from ar.hud import panel
 from ar.overlay import DASHED, composite, dash, outlines, silhouette
-from ar.renderer import render
 from sim.bodies.intensity import read_intensity, sidecar
 from sim.geometry.ball_at_rest import resting_tip
 from sim.loads import Pushed
@@ -49,7 +48,7 @@ def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
     tip = rested(site, pushed.point[worst], there, radius)
     tool = Probe(radius)
     stage = Stage(replace(find_scene("press"), viewpoint=VIEW, tool=tool), site, scan)
-    picture = render(camera, stage.layers(there, tool.pose(tip, site.axis, site.right)), stage.lamp)
+    picture = stage.picture(camera, there, tool.pose(tip, site.axis, site.right))
     shown = composite(picture, camera, stage.tumour(predicted), (TOOL,), "window").colour
     reference = stage.tumour(there)
     for outline in outlines(silhouette(camera, reference.vertices, reference.triangles)):

@@ -1,0 +1,104 @@
+"""Layers as one surface on a device: topology, looks and textures, which stay, apart from vertices, which move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache, partial
+
+import numpy as np
+import warp as wp
+
+from .layer import Layer, Solid
+from .place import faces_around
+from .shade import Look, Placed, Surfaces
+
+
+class Stack:
+    """Layers one after the other, those that stand still first.
+
+    `still` (S,) [m] are the vertices that never move, `still_faces` how many triangles they have. `casting` (C,) are
+    the triangles that throw shadows; `around` and `faces` are as in `faces_around`.
+    """
+
+    def __init__(self, layers: Sequence[Layer], device: str) -> None:
+        """Bring the layers to a device; ValueError when two have one id."""
+        ids = [layer.id for layer in layers]
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"layers have the ids {ids}: give each its own.")
+        layers = sorted(layers, key=lambda layer: not layer.still)
+        starts = np.cumsum([0, *(len(layer.vertices) for layer in layers)])
+        parts = [layer.triangles + start for layer, start in zip(layers, starts[:-1], strict=True)]
+        triangles = np.concatenate([np.zeros((0, 3), np.int32), *parts]).astype(np.int32)
+        casting = [part for layer, part in zip(layers, parts, strict=True) if layer.casts_shadow]
+        numbers = np.repeat(np.arange(len(layers)), [len(part) for part in parts])
+        begins, faces = faces_around(triangles, int(starts[-1]))
+        still = [layer for layer in layers if layer.still]
+        here = partial(wp.array, device=device)
+        vectors = partial(here, dtype=wp.vec3f)
+        texels, looks = dressed(layers, device)
+
+        self.device, self.vertices = device, int(starts[-1])
+        self.still_vertices, self.still_faces = int(starts[len(still)]), sum(len(layer.triangles) for layer in still)
+        self.still = here(np.concatenate([np.zeros((0, 3)), *(layer.vertices for layer in still)]), dtype=wp.vec3d)
+        self.casting = here(np.concatenate([np.zeros((0, 3), np.int32), *casting]).astype(np.int32), dtype=wp.vec3i)
+        self.around, self.faces = here(begins, dtype=wp.int32), here(faces, dtype=wp.int32)
+        self.surfaces = Surfaces()
+        self.surfaces.triangles = here(triangles, dtype=wp.vec3i)
+        self.surfaces.look_of = here(numbers.astype(np.uint8), dtype=wp.uint8)
+        self.surfaces.looks = here(looks, dtype=Look)
+        self.surfaces.colours = vectors(np.concatenate([np.zeros((0, 3)), *(layer.colour**2 for layer in layers)]))
+        rest = [layer.vertices if layer.rest is None else layer.rest for layer in layers]
+        self.surfaces.rest = vectors(np.concatenate([np.zeros((0, 3)), *rest]))
+        self.surfaces.texels = texels
+
+    def moved(self, vertices: np.ndarray | wp.array) -> wp.array:
+        """The vertices that move, (B, n, 3) [m] or a Warp array (B, n) of vec3d, on the device.
+
+        Raises
+        ------
+        ValueError
+            Another shape, or numbers that are not finite.
+        """
+        count = self.vertices - self.still_vertices
+        if isinstance(vertices, wp.array):
+            if vertices.dtype != wp.vec3d or vertices.ndim != 2 or vertices.shape[1] != count:
+                raise ValueError(f"vertices on a device are (B, {count}) of vec3d, not {vertices.shape}.")
+            return vertices
+        if vertices.ndim != 3 or vertices.shape[1:] != (count, 3):
+            raise ValueError(f"the layers that move have vertices (B, {count}, 3), not {vertices.shape}.")
+        if not np.isfinite(vertices).all():
+            raise ValueError("a vertex is not finite: every coordinate must be a finite number of metres.")
+        return wp.array(vertices, dtype=wp.vec3d, device=self.device)
+
+    def unplaced(self, count: int) -> Placed:
+        """Room for where the surface lies in so many pictures."""
+        placed, shape = Placed(), (count, self.vertices)
+        placed.seen, placed.lit = (wp.empty(shape, dtype=wp.vec3d, device=self.device) for _ in range(2))
+        placed.vertices, placed.normals = (wp.empty(shape, dtype=wp.vec3f, device=self.device) for _ in range(2))
+        return placed
+
+
+def dressed(layers: Sequence[Layer], device: str) -> tuple[wp.array, list[Look]]:
+    """The texels of all solid textures, and the looks of the layers."""
+    solids = list(dict.fromkeys(layer.solid for layer in layers if layer.solid is not None))
+    begins = np.cumsum([0, *(solid.values.size for solid in solids)])
+    looks = []
+    for layer in layers:
+        look = Look()
+        look.id, look.gloss, look.shininess = layer.id, layer.gloss, layer.shininess
+        look.textured = layer.solid is not None
+        if layer.solid is not None:
+            look.begin, look.size = int(begins[solids.index(layer.solid)]), wp.vec3i(*layer.solid.values.shape)
+            look.T_index_world, look.relief = wp.mat44f(layer.solid.T_index_world), layer.solid.relief
+            look.dark = wp.vec3f(layer.solid.dark)
+        looks.append(look)
+    return as_texels(tuple(solids), device), looks
+
+
+@lru_cache(maxsize=4)
+def as_texels(solids: tuple[Solid, ...], device: str) -> wp.array:
+    """Solid textures as the kernel takes them, one after the other."""
+    each = [solid.texels.reshape(-1, 4) for solid in solids]
+    # One alone, as of a scan, is large: on the processor it is taken as it is.
+    texels = each[0] if len(each) == 1 else np.concatenate([np.zeros((0, 4), np.float32), *each])
+    return wp.array(texels, dtype=wp.vec4f, device=device, copy=False)
