@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import cv2
@@ -12,8 +13,9 @@ import numpy as np
 from .camera import Camera
 from .hud import FINE, NARROW, folded, lay, millimetres
 from .layer import Layer, vertex_normals
-from .rasteriser import Fragments, rasterise
+from .rasteriser import seen
 from .renderer import Picture
+from .window import SURROUND, draw_window
 
 Style = Literal["window", "contour", "fill", "none"]
 # What may not be relied on is drawn in amber, and broken, with words in a paler one, so that pixels of the outline are
@@ -31,10 +33,8 @@ GAUGE = 0.6
 BESIDE = 10
 # A motion of fewer pixels has no arrow.
 LEAST_ARROW = 4.0
-# Light that falls to 1 / e over this depth under the surface [m]: the deeper, the darker.
-FADE = 0.03
-# Room for the window's soft rim round the silhouette [pixel].
-SURROUND = 24
+# Rows and columns of a picture from its corner on.
+WHOLE = slice(0, None), slice(0, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,6 @@ def composite(
     gauge: Gauge | None = None,
     before: Layer | None = None,
     doubt: str = "",
-    device: str = "cpu",
 ) -> Picture:
     """The picture with a hidden surface drawn into it; depth and segmentation stay as they are.
 
@@ -120,36 +119,46 @@ def composite(
     if doubt:
         hidden, margin = replace(hidden, colour=DOUBTFUL), 0.0
         gauge = None if gauge is None else replace(gauge, error=None)
-    grown = hidden.vertices + np.reshape(margin, (-1, 1)) * vertex_normals(hidden.vertices, hidden.triangles)
+    uncertain = bool(np.any(np.asarray(margin) > 0.0))
+    grown = hidden.vertices
+    if uncertain:
+        grown = grown + np.reshape(margin, (-1, 1)) * vertex_normals(hidden.vertices, hidden.triangles)
     past = hidden.vertices if before is None else before.vertices
-    box = box_around(camera, np.concatenate([hidden.vertices, grown, past]))
-    unlined = picture.colour
+    ends = np.zeros((0, 3)) if gauge is None else np.stack([gauge.tip, gauge.nearest])
+    surfaces = np.concatenate([hidden.vertices, grown, past])
+    box, region = box_around(camera, surfaces), box_around(camera, np.concatenate([surfaces, ends]))
+    covered = cv2.LUT(picture.segmentation, np.isin(np.arange(256), occluders).astype(np.uint8))
+    lines: list[np.ndarray] = []
     if box is not None:
-        # Everything but the gauge happens in the box, which is small: a view of `out`, a camera that sees just it.
-        here, ground = camera.cropped(*box), out[box]
-        fragments = rasterise(here, hidden.vertices, hidden.triangles, device=device)
+        # What is drawn of surfaces is in the box, which is small.
+        here = camera.cropped(*box)
+        found = seen(here, hidden.vertices, hidden.triangles)
+        mask = found.mask
+        lines = outlines(mask, box)
         tint = ink_of(hidden.colour)
         if style == "fill":
-            ground[fragments.mask] = 0.55 * ground[fragments.mask] + 0.45 * np.array(tint)
+            out[box][mask] = 0.55 * out[box][mask] + 0.45 * np.array(tint)
         if style == "window":
-            draw_window(ground, picture.depth[box], here, hidden, fragments)
-        unlined = out.copy()
-        if before is not None:
-            draw_before(ground, here, before, hidden, device)
-        if np.any(np.asarray(margin) > 0.0):
-            for outline in outlines(silhouette(here, grown, hidden.triangles, device)):
-                dash(ground, outline, [FAINT * part for part in tint], DASHED)
-        for ink, width in (((10.0, 12.0, 12.0), 4), (tint, 2)):
-            for outline in outlines(fragments.mask):
+            draw_window(out, picture.depth, box, here, hidden, found)
+    if region is not None:
+        unlined = out[region].copy()
+        if before is not None and box is not None:
+            draw_before(out, camera, before, hidden)
+        if uncertain:
+            for outline in outlined(camera, grown, hidden.triangles):
+                dash(out, outline, [FAINT * part for part in ink_of(hidden.colour)], DASHED)
+        for ink, width in (((10.0, 12.0, 12.0), 4), (ink_of(hidden.colour), 2)):
+            for outline in lines:
                 if doubt:
-                    dash(ground, outline, ink, BROKEN, width)
+                    dash(out, outline, ink, BROKEN, width)
                 else:
-                    cv2.polylines(ground, [outline], True, ink, width, cv2.LINE_AA)
-    if gauge is not None:
-        draw_line(out, camera, gauge)
-    covered = cv2.LUT(picture.segmentation, np.isin(np.arange(256), occluders).astype(np.uint8))
-    taken[:] = (cv2.inRange(cv2.absdiff(out, unlined), (0, 0, 0), (0, 0, 0)) == 0) & (covered == 0)
-    cv2.copyTo(picture.colour, covered, out)
+                    cv2.polylines(out, [outline], True, ink, width, cv2.LINE_AA)
+        if gauge is not None:
+            draw_line(out, camera, gauge)
+        same = cv2.inRange(cv2.absdiff(out[region], unlined), (0, 0, 0), (0, 0, 0))
+        taken[region] = (same == 0) & (covered[region] == 0)
+        # A view of columns is none of OpenCV's own arrays: it would write to a copy.
+        out[region] = cv2.copyTo(picture.colour[region], covered[region], out[region])
     # The corner first, so that its words never move; then by importance, for where there is no room some are left out.
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
@@ -166,9 +175,9 @@ def ink_of(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, floa
     return red, green, blue
 
 
-def draw_before(ground: np.ndarray, camera: Camera, before: Layer, hidden: Layer, device: str) -> None:
+def draw_before(ground: np.ndarray, camera: Camera, before: Layer, hidden: Layer) -> None:
     """Draw where the hidden surface was, dotted, and an arrow from its middle there to its middle now, in place."""
-    for outline in outlines(silhouette(camera, before.vertices, before.triangles, device)):
+    for outline in outlined_before(camera, before):
         for ink, width in (((10.0, 12.0, 12.0), 4), (ink_of(BEFORE), 2)):
             dash(ground, outline, ink, DOTTED, width)
     ends, depth = camera.project(np.stack([before.vertices.mean(axis=0), hidden.vertices.mean(axis=0)]))
@@ -185,14 +194,27 @@ def box_around(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None
     pixels, depth = camera.project(points)
     if not (depth > 0.0).all():
         return slice(0, camera.height), slice(0, camera.width)
-    low = np.maximum(np.floor(pixels.min(axis=0)) - SURROUND, 0.0).astype(int)
-    high = np.minimum(np.ceil(pixels.max(axis=0)) + SURROUND + 1.0, (camera.width, camera.height)).astype(int)
-    return (slice(low[1], high[1]), slice(low[0], high[0])) if (low < high).all() else None
+    low = np.maximum(np.floor(pixels.min(axis=0)) - SURROUND, 0.0).astype(int).tolist()
+    high = np.minimum(np.ceil(pixels.max(axis=0)) + SURROUND + 1.0, (camera.width, camera.height)).astype(int).tolist()
+    box = slice(low[1], high[1]), slice(low[0], high[0])
+    return box if all(side.start < side.stop for side in box) else None
 
 
-def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
+def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(H, W) bool: the pixels whose centres a surface covers, seen alone. vertices (V, 3) [m], triangles (F, 3)."""
-    return rasterise(camera, vertices, triangles, device=device).mask
+    return seen(camera, vertices, triangles).mask
+
+
+def outlined(camera: Camera, vertices: np.ndarray, triangles: np.ndarray) -> list[np.ndarray]:
+    """Closed outlines of a surface seen alone, each (n, 1, 2) int32 pixels."""
+    box = box_around(camera, vertices)
+    return [] if box is None else outlines(silhouette(camera.cropped(*box), vertices, triangles), box)
+
+
+@lru_cache(maxsize=4)
+def outlined_before(camera: Camera, layer: Layer) -> list[np.ndarray]:
+    """The same of a layer that stays: found once."""
+    return outlined(camera, layer.vertices, layer.triangles)
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -201,25 +223,10 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.count_nonzero(a & b) / union) if union else 0.0
 
 
-def outlines(mask: np.ndarray) -> list[np.ndarray]:
-    """Closed outlines of a mask (H, W), each (n, 1, 2) int32 pixels."""
-    return list(cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
-
-
-def draw_window(ground: np.ndarray, depth: np.ndarray, camera: Camera, hidden: Layer, seen: Fragments) -> None:
-    """Dim the ground round the silhouette with a soft rim, and let the hidden surface shine through, in place."""
-    outside = cv2.distanceTransform((~seen.mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3) / SURROUND
-    window = np.clip(1.25 - 1.25 * outside, 0.0, 1.0)
-    window *= window * (3.0 - 2.0 * window)
-    light = ground * (1.0 - 0.62 * window[..., None])
-    towards = vertex_normals(hidden.vertices, hidden.triangles) @ camera.T_camera_world[2, :3]
-    look = seen.interpolate(
-        hidden.triangles, np.column_stack([towards, 255.0 * np.asarray(hidden.colour)]).astype(np.float32)
-    )
-    under = np.where(depth > 0.0, np.maximum(seen.depth - depth, 0.0), 0.0)
-    shine = 1.1 * (0.25 + 0.75 * np.abs(look[..., 0])) * np.exp(-under / FADE)
-    light += shine[..., None] * look[..., 1:] * seen.mask[..., None]
-    ground[:] = np.clip(light, 0.0, 255.0)
+def outlines(mask: np.ndarray, box: tuple[slice, slice] = WHOLE) -> list[np.ndarray]:
+    """Closed outlines of a mask (H, W), each (n, 1, 2) int32 pixels of the picture that the mask is a box of."""
+    corner = box[1].start, box[0].start
+    return list(cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=corner)[0])
 
 
 def dash(out: np.ndarray, outline: np.ndarray, ink: Sequence[float], pattern: tuple[int, int], width: int = 1) -> None:

@@ -73,27 +73,39 @@ def rasterise(
     ValueError
         Wrong shapes, indices out of range, vertices that are not finite, or near <= 0.
     """
-    points, corners, nearest, rows = _drawn(camera, vertices, triangles, near, device)
-    shape = camera.height, camera.width
+    found = seen(camera, vertices, triangles, near, device)
+    shape, rows = (camera.height, camera.width), found.rows
     face = wp.full(shape, value=-1, dtype=wp.int32, device=device)
     weights = wp.zeros(shape, dtype=wp.vec3f, device=device)
     depth = wp.zeros(shape, dtype=wp.float32, device=device)
-    found = [nearest[0, rows], points, corners, rows.start]
+    inputs = [found.nearest[0, rows], found.points, found.triangles, rows.start]
     launch_in_bands(
-        read_nearest, found, [face[rows], weights[rows], depth[rows]], (rows.stop - rows.start) * camera.width, device
+        read_nearest, inputs, [face[rows], weights[rows], depth[rows]], (rows.stop - rows.start) * camera.width, device
     )
     return Fragments(face.numpy(), weights.numpy(), depth.numpy())
 
 
-def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
-    """(H, W) bool: the pixels whose centres a surface covers, seen alone. Arguments and errors as in `rasterise`."""
-    return _drawn(camera, vertices, triangles, NEAR, device)[2].numpy()[0] != np.uint64(NOTHING)
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A surface in one picture, on a device.
+
+    points (1, V) vec3d: homogeneous; triangles (F,) vec3i; nearest (1, H, W): z-buffer of (depth, face); rows: those
+    that may be covered.
+    """
+
+    points: wp.array
+    triangles: wp.array
+    nearest: wp.array
+    rows: slice
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(H, W) bool: the pixels whose centres the surface covers."""
+        return self.nearest.numpy()[0] != np.uint64(NOTHING)
 
 
-def _drawn(
-    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float, device: str
-) -> tuple[wp.array, wp.array, wp.array, slice]:
-    """Homogeneous points (1, V), triangles, z-buffer (1, H, W) of (depth, face), and the rows that may be covered."""
+def seen(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu") -> Seen:
+    """Draw one surface into a z-buffer. Arguments and errors as in `rasterise`."""
     vertices, triangles = checked_mesh(vertices, triangles)
     if not near > 0.0:
         raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
@@ -103,7 +115,7 @@ def _drawn(
     corners = wp.array(triangles, dtype=wp.vec3i, device=device, copy=False)
     nearest = empty_buffer(1, camera.height, camera.width, device)
     draw(points, corners, 0, rows, nearest, device, near)
-    return points, corners, nearest, rows
+    return Seen(points, corners, nearest, rows)
 
 
 def empty_buffer(count: int, height: int, width: int, device: str) -> wp.array:
@@ -174,13 +186,19 @@ def face_of(key: wp.uint64) -> wp.int32:
 
 
 @wp.func
-def weights_at(column: wp.int32, row: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3f:
-    """The barycentric weights e / sum e of a triangle's corners at a pixel."""
+def weights_at(column: wp.int32, row: wp.int32, edge_b: wp.vec3d, edge_c: wp.vec3d, normal: wp.vec3d) -> wp.vec3f:
+    """The barycentric weights e / sum e of a triangle's corners at a pixel, by two edges and their sum."""
     p = wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
-    scale = wp.float64(1.0) / wp.dot(p, wp.cross(b - a, c - a))
-    wb = wp.float32(wp.dot(p, wp.cross(c, a - c)) * scale)
-    wc = wp.float32(wp.dot(p, wp.cross(a, b - a)) * scale)
+    scale = wp.float64(1.0) / wp.dot(p, normal)
+    wb = wp.float32(wp.dot(p, edge_b) * scale)
+    wc = wp.float32(wp.dot(p, edge_c) * scale)
     return wp.vec3f(1.0 - wb - wc, wb, wc)
+
+
+@wp.func
+def weights_of(column: wp.int32, row: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3f:
+    """The barycentric weights of a triangle's corners at a pixel."""
+    return weights_at(column, row, wp.cross(c, a - c), wp.cross(a, b - a), wp.cross(b - a, c - a))
 
 
 @wp.func
@@ -335,5 +353,5 @@ def read_nearest(
             winner = face_of(key)
             t = triangles[winner]
             face[row, column] = winner
-            weights[row, column] = weights_at(column, first + row, q[0, t[0]], q[0, t[1]], q[0, t[2]])
+            weights[row, column] = weights_of(column, first + row, q[0, t[0]], q[0, t[1]], q[0, t[2]])
             depth[row, column] = depth_of(key)

@@ -14,7 +14,7 @@ from .layer import Layer
 from .parallel import launch_in_bands
 from .place import place
 from .rasteriser import NEAR, draw, empty_buffer, rows_reached
-from .shade import BRIGHTEST, SOFT, TILE, Light, Placed, Shadow, Still, bound, remember, shade
+from .shade import BRIGHTEST, SOFT, TILE, Light, Placed, Shadow, bound, remember, shade
 from .surfaces import Stack
 
 DRAPE = (0.13, 0.30, 0.36)
@@ -47,29 +47,33 @@ class Picture:
 class Pictures:
     """What cameras see, on the device that drew it; `.numpy()` of an array brings it here.
 
-    colour (B, H, W, 3) uint8, depth (B, H, W) float32 [m] and segmentation (B, H, W) uint8 are as in `Picture`.
+    colour (B, H, W) vec3ub: in NumPy (B, H, W, 3) uint8; depth (B, H, W) float32 [m] and segmentation (B, H, W) uint8
+    are as in `Picture`.
     """
 
     colour: wp.array
     depth: wp.array
     segmentation: wp.array
 
+    @property
+    def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
+        """All of them."""
+        return self.colour, self.depth, self.segmentation
+
 
 @dataclass(frozen=True, eq=False)
 class Backdrop:
-    """What one camera sees of the layers that stand still, and where all layers were when it was drawn."""
+    """What one camera sees of the layers that stand still, in full light.
+
+    `nearest` is the z-buffer, `placed` where all layers were when it was drawn; `lit_at` (H W) is where the shadow map
+    is read for each pixel.
+    """
 
     camera: Camera
     nearest: wp.array
     placed: Placed
-    still: Still
-
-    def copied(self) -> Placed:
-        """Where all layers were, in arrays that may be changed."""
-        placed = Placed()
-        for name in ("seen", "lit", "vertices", "normals"):
-            setattr(placed, name, wp.clone(getattr(self.placed, name)))
-        return placed
+    pictures: Pictures
+    lit_at: wp.array
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +128,7 @@ class Renderer:
         self.device, self.stack = device, Stack(layers, device)
         self.light, self.lamp_camera = as_light(lamp), lamp.camera()
         self.curve = wp.array(tone_curve(), dtype=wp.uint8, device=device)
-        self.nothing = nothing_still(device)
+        self.nowhere = wp.empty(0, dtype=wp.vec3f, device=device)
         self.backdrop: Backdrop | None = None
 
     def picture(self, camera: Camera, vertices: Sequence[np.ndarray]) -> Picture:
@@ -137,7 +141,7 @@ class Renderer:
         """
         moved = self.stack.moved(np.concatenate([np.zeros((0, 3)), *vertices])[None])
         drawn = self._drawn([camera], moved, self._backdrop(camera, moved) if self.stack.still_faces else None)
-        colour, depth, segmentation = (array.numpy()[0] for array in (drawn.colour, drawn.depth, drawn.segmentation))
+        colour, depth, segmentation = (array.numpy()[0] for array in drawn.arrays)
         return Picture(colour, depth, segmentation, np.zeros(segmentation.shape, np.uint8))
 
     def pictures(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
@@ -166,37 +170,42 @@ class Renderer:
 
     def _drawn(self, cameras: Sequence[Camera], moved: wp.array, backdrop: Backdrop | None) -> Pictures:
         """Draw every picture, upon the backdrop if there is one."""
-        stack, height, width = self.stack, cameras[0].height, cameras[0].width
-        if len(cameras) * max(height * width, SHADOW_PIXELS**2) >= 2**31:
-            raise ValueError(f"{len(cameras)} pictures of {width} x {height} are too many at once: draw fewer.")
+        count, height, width = len(cameras), cameras[0].height, cameras[0].width
+        if count * max(height * width, SHADOW_PIXELS**2) >= 2**31:
+            raise ValueError(f"{count} pictures of {width} x {height} are too many at once: draw fewer.")
+        stack, vertex, face = self.stack, 0, 0
         if backdrop is None:
-            vertex, face, still, placed = 0, 0, self.nothing, stack.unplaced(len(cameras))
-            nearest = empty_buffer(len(cameras), height, width, self.device)
+            nearest, placed = empty_buffer(count, height, width, self.device), stack.unplaced(count)
+            pictures, lit_at = empty_pictures(count, height, width, self.device), self.nowhere
         else:
-            vertex, face, still, placed = stack.still_vertices, stack.still_faces, backdrop.still, backdrop.copied()
-            nearest = wp.clone(backdrop.nearest)
+            vertex, face, lit_at = stack.still_vertices, stack.still_faces, backdrop.lit_at
+            nearest, placed = wp.clone(backdrop.nearest), copied(backdrop.placed)
+            pictures = Pictures(*(wp.clone(array) for array in backdrop.pictures.arrays))
         self._place(cameras, moved, placed, vertex)
         rows = self._rows(placed.seen, vertex, height)
         draw(placed.seen, stack.surfaces.triangles, face, rows, nearest, self.device)
-        return self._shaded(cameras, placed, nearest, stack.casting, still)
+        self._shade(cameras, placed, nearest, stack.casting, face, lit_at, pictures)
+        return pictures
 
-    def _shaded(
-        self, cameras: Sequence[Camera], placed: Placed, nearest: wp.array, casting: wp.array, still: Still
-    ) -> Pictures:
-        """Light what the z-buffers hold, in the shadow of some triangles."""
+    def _shade(
+        self,
+        cameras: Sequence[Camera],
+        placed: Placed,
+        nearest: wp.array,
+        casting: wp.array,
+        still: int,
+        lit_at: wp.array,
+        pictures: Pictures,
+    ) -> None:
+        """Light what the z-buffers hold, in the shadow of some triangles, into pictures that hold all else."""
         count, height, width = nearest.shape
-        shape = count, height * width
-        colour = wp.empty((*shape, 3), dtype=wp.uint8, device=self.device)
-        depth = wp.empty(shape, dtype=wp.float32, device=self.device)
-        segmentation = wp.empty(shape, dtype=wp.uint8, device=self.device)
+        shadow = self._shadow(placed, casting)
         inputs = [
-            nearest, self.stack.surfaces, placed, self._eyes(cameras), self.light, self._shadow(placed, casting),
-            self.curve, background(width, height, self.device), still,
+            width, height * width, nearest.flatten(), self.stack.surfaces, placed, self._eyes(cameras), self.light,
+            shadow, self.curve, still, lit_at,
         ]  # fmt: skip
-        launch_in_bands(shade, inputs, [colour, depth, segmentation], count * height * width, self.device)
-        return Pictures(
-            colour.reshape((*nearest.shape, 3)), depth.reshape(nearest.shape), segmentation.reshape(nearest.shape)
-        )
+        outputs = [array.flatten() for array in pictures.arrays]
+        launch_in_bands(shade, inputs, outputs, count * height * width, self.device)
 
     def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: Placed, since: int) -> None:
         """Find where the vertices from number `since` on lie in each picture."""
@@ -218,10 +227,12 @@ class Renderer:
         """Draw the shadow map of each picture."""
         count, tiles = placed.lit.shape[0], SHADOW_PIXELS // int(TILE)
         shadow = Shadow()
-        shadow.nearest = empty_buffer(count, SHADOW_PIXELS, SHADOW_PIXELS, self.device)
-        shadow.bounds = wp.empty((count, tiles, tiles), dtype=wp.vec2f, device=self.device)
-        draw(placed.lit, casting, 0, slice(0, SHADOW_PIXELS), shadow.nearest, self.device)
-        launch_in_bands(bound, [shadow.nearest], [shadow.bounds], count * tiles * tiles, self.device)
+        shadow.size = SHADOW_PIXELS
+        shadow.depth = wp.empty(count * SHADOW_PIXELS**2, dtype=wp.float32, device=self.device)
+        shadow.bounds = wp.empty(count * tiles**2, dtype=wp.vec2f, device=self.device)
+        nearest = empty_buffer(count, SHADOW_PIXELS, SHADOW_PIXELS, self.device)
+        draw(placed.lit, casting, 0, slice(0, SHADOW_PIXELS), nearest, self.device)
+        launch_in_bands(bound, [nearest], [shadow], count * tiles**2, self.device)
         return shadow
 
     def _eyes(self, cameras: Sequence[Camera]) -> wp.array:
@@ -231,29 +242,36 @@ class Renderer:
         """What a camera sees of the layers that stand still; that of the last camera is kept."""
         if self.backdrop is not None and self.backdrop.camera is camera:
             return self.backdrop
-        stack, size = self.stack, camera.height * camera.width
-        placed, nearest = stack.unplaced(1), empty_buffer(1, camera.height, camera.width, self.device)
+        stack, height, width = self.stack, camera.height, camera.width
+        placed, nearest = stack.unplaced(1), empty_buffer(1, height, width, self.device)
+        pictures = empty_pictures(1, height, width, self.device)
         self._place([camera], moved, placed, 0)
         there = stack.surfaces.triangles[: stack.still_faces]
-        draw(placed.seen, there, 0, slice(0, camera.height), nearest, self.device)
-        still = Still()
-        still.faces = stack.still_faces
-        still.colour = self._shaded([camera], placed, nearest, stack.casting[:0], self.nothing).colour.reshape(
-            (size, 3)
-        )
-        still.lit = wp.zeros(size, dtype=wp.vec3f, device=self.device)
-        inputs = [nearest, stack.surfaces, placed, self._eyes([camera]), self.light]
-        launch_in_bands(remember, inputs, [still.lit], size, self.device)
-        self.backdrop = Backdrop(camera, nearest, placed, still)
+        draw(placed.seen, there, 0, slice(0, height), nearest, self.device)
+        self._shade([camera], placed, nearest, stack.casting[:0], 0, self.nowhere, pictures)
+        lit_at = wp.zeros(height * width, dtype=wp.vec3f, device=self.device)
+        inputs = [width, nearest.flatten(), stack.surfaces, placed, self._eyes([camera]), self.light]
+        launch_in_bands(remember, inputs, [lit_at], height * width, self.device)
+        self.backdrop = Backdrop(camera, nearest, placed, pictures, lit_at)
         return self.backdrop
 
 
-def nothing_still(device: str) -> Still:
-    """What is seen of no layers that stand still."""
-    still = Still()
-    still.colour = wp.empty((0, 3), dtype=wp.uint8, device=device)
-    still.lit = wp.empty(0, dtype=wp.vec3f, device=device)
-    return still
+def empty_pictures(count: int, height: int, width: int, device: str) -> Pictures:
+    """Pictures in which nothing is seen but what is behind all."""
+    shape = count, height, width
+    colour = wp.empty(shape, dtype=wp.vec3ub, device=device)
+    for row in range(count):
+        wp.copy(colour[row], background(width, height, device))
+    depth = wp.zeros(shape, dtype=wp.float32, device=device)
+    return Pictures(colour, depth, wp.zeros(shape, dtype=wp.uint8, device=device))
+
+
+def copied(placed: Placed) -> Placed:
+    """The same arrays anew."""
+    out = Placed()
+    for name in ("seen", "lit", "vertices", "normals"):
+        setattr(out, name, wp.clone(getattr(placed, name)))
+    return out
 
 
 def projection(camera: Camera) -> np.ndarray:
@@ -279,10 +297,10 @@ def as_light(lamp: Lamp) -> Light:
 
 @lru_cache(maxsize=4)
 def background(width: int, height: int, device: str) -> wp.array:
-    """(H W, 3) uint8 on a device: a drape, brighter in the middle."""
+    """(H, W, 3) uint8 on a device: a drape, brighter in the middle."""
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
     fall = 1.0 - 0.45 * np.clip(np.hypot(x, y) / np.sqrt(2.0), 0.0, 1.0)
-    return wp.array((255.0 * fall.reshape(-1, 1) * DRAPE).astype(np.uint8), dtype=wp.uint8, device=device)
+    return wp.array((255.0 * fall[..., None] * DRAPE).astype(np.uint8), dtype=wp.vec3ub, device=device)
 
 
 @lru_cache(maxsize=1)

@@ -79,22 +79,36 @@ class Placed:
 
 @wp.struct
 class Shadow:
-    """Shadow maps (B, N, N) as z-buffers, and the least and greatest depth of each tile (B, N / TILE, N / TILE)."""
+    """Shadow maps, flat (B N N): depth [m], infinite where nothing is; and the least and greatest of each tile.
 
-    nearest: wp.array3d(dtype=wp.uint64)
-    bounds: wp.array3d(dtype=wp.vec2f)
+    `size` is N, and there are N / TILE tiles along each side.
+    """
+
+    size: wp.int32
+    depth: wp.array(dtype=wp.float32)
+    bounds: wp.array(dtype=wp.vec2f)
 
 
 @wp.struct
-class Still:
-    """What a camera sees of the layers that stand still, in full light (H W): `faces` of them are the first ones.
+class Corners:
+    """A face as its pixels need it: for the weights edges and normal in the picture, and what is blended."""
 
-    `lit` is where the shadow map is read for each pixel. Without such layers `faces` is 0.
-    """
-
-    faces: wp.int32
-    colour: wp.array2d(dtype=wp.uint8)
-    lit: wp.array(dtype=wp.vec3f)
+    edge_b: wp.vec3d
+    edge_c: wp.vec3d
+    normal: wp.vec3d
+    a: wp.vec3f
+    b: wp.vec3f
+    c: wp.vec3f
+    flat: wp.vec3f
+    normal_a: wp.vec3f
+    normal_b: wp.vec3f
+    normal_c: wp.vec3f
+    colour_a: wp.vec3f
+    colour_b: wp.vec3f
+    colour_c: wp.vec3f
+    rest_a: wp.vec3f
+    rest_b: wp.vec3f
+    rest_c: wp.vec3f
 
 
 @wp.struct
@@ -133,44 +147,59 @@ def sample(texels: wp.array(dtype=wp.vec4f), begin: wp.int32, size: wp.vec3i, in
     c = z - wp.float32(k)
     low = begin + (i * size[1] + j) * size[2] + k
     high = low + size[1] * size[2]
-    near = (1.0 - b) * ((1.0 - c) * texels[low] + c * texels[low + 1]) + b * (
-        (1.0 - c) * texels[low + size[2]] + c * texels[low + size[2] + 1]
+    near = wp.lerp(
+        wp.lerp(texels[low], texels[low + 1], c), wp.lerp(texels[low + size[2]], texels[low + size[2] + 1], c), b
     )
-    far = (1.0 - b) * ((1.0 - c) * texels[high] + c * texels[high + 1]) + b * (
-        (1.0 - c) * texels[high + size[2]] + c * texels[high + size[2] + 1]
+    far = wp.lerp(
+        wp.lerp(texels[high], texels[high + 1], c), wp.lerp(texels[high + size[2]], texels[high + size[2] + 1], c), b
     )
-    return (1.0 - a) * near + a * far
+    return wp.lerp(near, far, a)
+
+
+@wp.func
+def corners_of(picture: wp.int32, winner: wp.int32, surfaces: Surfaces, placed: Placed) -> Corners:
+    """What a pixel needs to know of a face: its neighbours mostly need the same."""
+    t = surfaces.triangles[winner]
+    qa = placed.seen[picture, t[0]]
+    qb = placed.seen[picture, t[1]]
+    qc = placed.seen[picture, t[2]]
+    out = Corners()
+    out.edge_b = wp.cross(qc, qa - qc)
+    out.edge_c = wp.cross(qa, qb - qa)
+    out.normal = wp.cross(qb - qa, qc - qa)
+    out.a = placed.vertices[picture, t[0]]
+    out.b = placed.vertices[picture, t[1]]
+    out.c = placed.vertices[picture, t[2]]
+    out.flat = wp.cross(out.b - out.a, out.c - out.a)
+    out.normal_a = placed.normals[picture, t[0]]
+    out.normal_b = placed.normals[picture, t[1]]
+    out.normal_c = placed.normals[picture, t[2]]
+    out.colour_a = surfaces.colours[t[0]]
+    out.colour_b = surfaces.colours[t[1]]
+    out.colour_c = surfaces.colours[t[2]]
+    out.rest_a = surfaces.rest[t[0]]
+    out.rest_b = surfaces.rest[t[1]]
+    out.rest_c = surfaces.rest[t[2]]
+    return out
 
 
 @wp.func
 def point_at(
-    picture: wp.int32,
-    winner: wp.int32,
-    column: wp.int32,
-    row: wp.int32,
-    look: Look,
-    surfaces: Surfaces,
-    placed: Placed,
-    eye: wp.vec3f,
+    column: wp.int32, row: wp.int32, corners: Corners, look: Look, texels: wp.array(dtype=wp.vec4f), eye: wp.vec3f
 ) -> Point:
     """What a pixel sees of a face."""
-    t = surfaces.triangles[winner]
-    w = weights_at(column, row, placed.seen[picture, t[0]], placed.seen[picture, t[1]], placed.seen[picture, t[2]])
-    a = placed.vertices[picture, t[0]]
-    b = placed.vertices[picture, t[1]]
-    c = placed.vertices[picture, t[2]]
+    w = weights_at(column, row, corners.edge_b, corners.edge_c, corners.normal)
     out = Point()
-    out.place = blend(w, a, b, c)
+    out.place = blend(w, corners.a, corners.b, corners.c)
     out.view = unit(eye - out.place)
-    n = unit(blend(w, placed.normals[picture, t[0]], placed.normals[picture, t[1]], placed.normals[picture, t[2]]))
+    n = unit(blend(w, corners.normal_a, corners.normal_b, corners.normal_c))
     # Towards the viewer by the flat side that is seen: near a silhouette the smooth normal may point away.
-    flat = wp.cross(b - a, c - a)
-    if wp.dot(flat, n) * wp.dot(flat, out.view) < 0.0:
+    if wp.dot(corners.flat, n) * wp.dot(corners.flat, out.view) < 0.0:
         n = -n
-    out.base = blend(w, surfaces.colours[t[0]], surfaces.colours[t[1]], surfaces.colours[t[2]])
+    out.base = blend(w, corners.colour_a, corners.colour_b, corners.colour_c)
     if look.textured:
-        x = blend(w, surfaces.rest[t[0]], surfaces.rest[t[1]], surfaces.rest[t[2]])
-        s = sample(surfaces.texels, look.begin, look.size, wp.transform_point(look.T_index_world, x))
+        x = blend(w, corners.rest_a, corners.rest_b, corners.rest_c)
+        s = sample(texels, look.begin, look.size, wp.transform_point(look.T_index_world, x))
         out.base = wp.cw_mul(out.base, look.dark + (wp.vec3f(1.0) - look.dark) * s[0])
         slope = wp.vec3f(s[1], s[2], s[3])
         n = unit(n - look.relief * (slope - wp.dot(slope, n) * n))
@@ -197,18 +226,19 @@ def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
     """
     column = wp.int32(at[0] + 0.5)
     row = wp.int32(at[1] + 0.5)
-    size = shadow.nearest.shape[1]
+    size = shadow.size
     if at[2] <= 0.0 or row < SOFT or column < SOFT or row >= size - SOFT or column >= size - SOFT:
         return 1.0
     z = at[2] - BIAS
-    top = (row - SOFT) / TILE
+    tiles = size / TILE
+    top = (picture * tiles + (row - SOFT) / TILE) * tiles
+    low = (picture * tiles + (row + SOFT) / TILE) * tiles
     left = (column - SOFT) / TILE
-    low = (row + SOFT) / TILE
     right = (column + SOFT) / TILE
-    first = shadow.bounds[picture, top, left]
-    second = shadow.bounds[picture, top, right]
-    third = shadow.bounds[picture, low, left]
-    fourth = shadow.bounds[picture, low, right]
+    first = shadow.bounds[top + left]
+    second = shadow.bounds[top + right]
+    third = shadow.bounds[low + left]
+    fourth = shadow.bounds[low + right]
     if z <= wp.min(wp.min(first[0], second[0]), wp.min(third[0], fourth[0])):
         return 1.0
     if z > wp.max(wp.max(first[1], second[1]), wp.max(third[1], fourth[1])):
@@ -217,11 +247,11 @@ def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
     reach = wp.float32(SOFT) + 0.5
     hidden = wp.float32(0.0)
     for i in range(row - SOFT, row + SOFT + 1):
+        along = wp.float32(0.0)
         for j in range(column - SOFT, column + SOFT + 1):
-            key = shadow.nearest[picture, i, j]
-            if key != NOTHING and z > depth_of(key):
-                across = wp.min(reach - wp.abs(wp.float32(i) - at[1]), 1.0)
-                hidden += across * wp.min(reach - wp.abs(wp.float32(j) - at[0]), 1.0)
+            if z > shadow.depth[(picture * size + i) * size + j]:
+                along += wp.min(reach - wp.abs(wp.float32(j) - at[0]), 1.0)
+        hidden += along * wp.min(reach - wp.abs(wp.float32(i) - at[1]), 1.0)
     return 1.0 - hidden / wp.float32(4 * SOFT * SOFT)
 
 
@@ -260,27 +290,28 @@ def bound(
     end: wp.int32,
     run: wp.int32,
     nearest: wp.array3d(dtype=wp.uint64),
-    # outputs
-    bounds: wp.array3d(dtype=wp.vec2f),
+    # output
+    shadow: Shadow,
 ):
-    """The least and greatest depth in each tile of shadow maps, infinite where nothing is."""
+    """The shadow maps' depths, and the least and greatest in each tile: a run of the tiles begin .. end - 1."""
     start = begin + wp.tid() * run
+    tiles = shadow.size / TILE
     for index in range(start, wp.min(start + run, end)):
-        side = bounds.shape[1]
-        picture = index / (side * side)
-        row = (index / side) % side
-        column = index % side
+        picture = index / (tiles * tiles)
+        row = (index / tiles) % tiles
+        column = index % tiles
         least = wp.float32(wp.inf)
         greatest = wp.float32(0.0)
         for i in range(row * TILE, (row + 1) * TILE):
             for j in range(column * TILE, (column + 1) * TILE):
                 key = nearest[picture, i, j]
-                if key == NOTHING:
-                    greatest = wp.float32(wp.inf)
-                else:
-                    least = wp.min(least, depth_of(key))
-                    greatest = wp.max(greatest, depth_of(key))
-        bounds[picture, row, column] = wp.vec2f(least, greatest)
+                depth = wp.float32(wp.inf)
+                if key != NOTHING:
+                    depth = depth_of(key)
+                shadow.depth[(picture * shadow.size + i) * shadow.size + j] = depth
+                least = wp.min(least, depth)
+                greatest = wp.max(greatest, depth)
+        shadow.bounds[index] = wp.vec2f(least, greatest)
 
 
 @forward_kernel
@@ -288,7 +319,8 @@ def remember(
     begin: wp.int32,
     end: wp.int32,
     run: wp.int32,
-    nearest: wp.array3d(dtype=wp.uint64),
+    width: wp.int32,
+    nearest: wp.array(dtype=wp.uint64),
     surfaces: Surfaces,
     placed: Placed,
     eyes: wp.array(dtype=wp.vec3f),
@@ -296,16 +328,17 @@ def remember(
     # outputs
     at: wp.array(dtype=wp.vec3f),
 ):
-    """Where the shadow map is read for each pixel of the first picture, flat (H W)."""
+    """Where the shadow map is read for each pixel of one picture, flat (H W)."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
-        row = index / nearest.shape[2]
-        column = index % nearest.shape[2]
-        key = nearest[0, row, column]
+        row = index / width
+        column = index - row * width
+        key = nearest[index]
         if key != NOTHING:
             winner = face_of(key)
             look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
-            point = point_at(0, winner, column, row, look, surfaces, placed, eyes[0])
+            corners = corners_of(0, winner, surfaces, placed)
+            point = point_at(column, row, corners, look, surfaces.texels, eyes[0])
             at[index] = read_at(point.place, point.normal, light)
 
 
@@ -314,49 +347,50 @@ def shade(
     begin: wp.int32,
     end: wp.int32,
     run: wp.int32,
-    nearest: wp.array3d(dtype=wp.uint64),
+    width: wp.int32,
+    size: wp.int32,
+    nearest: wp.array(dtype=wp.uint64),
     surfaces: Surfaces,
     placed: Placed,
     eyes: wp.array(dtype=wp.vec3f),
     light: Light,
     shadow: Shadow,
     curve: wp.array(dtype=wp.uint8),
-    background: wp.array2d(dtype=wp.uint8),
-    still: Still,
+    still: wp.int32,
+    lit_at: wp.array(dtype=wp.vec3f),
     # outputs
-    colour: wp.array3d(dtype=wp.uint8),
-    depth: wp.array2d(dtype=wp.float32),
-    segmentation: wp.array2d(dtype=wp.uint8),
+    colour: wp.array(dtype=wp.vec3ub),
+    depth: wp.array(dtype=wp.float32),
+    segmentation: wp.array(dtype=wp.uint8),
 ):
-    """A run of the pixels begin .. end - 1 of all pictures, one after the other; pictures are flat, (B, H W)."""
+    """A run of the pixels begin .. end - 1 of all pictures; these are flat (B H W), and of `size` = H W pixels.
+
+    The outputs hold what is seen where nothing is, and of the first `still` faces in full light. They are left there
+    unless a shadow falls on them; `lit_at` (H W) is where the shadow map is read for each of their pixels.
+    """
     start = begin + wp.tid() * run
-    size = nearest.shape[1] * nearest.shape[2]
+    last = wp.int32(-1)
+    corners = Corners()
+    look = Look()
     for index in range(start, wp.min(start + run, end)):
+        key = nearest[index]
         picture = index / size
         pixel = index - picture * size
-        row = pixel / nearest.shape[2]
-        column = pixel - row * nearest.shape[2]
-        key = nearest[picture, row, column]
-        if key == NOTHING:
-            depth[picture, pixel] = 0.0
-            segmentation[picture, pixel] = wp.uint8(0)
-            for channel in range(3):
-                colour[picture, pixel, channel] = background[pixel, channel]
-        else:
-            winner = face_of(key)
-            look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
-            depth[picture, pixel] = depth_of(key)
-            segmentation[picture, pixel] = look.id
-            share = wp.float32(1.0)
-            if winner < still.faces:
-                share = lit(picture, still.lit[pixel], shadow)
-            if winner < still.faces and share == 1.0:
-                for channel in range(3):
-                    colour[picture, pixel, channel] = still.colour[pixel, channel]
-            else:
-                point = point_at(picture, winner, column, row, look, surfaces, placed, eyes[picture])
-                if winner >= still.faces:
-                    share = lit(picture, read_at(point.place, point.normal, light), shadow)
-                out = light_on(point, look, light, share)
-                for channel in range(3):
-                    colour[picture, pixel, channel] = tone(out[channel], curve)
+        winner = face_of(key)
+        share = wp.float32(1.0)
+        if key != NOTHING and winner < still:
+            share = lit(picture, lit_at[pixel], shadow)
+        if key != NOTHING and (winner >= still or share < 1.0):
+            row = pixel / width
+            column = pixel - row * width
+            if winner != last or column == 0:
+                last = winner
+                corners = corners_of(picture, winner, surfaces, placed)
+                look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
+            point = point_at(column, row, corners, look, surfaces.texels, eyes[picture])
+            if winner >= still:
+                depth[index] = depth_of(key)
+                segmentation[index] = look.id
+                share = lit(picture, read_at(point.place, point.normal, light), shadow)
+            out = light_on(point, look, light, share)
+            colour[index] = wp.vec3ub(tone(out[0], curve), tone(out[1], curve), tone(out[2], curve))

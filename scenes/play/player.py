@@ -162,7 +162,7 @@ class Player:
         stage = self.stage.at(loads)
         picture = stage.picture(self.camera, positions, None if held is None else held.pose)
         rendered = clock.perf_counter()
-        tumour, rest = (stage.tumour(at) for at in (positions, self.site.anatomy.mesh.nodes))
+        tumour, rest = stage.tumour(positions), stage.tumour_at_rest
         doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
         over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt)

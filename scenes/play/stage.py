@@ -142,6 +142,11 @@ class Stage:
         vertices, triangles = self._tumour
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
+    @cached_property
+    def tumour_at_rest(self) -> Layer:
+        """The tumour's surface in the scan."""
+        return self.tumour(self.site.anatomy.mesh.nodes)
+
     @property
     def tumour_vertices(self) -> np.ndarray:
         """Mesh vertices (n,) of the tumour's surface, in the order in which they are drawn."""
