@@ -11,6 +11,8 @@ from .rasteriser import NOTHING, depth_of, face_of, weights_at
 BIAS = wp.constant(0.0002)
 # Half the width of the shadow's soft rim [shadow-map pixel].
 SOFT = wp.constant(3)
+TAPS = wp.constant(7)
+Taps = wp.types.vector(length=7, dtype=wp.float32)
 # The shadow map's bounds are kept for squares of so many pixels a side: the filter meets four of them at most.
 TILE = wp.constant(8)
 # Scene-linear light that is white.
@@ -245,13 +247,16 @@ def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
         return 0.0
     # A box 2 SOFT wide about (u, v): taps at its border count by the part of them inside, so that no steps show.
     reach = wp.float32(SOFT) + 0.5
+    across = Taps()
+    for j in range(TAPS):
+        across[j] = wp.min(reach - wp.abs(wp.float32(column - SOFT + j) - at[0]), 1.0)
     hidden = wp.float32(0.0)
-    for i in range(row - SOFT, row + SOFT + 1):
+    for i in range(TAPS):
+        begin = (picture * size + row - SOFT + i) * size + column - SOFT
         along = wp.float32(0.0)
-        for j in range(column - SOFT, column + SOFT + 1):
-            if z > shadow.depth[(picture * size + i) * size + j]:
-                along += wp.min(reach - wp.abs(wp.float32(j) - at[0]), 1.0)
-        hidden += along * wp.min(reach - wp.abs(wp.float32(i) - at[1]), 1.0)
+        for j in range(TAPS):
+            along += wp.where(z > shadow.depth[begin + j], across[j], 0.0)
+        hidden += along * wp.min(reach - wp.abs(wp.float32(row - SOFT + i) - at[1]), 1.0)
     return 1.0 - hidden / wp.float32(4 * SOFT * SOFT)
 
 
@@ -369,13 +374,17 @@ def shade(
     unless a shadow falls on them; `lit_at` (H W) is where the shadow map is read for each of their pixels.
     """
     start = begin + wp.tid() * run
+    picture = start / size
+    pixel = start - picture * size - 1
     last = wp.int32(-1)
     corners = Corners()
     look = Look()
     for index in range(start, wp.min(start + run, end)):
+        pixel += 1
+        if pixel == size:
+            pixel = 0
+            picture += 1
         key = nearest[index]
-        picture = index / size
-        pixel = index - picture * size
         winner = face_of(key)
         share = wp.float32(1.0)
         if key != NOTHING and winner < still:
