@@ -3,18 +3,23 @@
 from .browser import Browser
 from .camera import Camera, look_at
 from .layer import Layer, Solid
-from .overlay import composite
+from .overlay import Overlaid, composite
 from .rasteriser import rasterise
-from .renderer import Picture, render
+from .renderer import Lamp, Picture, Pictures, Renderer, lamp_beside, render
 from .screen import read_png, write_png, write_video
 
 __all__ = [
     "Browser",
     "Camera",
+    "Lamp",
     "Layer",
+    "Overlaid",
     "Picture",
+    "Pictures",
+    "Renderer",
     "Solid",
     "composite",
+    "lamp_beside",
     "look_at",
     "rasterise",
     "read_png",

@@ -15,7 +15,7 @@ from .hud import FINE, NARROW, folded, lay, millimetres
 from .layer import Layer, vertex_normals
 from .rasteriser import seen
 from .renderer import Picture
-from .window import SURROUND, draw_window
+from .window import SURROUND, with_window
 
 Style = Literal["window", "contour", "fill", "none"]
 # What may not be relied on is drawn in amber, and broken, with words in a paler one, so that pixels of the outline are
@@ -66,6 +66,14 @@ class Gauge:
         return millimetres(self.distance, self.error)
 
 
+@dataclass(frozen=True, eq=False)
+class Overlaid:
+    """A picture with lines and words in it: colour (H, W, 3) uint8, and taken (H, W) uint8, above 0 where they are."""
+
+    colour: np.ndarray
+    taken: np.ndarray
+
+
 def composite(
     picture: Picture,
     camera: Camera,
@@ -76,8 +84,8 @@ def composite(
     gauge: Gauge | None = None,
     before: Layer | None = None,
     doubt: str = "",
-) -> Picture:
-    """The picture with a hidden surface drawn into it; depth and segmentation stay as they are.
+) -> Overlaid:
+    """The picture with a hidden surface drawn into it. On a card, no depth comes back from it.
 
     Parameters
     ----------
@@ -109,13 +117,14 @@ def composite(
     """
     if style not in Style.__args__:
         raise ValueError(f"there is no overlay style {style!r}: choose one of {', '.join(Style.__args__)}.")
-    if picture.colour.shape[:2] != (camera.height, camera.width):
-        raise ValueError(f"the picture is {picture.colour.shape[:2]}, the camera {(camera.height, camera.width)}.")
-    out, taken = picture.colour.copy(), np.zeros(picture.segmentation.shape, np.uint8)
-    drawn = replace(picture, colour=out, taken=taken)
+    shape = picture.drawn.colour.shape[1:]
+    if shape != (camera.height, camera.width):
+        raise ValueError(f"the picture is {shape}, the camera {(camera.height, camera.width)}.")
+    taken = np.zeros(shape, np.uint8)
     if style == "none":
-        write_doubt(drawn, doubt)
-        return drawn
+        plain = Overlaid(picture.colour.copy(), taken)
+        write_doubt(plain, doubt)
+        return plain
     if doubt:
         hidden, margin = replace(hidden, colour=DOUBTFUL), 0.0
         gauge = None if gauge is None else replace(gauge, error=None)
@@ -128,18 +137,7 @@ def composite(
     surfaces = np.concatenate([hidden.vertices, grown, past])
     box, region = box_around(camera, surfaces), box_around(camera, np.concatenate([surfaces, ends]))
     covered = cv2.LUT(picture.segmentation, np.isin(np.arange(256), occluders).astype(np.uint8))
-    lines: list[np.ndarray] = []
-    if box is not None:
-        # What is drawn of surfaces is in the box, which is small.
-        here = camera.cropped(*box)
-        found = seen(here, hidden.vertices, hidden.triangles)
-        mask = found.mask
-        lines = outlines(mask, box)
-        tint = ink_of(hidden.colour)
-        if style == "fill":
-            out[box][mask] = 0.55 * out[box][mask] + 0.45 * np.array(tint)
-        if style == "window":
-            draw_window(out, picture.depth, box, here, hidden, found)
+    out, lines = _ground(picture, camera, box, hidden, style, occluders, covered)
     if region is not None:
         unlined = out[region].copy()
         if before is not None and box is not None:
@@ -158,7 +156,8 @@ def composite(
         same = cv2.inRange(cv2.absdiff(out[region], unlined), (0, 0, 0), (0, 0, 0))
         taken[region] = (same == 0) & (covered[region] == 0)
         # A view of columns is none of OpenCV's own arrays: it would write to a copy.
-        out[region] = cv2.copyTo(picture.colour[region], covered[region], out[region])
+        out[region] = cv2.copyTo(unlined, covered[region], out[region])
+    drawn = Overlaid(out, taken)
     # The corner first, so that its words never move; then by importance, for where there is no room some are left out.
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
@@ -167,6 +166,31 @@ def composite(
     if gauge is not None:
         write_gauge(drawn, camera, gauge, covered)
     return drawn
+
+
+def _ground(
+    picture: Picture,
+    camera: Camera,
+    box: tuple[slice, slice] | None,
+    hidden: Layer,
+    style: Style,
+    occluders: Sequence[int],
+    covered: np.ndarray,
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The picture (H, W, 3) uint8 with window or tint, a copy, and the hidden surface's outlines; all lies in `box`."""
+    if box is None:
+        return picture.colour.copy(), []
+    here, device = camera.cropped(*box), str(picture.drawn.colour.device)
+    found = seen(here, hidden.vertices, hidden.triangles, device=device)
+    mask = found.mask
+    lines = outlines(mask, box)
+    if style == "window":
+        return with_window(picture.drawn, box, here, hidden, found, mask, occluders), lines
+    out = picture.colour.copy()
+    if style == "fill":
+        tinted = mask & (covered[box] == 0)
+        out[box][tinted] = 0.55 * out[box][tinted] + 0.45 * np.array(ink_of(hidden.colour))
+    return out, lines
 
 
 def ink_of(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
@@ -247,7 +271,7 @@ def draw_line(out: np.ndarray, camera: Camera, gauge: Gauge) -> None:
     cv2.circle(out, nearest, 3, (250, 250, 250), -1, cv2.LINE_AA)
 
 
-def write_gauge(drawn: Picture, camera: Camera, gauge: Gauge, covered: np.ndarray) -> None:
+def write_gauge(drawn: Overlaid, camera: Camera, gauge: Gauge, covered: np.ndarray) -> None:
     """Write the gauge's number near the end of its line, in place; nothing when that lies behind the camera.
 
     covered (H, W) uint8: above 0 where tools are, which the number leaves in sight if it can.
@@ -258,7 +282,7 @@ def write_gauge(drawn: Picture, camera: Camera, gauge: Gauge, covered: np.ndarra
         lay(drawn.colour, drawn.taken, [str(gauge)], (column + BESIDE, row), GAUGE, sights=covered)
 
 
-def write_doubt(drawn: Picture, doubt: str) -> None:
+def write_doubt(drawn: Overlaid, doubt: str) -> None:
     """Write why an answer may not be relied on at the left of the foot, in place, even over other words."""
     height, width = drawn.taken.shape
     lay(drawn.colour, drawn.taken, doubt_lines(doubt, width), (0, height), FINE, ink_of(WARNING), needed=True)

@@ -101,7 +101,9 @@ class Seen:
     @property
     def mask(self) -> np.ndarray:
         """(H, W) bool: the pixels whose centres the surface covers."""
-        return self.nearest.numpy()[0] != np.uint64(NOTHING)
+        mask = wp.empty(self.nearest.size, dtype=wp.uint8, device=self.nearest.device)
+        launch_in_bands(cover, [self.nearest.flatten()], [mask], self.nearest.size, str(self.nearest.device))
+        return mask.numpy().reshape(self.nearest.shape[1:]).view(bool)
 
 
 def seen(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu") -> Seen:
@@ -327,6 +329,21 @@ def keep_nearest(
     start = since + chunk * run
     for face in range(start, wp.min(start + run, triangles.shape[0])):
         draw_triangle(picture, face, q, triangles, near, begin, end, part, parts, nearest)
+
+
+@forward_kernel
+def cover(
+    begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    nearest: wp.array(dtype=wp.uint64),
+    # output
+    mask: wp.array(dtype=wp.uint8),
+):
+    """Each pixel: 1 where anything is seen."""
+    start = begin + wp.tid() * run
+    for index in range(start, wp.min(start + run, end)):
+        mask[index] = wp.uint8(wp.where(nearest[index] != NOTHING, 1, 0))
 
 
 @forward_kernel

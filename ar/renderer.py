@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import warp as wp
@@ -19,28 +19,6 @@ from .surfaces import Stack
 
 DRAPE = (0.13, 0.30, 0.36)
 SHADOW_PIXELS = 384
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """What the camera sees.
-
-    Parameters
-    ----------
-    colour
-        (H, W, 3) uint8, sRGB.
-    depth
-        (H, W) float32 [m]: z in the camera frame, 0 where nothing is seen.
-    segmentation
-        (H, W) uint8: the id of the layer seen, 0 where nothing is seen.
-    taken
-        (H, W) uint8: above 0 where lines and words are drawn over it.
-    """
-
-    colour: np.ndarray
-    depth: np.ndarray
-    segmentation: np.ndarray
-    taken: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +37,28 @@ class Pictures:
     def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
         """All of them."""
         return self.colour, self.depth, self.segmentation
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What one camera sees; what is asked for is brought from the device that drew it."""
+
+    drawn: Pictures
+
+    @cached_property
+    def colour(self) -> np.ndarray:
+        """(H, W, 3) uint8, sRGB."""
+        return self.drawn.colour.numpy()[0]
+
+    @cached_property
+    def depth(self) -> np.ndarray:
+        """(H, W) float32 [m]: z in the camera frame, 0 where nothing is seen."""
+        return self.drawn.depth.numpy()[0]
+
+    @cached_property
+    def segmentation(self) -> np.ndarray:
+        """(H, W) uint8: the id of the layer seen, 0 where nothing is seen."""
+        return self.drawn.segmentation.numpy()[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +140,7 @@ class Renderer:
             Vertices of other shapes than the layers'.
         """
         moved = self.stack.moved(np.concatenate([np.zeros((0, 3)), *vertices])[None])
-        drawn = self._drawn([camera], moved, self._backdrop(camera, moved) if self.stack.still_faces else None)
-        colour, depth, segmentation = (array.numpy()[0] for array in drawn.arrays)
-        return Picture(colour, depth, segmentation, np.zeros(segmentation.shape, np.uint8))
+        return Picture(self._drawn([camera], moved, self._backdrop(camera, moved) if self.stack.still_faces else None))
 
     def pictures(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
         """What cameras of one size see; nothing leaves the device.

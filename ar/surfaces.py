@@ -46,7 +46,9 @@ class Stack:
         self.surfaces.triangles = here(triangles, dtype=wp.vec3i)
         self.surfaces.look_of = here(numbers.astype(np.uint8), dtype=wp.uint8)
         self.surfaces.looks = here(looks, dtype=Look)
-        self.surfaces.colours = vectors(np.concatenate([np.zeros((0, 3)), *(layer.colour**2 for layer in layers)]))
+        self.surfaces.colours = vectors(
+            np.concatenate([np.zeros((0, 3)), *(np.square(layer.colour) for layer in layers)])
+        )
         rest = [layer.vertices if layer.rest is None else layer.rest for layer in layers]
         self.surfaces.rest = vectors(np.concatenate([np.zeros((0, 3)), *rest]))
         self.surfaces.texels = texels

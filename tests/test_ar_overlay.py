@@ -170,8 +170,9 @@ def test_the_overlay_stands_where_the_tumour_is(style):
     assert [np.mean(columns), np.mean(rows)] == pytest.approx(middle, abs=2.0)
     outline = silhouette(here, tumour().vertices, tumour().triangles)
     assert changed[outline].mean() > (0.2 if style == "contour" else 0.95)
-    for same in ("depth", "segmentation"):
-        assert np.array_equal(getattr(picture, same), getattr(drawn, same))
+    fresh = render(here, [cortex()], LAMP)
+    for same in ("colour", "depth", "segmentation"):
+        assert np.array_equal(getattr(picture, same), getattr(fresh, same))
 
 
 @pytest.mark.parametrize("style", ["window", "contour", "fill"])
@@ -295,7 +296,6 @@ def test_what_lines_and_words_cover_is_reported():
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
     drawn = composite(picture, here, tumour(), style="contour", gauge=gauge, before=tumour((0.01, 0.0, -0.02)))
     changed = (drawn.colour != picture.colour).any(axis=2)
-    assert not picture.taken.any()
     taken = drawn.taken > 0
     halo = cv2.dilate(taken.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     assert (halo | ~changed).all() and changed[taken].mean() > 0.5

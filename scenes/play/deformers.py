@@ -42,6 +42,10 @@ class Theatre:
         """The open cortex."""
         return site_of(self.anatomy)
 
+    def stage(self, scene: Scene) -> Stage:
+        """A scene's stage on this anatomy, drawn on this theatre's device."""
+        return Stage(scene, self.site, self.intensity, device=find_device(self.device, LIVE.precision).name)
+
     def refusals(self, scene: Scene) -> dict[str, str | None]:
         """Why each learnt model may not answer a scene, by name; None if it may.
 
@@ -106,7 +110,7 @@ class Theatre:
         InputError
             As `deformer`; an anatomy without open cortex.
         """
-        return Player(Stage(scene, self.site, self.intensity), self.deformer(name, scene))
+        return Player(self.stage(scene), self.deformer(name, scene))
 
 
 def plan_of(deformer: Deformer) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ from .page_text import deformer_words, effect_words, plan_words, report, words
 from .page_verdict import Judged, changed, judge, verdict_words
 from .player import Frame, Player
 from .replay import Session
-from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR, Stage
+from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR
 from .tool_holder import holding
 from .waiting_notice import Busy
 
@@ -150,7 +150,7 @@ class Demo:
 
     def _cast(self, scene: Scene, deformer: str) -> None:
         """Make a stage for a scene, and have a deformer play on it."""
-        stage = Stage(scene, self.theatre.site, self.theatre.intensity)
+        stage = self.theatre.stage(scene)
         sessions = {(deformer, frozenset[str]()): Session(Player(stage, self.theatre.deformer(deformer, scene)))}
         self.stage, self.sessions, self.tally = stage, sessions, Tally()
         self.wish = Wish(deformer, FIRST, scene.name, clocked=clocked(scene, stage.site))

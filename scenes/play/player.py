@@ -12,7 +12,7 @@ import numpy as np
 from ar.camera import Camera
 from ar.hud import NARROW, folded, lay, panel
 from ar.layer import Layer
-from ar.overlay import Gauge, Style, composite
+from ar.overlay import Gauge, Overlaid, Style, composite
 from ar.renderer import Picture
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
@@ -228,7 +228,7 @@ def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
     return Gauge(tip, closest(tip[None], hidden.vertices[hidden.triangles]).point[0])
 
 
-def annotate(over: Picture, number: int, remark: str) -> None:
+def annotate(over: Overlaid, number: int, remark: str) -> None:
     """Write a remark at the left of a composite picture's foot, and a frame's number at its right, in place."""
     height, width = over.taken.shape
     lay(over.colour, over.taken, folded(remark, NARROW * width), (0, height))

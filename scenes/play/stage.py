@@ -56,12 +56,16 @@ class Cortex:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The drawn parts of a scene; positions are those of all mesh vertices (V, 3) [m]."""
+    """The drawn parts of a scene; positions are those of all mesh vertices (V, 3) [m].
+
+    `device` is the Warp device that draws.
+    """
 
     scene: Scene
     site: Site
     intensity: Intensity | None = None
     left: Remains | None = None
+    device: str = "cpu"
 
     @property
     def anatomy(self) -> Anatomy:
@@ -129,7 +133,7 @@ class Stage:
         layers = self.layers(positions, pose)
         count = len(layers)
         if count not in self._renderers:
-            self._renderers[count] = Renderer(layers, self.lamp)
+            self._renderers[count] = Renderer(layers, self.lamp, self.device)
         return self._renderers[count].picture(camera, [layer.vertices for layer in layers if not layer.still])
 
     @cached_property

@@ -1,0 +1,228 @@
+"""Pictures of many cameras and frames: as rays and formulas have them, alone and together, on any device."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import warp as wp
+from test_ar_raster import sphere
+
+from ar.camera import Camera, look_at
+from ar.layer import Layer, Solid, vertex_normals
+from ar.overlay import box_around, composite
+from ar.rasteriser import NOTHING, empty_buffer, keep_nearest, seen
+from ar.raycast import raycast
+from ar.renderer import Lamp, Picture, Pictures, Renderer, as_light, render, tone_curve
+from ar.shade import BRIGHTEST
+from ar.window import FADE, SURROUND, chamfer, outside, with_window
+
+FLOOR, BALL, EGG = 1, 2, 3
+LAMP = Lamp(np.array([-0.15, 0.1, 0.3]), np.zeros(3), 0.08)
+
+
+def camera(turn: float = 0.0, width: int = 160, height: int = 120) -> Camera:
+    eye = 0.3 * np.array([np.sin(turn), -0.3, np.cos(turn)])
+    return look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]), np.radians(30.0), width, height)
+
+
+def floor(**look) -> Layer:
+    x, y = np.meshgrid(*[np.linspace(-0.08, 0.08, 12)] * 2, indexing="ij")
+    vertices = np.stack([x, y, 0.01 * np.sin(40.0 * x)], -1).reshape(-1, 3)
+    index = np.arange(144).reshape(12, 12)
+    quads = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], -1).reshape(-1, 4)
+    return Layer("floor", FLOOR, vertices, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), **look)
+
+
+def ball(centre=(0.0, 0.0, 0.03), **look) -> Layer:
+    vertices, triangles = sphere(20, 30, 0.02)
+    return Layer("ball", BALL, vertices + centre, triangles, (0.3, 0.7, 0.9), **look)
+
+
+def striped() -> Layer:
+    values = np.indices((9, 9, 9)).sum(axis=0) % 3 / 2.0
+    T = np.diag([20.0, 20.0, 20.0, 1.0])
+    T[:3, 3] = 4.0
+    layer = floor(colour=(0.9, 0.6, 0.5))
+    return replace(layer, solid=Solid(values, T, (0.2, 0.1, 0.1), 1e-3), rest=layer.vertices)
+
+
+def scene(still: bool = False) -> list[Layer]:
+    """A floor, and a ball above it that throws its shadow on it."""
+    return [replace(striped(), still=still), ball(casts_shadow=True, gloss=0.8)]
+
+
+def agree(one: np.ndarray, other: np.ndarray) -> float:
+    """The share of pixels (..., 3) that are at most one grey level apart."""
+    return float((np.abs(one.astype(int) - other).max(axis=-1) <= 1).mean())
+
+
+def test_depth_and_segmentation_are_what_rays_see():
+    layers = scene()
+    picture, here = render(camera(), layers, LAMP), camera()
+    vertices = np.concatenate([layer.vertices for layer in layers])
+    cast = raycast(here, vertices, np.concatenate([layers[0].triangles, layers[1].triangles + len(layers[0].vertices)]))
+    ids = np.where(cast.face < 0, 0, np.where(cast.face < len(layers[0].triangles), FLOOR, BALL))
+    same = picture.segmentation == ids
+    assert same.mean() > 0.999 and set(np.unique(ids)) == {0, FLOOR, BALL}
+    assert np.abs(picture.depth - cast.depth)[same].max() < 1e-6
+
+
+def test_colours_follow_from_the_formulas_at_the_points_that_rays_see():
+    """Without texture and shadow, in NumPy: base (ambient + wrapped Lambert) + Fresnel x lobe, under the lamp's rim."""
+    here, layer, light = camera(0.0, 320, 240), ball(gloss=0.4, shininess=30.0), as_light(LAMP)
+    picture, cast = render(here, [layer], LAMP), raycast(here, layer.vertices, layer.triangles)
+    normals, on = vertex_normals(layer.vertices, layer.triangles), cast.mask
+
+    def unit(v):
+        return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+    def dot(a, b):
+        return (a * b).sum(axis=-1, keepdims=True)
+
+    place = cast.interpolate(layer.triangles, layer.vertices)[on]
+    n, view = unit(cast.interpolate(layer.triangles, normals)[on]), unit(here.centre - place)
+    n = np.where(dot(n, view) < 0.0, -n, n)
+    ray = unit(LAMP.position - place)
+    rim = np.clip((dot(-ray, np.array(light.axis)) - light.outer) * light.steepness, 0.0, 1.0)
+    arriving = rim * rim * (3.0 - 2.0 * rim) * light.strength
+    middle = unit(ray + view)
+    fresnel = 0.04 + 0.96 * (1.0 - dot(view, middle).clip(0.0)) ** 5
+    lobe = np.exp(30.0 * (dot(n, middle) - 1.0)) * 38.0 * 0.12
+    base = np.square((0.3, 0.7, 0.9))
+    out = base * (
+        light.ambient * (0.35 + 0.65 * dot(n, view).clip(0.0)) + arriving * (dot(n, ray) + 0.2).clip(0.0) * 0.83333
+    )
+    out = out + 0.4 * arriving * fresnel * lobe
+    wanted = tone_curve()[(np.clip(out / float(BRIGHTEST), 0.0, 1.0) * 4095.0).astype(int)]
+    inside = cv2.erode(on.astype(np.uint8), np.ones((3, 3), np.uint8))[on] > 0
+    assert inside.sum() > 1000 and agree(picture.colour[on][inside], wanted[inside]) > 0.999
+
+
+def test_what_stands_still_is_drawn_once_and_looks_the_same(monkeypatch):
+    """Also where the shadow of what moves falls on it, and from another camera."""
+    renderer, drawn = Renderer(scene(still=True), LAMP), []
+    backdrop = Renderer._backdrop
+    monkeypatch.setattr(Renderer, "_backdrop", lambda *known: drawn.append(known[1]) or backdrop(*known))
+    here, there = camera(), camera(0.4)
+    for eye, centre in ((here, (0.0, 0.0, 0.03)), (here, (0.02, 0.01, 0.02)), (there, (0.0, 0.0, 0.03))):
+        moved = replace(scene()[1], vertices=ball(centre).vertices)
+        one, other = renderer.picture(eye, [moved.vertices]), render(eye, [striped(), moved], LAMP)
+        for name in ("colour", "depth", "segmentation"):
+            assert np.array_equal(getattr(one, name), getattr(other, name))
+        lit = render(eye, [striped(), replace(moved, casts_shadow=False)], LAMP)
+        shaded = (lit.colour.astype(int) - other.colour).sum(axis=2) > 60
+        assert (shaded & (other.segmentation == FLOOR)).sum() > 100
+    assert len(drawn) == 3 and renderer.backdrop is not None and renderer.backdrop.camera is there
+
+
+def test_pictures_together_are_those_alone():
+    """Of several cameras and frames, or of one camera; a layer that stands still is seen by all."""
+    renderer = Renderer(scene(still=True), LAMP)
+    centres = [(0.0, 0.0, 0.03), (0.03, 0.0, 0.02), (-0.02, 0.02, 0.04)]
+    moved = np.stack([ball(centre).vertices for centre in centres])
+    for cameras in ([camera(turn) for turn in (0.0, 0.3, -0.5)], [camera(0.2)]):
+        together = renderer.pictures(moved, cameras)
+        on_device = renderer.pictures(wp.array(moved, dtype=wp.vec3d, device="cpu"), cameras)
+        assert together.colour.shape == (3, 120, 160)
+        for row, vertices in enumerate(moved):
+            alone = renderer.picture(cameras[row % len(cameras)], [vertices])
+            for name in ("colour", "depth", "segmentation"):
+                assert np.array_equal(getattr(together, name).numpy()[row], getattr(alone, name))
+                assert np.array_equal(getattr(on_device, name).numpy()[row], getattr(alone, name))
+    assert not np.array_equal(together.colour.numpy()[0], together.colour.numpy()[1])
+
+
+def test_two_solid_textures_are_kept_apart():
+    other = replace(ball(), solid=Solid(np.eye(4)[:, None].repeat(3, 1), 50.0 * np.eye(4)), rest=ball().vertices)
+    both = render(camera(), [striped(), other], LAMP)
+    for layer in (striped(), other):
+        alone = render(camera(), [layer], LAMP)
+        here = both.segmentation == layer.id
+        assert here.sum() > 500 and np.array_equal(both.colour[here], alone.colour[here])
+
+
+def test_rows_shared_by_threads_give_the_same_depths():
+    """As on a card, where several threads draw each triangle."""
+    here, layer = camera(), scene()[0]
+    whole = seen(here, layer.vertices, layer.triangles)
+    for parts, begin, end in ((3, 0, 120), (8, 0, 120), (7, 31, 90)):
+        shared = empty_buffer(1, 120, 160, "cpu")
+        size = 1, -(-len(layer.triangles) // 64), parts
+        inputs = [whole.points, whole.triangles, 0, wp.float64(1e-3), begin, end, parts, 64]
+        wp.launch(keep_nearest, size, inputs, [shared], device="cpu")
+        assert np.array_equal(shared.numpy()[0, begin:end], whole.nearest.numpy()[0, begin:end])
+        assert (shared.numpy()[0, :begin] == np.uint64(NOTHING)).all()
+
+
+def test_the_rim_is_as_wide_by_kernels_as_by_opencv():
+    random = np.random.default_rng(3)
+    mask = np.zeros((90, 110), np.uint8)
+    for row, column, radius in random.integers((20, 20, 2), (70, 90, 14), (4, 3)):
+        cv2.circle(mask, (int(column), int(row)), int(radius), (1,), -1)
+    known = outside(mask.view(bool), "cpu").numpy()
+    found = chamfer(wp.array(mask, dtype=wp.uint8, device="cpu"), "cpu").numpy()
+    near = known < float(SURROUND)
+    assert 0 < near.sum() < near.size and np.abs(found - known)[near].max() < 2e-3
+    assert found[~near].min() > float(SURROUND) - 1e-3
+
+
+def test_the_window_is_what_its_formula_says():
+    """In NumPy, pixel by pixel: dimmed round the silhouette, and darker the deeper the hidden surface lies."""
+    here = camera()
+    hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG, colour=(0.2, 0.9, 0.3))
+    picture = render(here, [floor()], LAMP)
+    cast = raycast(here, hidden.vertices, hidden.triangles)
+    box = box_around(here, hidden.vertices)
+    part = here.cropped(*box)
+    found = seen(part, hidden.vertices, hidden.triangles)
+    shown = with_window(picture.drawn, box, part, hidden, found, found.mask, ())
+    away = cv2.distanceTransform((~cast.mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3) / float(SURROUND)
+    window = np.clip(1.25 - 1.25 * away, 0.0, 1.0)[..., None]
+    wanted = picture.colour * (1.0 - 0.62 * window**2 * (3.0 - 2.0 * window))
+    normals = cast.interpolate(hidden.triangles, vertex_normals(hidden.vertices, hidden.triangles))
+    facing = normals @ here.T_camera_world[2, :3]
+    under = np.where(picture.depth > 0.0, (cast.depth - picture.depth).clip(0.0), 0.0)
+    shine = 1.1 * (0.25 + 0.75 * np.abs(facing)) * np.exp(-under / float(FADE)) * cast.mask
+    wanted = np.clip(wanted + shine[..., None] * 255.0 * np.array(hidden.colour[0]), 0.0, 255.0).astype(np.uint8)
+    assert found.mask.sum() > 300 and agree(shown, wanted) > 0.999
+    assert agree(shown, picture.colour) < 0.95
+
+
+@pytest.mark.parametrize(
+    ("attempt", "reason"),
+    [
+        (lambda it: it.picture(camera(), [ball().vertices[1:]]), "vertices"),
+        (lambda it: it.pictures(ball().vertices, [camera()]), "vertices"),
+        (lambda it: it.pictures(np.full((1, *ball().vertices.shape), np.nan), [camera()]), "finite"),
+        (lambda it: it.pictures(wp.zeros((1, 4), dtype=wp.vec3d, device="cpu"), [camera()]), "vec3d"),
+        (lambda it: it.pictures(np.stack([ball().vertices] * 3), [camera()] * 2), "cameras"),
+        (lambda it: it.pictures(np.stack([ball().vertices] * 2), [camera(), camera(width=80)]), "sizes"),
+        (lambda it: it.pictures(np.stack([ball().vertices] * 2), [camera(width=40000, height=40000)]), "too many"),
+    ],
+)
+def test_what_cannot_be_drawn_together_is_refused(attempt, reason):
+    with pytest.raises(ValueError, match=reason):
+        attempt(Renderer(scene(still=True), LAMP))
+
+
+def drawn_on(device: str) -> tuple[Pictures, Picture, np.ndarray]:
+    """Pictures together and alone, and one with an overlay, all drawn by a device."""
+    renderer = Renderer(scene(still=True), LAMP, device)
+    moved = np.stack([ball((0.01 * row, 0.0, 0.03)).vertices for row in range(4)])
+    together = renderer.pictures(moved, [camera(0.1 * row, 640, 480) for row in range(4)])
+    alone = renderer.picture(camera(0.0, 640, 480), [moved[0]])
+    hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG, colour=(0.2, 0.9, 0.3))
+    return together, alone, composite(alone, camera(0.0, 640, 480), hidden, (BALL,)).colour
+
+
+@pytest.mark.gpu
+def test_the_graphics_card_draws_the_same_pictures():
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    (many, one, shown), (many_there, one_there, shown_there) = drawn_on("cpu"), drawn_on("cuda:0")
+    assert agree(many.colour.numpy(), many_there.colour.numpy()) > 0.999
+    same = many.segmentation.numpy() == many_there.segmentation.numpy()
+    assert same.mean() > 0.999
+    assert np.abs(many.depth.numpy() - many_there.depth.numpy())[same].max() < 1e-5
+    assert agree(one.colour, one_there.colour) > 0.999 and agree(shown, shown_there) > 0.999
