@@ -1,13 +1,15 @@
 """`sulcus bench frame`: every stage of a page's frame is timed, and the page gets the pictures."""
 
 import json
+from functools import partial
 
 import pytest
 from theatres import put, short, theatre_of
 
 from ar.browser import Browser
+from ar.renderer import Renderer
 from scenes.bench import frame
-from scenes.bench.frame import STAGES, WARM_UP, frames_of, size_of, table
+from scenes.bench.frame import STAGES, WARM_UP, batch_rate, frames_of, size_of, table
 from scenes.cli import main
 from scenes.play.player import Player
 
@@ -40,13 +42,30 @@ def test_a_frame_is_the_sum_of_its_stages():
     assert rows[-1].p95 == pytest.approx(22900.0)
 
 
+def test_a_batch_is_of_so_many_frames_and_cameras(box, monkeypatch):
+    asked, pictures = [], Renderer.pictures
+
+    def heard(renderer, vertices, cameras):
+        asked.append((vertices, cameras))
+        return pictures(renderer, vertices, cameras)
+
+    monkeypatch.setattr(Renderer, "pictures", heard)
+    assert batch_rate(theatre_of(box).player("linear", short()), 3, 0.01) > 0.0
+    vertices, cameras = asked[-1]
+    assert len(asked) >= 2 and len({vertex.tobytes() for vertex in vertices}) > 1
+    assert len({camera.T_camera_world.tobytes() for camera in cameras}) == len(cameras) == len(vertices) == 3
+
+
 def test_the_command_says_the_size_and_every_stage(box, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(frame, "WARM_UP", 1)
+    monkeypatch.setattr(frame, "batch_rate", partial(frame.batch_rate, seconds=0.01))
     words = ["bench", "frame", "--anatomy", str(put(theatre_of(box), tmp_path / "box.vtu")), "--device", "cpu"]
     words += ["--deformer", "linear", "--size", "160x120", "--frames", "2"]
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert [row["stage"] for row in said["rows"]] == [*STAGES, "frame"] and "160 x 120" in said["machine"]
+    assert said["batch"] == 4 and said["pictures_per_second"] > 0.0
+    assert main([*words, "--batch", "0"]) == 2 and "--batch" in capsys.readouterr().err
     assert main([*words[:-1], "0"]) == 2 and "--frames" in capsys.readouterr().err
 
 

@@ -7,10 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
 
 from ar.browser import Browser
 from ar.page_parts import Body, Playback, Viewpoint
 from ar.page_sight import coded
+from ar.renderer import Renderer
 from sim.errors import InputError
 
 from ..play.page import pictured
@@ -81,6 +83,32 @@ def frames_of(player: Player, count: int) -> Iterator[tuple[float, ...]]:
                 )  # fmt: skip
     finally:
         page.close()
+
+
+def batch_rate(player: Player, count: int, seconds: float = 2.0) -> float:
+    """Pictures a second, of as many frames together, each by a camera of its own: colour, depth and segmentation.
+
+    The vertices come from the host; the pictures stay on the device that draws them.
+    """
+    stage, scene = player.stage, player.scene
+    scenes = []
+    for number in np.linspace(0, len(scene.times) - 1, count).astype(int).tolist():
+        touch = player.touch(number)
+        positions = player.positions(player.answer(player.loads(number, touch)))
+        held = None if scene.tool is None else player.tool(scene.tool, touch, positions)
+        scenes.append(stage.layers(positions, None if held is None else held.pose))
+    moved = np.stack([np.concatenate([layer.vertices for layer in each if not layer.still]) for each in scenes])
+    # All within half a degree.
+    cameras = [player.camera.perturbed(0.5 * (row - 0.5 * count) / count) for row in range(count)]
+    renderer = Renderer(scenes[0], stage.lamp, stage.device)
+    renderer.pictures(moved, cameras)
+    wp.synchronize()
+    done, begun = 0, clock.perf_counter()
+    while clock.perf_counter() - begun < seconds:
+        renderer.pictures(moved, cameras)
+        wp.synchronize()
+        done += count
+    return done / (clock.perf_counter() - begun)
 
 
 def open_page(player: Player) -> Browser:
