@@ -256,8 +256,8 @@ def outlines(mask: np.ndarray, box: tuple[slice, slice] = WHOLE) -> list[np.ndar
 def dash(out: np.ndarray, outline: np.ndarray, ink: Sequence[float], pattern: tuple[int, int], width: int = 1) -> None:
     """Draw strokes of an outline (n, 1, 2) with gaps, both of so many pixels as `pattern` says, in place."""
     stroke, gap = pattern
-    for start in range(0, len(outline), stroke + gap):
-        cv2.polylines(out, [outline[start : start + stroke]], False, ink, width, cv2.LINE_AA)
+    strokes = [outline[start : start + stroke] for start in range(0, len(outline), stroke + gap)]
+    cv2.polylines(out, strokes, False, ink, width, cv2.LINE_AA)
 
 
 def draw_line(out: np.ndarray, camera: Camera, gauge: Gauge) -> None:

@@ -30,7 +30,7 @@ if (number >= Number(picture.dataset.number || 0)) {{
 
 def coded(colour: np.ndarray) -> str:
     """A picture (H, W, 3) uint8 as an address that holds it."""
-    written = cv2.imencode(".jpg", np.ascontiguousarray(colour[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    written = cv2.imencode(".jpg", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(written.tobytes()).decode()}"
 
 

@@ -115,7 +115,7 @@ def test_drawing_is_a_function_of_its_moment(play):
     first = play.draw(36, 1.2, touch)
     play.draw(3, 0.1, Touch(0.01, 0.0, 0.1, (0.3, 0.1)))
     again = play.draw(36, 1.2, touch)
-    for name in ("colour", "depth", "normal", "segmentation"):
+    for name in ("colour", "depth", "segmentation"):
         assert np.array_equal(getattr(first.picture, name), getattr(again.picture, name))
     assert np.array_equal(first.shown, again.shown) and np.array_equal(first.pose, again.pose)
     assert np.array_equal(first.deformation.displacement, again.deformation.displacement)
