@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from .parallel import forward_kernel
-from .shade import Placed
+from .shade_structs import Placed
 
 
 def faces_around(triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,8 @@ from .layer import Layer
 from .parallel import launch_in_bands
 from .place import place
 from .rasteriser import NEAR, draw, empty_buffer, rows_reached
-from .shade import BRIGHTEST, SOFT, TILE, Light, Placed, Shadow, bound, remember, shade
+from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
+from .shade_structs import Light, Placed, Shadow
 from .surfaces import Stack
 
 DRAPE = (0.13, 0.30, 0.36)
@@ -128,6 +129,7 @@ class Renderer:
         self.device, self.stack = device, Stack(layers, device)
         self.light, self.lamp_camera = as_light(lamp), lamp.camera()
         self.curve = wp.array(tone_curve(), dtype=wp.uint8, device=device)
+        self.unshaded = wp.empty(0, dtype=wp.vec3i, device=device)
         self.nowhere = wp.empty(0, dtype=wp.vec3f, device=device)
         self.backdrop: Backdrop | None = None
 
@@ -246,7 +248,7 @@ class Renderer:
         self._place([camera], moved, placed, 0)
         there = stack.surfaces.triangles[: stack.still_faces]
         draw(placed.seen, there, 0, slice(0, height), nearest, self.device)
-        self._shade([camera], placed, nearest, stack.casting[:0], 0, self.nowhere, pictures)
+        self._shade([camera], placed, nearest, self.unshaded, 0, self.nowhere, pictures)
         lit_at = wp.zeros(height * width, dtype=wp.vec3f, device=self.device)
         inputs = [width, nearest.flatten(), stack.surfaces, placed, self._eyes([camera]), self.light]
         launch_in_bands(remember, inputs, [lit_at], height * width, self.device)

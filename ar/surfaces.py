@@ -10,7 +10,7 @@ import warp as wp
 
 from .layer import Layer, Solid
 from .place import faces_around
-from .shade import Look, Placed, Surfaces
+from .shade_structs import Look, Placed, Surfaces
 
 
 class Stack:

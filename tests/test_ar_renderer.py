@@ -116,6 +116,13 @@ def test_what_stands_still_is_drawn_once_and_looks_the_same(monkeypatch):
     assert len(drawn) == 3 and renderer.backdrop is not None and renderer.backdrop.camera is there
 
 
+def test_without_shadows_or_anything_that_moves_it_looks_the_same():
+    for layers, moved in (([striped(), ball()], [ball().vertices]), ([striped()], [])):
+        still = [replace(layers[0], still=True), *layers[1:]]
+        one, other = Renderer(still, LAMP).picture(camera(), moved), render(camera(), layers, LAMP)
+        assert np.array_equal(one.colour, other.colour) and np.array_equal(one.depth, other.depth)
+
+
 def test_pictures_together_are_those_alone():
     """Of several cameras and frames, or of one camera; a layer that stands still is seen by all."""
     renderer = Renderer(scene(still=True), LAMP)
@@ -174,6 +181,7 @@ def test_the_window_is_what_its_formula_says():
     picture = render(here, [floor()], LAMP)
     cast = raycast(here, hidden.vertices, hidden.triangles)
     box = box_around(here, hidden.vertices)
+    assert box is not None
     part = here.cropped(*box)
     found = seen(part, hidden.vertices, hidden.triangles)
     shown = with_window(picture.drawn, box, part, hidden, found, found.mask, ())

@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 from theatres import PUSHING, player, put, small, theatre_of
 
 from ar.hud import millimetres
 from ar.overlay import composite
+from ar.renderer import Picture
 from scenes.cli import main
 from scenes.play.checks import Figures, measure
 from scenes.play.player import annotate, gauged
@@ -202,7 +204,8 @@ def test_what_is_not_finite_fails(play, frames, truth):
     for poison in (np.nan, np.inf):
         depth = frames[1].picture.depth.copy()
         depth[3, 5] = poison
-        off = replace(frames[1], picture=replace(frames[1].picture, depth=depth))
+        there = wp.array(depth[None], dtype=wp.float32, device="cpu")
+        off = replace(frames[1], picture=Picture(replace(frames[1].picture.drawn, depth=there)))
         assert about(broken(play, [frames[0], off, *frames[2:]], truth)[0], "not finite")
         # No deformer lets such a displacement pass: it can only be put in afterwards.
         answer = replace(frames[1].deformation, displacement=frames[1].deformation.displacement.copy())
