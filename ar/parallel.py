@@ -14,14 +14,17 @@ forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
 """`wp.kernel` without adjoint, launched as wide as the work: pictures are not differentiated here."""
 
 
-def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str) -> None:
-    """Launch a kernel over `count` independent items; it takes (begin, end, run) first, see `run_length`."""
+def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str, bands: int = 1) -> None:
+    """Launch a kernel over `count` independent items; it takes (begin, end, run) first, see `run_length`.
+
+    On a processor there are so many bands for each core: several where some items take longer than others.
+    """
     run = run_length(device)
 
     def launch(begin: int, end: int) -> None:
         wp.launch(kernel, -(-(end - begin) // run), [begin, end, run, *inputs], outputs, device=device)
 
-    in_bands(launch, count, device)
+    in_bands(launch, count, device, bands)
 
 
 def run_length(device: str) -> int:
@@ -29,15 +32,15 @@ def run_length(device: str) -> int:
     return 64 if device == "cpu" else 1
 
 
-def in_bands(draw: Callable[[int, int], None], count: int, device: str) -> None:
-    """Call `draw(begin, end)` on ranges that cover 0 .. count: a thread for each core, where kernels have one each.
+def in_bands(draw: Callable[[int, int], None], count: int, device: str, bands: int = 1) -> None:
+    """Call `draw(begin, end)` on ranges that cover 0 .. count: `bands` for each core, where kernels have one each.
 
     The ranges must not write to the same places; the modules of their kernels must be loaded.
     """
     if device != "cpu":
         return draw(0, count)
     pool, cores = workers()
-    edges = np.linspace(0, count, cores + 1).astype(int).tolist()
+    edges = np.linspace(0, count, bands * cores + 1).astype(int).tolist()
     list(pool.map(draw, edges[:-1], edges[1:]))
 
 

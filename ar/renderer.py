@@ -205,7 +205,7 @@ class Renderer:
             shadow, self.curve, still, lit_at,
         ]  # fmt: skip
         outputs = [array.flatten() for array in pictures.arrays]
-        launch_in_bands(shade, inputs, outputs, count * height * width, self.device)
+        launch_in_bands(shade, inputs, outputs, count * height * width, self.device, bands=4)
 
     def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: Placed, since: int) -> None:
         """Find where the vertices from number `since` on lie in each picture."""
