@@ -150,7 +150,8 @@ class Demo:
 
     def _cast(self, scene: Scene, deformer: str) -> None:
         """Make a stage for a scene, and have a deformer play on it."""
-        stage = self.theatre.stage(scene)
+        # Not on a card: there, what is drawn while the referee's thread records a CUDA graph would be recorded with it.
+        stage = replace(self.theatre.stage(scene), device="cpu")
         sessions = {(deformer, frozenset[str]()): Session(Player(stage, self.theatre.deformer(deformer, scene)))}
         self.stage, self.sessions, self.tally = stage, sessions, Tally()
         self.wish = Wish(deformer, FIRST, scene.name, clocked=clocked(scene, stage.site))
