@@ -244,7 +244,8 @@ class ContactDescent:
                 learnt = batch.pairs.of(missing)
                 own = doubled(learnt.sw[:, :, rows])
                 soft = Softness(self.compliance, self.problem.device, own, doubled(learnt.middle))
-                free = free - (learnt.weights(self._pull(now.smooth, batch.force)[:, missing]).mT @ own)[:, 0].T
+                weights = learnt.weights(self._pull(now.smooth, batch.force)[:, missing])
+                free = free - (doubled(weights).mT @ own)[:, 0].T
             one, solved = settled(barrier, soft, here, doubled(free), known, exact[missing], batch.drag[missing], most)
             force[:, missing[solved]] = one[:, solved]
             missing = missing[~solved]
@@ -263,7 +264,9 @@ class ContactDescent:
         then they have not moved, and forget what has misled them.
         """
         limits, now, t = self.limits, batch.now, batch.length
-        new = self._judged(batch.judge, now.u + placed(self.problem.device, t.astype(now.u.dtype)) * batch.x)
+        new = self._judged(
+            batch.judge, now.u + placed(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
+        )
         ahead = np.where(new.finite, _dots(new.whole, batch.x), np.inf)
         far = goes_too_far(ahead, batch.promised) & (t > limits.least)
         batch.length = np.where(far, t * kept_of(ahead, batch.promised), t)
@@ -298,8 +301,9 @@ class ContactDescent:
         if barrier is None:
             return 0.0 * own
         slope = barrier.slope(doubled(now.u[rows]))
-        touched = (slope != 0.0).reshape(-1, 3, slope.shape[1]).any(1)
-        return -own * touched.repeat(3, 0)
+        shape = -1, 3, slope.shape[1]
+        touched = (slope != 0.0).reshape(shape).any(1)
+        return (-own.reshape(shape) * touched[:, None]).reshape(slope.shape)
 
     def _pull(self, smooth: Any, force: Any) -> Any:
         """Smooth gradients (3N, b) and forces (3n, b) on the touchable nodes, together (3N, b)."""

@@ -245,7 +245,7 @@ class Strategy:
     def _touching(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
         """Of cases whose tools have gone so many times their gap: what touches and what gives apart, then Newton.
 
-        Newton has them one by one: the preconditioner of a single one knows what it touches.
+        On the CPU Newton has them one by one: the preconditioner of a single one knows what it touches.
         """
         problem, touch, device = self.problem, self._proximal, self.problem.device
         problem.begin(cases)
@@ -256,14 +256,17 @@ class Strategy:
         outcome = np.full(count, Outcome.BUDGET, object)
         outcome[found.status == DONE] = Outcome.CONVERGED
         answer = self._answer(found.u, outcome, found.steps, found.residual, 0)
-        for row in np.flatnonzero(~answer.good):
-            here = np.array([row])
-            one = cases.rows(here)
-            if found.residual[row] <= self.gaps.nearly:
-                problem.begin(one)
-                answer.put(here, self._thorough(gathered(device, found.u, here), few), device)
-            if not answer.good[row]:
-                answer.put(here, self._closed(one, gathered(device, start, here), outer, gaps), device)
+
+        def batched(rows: np.ndarray) -> Sequence[np.ndarray]:
+            return [rows][: len(rows)] if device.on_cuda else list(rows[:, None])
+
+        near = np.flatnonzero(~answer.good & (found.residual <= self.gaps.nearly))
+        for some in batched(near):
+            problem.begin(cases.rows(some))
+            answer.put(some, self._thorough(gathered(device, found.u, some), few), device)
+        left = np.flatnonzero(~answer.good)
+        for some in batched(left):
+            answer.put(some, self._closed(cases.rows(some), gathered(device, start, some), outer, gaps), device)
         return answer
 
     def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> Answer:
