@@ -46,7 +46,6 @@ OWNERS = {
     "torch": {
         "sim/linalg/dense_inverse.py",
         "sim/linalg/block_inverse.py",
-        "sim/linalg/relief.py",
         "sim/runtime/dense_product.py",
         "sim/runtime/views.py",
         "surrogate/regressors/ann.py",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -15,9 +16,9 @@ from sim.effects import Elasticity, Held, ToolContact
 from sim.fem import Fem
 from sim.linalg.compliance import Columns, Compliance
 from sim.linalg.pcg import Preconditioner
-from sim.linalg.relief import relieved
 from sim.loads import Loads, Touching
 from sim.local_solvers.contact_descent import ContactDescent
+from sim.local_solvers.contact_forces import Softness, scratch_of, settled
 from sim.local_solvers.contact_preconditioner import ContactPreconditioner
 from sim.material import Material
 from sim.minimisers.compact_lbfgs import Pairs, PairsOfColumns, no_pairs
@@ -208,19 +209,27 @@ def test_contact_solved_apart_is_what_newton_finds() -> None:
     np.testing.assert_allclose(found.displacement, newton.displacement, atol=1e-8)
 
 
-@pytest.mark.parametrize("sharp", [False, True])
-def test_springs_on_a_compliant_body_relieve_it(sharp: bool) -> None:
-    """Against the plain formula; a stiffness below zero that the body cannot hold is not convex."""
-    rng = np.random.default_rng(4)
-    compliance = np.stack([matrix @ matrix.T + 0.1 * np.eye(9) for matrix in rng.normal(size=(3, 9, 9))])
-    stiffness = np.stack([1e3 * matrix @ matrix.T for matrix in rng.normal(size=(3, 9, 4))])
-    if sharp:
-        stiffness[1] -= 100.0 * np.eye(9)
-    along = rng.normal(size=(3, 9, 1))
-    found, convex = relieved(Device("cpu", "float64"), compliance, stiffness, along)
-    expected = stiffness @ np.linalg.solve(np.eye(9) + compliance @ stiffness, along)
-    assert convex.tolist() == [True, not sharp, True]
-    np.testing.assert_allclose(found[convex], expected[convex], rtol=1e-9)
+@pytest.mark.parametrize("drag", [0.0, 0.5])
+def test_forces_are_those_of_tools_where_nodes_go_under_them(drag: float) -> None:
+    """f = c'(w) + d (w - v) where that is not zero, w = w1 - C (f - f1): of each column by itself."""
+    fem, descent = parts()
+    soft, n = descent.compliance, len(descent.barrier.touchable)
+    device = replace(fem.problem.device, precision="float64")
+    shallow = (at(0.031, 0.028, HEIGHT - 3e-4), at(0.02, 0.02, HEIGHT - 2e-4), at(0.0, 0.0, 0.2))
+    fem.problem.begin(Cases(touching(*shallow), np.zeros(3)))
+    barrier = descent.barrier.reduced(np.arange(3))
+    assert barrier is not None
+    here, known = np.zeros((3 * n, 3)), np.zeros((3 * n, 3))
+    model = Softness(soft, device, partial(scratch_of, device))
+    force, found = settled(barrier, model, here, here + 1e-4, known, np.full(3, 1e-6), np.full(3, drag))
+    assert found.all() and not force[:, 2].any()
+    w = here + 1e-4 - soft.between(np.ones(n, bool)) @ force
+    slope, touched = barrier.slope(w), (barrier.slope(here) != 0.0).reshape(n, 3, 3).any(axis=1)
+    for column in range(2):
+        rows = np.repeat(touched[:, column], 3)
+        stiff = drag / np.diag(soft.between(np.ones(n, bool)))[rows].mean()
+        slope[rows, column] += stiff * w[rows, column]
+        np.testing.assert_allclose(force[:, column], slope[:, column], atol=1e-6 * np.abs(slope[:, column]).max())
 
 
 def test_a_batch_of_which_one_case_is_slow_goes_on() -> None:

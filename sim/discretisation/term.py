@@ -206,14 +206,43 @@ class Barrier(Term, Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class BlockFunctions:
+    """What blocks of threads compute of a Barrier, as functions of Warp. All threads of a block must call them.
+
+    Parameters
+    ----------
+    stage, near
+        Structs that they take: what the barrier is, and what of it may be felt, which they keep up to date.
+    add_force
+        (x, stage, near, column, thread, out): add its gradient at x (3n, b) to out (3n, b).
+    add_matrix
+        (x, stage, near, definite, place, column, thread, out): add its curvature to out (b, 3m, 3m), as
+        `Reduction.curvature`, after `add_force` at the same place.
+    longest
+        (x, way, stage, near, column, thread): the share of a way, at most 1, that stays inside the domain.
+    """
+
+    stage: Any
+    near: Any
+    add_force: wp.Function
+    add_matrix: wp.Function
+    longest: wp.Function
+
+
 class Reduction(Protocol):
     """A Barrier of b columns on the n nodes that can be touched: a function of where they go, w (3n, b) [m].
 
     Arrays are those of `views.library`, float64.
     """
 
-    def keep(self, columns: np.ndarray) -> None:
-        """Keep these columns (k,), in this order."""
+    @property
+    def functions(self) -> BlockFunctions:
+        """Its functions for kernels."""
+        ...
+
+    def stage(self, columns: np.ndarray) -> tuple[Any, Any]:
+        """The structs `stage` and `near` for some columns (k,)."""
         ...
 
     def slope(self, w: Any) -> Any:
@@ -225,10 +254,6 @@ class Reduction(Protocol):
 
         Positive semi-definite where it is to be `definite` (b,).
         """
-        ...
-
-    def longest_step(self, w: Any, dw: Any) -> np.ndarray:
-        """The longest fraction (b,), at most 1, of dw (3n, b) [m] that stays inside the domain."""
         ...
 
 

@@ -53,8 +53,8 @@ class Compliance:
         self._problem, self._preconditioner = problem, preconditioner
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
         self._width = 3 * columns.block
-        self._between = view(replace(device, precision="float64").zeros(len(self.rows), len(self.rows)))
-        self._known = np.zeros(-(-len(nodes) // columns.block), bool)
+        self.columns = view(replace(device, precision="float64").zeros(len(self.rows), len(self.rows)))
+        self.known = np.zeros(len(nodes), bool)
         size = self._width * problem.rows * np.dtype(device.precision).itemsize
         self._block = lru_cache(max(columns.fewest_blocks, columns.most_bytes // size))(self._columns)
 
@@ -78,10 +78,13 @@ class Compliance:
 
     def between(self, acting: np.ndarray) -> Any:
         """H (3n, 3n) [m/N] between these n nodes: at least its columns at those that are `acting` (n,) bool."""
-        for block in self._acting(np.repeat(acting, 3)):
-            if not self._known[block]:
-                self._block(block)
-        return self._between
+        self.know(acting)
+        return self.columns.T
+
+    def know(self, acting: np.ndarray) -> None:
+        """See to it that at least the `columns`, here rows, at `acting` (n,) nodes are `known` (n,)."""
+        for block in self._acting(np.repeat(acting & ~self.known, 3)):
+            self._block(block)
 
     def _acting(self, rows: np.ndarray) -> list[int]:
         """The blocks that some rows (3n,) bool are in."""
@@ -96,5 +99,5 @@ class Compliance:
         unit = np.zeros((self._problem.rows, self._width))
         unit[self.rows[own], np.arange(len(self.rows[own]))] = 1.0
         whole = self.answered(placed(self._problem.device, unit))[:, : len(self.rows[own])]
-        self._between[:, own], self._known[block] = whole[self.rows], True
+        self.columns[own], self.known[own.start // 3 : own.stop // 3] = whole[self.rows].T, True
         return whole

@@ -12,8 +12,9 @@ move by x = -H (s'(u) + f), with the tools' forces f on them as `contact_forces`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,10 @@ from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from ..minimisers.line_search import goes_too_far, kept_of
 from ..minimisers.residual import Judge, judge_of, relative
+from ..runtime.device import Device
 from ..runtime.views import doubled, from_view, in_order, on_host, placed, view
-from .contact_forces import BENT, FORCES, ForceLimits, Softness, settled
+from .contact_forces import BENT, FORCES, ForceLimits, Softness, scratch_of, settled
+from .contact_kernel import Scratch
 
 
 @dataclass(frozen=True)
@@ -161,6 +164,16 @@ class ContactDescent:
         """At the nodes that can be touched."""
         return Compliance(self.problem, self.preconditioner, self.barrier.touchable)
 
+    @cached_property
+    def _room(self) -> Callable[[int, int, int], Scratch]:
+        """`scratch_of`, which takes long, of sizes that were asked for lately."""
+        return lru_cache(2)(partial(scratch_of, self._exact))
+
+    @property
+    def _exact(self) -> Device:
+        """The device in double precision."""
+        return replace(self.problem.device, precision="float64")
+
     def descend(self, start: wp.array, tolerance: np.ndarray, most: int) -> Descended:
         """As `Lbfgs.descend`, in at most `most` steps of each column; nothing is learnt."""
         count, device, limits = start.shape[1], self.problem.device, self.limits
@@ -238,12 +251,12 @@ class ContactDescent:
             if barrier is None or not len(missing):
                 missing = missing[:0]
                 break
-            soft, free = Softness(self.compliance, self.problem.device), now.u[rows] - batch.rest[rows]
+            soft, free = Softness(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows]
             free, here, known = free[:, missing], doubled(now.u[rows][:, missing]), batch.force[:, missing]
             if batch.pairs.most:
                 learnt = batch.pairs.of(missing)
                 own = doubled(learnt.sw[:, :, rows])
-                soft = Softness(self.compliance, self.problem.device, own, doubled(learnt.middle))
+                soft = replace(soft, learnt=own, middle=doubled(learnt.middle))
                 weights = learnt.weights(self._pull(now.smooth, batch.force)[:, missing])
                 free = free - (doubled(weights).mT @ own)[:, 0].T
             one, solved = settled(barrier, soft, here, doubled(free), known, exact[missing], batch.drag[missing], most)

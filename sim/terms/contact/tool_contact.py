@@ -17,7 +17,9 @@ from ...loads import Retracted, Touching
 from ...runtime.device import Device
 from ...tools import Tool, cores_of, distances_to
 from .reduced import Reduced
-from .tool_kernels import BULGE, Scale, Surface, Tools, kernels_of
+from .tool_blocks import Near, Stage
+from .tool_functions import BULGE, Scale, Surface, Tools
+from .tool_kernels import kernels_of
 from .tool_path import TOUCH, Touch, Way, approach
 
 # Of a triangle cut into smaller ones, the farthest point is so many of their edges from the nearest centre.
@@ -77,12 +79,14 @@ class Contact:
         self._surface = Surface()
         self._surface.rest = device.array(nodes, wp.vec3d)
         self._surface.table = device.array(triangles, wp.int32)
-        self._surface.pieces = device.array(np.ceil(longest / fine), wp.int32)
+        pieces = np.ceil(longest / fine).astype(np.int32)
+        self._surface.pieces, self._rows = device.array(pieces, wp.int32), int(pieces.max())
         self._surface.area = device.array(areas(corners), wp.float64)
-        self._tools = Tools()
-        self._tools.centre = device.array(np.array([core.centre for core in cores]), wp.vec3d)
-        self._tools.half = device.array(np.array([core.half for core in cores]), wp.vec3d)
-        self._tools.radius = device.array(np.array([core.radius + touch.sag * gap for core in cores]), wp.float64)
+        self._cores = [
+            device.array(np.array([core.centre for core in cores]), wp.vec3d),
+            device.array(np.array([core.half for core in cores]), wp.vec3d),
+            device.array(np.array([core.radius + touch.sag * gap for core in cores]), wp.float64),
+        ]
         self._asked, self._gap, self._shear = gap, (1.0 - touch.sag) * gap, shear
         self.widen(1.0)
         self._pose: np.ndarray | None = None
@@ -177,7 +181,7 @@ class Contact:
         term = Contact(
             self.name, self._shapes, self._way, nodes, own, corners, self._asked, self._shear, exact, self._touch
         )
-        return term, Reduced(term, len(nodes), exact)
+        return term, Reduced(term, len(nodes), own.shape[1], exact)
 
     def reduced(self, columns: np.ndarray) -> Reduced | None:
         """As `Local.reduced`."""
@@ -211,9 +215,26 @@ class Contact:
     def _stand(self, pose: np.ndarray | None) -> None:
         self._pose = pose
         if pose is not None:
-            of_cores = pose[:, self._owner].swapaxes(0, 1)
-            self._tools.rotation = self._device.array(of_cores[:, :, :3, :3], wp.mat33d)
-            self._tools.origin = self._device.array(of_cores[:, :, :3, 3], wp.vec3d)
+            self._tools = self._standing(pose)
+
+    def _standing(self, pose: np.ndarray) -> Tools:
+        out, of_cores = Tools(), pose[:, self._owner].swapaxes(0, 1)
+        out.centre, out.half, out.radius = self._cores
+        out.rotation = self._device.array(of_cores[:, :, :3, :3], wp.mat33d)
+        out.origin = self._device.array(of_cores[:, :, :3, 3], wp.vec3d)
+        return out
+
+    def stage(self, columns: np.ndarray) -> tuple[Stage, Near]:
+        """As `Dense.stage`."""
+        if self._pose is None:
+            raise ValueError("no tool is there")
+        out, near, name = Stage(), Near(), self._device.name
+        out.surface, out.tools, out.scale = self._surface, self._standing(self._pose[columns]), self._scale
+        out.rows = self._rows
+        near.pairs = wp.empty((len(columns), len(self._triangles) * len(self._owner)), dtype=wp.int32, device=name)
+        near.count = wp.empty(len(columns), dtype=wp.int32, device=name)
+        near.least = wp.empty(len(columns), dtype=wp.float64, device=name)
+        return out, near
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:
         if self._pose is not None:

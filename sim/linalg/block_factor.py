@@ -1,0 +1,77 @@
+"""Small dense systems, each a block of threads' own: Cholesky's factor, and solving with it, in double precision.
+
+Golub, Van Loan 2013, "Matrix Computations", algorithm 4.2.1 in its outer product form.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from ..runtime.blocks import threads_of, wait
+from ..runtime.device import Device
+
+
+@dataclass(frozen=True)
+class Functions:
+    """Functions of Warp on matrices (b, n, n) and vectors (b, n), of which the first `size` rows count."""
+
+    factor: wp.Function
+    solve: wp.Function
+
+
+@cache
+def functions_of(device: Device) -> Functions:
+    """Those for the blocks of a device."""
+    down, across = threads_of(device)
+    threads = down * across
+
+    @wp.func
+    def factor(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int) -> bool:
+        """A = L L', of whose upper half A is read: L' is left there and L in the lower. False where A is not positive.
+
+        Then nothing that is left means anything.
+        """
+        i0, j0 = me // across, me % across
+        for k in range(size):
+            pivot = a[c, k, k]
+            if not pivot > wp.float64(0.0):
+                return False
+            for i in range(k + 1 + i0, size, down):
+                share = a[c, k, i] / pivot
+                for j in range(i + j0, size, across):
+                    a[c, i, j] = a[c, i, j] - share * a[c, k, j]
+            wait()
+        for i in range(i0, size, down):
+            root = wp.sqrt(a[c, i, i])
+            for j in range(i + 1 + j0, size, across):
+                a[c, i, j] = a[c, i, j] / root
+                a[c, j, i] = a[c, i, j]
+        wait()
+        for i in range(me, size, threads):
+            a[c, i, i] = wp.sqrt(a[c, i, i])
+        wait()
+        return True
+
+    @wp.func
+    def solve(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int, x: wp.array2d(dtype=wp.float64)):
+        """x = A^-1 x, of A what `factor` has left."""
+        for k in range(size):
+            y = x[c, k] / a[c, k, k]
+            for i in range(k + 1 + me, size, threads):
+                x[c, i] = x[c, i] - a[c, k, i] * y
+            wait()
+            if me == 0:
+                x[c, k] = y
+        wait()
+        for n in range(size):
+            k = size - 1 - n
+            y = x[c, k] / a[c, k, k]
+            for i in range(me, k, threads):
+                x[c, i] = x[c, i] - a[c, k, i] * y
+            wait()
+            if me == 0:
+                x[c, k] = y
+        wait()
+
+    return Functions(factor, solve)

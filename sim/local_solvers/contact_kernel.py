@@ -1,0 +1,389 @@
+"""Newton's method for the forces of tools, each column's by a block of threads from beginning to end."""
+
+from functools import cache
+
+import warp as wp
+
+from ..discretisation.term import BlockFunctions
+from ..linalg.block_factor import functions_of
+from ..minimisers.lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
+from ..runtime.blocks import threads_of, total, wait
+from ..runtime.device import Device, forward_kernel
+
+OPEN, FOUND, NONE, CROWDED, UNKNOWN = (wp.constant(number) for number in range(5))
+"""What a column is: to be done, found, without an equilibrium, with too many touched nodes, or lacking a compliance."""
+
+
+@wp.struct
+class Model:
+    """How nodes give way: the compliance at rest, transposed (3n, 3n), and what b columns have learnt since.
+
+    `known` (n,): whether a node's column is; `learnt` (b, p, 3n), `middle` (b, p, p). A compliance between touched
+    nodes is `rounded`: that share of its mean makes it definite.
+    """
+
+    rest: wp.array2d(dtype=wp.float64)
+    known: wp.array(dtype=wp.int32)
+    learnt: wp.array3d(dtype=wp.float64)
+    middle: wp.array3d(dtype=wp.float64)
+    rounded: wp.float64
+
+
+@wp.struct
+class Ends:
+    """When it ends: as `contact_forces.ForceLimits`, and with room for so many touched nodes."""
+
+    iterations: wp.int32
+    cuts: wp.int32
+    late: wp.int32
+    room: wp.int32
+
+
+@wp.struct
+class Scratch:
+    """What b columns need meanwhile; n nodes, m touched ones at most.
+
+    `forces`, .., `held`: (3n, b). `place`, `acts` (n, b): where a node stands in `touched`, `acting` (b, n).
+    `counts` (b, 2): of both lists. Matrices (b, 3m, 3m), vectors (b, 3m).
+    """
+
+    force: wp.array2d(dtype=wp.float64)
+    w: wp.array2d(dtype=wp.float64)
+    at: wp.array2d(dtype=wp.float64)
+    slope: wp.array2d(dtype=wp.float64)
+    change: wp.array2d(dtype=wp.float64)
+    way: wp.array2d(dtype=wp.float64)
+    held: wp.array2d(dtype=wp.float64)
+    place: wp.array2d(dtype=wp.int32)
+    acts: wp.array2d(dtype=wp.int32)
+    touched: wp.array2d(dtype=wp.int32)
+    acting: wp.array2d(dtype=wp.int32)
+    counts: wp.array2d(dtype=wp.int32)
+    shares: wp.array2d(dtype=wp.float64)
+    learnt: wp.array3d(dtype=wp.float64)
+    soft: wp.array3d(dtype=wp.float64)
+    stiff: wp.array3d(dtype=wp.float64)
+    both: wp.array3d(dtype=wp.float64)
+    system: wp.array3d(dtype=wp.float64)
+    x: wp.array2d(dtype=wp.float64)
+    y: wp.array2d(dtype=wp.float64)
+
+
+TOUCHED, ACTING = wp.constant(0), wp.constant(1)
+
+
+@cache
+def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
+    """It, for what touches: launches over (column, thread)."""
+    down, across = threads_of(device)
+    threads, dense, Stage, Near = down * across, functions_of(device), barrier.stage, barrier.near
+    overshoot, least, middle, most = (wp.constant(wp.float64(x)) for x in (OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT))
+    factor, solve = dense.factor, dense.solve
+    add_force, add_matrix, longest = barrier.add_force, barrier.add_matrix, barrier.longest
+
+    @wp.func
+    def dot(x: wp.array2d(dtype=wp.float64), y: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
+        """x . y."""
+        own = wp.float64(0.0)
+        for r in range(me, x.shape[0], threads):
+            own += x[r, c] * y[r, c]
+        return total(own, c, me, s.shares)
+
+    @wp.func
+    def listed(
+        x: wp.array2d(dtype=wp.float64),
+        place: wp.array2d(dtype=wp.int32),
+        nodes: wp.array2d(dtype=wp.int32),
+        counts: wp.array2d(dtype=wp.int32),
+        which: int,
+        c: int,
+        me: int,
+    ) -> int:
+        """The nodes where x is not zero, ascending: how many, which, and each node's place among them or -1."""
+        n = place.shape[0]
+        own = (n + threads - 1) // threads
+        begin, end = me * own, wp.min((me + 1) * own, n)
+        for i in range(begin, end):
+            place[i, c] = 0
+            for k in range(3):
+                if x[3 * i + k, c] != wp.float64(0.0):
+                    place[i, c] = 1
+        wait()
+        number = wp.int32(0)
+        for i in range(wp.min(begin, n)):
+            number += place[i, c]
+        wait()
+        for i in range(begin, end):
+            if place[i, c] != 0:
+                nodes[c, number] = i
+                place[i, c] = number
+                number += 1
+            else:
+                place[i, c] = -1
+        if begin < n and end == n:
+            counts[c, which] = number
+        wait()
+        return counts[c, which]
+
+    @wp.func
+    def feel(
+        x: wp.array2d(dtype=wp.float64),
+        here: wp.array2d(dtype=wp.float64),
+        stage: Stage,
+        near: Near,
+        s: Scratch,
+        c: int,
+        me: int,
+    ):
+        """The slope at x."""
+        for r in range(me, x.shape[0], threads):
+            s.slope[r, c] = s.held[r, c] * (x[r, c] - here[r, c])
+        add_force(x, stage, near, c, me, s.slope)
+
+    @wp.func
+    def curve(stage: Stage, near: Near, definite: int, m: int, s: Scratch, c: int, me: int):
+        """The curvature at w between the m touched nodes."""
+        for i in range(me // across, 3 * m, down):
+            for j in range(me % across, 3 * m, across):
+                s.stiff[c, i, j] = wp.float64(0.0)
+        wait()
+        add_matrix(s.w, stage, near, definite, s.place, c, me, s.stiff)
+        for i in range(me, 3 * m, threads):
+            s.stiff[c, i, i] = s.stiff[c, i, i] + s.held[3 * s.touched[c, i // 3] + i % 3, c]
+        wait()
+
+    @wp.func
+    def give(
+        model: Model,
+        f: wp.array2d(dtype=wp.float64),
+        out: wp.array2d(dtype=wp.float64),
+        sign: wp.float64,
+        s: Scratch,
+        c: int,
+        me: int,
+    ):
+        """How far nodes go under forces, with a sign."""
+        m = listed(f, s.acts, s.acting, s.counts, ACTING, c, me)
+        pairs = model.learnt.shape[1]
+        for p in range(me, pairs, threads):
+            own = wp.float64(0.0)
+            for a in range(3 * m):
+                j = 3 * s.acting[c, a // 3] + a % 3
+                own += model.learnt[c, p, j] * f[j, c]
+            s.x[c, p] = own
+        wait()
+        for p in range(me, pairs, threads):
+            own = wp.float64(0.0)
+            for q in range(pairs):
+                own += model.middle[c, p, q] * s.x[c, q]
+            s.y[c, p] = own
+        wait()
+        for i in range(me, out.shape[0], threads):
+            own = wp.float64(0.0)
+            for a in range(3 * m):
+                j = 3 * s.acting[c, a // 3] + a % 3
+                own += model.rest[j, i] * f[j, c]
+            for p in range(pairs):
+                own += s.y[c, p] * model.learnt[c, p, i]
+            out[i, c] = sign * own
+        wait()
+
+    @wp.func
+    def soften(model: Model, m: int, s: Scratch, c: int, me: int) -> wp.float64:
+        """The compliance between m touched nodes; its mean."""
+        pairs = model.learnt.shape[1]
+        for j in range(me, 3 * m, threads):
+            row = 3 * s.touched[c, j // 3] + j % 3
+            for p in range(pairs):
+                own = wp.float64(0.0)
+                for q in range(pairs):
+                    own += model.middle[c, p, q] * model.learnt[c, q, row]
+                s.learnt[c, p, j] = own
+        wait()
+        for i in range(me // across, 3 * m, down):
+            first = 3 * s.touched[c, i // 3] + i % 3
+            for j in range(i + me % across, 3 * m, across):
+                own = model.rest[first, 3 * s.touched[c, j // 3] + j % 3]
+                for p in range(pairs):
+                    own += model.learnt[c, p, first] * s.learnt[c, p, j]
+                s.soft[c, i, j] = own
+        wait()
+        own = wp.float64(0.0)
+        for i in range(me, 3 * m, threads):
+            own += s.soft[c, i, i]
+        mean = total(own, c, me, s.shares) / wp.float64(3 * m)
+        for i in range(me, 3 * m, threads):
+            s.soft[c, i, i] = s.soft[c, i, i] + model.rounded * mean
+        wait()
+        return mean
+
+    @wp.func
+    def relieve(m: int, s: Scratch, c: int, me: int) -> bool:
+        """Take D (1 + C D)^-1 a from the change, C = L L' as `soft` has it; false where that is not convex.
+
+        It is D (a - L (1 + L' D L)^-1 L' D a): Woodbury 1950. a is what `at` is at the touched nodes.
+        """
+        size = 3 * m
+        for i in range(me // across, size, down):
+            for j in range(me % across, size, across):
+                own = wp.float64(0.0)
+                for p in range(j, size):
+                    own += s.stiff[c, i, p] * s.soft[c, p, j]
+                s.both[c, i, j] = own
+        wait()
+        for i in range(me // across, size, down):
+            for j in range(i + me % across, size, across):
+                own = wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
+                for p in range(i, size):
+                    own += s.soft[c, p, i] * s.both[c, p, j]
+                s.system[c, i, j] = own
+        for i in range(me, size, threads):
+            own = wp.float64(0.0)
+            for p in range(size):  # L' D a = (D L)' a
+                own += s.both[c, p, i] * s.at[3 * s.touched[c, p / 3] + p % 3, c]
+            s.x[c, i] = own
+        wait()
+        if not factor(s.system, size, c, me):
+            return False
+        solve(s.system, size, c, me, s.x)
+        for i in range(me, size, threads):
+            own = s.at[3 * s.touched[c, i // 3] + i % 3, c]
+            for p in range(i + 1):
+                own -= s.soft[c, i, p] * s.x[c, p]
+            s.y[c, i] = own
+        wait()
+        for i in range(me, size, threads):
+            own = wp.float64(0.0)
+            for p in range(size):
+                own += s.stiff[c, i, p] * s.y[c, p]
+            row = 3 * s.touched[c, i // 3] + i % 3
+            s.change[row, c] = s.change[row, c] - own
+        wait()
+        return True
+
+    @wp.func
+    def are_known(model: Model, m: int, s: Scratch, c: int) -> bool:
+        """Whether the compliance at all touched nodes is."""
+        missing = wp.int32(0)
+        for i in range(m):
+            missing += 1 - model.known[s.touched[c, i]]
+        return missing == 0
+
+    @forward_kernel(module="unique")
+    def settle(
+        here: wp.array2d(dtype=wp.float64),
+        there: wp.array2d(dtype=wp.float64),
+        known: wp.array2d(dtype=wp.float64),
+        tolerance: wp.array(dtype=wp.float64),
+        drag: wp.array(dtype=wp.float64),
+        first: int,
+        stage: Stage,
+        near: Near,
+        model: Model,
+        ends: Ends,
+        s: Scratch,
+        # outputs
+        out: wp.array2d(dtype=wp.float64),
+        status: wp.array(dtype=wp.int32),
+    ):
+        """As `contact_forces.settled`, of columns that are open."""
+        c, me = wp.tid()
+        c = c + first
+        if status[c] != OPEN:
+            return
+        size = here.shape[0]
+        for r in range(me, size, threads):
+            s.held[r, c] = wp.float64(0.0)
+            s.force[r, c] = known[r, c]
+            s.w[r, c] = here[r, c]
+        wait()
+        feel(s.w, here, stage, near, s, c, me)
+        m = listed(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
+        if m > ends.room or not are_known(model, m, s, c):
+            wait()
+            if me == 0:
+                status[c] = wp.where(m > ends.room, CROWDED, UNKNOWN)
+            return
+        if m > 0:
+            stiff = drag[c] / soften(model, m, s, c, me)
+            for i in range(me, 3 * m, threads):
+                row = 3 * s.touched[c, i // 3] + i % 3
+                s.held[row, c] = stiff
+                s.x[c, i] = there[row, c] - here[row, c]
+            wait()
+            if factor(s.soft, 3 * m, c, me):
+                solve(s.soft, 3 * m, c, me, s.x)
+                for i in range(me, 3 * m, threads):
+                    row = 3 * s.touched[c, i // 3] + i % 3
+                    s.force[row, c] = s.force[row, c] + s.x[c, i]
+        wait()
+        for r in range(me, size, threads):
+            s.change[r, c] = s.force[r, c] - known[r, c]
+        wait()
+        give(model, s.change, s.at, wp.float64(-1.0), s, c, me)
+        for r in range(me, size, threads):
+            s.w[r, c] = there[r, c] + s.at[r, c]
+        wait()
+        feel(s.w, here, stage, near, s, c, me)
+        convex, verdict = wp.bool(True), wp.int32(OPEN)
+        for step in range(ends.iterations + 1):
+            m = listed(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
+            for r in range(me, size, threads):
+                s.change[r, c] = s.slope[r, c] - s.force[r, c]
+            wait()
+            left = dot(s.change, s.change, s, c, me)
+            if left <= tolerance[c] * tolerance[c] * dot(s.slope, s.slope, s, c, me):
+                verdict = wp.int32(FOUND)
+            elif m > ends.room:
+                verdict = wp.int32(CROWDED)
+            elif step == ends.iterations or not (convex or step <= ends.late):
+                verdict = wp.int32(NONE)
+            elif not are_known(model, m, s, c):
+                verdict = wp.int32(UNKNOWN)
+            if verdict != OPEN:
+                break
+            # What is out of balance, and the change of the forces that makes good for it.
+            give(model, s.change, s.at, wp.float64(1.0), s, c, me)
+            convex = True
+            if m > 0:
+                soften(model, m, s, c, me)
+                convex = factor(s.soft, 3 * m, c, me)
+                sound = convex
+                if sound:
+                    curve(stage, near, 0, m, s, c, me)
+                    convex = relieve(m, s, c, me)
+                if sound and not convex:  # there tools count as flat
+                    curve(stage, near, 1, m, s, c, me)
+                    relieve(m, s, c, me)
+            give(model, s.change, s.way, wp.float64(-1.0), s, c, me)
+            own = wp.float64(0.0)
+            for r in range(me, size, threads):
+                own += (s.slope[r, c] - s.force[r, c]) * s.way[r, c]
+            promised = -total(own, c, me, s.shares)
+            t = longest(s.w, s.way, stage, near, c, me)
+            for cut in range(ends.cuts + 1):
+                for r in range(me, size, threads):
+                    s.at[r, c] = s.w[r, c] + t * s.way[r, c]
+                wait()
+                feel(s.at, here, stage, near, s, c, me)
+                own = wp.float64(0.0)
+                for r in range(me, size, threads):
+                    own += (s.slope[r, c] - s.force[r, c] - t * s.change[r, c]) * s.way[r, c]
+                ahead = total(own, c, me, s.shares)
+                if ahead <= overshoot * wp.abs(promised) or cut == ends.cuts:
+                    break
+                share = middle
+                if promised > wp.float64(0.0) and wp.isfinite(ahead):
+                    share = wp.clamp(promised / (promised + ahead), least, most)
+                t = t * share
+            for r in range(me, size, threads):
+                s.force[r, c] = s.force[r, c] + t * s.change[r, c]
+                s.w[r, c] = s.at[r, c]
+            wait()
+        if verdict == FOUND:
+            for r in range(me, size, threads):
+                out[r, c] = s.force[r, c]
+        if me == 0:
+            status[c] = verdict
+
+    return settle

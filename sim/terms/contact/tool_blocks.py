@@ -1,0 +1,132 @@
+"""Contact of columns that each have a block of threads: its forces, its curvature, and how far one may go."""
+
+from functools import cache
+
+import warp as wp
+
+from ...discretisation.term import BlockFunctions
+from ...runtime.blocks import threads_of, wait
+from ...runtime.device import Device
+from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools
+from .tool_functions import functions_of as at_triangles
+
+
+@wp.struct
+class Stage:
+    """Surface and tools, how they repel, and into how many rows of parts a triangle is cut at most."""
+
+    surface: Surface
+    tools: Tools
+    scale: Scale
+    rows: wp.int32
+
+
+@wp.struct
+class Near:
+    """Pairs of a triangle and a tool that may be near: room for all (b, S T); how many (b,), and a number (b,)."""
+
+    pairs: wp.array2d(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    least: wp.array(dtype=wp.float64)
+
+
+@cache
+def functions_of(device: Device, size: int) -> BlockFunctions:
+    """Functions for surface triangles of `size` nodes, 3 or 6."""
+    down, across = threads_of(device)
+    threads, one = down * across, at_triangles(device, size)
+    bulge, kept = wp.constant(wp.float64(BULGE)), wp.constant(wp.float64(ROOM_KEPT))
+    nodes_of, motion_of, spread, weight_of, is_near = (
+        one.nodes_of,
+        one.motion_of,
+        one.spread,
+        one.weight_of,
+        one.is_near,
+    )
+    force_in_row, add_matrix_in_row, share_in_row = one.force_in_row, one.add_matrix_in_row, one.share_in_row
+
+    @wp.func
+    def look(x: wp.array2d(dtype=wp.float64), reach: wp.float64, stage: Stage, near: Near, c: int, me: int) -> int:
+        """Find what may be within a reach; how many rows of parts these pairs have at most."""
+        if me == 0:
+            near.count[c] = 0
+        wait()
+        tools = stage.tools.radius.shape[0]
+        for pair in range(me, stage.surface.area.shape[0] * tools, threads):
+            if is_near(nodes_of(stage.surface, x, pair // tools, c), stage.tools, reach, pair % tools, c):
+                near.pairs[c, wp.atomic_add(near.count, c, 1)] = pair
+        wait()
+        return stage.rows * near.count[c]
+
+    @wp.func
+    def add_force(
+        x: wp.array2d(dtype=wp.float64),
+        stage: Stage,
+        near: Near,
+        c: int,
+        me: int,
+        # outputs
+        out: wp.array2d(dtype=wp.float64),
+    ):
+        """f_a += sum over points of w k b'(d) n N_a; what is near at x is known from now on."""
+        tools, gap = stage.tools.radius.shape[0], stage.scale.gap
+        for item in range(me, look(x, gap, stage, near, c, me), threads):
+            pair, i = near.pairs[c, item // stage.rows], item % stage.rows
+            s = pair // tools
+            n = stage.surface.pieces[s]
+            if i < n:
+                force = force_in_row(nodes_of(stage.surface, x, s, c), n, i, stage.tools, gap, pair % tools, c)
+                spread(stage.surface, weight_of(stage.surface, stage.scale, s) * force, s, c, out)
+        wait()
+
+    @wp.func
+    def add_matrix(
+        x: wp.array2d(dtype=wp.float64),
+        stage: Stage,
+        near: Near,
+        definite: int,
+        place: wp.array2d(dtype=wp.int32),
+        c: int,
+        me: int,
+        # outputs
+        out: wp.array3d(dtype=wp.float64),
+    ):
+        """K_ab += sum over points of w k H N_a N_b between nodes that have a place, with what is known to be near."""
+        tools = stage.tools.radius.shape[0]
+        for item in range(me, stage.rows * near.count[c], threads):
+            pair, i = near.pairs[c, item // stage.rows], item % stage.rows
+            s = pair // tools
+            if i < stage.surface.pieces[s]:
+                at = nodes_of(stage.surface, x, s, c)
+                add_matrix_in_row(
+                    at, stage.surface, stage.tools, stage.scale, definite, place, s, i, pair % tools, c, out
+                )
+        wait()
+
+    @wp.func
+    def longest(
+        x: wp.array2d(dtype=wp.float64),
+        way: wp.array2d(dtype=wp.float64),
+        stage: Stage,
+        near: Near,
+        c: int,
+        me: int,
+    ) -> wp.float64:
+        """The share of a way from x, at most 1, that may be gone; what is near is no longer known."""
+        farthest = wp.float64(0.0)
+        for i in range(x.shape[0] // 3):
+            farthest = wp.max(farthest, wp.length(wp.vec3d(way[3 * i, c], way[3 * i + 1, c], way[3 * i + 2, c])))
+        if me == 0:
+            near.least[c] = wp.float64(1.0)
+        tools = stage.tools.radius.shape[0]
+        for item in range(me, look(x, bulge * farthest / kept, stage, near, c, me), threads):
+            pair, i = near.pairs[c, item // stage.rows], item % stage.rows
+            s = pair // tools
+            n = stage.surface.pieces[s]
+            if i < n:
+                at, along = nodes_of(stage.surface, x, s, c), motion_of(stage.surface, way, s, c)
+                wp.atomic_min(near.least, c, share_in_row(at, along, n, i, stage.tools, pair % tools, c))
+        wait()
+        return near.least[c]
+
+    return BlockFunctions(Stage, Near, add_force, add_matrix, longest)

@@ -1,0 +1,262 @@
+"""What contact is at a surface triangle and a tool: its forces, its curvature, and how far it lets the triangle go."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from ...runtime.device import Device
+from .barrier import barrier, barrier_curvature, barrier_slope
+
+# A step takes no point farther than this share of its distance from the middle of a tool.
+ROOM_KEPT = 0.8
+# Curved triangles reach farther from their centre than their nodes do.
+BULGE = 1.5
+
+
+@wp.struct
+class Tools:
+    """T tools in b columns: cores as `tools.Core`, and how they stand: rotations and places."""
+
+    centre: wp.array(dtype=wp.vec3d)
+    half: wp.array(dtype=wp.vec3d)
+    radius: wp.array(dtype=wp.float64)
+    rotation: wp.array2d(dtype=wp.mat33d)
+    origin: wp.array2d(dtype=wp.vec3d)
+
+
+@wp.struct
+class Surface:
+    """Surface triangles: their nodes' places at rest and numbers, areas, and into how many parts an edge is cut."""
+
+    rest: wp.array(dtype=wp.vec3d)
+    table: wp.array2d(dtype=wp.int32)
+    pieces: wp.array(dtype=wp.int32)
+    area: wp.array(dtype=wp.float64)
+
+
+@wp.struct
+class Scale:
+    """How wide the barrier is [m], and how stiff [Pa/m]."""
+
+    gap: wp.float64
+    stiffness: wp.float64
+
+
+@wp.struct
+class Touch:
+    """Distance to a tool [m], its gradient, and its second derivative [1/m]."""
+
+    distance: wp.float64
+    normal: wp.vec3d
+    bend: wp.mat33d
+
+
+@wp.func
+def touch_of(x: wp.vec3d, tools: Tools, k: int, c: int) -> Touch:
+    """d = |v| - r, v from the nearest point of the core to x; n = v / |v|; dn = (M - n (x) n) / |v|.
+
+    M keeps the components in which x lies beyond the core.
+    """
+    one, zero = wp.float64(1.0), wp.float64(0.0)
+    R, half = tools.rotation[k, c], tools.half[k]
+    p = wp.transpose(R) * (x - tools.origin[k, c]) - tools.centre[k]
+    v, beyond = wp.vec3d(), wp.vec3d()
+    for i in range(3):
+        v[i] = p[i] - wp.clamp(p[i], -half[i], half[i])
+        beyond[i] = wp.where(v[i] != zero or half[i] == zero, one, zero)
+    length = wp.length(v)
+    out = Touch()
+    out.distance = length - tools.radius[k]
+    out.normal = R * wp.vec3d(zero, zero, -one)  # on the core itself: away from the shaft
+    if length > zero:
+        n = v / length
+        out.normal = R * n
+        out.bend = R * ((wp.diag(beyond) - wp.outer(n, n)) / length) * wp.transpose(R)
+    return out
+
+
+@dataclass(frozen=True)
+class Functions:
+    """Functions of Warp for triangles of one number of nodes, of which `forces` (size, 3) are a type.
+
+    A triangle is looked at in the centres of pieces^2 equal parts, which lie in as many rows as there are pieces. What
+    says `_in_row` is the sum over one of these rows.
+    """
+
+    forces: Any
+    motion_of: wp.Function
+    nodes_of: wp.Function
+    spread: wp.Function
+    weight_of: wp.Function
+    reach_of: wp.Function
+    is_near: wp.Function
+    shape_of: wp.Function
+    curvature_at: wp.Function
+    energy_in_row: wp.Function
+    force_in_row: wp.Function
+    add_matrix_in_row: wp.Function
+    share_in_row: wp.Function
+
+
+@cache
+def functions_of(device: Device, size: int) -> Functions:
+    """Functions for surface triangles of `size` nodes, 3 or 6.
+
+    Positions and distances are in double precision whatever the device's scalar: gaps are small beside bodies.
+    """
+    scalar = device.scalar
+    shares = wp.types.vector(length=size, dtype=wp.float64)
+    forces = wp.types.matrix(shape=(size, 3), dtype=wp.float64)
+    bulge, kept = wp.constant(wp.float64(BULGE if size == 6 else 1.0)), wp.constant(wp.float64(ROOM_KEPT))
+
+    @wp.func
+    def shape_of(i: int, j: int, n: int) -> shares:
+        """Shape functions at the centre of the j-th part of the i-th row; odd parts are turned round."""
+        third, turned = wp.float64(1.0) / wp.float64(3 * n), j % 2
+        y = wp.float64(3 * i + 1 + turned) * third
+        z = wp.float64(3 * (j // 2) + 1 + turned) * third
+        L = wp.vec3d(wp.float64(1.0) - y - z, y, z)
+        out = shares()
+        for a in range(3):
+            if wp.static(size == 3):
+                out[a] = L[a]
+            else:
+                out[a] = L[a] * (wp.float64(2.0) * L[a] - wp.float64(1.0))
+                out[wp.static(size - 3) + a] = wp.float64(4.0) * L[a] * L[(a + 1) % 3]
+        return out
+
+    @wp.func
+    def motion_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
+        """How far a triangle's nodes go (size, 3)."""
+        out = forces()
+        for a in range(size):
+            for k in range(3):
+                out[a, k] = wp.float64(u[3 * surface.table[s, a] + k, c])
+        return out
+
+    @wp.func
+    def nodes_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
+        """Where they are (size, 3)."""
+        out = motion_of(surface, u, s, c)
+        for a in range(size):
+            for k in range(3):
+                out[a, k] += surface.rest[surface.table[s, a]][k]
+        return out
+
+    @wp.func
+    def spread(surface: Surface, total: forces, s: int, c: int, out: wp.array2d(dtype=scalar)):
+        """f_a += total_a."""
+        for a in range(size):
+            for k in range(3):
+                wp.atomic_add(out, 3 * surface.table[s, a] + k, c, scalar(total[a, k]))
+
+    @wp.func
+    def weight_of(surface: Surface, scale: Scale, s: int) -> wp.float64:
+        """Stiffness times the area that each point of a triangle stands for [N/m]."""
+        return scale.stiffness * surface.area[s] / wp.float64(surface.pieces[s] * surface.pieces[s])
+
+    @wp.func
+    def reach_of(along: forces) -> wp.float64:
+        """How far a point of a triangle is from where there is nothing, at most: (size, 3) from there."""
+        out = wp.float64(0.0)
+        for a in range(size):
+            out = wp.max(out, wp.length(along[a]))
+        return bulge * out
+
+    @wp.func
+    def is_near(at: forces, tools: Tools, gap: wp.float64, k: int, c: int) -> bool:
+        """Whether any point of a triangle may be in a tool's reach."""
+        middle, around = wp.vec3d(), at
+        for a in range(3):
+            middle += at[a] / wp.float64(3.0)
+        for a in range(size):
+            around[a] = at[a] - middle
+        return touch_of(middle, tools, k, c).distance < gap + reach_of(around)
+
+    @wp.func
+    def curvature_at(touch: Touch, gap: wp.float64, definite: int) -> wp.mat33d:
+        """b'' n (x) n + b' dn; the first alone, which is never negative, where `definite`."""
+        out = barrier_curvature(touch.distance, gap) * wp.outer(touch.normal, touch.normal)
+        if definite == 0:
+            out += barrier_slope(touch.distance, gap) * touch.bend
+        return out
+
+    @wp.func
+    def energy_in_row(at: forces, n: int, i: int, tools: Tools, gap: wp.float64, k: int, c: int) -> wp.float64:
+        """Sum over points of b(d)."""
+        total = wp.float64(0.0)
+        for j in range(2 * (n - i) - 1):
+            total += barrier(touch_of(shape_of(i, j, n) * at, tools, k, c).distance, gap)
+        return total
+
+    @wp.func
+    def force_in_row(at: forces, n: int, i: int, tools: Tools, gap: wp.float64, k: int, c: int) -> forces:
+        """Sum over points of N_a b'(d) n."""
+        total = forces()
+        for j in range(2 * (n - i) - 1):
+            N = shape_of(i, j, n)
+            touch = touch_of(N * at, tools, k, c)
+            if touch.distance < gap:
+                total += wp.outer(N, barrier_slope(touch.distance, gap) * touch.normal)
+        return total
+
+    @wp.func
+    def add_matrix_in_row(
+        at: forces,
+        surface: Surface,
+        tools: Tools,
+        scale: Scale,
+        definite: int,
+        place: wp.array2d(dtype=wp.int32),
+        s: int,
+        i: int,
+        k: int,
+        c: int,
+        out: wp.array3d(dtype=wp.float64),
+    ):
+        """K_ab += sum over points of w k H N_a N_b between the nodes that have a place."""
+        n, weight = surface.pieces[s], weight_of(surface, scale, s)
+        for j in range(2 * (n - i) - 1):
+            N = shape_of(i, j, n)
+            touch = touch_of(N * at, tools, k, c)
+            if touch.distance < scale.gap:
+                H = weight * curvature_at(touch, scale.gap, definite)
+                for a in range(size):
+                    first = 3 * place[surface.table[s, a], c]
+                    for b in range(size):
+                        second = 3 * place[surface.table[s, b], c]
+                        if first >= 0 and second >= 0:
+                            for row in range(3):
+                                for column in range(3):
+                                    share = N[a] * N[b] * H[row, column]
+                                    wp.atomic_add(out, c, first + row, second + column, share)
+
+    @wp.func
+    def share_in_row(at: forces, along: forces, n: int, i: int, tools: Tools, k: int, c: int) -> wp.float64:
+        """The share of a motion, at most 1, after which no point is as far as the middle of a tool."""
+        out = wp.float64(1.0)
+        for j in range(2 * (n - i) - 1):
+            N = shape_of(i, j, n)
+            room = kept * (touch_of(N * at, tools, k, c).distance + tools.radius[k])
+            far = wp.length(N * along)
+            if far > room:
+                out = wp.min(out, room / far)
+        return out
+
+    return Functions(
+        forces,
+        motion_of,
+        nodes_of,
+        spread,
+        weight_of,
+        reach_of,
+        is_near,
+        shape_of,
+        curvature_at,
+        energy_in_row,
+        force_in_row,
+        add_matrix_in_row,
+        share_in_row,
+    )
