@@ -37,7 +37,7 @@ TOOLS = cost(
     "contact.barrier contact.reduced contact.tool_blocks contact.tool_contact contact.tool_functions contact.tool_kernels "
     "contact.tool_path",
     "contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction",
-    "Contact Reduced Touch",
+    "Contact Functions Reduced Touch",
 )
 # A new effect adds one line.
 OF_EFFECT = {
