@@ -34,8 +34,8 @@ def cost(modules: str = "", kernels: str = "", classes: str = "") -> Cost:
 
 
 TOOLS = cost(
-    "contact.barrier contact.reduced contact.tool_blocks contact.tool_contact contact.tool_functions contact.tool_kernels "
-    "contact.tool_path",
+    "contact.barrier contact.reduced contact.tool_blocks contact.tool_contact contact.tool_functions "
+    "contact.tool_kernels contact.tool_path",
     "contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction",
     "Contact Functions Reduced Touch",
 )
