@@ -69,6 +69,9 @@ class Scratch:
     y: wp.array2d(dtype=wp.float64)
 
 
+# So many sums at once keep a thread from waiting for memory.
+WIDE = wp.constant(8)
+Strip = wp.types.vector(length=WIDE, dtype=wp.float64)
 TOUCHED, ACTING = wp.constant(0), wp.constant(1)
 
 
@@ -178,14 +181,22 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 own += model.middle[c, p, q] * s.x[c, q]
             s.y[c, p] = own
         wait()
-        for i in range(me, out.shape[0], threads):
-            own = wp.float64(0.0)
-            for a in range(3 * m):
-                j = 3 * s.acting[c, a // 3] + a % 3
-                own += model.rest[j, i] * f[j, c]
+        size = out.shape[0]
+        for first in range(me, size, WIDE * threads):
+            sums = Strip()
+            for a in range(m):
+                for k in range(3):
+                    j = 3 * s.acting[c, a] + k
+                    share = f[j, c]
+                    for q in range(WIDE):
+                        sums[q] += model.rest[j, wp.min(first + q * threads, size - 1)] * share
             for p in range(pairs):
-                own += s.y[c, p] * model.learnt[c, p, i]
-            out[i, c] = sign * own
+                share = s.y[c, p]
+                for q in range(WIDE):
+                    sums[q] += model.learnt[c, p, wp.min(first + q * threads, size - 1)] * share
+            for q in range(WIDE):
+                if first + q * threads < size:
+                    out[first + q * threads, c] = sign * sums[q]
         wait()
 
     @wp.func
@@ -225,18 +236,29 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         """
         size = 3 * m
         for i in range(me // across, size, down):
-            for j in range(me % across, size, across):
-                own = wp.float64(0.0)
-                for p in range(j, size):
-                    own += s.stiff[c, i, p] * s.soft[c, p, j]
-                s.both[c, i, j] = own
+            for first in range(me % across, size, WIDE * across):
+                sums = Strip()
+                for p in range(first, size):
+                    share = s.stiff[c, i, p]
+                    for q in range(WIDE):
+                        j = first + q * across
+                        if j <= p:
+                            sums[q] += share * s.soft[c, p, j]
+                for q in range(WIDE):
+                    if first + q * across < size:
+                        s.both[c, i, first + q * across] = sums[q]
         wait()
         for i in range(me // across, size, down):
-            for j in range(i + me % across, size, across):
-                own = wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
+            for first in range(i + me % across, size, WIDE * across):
+                sums = Strip()
                 for p in range(i, size):
-                    own += s.soft[c, p, i] * s.both[c, p, j]
-                s.system[c, i, j] = own
+                    share = s.soft[c, p, i]
+                    for q in range(WIDE):
+                        sums[q] += share * s.both[c, p, wp.min(first + q * across, size - 1)]
+                for q in range(WIDE):
+                    j = first + q * across
+                    if j < size:
+                        s.system[c, i, j] = sums[q] + wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
         for i in range(me, size, threads):
             own = wp.float64(0.0)
             for p in range(size):  # L' D a = (D L)' a

@@ -35,15 +35,11 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
     """Functions for surface triangles of `size` nodes, 3 or 6."""
     down, across = threads_of(device)
     threads, one = down * across, at_triangles(device, size)
+
     bulge, kept = wp.constant(wp.float64(BULGE)), wp.constant(wp.float64(ROOM_KEPT))
-    nodes_of, motion_of, spread, weight_of, is_near = (
-        one.nodes_of,
-        one.motion_of,
-        one.spread,
-        one.weight_of,
-        one.is_near,
-    )
-    force_in_row, add_matrix_in_row, share_in_row = one.force_in_row, one.add_matrix_in_row, one.share_in_row
+    nodes_of, motion_of, seen, spread = one.nodes_of, one.motion_of, one.seen, one.spread
+    weight_of, reach_of, is_near, force_in_row = one.weight_of, one.reach_of, one.is_near, one.force_in_row
+    add_matrix_in_row, share_in_row = one.add_matrix_in_row, one.share_in_row
 
     @wp.func
     def look(x: wp.array2d(dtype=wp.float64), reach: wp.float64, stage: Stage, near: Near, c: int, me: int) -> int:
@@ -53,7 +49,9 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
         wait()
         tools = stage.tools.radius.shape[0]
         for pair in range(me, stage.surface.area.shape[0] * tools, threads):
-            if is_near(nodes_of(stage.surface, x, pair // tools, c), stage.tools, reach, pair % tools, c):
+            k = pair % tools
+            own = seen(nodes_of(stage.surface, x, pair // tools, c), stage.tools, k, c)
+            if is_near(own, reach, stage.tools.half[k], stage.tools.radius[k]):
                 near.pairs[c, wp.atomic_add(near.count, c, 1)] = pair
         wait()
         return stage.rows * near.count[c]
@@ -72,11 +70,14 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
         tools, gap = stage.tools.radius.shape[0], stage.scale.gap
         for item in range(me, look(x, gap, stage, near, c, me), threads):
             pair, i = near.pairs[c, item // stage.rows], item % stage.rows
-            s = pair // tools
+            s, k = pair // tools, pair % tools
             n = stage.surface.pieces[s]
             if i < n:
-                force = force_in_row(nodes_of(stage.surface, x, s, c), n, i, stage.tools, gap, pair % tools, c)
-                spread(stage.surface, weight_of(stage.surface, stage.scale, s) * force, s, c, out)
+                own = seen(nodes_of(stage.surface, x, s, c), stage.tools, k, c)
+                force = force_in_row(own, n, i, stage.tools.half[k], stage.tools.radius[k], gap)
+                if reach_of(force) > wp.float64(0.0):
+                    weight = weight_of(stage.surface, stage.scale, s)
+                    spread(stage.surface, weight * force * wp.transpose(stage.tools.rotation[k, c]), s, c, out)
         wait()
 
     @wp.func
@@ -95,12 +96,10 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
         tools = stage.tools.radius.shape[0]
         for item in range(me, stage.rows * near.count[c], threads):
             pair, i = near.pairs[c, item // stage.rows], item % stage.rows
-            s = pair // tools
+            s, k = pair // tools, pair % tools
             if i < stage.surface.pieces[s]:
-                at = nodes_of(stage.surface, x, s, c)
-                add_matrix_in_row(
-                    at, stage.surface, stage.tools, stage.scale, definite, place, s, i, pair % tools, c, out
-                )
+                own = seen(nodes_of(stage.surface, x, s, c), stage.tools, k, c)
+                add_matrix_in_row(own, stage.surface, stage.tools, stage.scale, definite, place, s, i, k, c, out)
         wait()
 
     @wp.func
@@ -121,11 +120,14 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
         tools = stage.tools.radius.shape[0]
         for item in range(me, look(x, bulge * farthest / kept, stage, near, c, me), threads):
             pair, i = near.pairs[c, item // stage.rows], item % stage.rows
-            s = pair // tools
+            s, k = pair // tools, pair % tools
             n = stage.surface.pieces[s]
             if i < n:
-                at, along = nodes_of(stage.surface, x, s, c), motion_of(stage.surface, way, s, c)
-                wp.atomic_min(near.least, c, share_in_row(at, along, n, i, stage.tools, pair % tools, c))
+                own, along = (
+                    seen(nodes_of(stage.surface, x, s, c), stage.tools, k, c),
+                    motion_of(stage.surface, way, s, c),
+                )
+                wp.atomic_min(near.least, c, share_in_row(own, along, n, i, stage.tools.half[k], stage.tools.radius[k]))
         wait()
         return near.least[c]
 

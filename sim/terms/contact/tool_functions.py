@@ -13,6 +13,9 @@ from .barrier import barrier, barrier_curvature, barrier_slope
 ROOM_KEPT = 0.8
 # Curved triangles reach farther from their centre than their nodes do.
 BULGE = 1.5
+# From one point of a row to the next it is so many times what the nodes are from the middle of their corners, over the
+# pieces: the shape functions' slopes, summed.
+STEEP = {3: 4.0 / 3.0, 6: 28.0 / 3.0}
 
 
 @wp.struct
@@ -54,26 +57,41 @@ class Touch:
 
 
 @wp.func
-def touch_of(x: wp.vec3d, tools: Tools, k: int, c: int) -> Touch:
-    """d = |v| - r, v from the nearest point of the core to x; n = v / |v|; dn = (M - n (x) n) / |v|.
+def touch_of(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> Touch:
+    """As a core sees a point: d = |v| - r, v from its nearest point to p; n = v / |v|; dn = (M - n (x) n) / |v|.
 
-    M keeps the components in which x lies beyond the core.
+    M keeps the components in which p lies beyond the core.
     """
     one, zero = wp.float64(1.0), wp.float64(0.0)
-    R, half = tools.rotation[k, c], tools.half[k]
-    p = wp.transpose(R) * (x - tools.origin[k, c]) - tools.centre[k]
     v, beyond = wp.vec3d(), wp.vec3d()
     for i in range(3):
         v[i] = p[i] - wp.clamp(p[i], -half[i], half[i])
         beyond[i] = wp.where(v[i] != zero or half[i] == zero, one, zero)
     length = wp.length(v)
     out = Touch()
-    out.distance = length - tools.radius[k]
-    out.normal = R * wp.vec3d(zero, zero, -one)  # on the core itself: away from the shaft
+    out.distance = length - radius
+    out.normal = wp.vec3d(zero, zero, -one)  # on the core itself: away from the shaft
     if length > zero:
-        n = v / length
-        out.normal = R * n
-        out.bend = R * ((wp.diag(beyond) - wp.outer(n, n)) / length) * wp.transpose(R)
+        out.normal = v / length
+        out.bend = (wp.diag(beyond) - wp.outer(out.normal, out.normal)) / length
+    return out
+
+
+@wp.func
+def clear(room: wp.float64, pace: wp.float64, most: int) -> int:
+    """How many points on, 1 to `most`, the next is that may lack room: from one to the next it shrinks by a pace."""
+    out = wp.int32(1)
+    if room > pace:
+        out = wp.int32(wp.min(room / pace, wp.float64(most)))
+    return out
+
+
+@wp.func
+def curvature_at(touch: Touch, gap: wp.float64, definite: int) -> wp.mat33d:
+    """b'' n (x) n + b' dn; the first alone, which is never negative, where `definite`."""
+    out = barrier_curvature(touch.distance, gap) * wp.outer(touch.normal, touch.normal)
+    if definite == 0:
+        out += barrier_slope(touch.distance, gap) * touch.bend
     return out
 
 
@@ -82,18 +100,20 @@ class Functions:
     """Functions of Warp for triangles of one number of nodes, of which `forces` (size, 3) are a type.
 
     A triangle is looked at in the centres of pieces^2 equal parts, which lie in as many rows as there are pieces. What
-    says `_in_row` is the sum over one of these rows.
+    says `_in_row` is the sum over one of these rows. It is asked and answered in the axes of a core (`seen`), and looks
+    at no point that is surely out of its reach.
     """
 
     forces: Any
     motion_of: wp.Function
     nodes_of: wp.Function
+    seen: wp.Function
     spread: wp.Function
     weight_of: wp.Function
     reach_of: wp.Function
+    pace_of: wp.Function
     is_near: wp.Function
     shape_of: wp.Function
-    curvature_at: wp.Function
     energy_in_row: wp.Function
     force_in_row: wp.Function
     add_matrix_in_row: wp.Function
@@ -109,7 +129,9 @@ def functions_of(device: Device, size: int) -> Functions:
     scalar = device.scalar
     shares = wp.types.vector(length=size, dtype=wp.float64)
     forces = wp.types.matrix(shape=(size, 3), dtype=wp.float64)
+    blocks = wp.types.matrix(shape=(3 * size * (size + 1) // 2, 3), dtype=wp.float64)
     bulge, kept = wp.constant(wp.float64(BULGE if size == 6 else 1.0)), wp.constant(wp.float64(ROOM_KEPT))
+    steep = wp.constant(wp.float64(STEEP[size]))
 
     @wp.func
     def shape_of(i: int, j: int, n: int) -> shares:
@@ -146,6 +168,16 @@ def functions_of(device: Device, size: int) -> Functions:
         return out
 
     @wp.func
+    def seen(at: forces, tools: Tools, k: int, c: int) -> forces:
+        """The same from the middle of a core, along its axes."""
+        R = tools.rotation[k, c]
+        start = tools.origin[k, c] + R * tools.centre[k]
+        out = forces()
+        for a in range(size):
+            out[a] = wp.transpose(R) * (at[a] - start)
+        return out
+
+    @wp.func
     def spread(surface: Surface, total: forces, s: int, c: int, out: wp.array2d(dtype=scalar)):
         """f_a += total_a."""
         for a in range(size):
@@ -166,40 +198,49 @@ def functions_of(device: Device, size: int) -> Functions:
         return bulge * out
 
     @wp.func
-    def is_near(at: forces, tools: Tools, gap: wp.float64, k: int, c: int) -> bool:
-        """Whether any point of a triangle may be in a tool's reach."""
-        middle, around = wp.vec3d(), at
+    def around(at: forces) -> forces:
+        """Nodes (size, 3) from the middle of their corners."""
+        middle, out = wp.vec3d(), at
         for a in range(3):
             middle += at[a] / wp.float64(3.0)
         for a in range(size):
-            around[a] = at[a] - middle
-        return touch_of(middle, tools, k, c).distance < gap + reach_of(around)
-
-    @wp.func
-    def curvature_at(touch: Touch, gap: wp.float64, definite: int) -> wp.mat33d:
-        """b'' n (x) n + b' dn; the first alone, which is never negative, where `definite`."""
-        out = barrier_curvature(touch.distance, gap) * wp.outer(touch.normal, touch.normal)
-        if definite == 0:
-            out += barrier_slope(touch.distance, gap) * touch.bend
+            out[a] = at[a] - middle
         return out
 
     @wp.func
-    def energy_in_row(at: forces, n: int, i: int, tools: Tools, gap: wp.float64, k: int, c: int) -> wp.float64:
+    def pace_of(at: forces, n: int) -> wp.float64:
+        """How far one point of a row is from the next, at most.
+
+        Between them barycentric coordinates change by 1, 1 and 2 thirds of a piece.
+        """
+        return steep * reach_of(around(at)) / (bulge * wp.float64(n))
+
+    @wp.func
+    def is_near(at: forces, reach: wp.float64, half: wp.vec3d, radius: wp.float64) -> bool:
+        """Whether any point of a triangle may be in a core's reach."""
+        arms = around(at)
+        return touch_of(at[0] - arms[0], half, radius).distance < reach + reach_of(arms)
+
+    @wp.func
+    def energy_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> wp.float64:
         """Sum over points of b(d)."""
-        total = wp.float64(0.0)
-        for j in range(2 * (n - i) - 1):
-            total += barrier(touch_of(shape_of(i, j, n) * at, tools, k, c).distance, gap)
+        total, pace, most, j = wp.float64(0.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
+        while j < most:
+            d = touch_of(shape_of(i, j, n) * at, half, radius).distance
+            total += barrier(d, gap)
+            j += clear(d - gap, pace, most)
         return total
 
     @wp.func
-    def force_in_row(at: forces, n: int, i: int, tools: Tools, gap: wp.float64, k: int, c: int) -> forces:
+    def force_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> forces:
         """Sum over points of N_a b'(d) n."""
-        total = forces()
-        for j in range(2 * (n - i) - 1):
+        total, pace, most, j = forces(), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
+        while j < most:
             N = shape_of(i, j, n)
-            touch = touch_of(N * at, tools, k, c)
+            touch = touch_of(N * at, half, radius)
             if touch.distance < gap:
                 total += wp.outer(N, barrier_slope(touch.distance, gap) * touch.normal)
+            j += clear(touch.distance - gap, pace, most)
         return total
 
     @wp.func
@@ -217,44 +258,60 @@ def functions_of(device: Device, size: int) -> Functions:
         out: wp.array3d(dtype=wp.float64),
     ):
         """K_ab += sum over points of w k H N_a N_b between the nodes that have a place."""
-        n, weight = surface.pieces[s], weight_of(surface, scale, s)
-        for j in range(2 * (n - i) - 1):
+        n, half, radius = surface.pieces[s], tools.half[k], tools.radius[k]
+        total, felt, pace, most, j = blocks(), wp.bool(False), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
+        while j < most:
             N = shape_of(i, j, n)
-            touch = touch_of(N * at, tools, k, c)
+            touch = touch_of(N * at, half, radius)
             if touch.distance < scale.gap:
-                H = weight * curvature_at(touch, scale.gap, definite)
+                felt = True
+                H = curvature_at(touch, scale.gap, definite)
                 for a in range(size):
-                    first = 3 * place[surface.table[s, a], c]
                     for b in range(size):
-                        second = 3 * place[surface.table[s, b], c]
-                        if first >= 0 and second >= 0:
+                        if b <= a:
                             for row in range(3):
-                                for column in range(3):
-                                    share = N[a] * N[b] * H[row, column]
-                                    wp.atomic_add(out, c, first + row, second + column, share)
+                                q = 3 * (a * (a + 1) // 2 + b) + row
+                                total[q] = total[q] + N[a] * N[b] * H[row]
+            j += clear(touch.distance - scale.gap, pace, most)
+        if felt:
+            R, weight = tools.rotation[k, c], weight_of(surface, scale, s)
+            for a in range(size):
+                first = 3 * place[surface.table[s, a], c]
+                for b in range(size):
+                    second, q = 3 * place[surface.table[s, b], c], 3 * (a * (a + 1) // 2 + b)
+                    if b <= a and first >= 0 and second >= 0:
+                        H = weight * (R * wp.matrix_from_rows(total[q], total[q + 1], total[q + 2]) * wp.transpose(R))
+                        for row in range(3):
+                            for column in range(3):
+                                wp.atomic_add(out, c, first + row, second + column, H[row, column])
+                                if a != b:
+                                    wp.atomic_add(out, c, second + column, first + row, H[row, column])
 
     @wp.func
-    def share_in_row(at: forces, along: forces, n: int, i: int, tools: Tools, k: int, c: int) -> wp.float64:
-        """The share of a motion, at most 1, after which no point is as far as the middle of a tool."""
-        out = wp.float64(1.0)
-        for j in range(2 * (n - i) - 1):
+    def share_in_row(at: forces, along: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64) -> wp.float64:
+        """The share of a motion, at most 1, after which no point is as far as the middle of a core."""
+        out, pace, most, j = wp.float64(1.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
+        farthest = reach_of(along)
+        while j < most:
             N = shape_of(i, j, n)
-            room = kept * (touch_of(N * at, tools, k, c).distance + tools.radius[k])
+            room = touch_of(N * at, half, radius).distance + radius
             far = wp.length(N * along)
-            if far > room:
-                out = wp.min(out, room / far)
+            if far > kept * room:
+                out = wp.min(out, kept * room / far)
+            j += clear(room - farthest / kept, pace, most)
         return out
 
     return Functions(
         forces,
         motion_of,
         nodes_of,
+        seen,
         spread,
         weight_of,
         reach_of,
+        pace_of,
         is_near,
         shape_of,
-        curvature_at,
         energy_in_row,
         force_in_row,
         add_matrix_in_row,

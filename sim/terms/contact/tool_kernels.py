@@ -7,7 +7,7 @@ import warp as wp
 
 from ...runtime.device import Device, forward_kernel
 from .barrier import barrier_slope
-from .tool_functions import ROOM_KEPT, Scale, Surface, Tools, functions_of, touch_of
+from .tool_functions import ROOM_KEPT, Scale, Surface, Tools, clear, curvature_at, functions_of, touch_of
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ def kernels_of(device: Device, size: int) -> Kernels:
     """Kernels for surface triangles of `size` nodes, 3 or 6. Each launches over (triangle, column)."""
     scalar, mat = device.scalar, device.matrix
     here, kept = functions_of(device, size), wp.constant(wp.float64(ROOM_KEPT))
-    forces, nodes_of, motion_of, spread, weight_of = (
-        here.forces,
-        here.nodes_of,
-        here.motion_of,
-        here.spread,
+    forces, nodes_of, motion_of, seen, spread = here.forces, here.nodes_of, here.motion_of, here.seen, here.spread
+    weight_of, is_near, reach_of, pace_of, shape_of = (
         here.weight_of,
+        here.is_near,
+        here.reach_of,
+        here.pace_of,
+        here.shape_of,
     )
-    is_near, reach_of, shape_of, curvature_at = here.is_near, here.reach_of, here.shape_of, here.curvature_at
     energy_in_row, force_in_row = here.energy_in_row, here.force_in_row
     add_matrix_in_row, share_in_row = here.add_matrix_in_row, here.share_in_row
 
@@ -52,10 +52,11 @@ def kernels_of(device: Device, size: int) -> Kernels:
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, scale.gap, k, c):
+            own, half, radius = seen(at, tools, k, c), tools.half[k], tools.radius[k]
+            if is_near(own, scale.gap, half, radius):
                 total = wp.float64(0.0)
                 for i in range(n):
-                    total += energy_in_row(at, n, i, tools, scale.gap, k, c)
+                    total += energy_in_row(own, n, i, half, radius, scale.gap)
                 wp.atomic_add(out, c, weight * total)
 
     @forward_kernel(module="unique")
@@ -71,11 +72,12 @@ def kernels_of(device: Device, size: int) -> Kernels:
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, scale.gap, k, c):
+            own, half, radius = seen(at, tools, k, c), tools.half[k], tools.radius[k]
+            if is_near(own, scale.gap, half, radius):
                 total = forces()
                 for i in range(n):
-                    total += force_in_row(at, n, i, tools, scale.gap, k, c)
-                spread(surface, weight * total, s, c, out)
+                    total += force_in_row(own, n, i, half, radius, scale.gap)
+                spread(surface, weight * total * wp.transpose(tools.rotation[k, c]), s, c, out)
 
     @forward_kernel(module="unique")
     def add_curvature(
@@ -92,15 +94,18 @@ def kernels_of(device: Device, size: int) -> Kernels:
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, scale.gap, k, c):
-                along, total = motion_of(surface, p, s, c), forces()
+            own, half, radius = seen(at, tools, k, c), tools.half[k], tools.radius[k]
+            if is_near(own, scale.gap, half, radius):
+                along, total, pace = motion_of(surface, p, s, c) * tools.rotation[k, c], forces(), pace_of(own, n)
                 for i in range(n):
-                    for j in range(2 * (n - i) - 1):
+                    most, j = 2 * (n - i) - 1, wp.int32(0)
+                    while j < most:
                         N = shape_of(i, j, n)
-                        touch = touch_of(N * at, tools, k, c)
+                        touch = touch_of(N * own, half, radius)
                         if touch.distance < scale.gap:
-                            total += wp.outer(N, weight * (curvature_at(touch, scale.gap, definite[c]) * (N * along)))
-                spread(surface, total, s, c, out)
+                            total += wp.outer(N, curvature_at(touch, scale.gap, definite[c]) * (N * along))
+                        j += clear(touch.distance - scale.gap, pace, most)
+                spread(surface, weight * total * wp.transpose(tools.rotation[k, c]), s, c, out)
 
     @forward_kernel(module="unique")
     def add_diagonal(
@@ -116,19 +121,23 @@ def kernels_of(device: Device, size: int) -> Kernels:
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, scale.gap, k, c):
+            own, half, radius, R = seen(at, tools, k, c), tools.half[k], tools.radius[k], tools.rotation[k, c]
+            if is_near(own, scale.gap, half, radius):
+                pace = pace_of(own, n)
                 for i in range(n):
-                    for j in range(2 * (n - i) - 1):
+                    most, j = 2 * (n - i) - 1, wp.int32(0)
+                    while j < most:
                         N = shape_of(i, j, n)
-                        touch = touch_of(N * at, tools, k, c)
+                        touch = touch_of(N * own, half, radius)
                         if touch.distance < scale.gap:
-                            H = weight * curvature_at(touch, scale.gap, definite[c])
+                            H = weight * (R * curvature_at(touch, scale.gap, definite[c]) * wp.transpose(R))
                             for a in range(size):
                                 block = mat()
                                 for row in range(3):
                                     for column in range(3):
                                         block[row, column] = scalar(N[a] * N[a] * H[row, column])
                                 wp.atomic_add(out, surface.table[s, a], c, block)
+                        j += clear(touch.distance - scale.gap, pace, most)
 
     @forward_kernel(module="unique")
     def add_matrix(
@@ -145,9 +154,10 @@ def kernels_of(device: Device, size: int) -> Kernels:
         s, c = wp.tid()
         at = nodes_of(surface, u, s, c)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, scale.gap, k, c):
+            own = seen(at, tools, k, c)
+            if is_near(own, scale.gap, tools.half[k], tools.radius[k]):
                 for i in range(surface.pieces[s]):
-                    add_matrix_in_row(at, surface, tools, scale, definite[c], place, s, i, k, c, out)
+                    add_matrix_in_row(own, surface, tools, scale, definite[c], place, s, i, k, c, out)
 
     @forward_kernel(module="unique")
     def add_reaction(
@@ -162,16 +172,22 @@ def kernels_of(device: Device, size: int) -> Kernels:
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, scale.gap, k, c):
+            own, half, radius = seen(at, tools, k, c), tools.half[k], tools.radius[k]
+            if is_near(own, scale.gap, half, radius):
+                force, moment, pace = wp.vec3d(), wp.vec3d(), pace_of(own, n)
                 for i in range(n):
-                    for j in range(2 * (n - i) - 1):
-                        x = shape_of(i, j, n) * at
-                        touch = touch_of(x, tools, k, c)
-                        force = -weight * barrier_slope(touch.distance, scale.gap) * touch.normal
-                        moment = wp.cross(x - tools.origin[k, c], force)
-                        for row in range(3):
-                            wp.atomic_add(out, c, k, row, force[row])
-                            wp.atomic_add(out, c, k, 3 + row, moment[row])
+                    most, j = 2 * (n - i) - 1, wp.int32(0)
+                    while j < most:
+                        x = shape_of(i, j, n) * own
+                        touch = touch_of(x, half, radius)
+                        push = -weight * barrier_slope(touch.distance, scale.gap) * touch.normal
+                        force += push
+                        moment += wp.cross(x + tools.centre[k], push)
+                        j += clear(touch.distance - scale.gap, pace, most)
+                force, moment = tools.rotation[k, c] * force, tools.rotation[k, c] * moment
+                for row in range(3):
+                    wp.atomic_add(out, c, k, row, force[row])
+                    wp.atomic_add(out, c, k, 3 + row, moment[row])
 
     @forward_kernel(module="unique")
     def bound_step(
@@ -187,8 +203,9 @@ def kernels_of(device: Device, size: int) -> Kernels:
         s, c = wp.tid()
         at, n, along = nodes_of(surface, u, s, c), surface.pieces[s], motion_of(surface, du, s, c)
         for k in range(tools.radius.shape[0]):
-            if is_near(at, tools, reach_of(along) / kept, k, c):
+            own, half, radius = seen(at, tools, k, c), tools.half[k], tools.radius[k]
+            if is_near(own, reach_of(along) / kept, half, radius):
                 for i in range(n):
-                    wp.atomic_min(out, c, scalar(share_in_row(at, along, n, i, tools, k, c)))
+                    wp.atomic_min(out, c, scalar(share_in_row(own, along, n, i, half, radius)))
 
     return Kernels(add_energy, add_gradient, add_curvature, add_diagonal, add_matrix, add_reaction, bound_step)
