@@ -34,9 +34,10 @@ def cost(modules: str = "", kernels: str = "", classes: str = "") -> Cost:
 
 
 TOOLS = cost(
-    "contact.barrier contact.reduced contact.tool_blocks contact.tool_contact contact.tool_functions "
+    "contact.barrier contact.enclosure contact.reduced contact.tool_blocks contact.tool_contact contact.tool_functions "
     "contact.tool_kernels contact.tool_path",
-    "contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction",
+    "contact.enclosure:add_angle contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction "
+    "contact.tool_kernels:clearance",
     "Contact Functions Reduced Touch",
 )
 # A new effect adds one line.

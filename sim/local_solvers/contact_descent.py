@@ -32,7 +32,7 @@ from ..minimisers.residual import Judge, judge_of, relative
 from ..runtime.device import Device
 from ..runtime.views import doubled, from_view, in_order, on_host, placed, view
 from .contact_forces import BENT, FORCES, ForceLimits, Softness, scratch_of, settled
-from .contact_kernel import Scratch
+from .contact_structs import Scratch
 
 
 @dataclass(frozen=True)

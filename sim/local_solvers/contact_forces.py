@@ -26,7 +26,8 @@ from ..runtime.blocks import launch, threads_of
 from ..runtime.device import Device
 from ..runtime.threads import together
 from ..runtime.views import from_view, on_host, view
-from .contact_kernel import CROWDED, FOUND, OPEN, UNKNOWN, Ends, Model, Scratch, kernel_of
+from .contact_kernel import kernel_of
+from .contact_structs import CROWDED, FOUND, OPEN, UNKNOWN, Ends, Model, Scratch
 
 
 @dataclass(frozen=True)

@@ -9,65 +9,7 @@ from ..linalg.block_factor import functions_of
 from ..minimisers.lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
 from ..runtime.blocks import threads_of, total, wait
 from ..runtime.device import Device, forward_kernel
-
-OPEN, FOUND, NONE, CROWDED, UNKNOWN = (wp.constant(number) for number in range(5))
-"""What a column is: to be done, found, without an equilibrium, with too many touched nodes, or lacking a compliance."""
-
-
-@wp.struct
-class Model:
-    """How nodes give way: the compliance at rest, transposed (3n, 3n), and what b columns have learnt since.
-
-    `known` (n,): whether a node's column is; `learnt` (b, p, 3n), `middle` (b, p, p). A compliance between touched
-    nodes is `rounded`: that share of its mean makes it definite.
-    """
-
-    rest: wp.array2d(dtype=wp.float64)
-    known: wp.array(dtype=wp.int32)
-    learnt: wp.array3d(dtype=wp.float64)
-    middle: wp.array3d(dtype=wp.float64)
-    rounded: wp.float64
-
-
-@wp.struct
-class Ends:
-    """When it ends: as `contact_forces.ForceLimits`, and with room for so many touched nodes."""
-
-    iterations: wp.int32
-    cuts: wp.int32
-    late: wp.int32
-    room: wp.int32
-
-
-@wp.struct
-class Scratch:
-    """What b columns need meanwhile; n nodes, m touched ones at most.
-
-    `forces`, .., `held`: (3n, b). `place`, `acts` (n, b): where a node stands in `touched`, `acting` (b, n).
-    `counts` (b, 2): of both lists. Matrices (b, 3m, 3m), vectors (b, 3m).
-    """
-
-    force: wp.array2d(dtype=wp.float64)
-    w: wp.array2d(dtype=wp.float64)
-    at: wp.array2d(dtype=wp.float64)
-    slope: wp.array2d(dtype=wp.float64)
-    change: wp.array2d(dtype=wp.float64)
-    way: wp.array2d(dtype=wp.float64)
-    held: wp.array2d(dtype=wp.float64)
-    place: wp.array2d(dtype=wp.int32)
-    acts: wp.array2d(dtype=wp.int32)
-    touched: wp.array2d(dtype=wp.int32)
-    acting: wp.array2d(dtype=wp.int32)
-    counts: wp.array2d(dtype=wp.int32)
-    shares: wp.array2d(dtype=wp.float64)
-    learnt: wp.array3d(dtype=wp.float64)
-    soft: wp.array3d(dtype=wp.float64)
-    stiff: wp.array3d(dtype=wp.float64)
-    both: wp.array3d(dtype=wp.float64)
-    system: wp.array3d(dtype=wp.float64)
-    x: wp.array2d(dtype=wp.float64)
-    y: wp.array2d(dtype=wp.float64)
-
+from .contact_structs import CROWDED, FOUND, NONE, OPEN, UNKNOWN, Ends, Model, Scratch
 
 # So many sums at once keep a thread from waiting for memory.
 WIDE = wp.constant(8)
@@ -156,6 +98,11 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         wait()
 
     @wp.func
+    def between(model: Model, i: int, j: int) -> wp.float64:
+        """The compliance at rest between touched nodes, symmetric: half precision may have rounded its columns."""
+        return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i])
+
+    @wp.func
     def give(
         model: Model,
         f: wp.array2d(dtype=wp.float64),
@@ -189,7 +136,11 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                     j = 3 * s.acting[c, a] + k
                     share = f[j, c]
                     for q in range(WIDE):
-                        sums[q] += model.rest[j, wp.min(first + q * threads, size - 1)] * share
+                        i = wp.min(first + q * threads, size - 1)
+                        soft = model.rest[j, i]
+                        if s.place[i // 3, c] >= 0:
+                            soft = between(model, i, j)
+                        sums[q] += soft * share
             for p in range(pairs):
                 share = s.y[c, p]
                 for q in range(WIDE):
@@ -214,7 +165,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         for i in range(me // across, 3 * m, down):
             first = 3 * s.touched[c, i // 3] + i % 3
             for j in range(i + me % across, 3 * m, across):
-                own = model.rest[first, 3 * s.touched[c, j // 3] + j % 3]
+                own = between(model, first, 3 * s.touched[c, j // 3] + j % 3)
                 for p in range(pairs):
                     own += model.learnt[c, p, first] * s.learnt[c, p, j]
                 s.soft[c, i, j] = own

@@ -28,6 +28,7 @@ from ..minimisers.newton_cg import NewtonCG
 from ..minimisers.residual import shortfall
 from ..runtime.columns import gathered, scattered
 from ..runtime.device import Device
+from ..runtime.views import in_order, on_host, view
 from .plan import Plan, Step
 from .stepping import GAPS, STEPPING, Gaps, Stepping
 
@@ -173,7 +174,8 @@ class Strategy:
         for term in self.problem.terms:
             if not term.passive:
                 term.add_gradient(rest, loud)
-        acts = (loud.numpy() != 0.0).any(axis=0)
+        with in_order(self.problem.device):
+            acts = on_host((view(loud) != 0.0).any(0))
         if not acts.all():
             acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.barriers)])
         return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
@@ -181,7 +183,10 @@ class Strategy:
     def _rested(self, start: wp.array) -> wp.array:
         """Start (3N, b) [m], or rest where nothing acts there: in float32 no descent would end in letting go."""
         acts = self._acts(start.shape[1])
-        return start if acts.all() else self.problem.device.array(np.where(acts, start.numpy(), 0.0))
+        if not acts.all():
+            with in_order(self.problem.device):
+                view(start := wp.clone(start))[:, ~acts] = 0.0
+        return start
 
     def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The first of some guesses (3N, B) [m] of each case that is not inside out; which cases (B,) have none."""

@@ -12,13 +12,14 @@ from ...discretisation.space import Discretisation
 from ...discretisation.term import Cases
 from ...effects import Retraction, ToolContact
 from ...errors import InputError
-from ...geometry.surface import areas, edge_lengths, enclosed
+from ...geometry.surface import areas, edge_lengths
 from ...loads import Retracted, Touching
 from ...runtime.device import Device
-from ...tools import Tool, cores_of, distances_to
+from ...tools import Tool, cores_of
+from .enclosure import any_enclosed
 from .reduced import Reduced
 from .tool_blocks import Near, Stage
-from .tool_functions import BULGE, Scale, Surface, Tools
+from .tool_functions import Scale, Surface, Tools
 from .tool_kernels import kernels_of
 from .tool_path import TOUCH, Touch, Way, approach
 
@@ -69,8 +70,9 @@ class Contact:
         self.name = name
         cores = [core for tool in tools for core in cores_of(tool)]
         self._owner = np.repeat(np.arange(len(tools)), [len(cores_of(tool)) for tool in tools])
-        self._whole, self._corners = (nodes, whole), [core.corners for core in cores]
-        self._triangles = triangles
+        self._first, self._sag = np.unique(self._owner, return_index=True)[1], touch.sag * gap
+        self._nodes, self._corners = nodes, [core.corners for core in cores]
+        self._triangles, self._closed = triangles, device.array(whole, wp.int32)
         self._shapes, self._way, self._device, self._touch = tools, way, device, touch
         self._kernels = kernels_of(device, triangles.shape[1])
         corners = nodes[triangles[:, :3]]
@@ -85,7 +87,7 @@ class Contact:
         self._cores = [
             device.array(np.array([core.centre for core in cores]), wp.vec3d),
             device.array(np.array([core.half for core in cores]), wp.vec3d),
-            device.array(np.array([core.radius + touch.sag * gap for core in cores]), wp.float64),
+            device.array(np.array([core.radius + self._sag for core in cores]), wp.float64),
         ]
         self._asked, self._gap, self._shear = gap, (1.0 - touch.sag) * gap, shear
         self.widen(1.0)
@@ -96,14 +98,11 @@ class Contact:
         way = self._way(cases)
         if way is None:
             return np.ones(len(cases.loads))
-        corners = (self._whole[0] + u.numpy().T.reshape(-1, *self._whole[0].shape))[:, self._triangles]
-        middle = corners[:, :, :3].mean(axis=2)
-        reach = BULGE * np.linalg.norm(corners - middle[:, :, None], axis=3).max(axis=2)
-        clear = [
-            [(distances_to(tool, at, points) - far).min() for tool, at in zip(self._shapes, pose, strict=True)]
-            for pose, points, far in zip(way.at(cases.gone), middle, reach, strict=True)
-        ]
-        return way.stride(self._shapes, np.reshape(clear, way.end.shape[:2]).clip(0.0), self._touch)
+        clear = wp.full((len(self._owner), u.shape[1]), np.inf, dtype=wp.float64, device=self._device.name)
+        inputs = [u, self._surface, self._standing(way.at(cases.gone))]
+        self._device.launch(self._kernels.clearance, (len(self._triangles), u.shape[1]), inputs, [clear])
+        of_tools = np.minimum.reduceat(clear.numpy(), self._first, axis=0).T + self._sag
+        return way.stride(self._shapes, of_tools.clip(0.0), self._touch)
 
     def gaps(self, cases: Cases) -> np.ndarray:
         """As the farthest-moved tool goes."""
@@ -114,13 +113,11 @@ class Contact:
         """In which columns (b,) the middle of a tool, or a corner of what it is made of, is inside the body."""
         if self._pose is None:
             return np.zeros(u.shape[1], bool)
-        nodes, surface = self._whole
-        moved = nodes + u.numpy().T.reshape(u.shape[1], -1, 3)
-        inner = [
-            np.concatenate([corners @ T[:3, :3].T + T[:3, 3] for corners, T in zip(self._corners, pose, strict=True)])
-            for pose in self._pose[:, self._owner]
+        points = [
+            corners @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+            for corners, pose in zip(self._corners, self._pose[:, self._owner].swapaxes(0, 1), strict=True)
         ]
-        return np.array([enclosed(points, body, surface).any() for points, body in zip(inner, moved, strict=True)])
+        return any_enclosed(self._device, np.concatenate(points, axis=1), self._surface.rest, self._closed, u)
 
     def widen(self, times: float) -> None:
         """The barrier as many times as wide, and as much softer."""
@@ -176,7 +173,7 @@ class Contact:
     @cached_property
     def _alone(self) -> "tuple[Contact, Reduced]":
         """The same on the touchable nodes alone, and as a function of where these go."""
-        nodes, own = self._whole[0][self.touchable], np.searchsorted(self.touchable, self._triangles)
+        nodes, own = self._nodes[self.touchable], np.searchsorted(self.touchable, self._triangles)
         corners, exact = own[:, :3], replace(self._device, precision="float64")
         term = Contact(
             self.name, self._shapes, self._way, nodes, own, corners, self._asked, self._shear, exact, self._touch
@@ -206,7 +203,7 @@ class Contact:
         """(b, tools, 6): force [N] and moment [N m] about its origin that each tool exerts at u (3N, b) [m]."""
         out = wp.zeros((u.shape[1], len(self._owner), 6), dtype=wp.float64, device=self._device.name)
         self._launch(self._kernels.add_reaction, [u], out, u.shape[1])
-        return np.add.reduceat(out.numpy(), np.unique(self._owner, return_index=True)[1], axis=1)
+        return np.add.reduceat(out.numpy(), self._first, axis=1)
 
     def end(self, u: wp.array) -> np.ndarray | None:
         """Where the tools are (b, tools, 4, 4): the next way begins there."""

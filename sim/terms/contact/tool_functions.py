@@ -112,6 +112,7 @@ class Functions:
     weight_of: wp.Function
     reach_of: wp.Function
     pace_of: wp.Function
+    least_distance: wp.Function
     is_near: wp.Function
     shape_of: wp.Function
     energy_in_row: wp.Function
@@ -216,10 +217,15 @@ def functions_of(device: Device, size: int) -> Functions:
         return steep * reach_of(around(at)) / (bulge * wp.float64(n))
 
     @wp.func
+    def least_distance(at: forces, times: wp.float64, half: wp.vec3d, radius: wp.float64) -> wp.float64:
+        """No point of a triangle so many times as large is nearer to a core."""
+        arms = around(at)
+        return touch_of(at[0] - arms[0], half, radius).distance - times * reach_of(arms)
+
+    @wp.func
     def is_near(at: forces, reach: wp.float64, half: wp.vec3d, radius: wp.float64) -> bool:
         """Whether any point of a triangle may be in a core's reach."""
-        arms = around(at)
-        return touch_of(at[0] - arms[0], half, radius).distance < reach + reach_of(arms)
+        return least_distance(at, wp.float64(1.0), half, radius) < reach
 
     @wp.func
     def energy_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> wp.float64:
@@ -310,6 +316,7 @@ def functions_of(device: Device, size: int) -> Functions:
         weight_of,
         reach_of,
         pace_of,
+        least_distance,
         is_near,
         shape_of,
         energy_in_row,

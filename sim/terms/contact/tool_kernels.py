@@ -7,7 +7,7 @@ import warp as wp
 
 from ...runtime.device import Device, forward_kernel
 from .barrier import barrier_slope
-from .tool_functions import ROOM_KEPT, Scale, Surface, Tools, clear, curvature_at, functions_of, touch_of
+from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools, clear, curvature_at, functions_of, touch_of
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class Kernels:
     add_matrix: wp.Kernel
     add_reaction: wp.Kernel
     bound_step: wp.Kernel
+    clearance: wp.Kernel
 
 
 @cache
@@ -28,10 +29,12 @@ def kernels_of(device: Device, size: int) -> Kernels:
     """Kernels for surface triangles of `size` nodes, 3 or 6. Each launches over (triangle, column)."""
     scalar, mat = device.scalar, device.matrix
     here, kept = functions_of(device, size), wp.constant(wp.float64(ROOM_KEPT))
+    stretch = wp.constant(wp.float64(1.0 if size == 6 else BULGE))
     forces, nodes_of, motion_of, seen, spread = here.forces, here.nodes_of, here.motion_of, here.seen, here.spread
-    weight_of, is_near, reach_of, pace_of, shape_of = (
+    weight_of, is_near, least_distance, reach_of, pace_of, shape_of = (
         here.weight_of,
         here.is_near,
+        here.least_distance,
         here.reach_of,
         here.pace_of,
         here.shape_of,
@@ -208,4 +211,20 @@ def kernels_of(device: Device, size: int) -> Kernels:
                 for i in range(n):
                     wp.atomic_min(out, c, scalar(share_in_row(own, along, n, i, half, radius)))
 
-    return Kernels(add_energy, add_gradient, add_curvature, add_diagonal, add_matrix, add_reaction, bound_step)
+    @forward_kernel(module="unique")
+    def clearance(
+        u: wp.array2d(dtype=scalar),
+        surface: Surface,
+        tools: Tools,
+        # outputs
+        out: wp.array2d(dtype=wp.float64),
+    ):
+        """How far each tool is from the surface at least, which may stretch."""
+        s, c = wp.tid()
+        at = nodes_of(surface, u, s, c)
+        for k in range(tools.radius.shape[0]):
+            wp.atomic_min(out, k, c, least_distance(seen(at, tools, k, c), stretch, tools.half[k], tools.radius[k]))
+
+    return Kernels(
+        add_energy, add_gradient, add_curvature, add_diagonal, add_matrix, add_reaction, bound_step, clearance
+    )

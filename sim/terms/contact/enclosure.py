@@ -1,0 +1,51 @@
+"""Whether points lie inside a body's surface, of many bodies at once.
+
+By the solid angle that it fills: van Oosterom, Strackee 1983, "The solid angle of a plane triangle", IEEE Trans.
+Biomed. Eng. 30:125-126, equation 8.
+"""
+
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from ...runtime.device import Device, forward_kernel
+
+
+@cache
+def kernel_of(device: Device) -> wp.Kernel:
+    """It launches over (triangle, column)."""
+    scalar = device.scalar
+
+    @forward_kernel(module="unique")
+    def add_angle(
+        points: wp.array2d(dtype=wp.vec3d),
+        rest: wp.array(dtype=wp.vec3d),
+        triangles: wp.array2d(dtype=wp.int32),
+        u: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=wp.float64),
+    ):
+        """Half the solid angle [sr] under which points (p, b) see a triangle."""
+        s, c = wp.tid()
+        corners = wp.mat33d()
+        for row in range(3):
+            i = triangles[s, row]
+            for k in range(3):
+                corners[row, k] = rest[i][k] + wp.float64(u[3 * i + k, c])
+        for p in range(points.shape[0]):
+            x, y, z = corners[0] - points[p, c], corners[1] - points[p, c], corners[2] - points[p, c]
+            a, b, d = wp.length(x), wp.length(y), wp.length(z)
+            along = a * b * d + wp.dot(x, y) * d + wp.dot(y, z) * a + wp.dot(z, x) * b
+            wp.atomic_add(out, p, c, wp.atan2(wp.dot(x, wp.cross(y, z)), along))
+
+    return add_angle
+
+
+def any_enclosed(device: Device, points: np.ndarray, rest: wp.array, triangles: wp.array, u: wp.array) -> np.ndarray:
+    """In which columns (b,) any of their points (b, p, 3) [m] lies inside the surface, outwards, moved by u (3N, b)."""
+    points = np.ascontiguousarray(points.swapaxes(0, 1))
+    angle = wp.zeros(points.shape[:2], dtype=wp.float64, device=device.name)
+    inputs = [device.array(points, wp.vec3d), rest, triangles, u]
+    device.launch(kernel_of(device), (len(triangles), points.shape[1]), inputs, [angle])
+    return (angle.numpy() > np.pi).any(axis=0)
