@@ -59,6 +59,16 @@ def test_a_row_for_each_tissue_and_set(words, capsys):
     assert captured.err.count("the tools together (bipolar): 6 loads in") == 2
 
 
+def test_poses_of_a_ball_have_rows_too(words, capsys):
+    few = ["--poses", "--presets", "palpation", "bipolar", "--count", "3", "--repeats", "1", "--poisson", "0.4"]
+    assert main([*words, *few, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["preset"], row["loads"], row["converged"]) for row in said] == [("palpation", 3, 3), ("bipolar", 3, 3)]
+    assert all(1e-9 < row["double"] < 1.1e-4 for row in said)
+    assert main([*words, *few[:2], "spatula"]) == 2
+    assert "no ball stands for the preset spatula" in capsys.readouterr().err
+
+
 def test_a_load_that_does_not_converge_is_counted_and_said(words, monkeypatch, capsys):
     """One step is too few for a brutal load; where no tool is asked for there is no sum over the tools."""
     monkeypatch.setattr(throughput, "TRAIN", Accuracy(tolerance=1e-4, outer=1, precision="float32", steps=0))

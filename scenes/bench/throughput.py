@@ -9,11 +9,12 @@ import numpy as np
 
 from sim.accuracy import REFERENCE, TRAIN
 from sim.anatomy import Anatomy
-from sim.effects import pushed_effects
+from sim.effects import Effect, pushed_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
 from surrogate.data.tool_loads import TOOLS, draw
+from surrogate.data.tool_poses import draw_poses
 
 from .robustness import CHECKED, Trial
 from .stopwatch import timed
@@ -92,25 +93,30 @@ class Together:
         return self.loads / self.seconds if self.loads else None
 
 
-def drawn(anatomy: Anatomy, presets: Sequence[str], count: int) -> dict[str, Drawn]:
-    """`count` loads of each preset; of the published protocol no more than it has.
+def drawn(anatomy: Anatomy, presets: Sequence[str], count: int, posed: bool = False) -> dict[str, Drawn]:
+    """`count` loads of each preset, or poses of its ball; of the published protocol no more than it has.
 
     Raises
     ------
     InputError
-        As `draw`.
+        As `draw`, or as `draw_poses`.
     """
-    out = {}
+    out, by = {}, draw_poses if posed else draw
     for preset in presets:
-        draw(preset, anatomy, 1, SEED)  # the cortex is measured at the first draw
-        out[preset] = timed(draw, preset, anatomy, count, SEED)
+        by(preset, anatomy, 1, SEED)  # the cortex is measured at the first draw
+        out[preset] = timed(by, preset, anatomy, count, SEED)
     return out
 
 
 def rows(
-    trial: Trial, material: Material, sets: Mapping[str, Drawn], repeats: int, done: Callable[[], object]
+    trial: Trial,
+    material: Material,
+    sets: Mapping[str, Drawn],
+    repeats: int,
+    done: Callable[[], object],
+    tools: tuple[Effect, ...] = (),
 ) -> Iterator[Row]:
-    """A row for each set of loads on one tissue, to 1e-4 in single precision.
+    """A row for each set of loads on one tissue under `tools`, to 1e-4 in single precision.
 
     `done` is called `repeats` + 2 times a row: after the warm-up, after each repeat, and after the check.
 
@@ -119,7 +125,7 @@ def rows(
     InputError
         As `Fem`.
     """
-    trial = replace(trial, effects=pushed_effects(trial.anatomy, material))
+    trial = replace(trial, effects=(*pushed_effects(trial.anatomy, material), *tools))
     fem, set_up = timed(trial.fem, TRAIN)
     # Judged on the host whatever the device: other kernels and other arithmetic than those that are measured.
     judge = replace(trial, device="cpu", batch=CHECKED).fem(REFERENCE)

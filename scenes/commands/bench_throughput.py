@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,9 @@ from surrogate.data.tool_loads import PRESETS
 from ..script.shipped_files import template_path
 
 if TYPE_CHECKING:
-    from ..bench.throughput import Row, Together
+    from sim.effects import Effect
+
+    from ..bench.throughput import Drawn, Row, Together
 
 YOUNG = 3000.0
 # Loads together on the CPU, where more gain nothing; and loads a row there, and on CUDA.
@@ -36,8 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
     parser.add_argument(
-        "--presets", nargs="+", choices=PRESETS, default=list(PRESETS), metavar="SET", help="of loads (default: all)"
+        "--presets",
+        nargs="+",
+        choices=PRESETS,
+        metavar="SET",
+        help="of loads (default: all, of --poses the round tools)",
     )
+    parser.add_argument("--poses", action="store_true", help="poses of the ball that stands for each tool, not forces")
     parser.add_argument(
         "--laws", nargs="+", choices=LAWS, default=["stable-neo-hookean", "neo-hookean"], metavar="LAW",
         help=f"with E = {YOUNG:g} Pa (default: stable-neo-hookean neo-hookean)",
@@ -55,7 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
+    from sim.effects import ToolContact
     from sim.runtime.device import find_device
+    from surrogate.data.tool_poses import ROUND, ball_of
 
     from ..bench.robustness import Trial
     from ..bench.stages import machine
@@ -69,19 +79,26 @@ def run(args: argparse.Namespace) -> int:
     materials = [Material(law, YOUNG, poisson) for law in args.laws for poisson in args.poisson]
     anatomy = read_anatomy(args.anatomy or template_path())
     trial = Trial(anatomy, (), args.element, args.device, batch)
-    sets = drawn(anatomy, args.presets, count)
+    sets = drawn(anatomy, args.presets or (ROUND if args.poses else PRESETS), count, args.poses)
+    groups: list[tuple[dict[str, Drawn], tuple[Effect, ...]]] = [(sets, ())]
+    if args.poses:
+        groups = [({name: loads}, (ToolContact((ball_of(name),)),)) for name, loads in sets.items()]
     table = sys.stderr if args.json else sys.stdout
     where = machine(args.device)
     print(where, file=table)
     found: list[Row] = []
     with tqdm(total=len(materials) * len(sets) * (args.repeats + 2), unit="solve", file=sys.stderr) as bar:
-        for material in materials:
-            for row in rows(trial, material, sets, args.repeats, bar.update):
-                with tqdm.external_write_mode(table):
-                    if not found:
-                        print(_header(row, batch, args.repeats), file=table)
-                    print(_line(row), file=table, flush=True)
-                found.append(row)
+        measured = (
+            rows(trial, material, some, args.repeats, bar.update, tools)
+            for material in materials
+            for some, tools in groups
+        )
+        for row in chain.from_iterable(measured):
+            with tqdm.external_write_mode(table):
+                if not found:
+                    print(_header(row, batch, args.repeats), file=table)
+                print(_line(row), file=table, flush=True)
+            found.append(row)
     tools = together(found)
     print("", *map(_sentence, tools), sep="\n", file=table)
     if args.json:
