@@ -129,7 +129,7 @@ class PatchElimination:
         pull.numpy()[patch.rows, 0] += own
         new = self._answered(judge, now.u, pull)
         forces = _norms(new.g)
-        forces[patch.nodes] = np.linalg.norm(own.reshape(-1, 3), axis=1)
+        forces[patch.nodes] = np.linalg.norm(own.reshape(-1, 3).astype(np.float64), axis=1)
         return new, nodes, forces
 
     def _answered(self, judge: Judge, u: wp.array, force: wp.array) -> State:
