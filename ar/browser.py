@@ -16,12 +16,11 @@ import cv2
 import numpy as np
 import viser
 
-from .guard import bracketed, open_server
+from .guard import LIMITS, Limits, bracketed, open_server
 from .page_parts import Body, Choice, Control, Deed, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
 from .page_sight import PICTURE, SAID, coded, sight
 from .page_style import NOTE, PAGE, STATUS, style
 
-PICTURES_PER_SECOND = 15.0
 # Behind all that is added later.
 LAST = 1e9
 # Width of the docked panel where a browser does not know the page's own rules [CSS pixel].
@@ -38,7 +37,7 @@ class Browser:
     """A screen in the browser, for any number of visitors, who share picture and controls.
 
     `show`, `move`, `report`, `write` and `put` only note what is newest. They may be called from any thread at any
-    rate. A thread of the page sends it on, 15 times a second at most.
+    rate. A thread of the page sends it on, as often as `Limits` allow.
     """
 
     def __init__(
@@ -53,6 +52,7 @@ class Browser:
         port: int = 8080,
         size: tuple[int, int] = (640, 480),
         signs: Sequence[Sign] = (),
+        limits: Limits = LIMITS,
     ) -> None:
         """Start the server; where `port` is taken, the next free one serves, see `address`.
 
@@ -68,7 +68,8 @@ class Browser:
             A viser that serves otherwise than `ar.guard` knows.
         """
         check_address(host, port)
-        self.server, self.token = open_server(host, port, title)
+        self.limits = limits
+        self.server, self.token = open_server(host, port, title, limits)
         self.dress(viewpoint, signs)
         gui = self.server.gui
         gui.add_html(style(size[0] / size[1]))
@@ -253,7 +254,7 @@ class Browser:
 
     def send(self) -> None:
         """Send what is newest until the page is closed; all that came together arrives together."""
-        while not self.closed.wait(1.0 / PICTURES_PER_SECOND):
+        while not self.closed.wait(1.0 / self.limits.sendings):
             with self.sending:
                 with self.lock:
                     newest, self.newest = self.newest, {}

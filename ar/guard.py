@@ -31,12 +31,31 @@ from .messages import LARGEST, MessageError, checked
 
 # The guard stands on how this release line of viser serves: another is refused.
 KNOWN = "1.1."
-# Browsers that are served at once.
-VISITORS = 32
-# Messages that a visitor may send at once, and per second for long; viser's own page sends some 50 a second at most.
-BURST, PER_SECOND = 1000.0, 200.0
 # Another page must not frame this one to have it clicked, nor learn its address.
 HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "Referrer-Policy": "no-referrer"}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much goes back and forth between a page and its visitors.
+
+    Parameters
+    ----------
+    visitors
+        Browsers that are served at once.
+    burst, per_second
+        Messages that one may send at once, and per second for long; viser's own page sends some 50 a second at most.
+    sendings
+        Times per second that the page sends what is new, at most.
+    """
+
+    visitors: int = 32
+    burst: float = 1000.0
+    per_second: float = 200.0
+    sendings: float = 15.0
+
+
+LIMITS = Limits()
 
 
 class UnguardedError(RuntimeError):
@@ -97,10 +116,10 @@ class Door:
 class Visit(ServerConnection):
     """A visitor's connection: what it sends is checked before viser hears it; `controls` finds what can be set."""
 
-    def __init__(self, *args: Any, controls: Callable[[str], object], **settings: Any) -> None:
+    def __init__(self, *args: Any, controls: Callable[[str], object], limits: Limits, **settings: Any) -> None:
         super().__init__(*args, **settings)
-        self.controls = controls
-        self.credit, self.counted = BURST, self.loop.time()
+        self.controls, self.limits = controls, limits
+        self.credit, self.counted = limits.burst, self.loop.time()
 
     def data_received(self, data: bytes) -> None:
         """Answer what asks otherwise than by GET, which websockets leaves without an answer."""
@@ -132,8 +151,8 @@ class Visit(ServerConnection):
         MessageError
             More came than a page sends.
         """
-        now = self.loop.time()
-        self.credit = min(BURST, self.credit + (now - self.counted) * PER_SECOND) - 1.0
+        now, limits = self.loop.time(), self.limits
+        self.credit = min(limits.burst, self.credit + (now - self.counted) * limits.per_second) - 1.0
         self.counted = now
         if self.credit < 0.0:
             raise MessageError("there are too many", malformed=True)
@@ -171,7 +190,7 @@ class Controls:
         return None
 
 
-def open_server(host: str, port: int, title: str) -> tuple[viser.ViserServer, str | None]:
+def open_server(host: str, port: int, title: str, limits: Limits = LIMITS) -> tuple[viser.ViserServer, str | None]:
     """Serve a page; returns viser's server and the token that the page's address must carry, if any.
 
     Raises
@@ -182,7 +201,7 @@ def open_server(host: str, port: int, title: str) -> tuple[viser.ViserServer, st
     if not viser.__version__.startswith(KNOWN):
         raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}*.")
     door, controls = Door.of(host), Controls()
-    with guarding(door, controls) as opened:
+    with guarding(door, controls, limits) as opened:
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     try:
         assert opened
@@ -200,7 +219,7 @@ PATCHING = threading.Lock()
 
 
 @contextmanager
-def guarding(door: Door, controls: Controls) -> Iterator[list[bool]]:
+def guarding(door: Door, controls: Controls, limits: Limits) -> Iterator[list[bool]]:
     """Guard the server that viser opens meanwhile; what it yields is true once it was opened."""
     opened: list[bool] = []
     serve = websockets.asyncio.server.serve
@@ -209,8 +228,9 @@ def guarding(door: Door, controls: Controls) -> Iterator[list[bool]]:
 
     def guarded(*args: Any, process_request: Callable, **settings: Any) -> Any:
         opened.append(True)
-        settings |= {"max_size": LARGEST, "logger": log, "create_connection": partial(Visit, controls=controls)}
-        return serve(*args, process_request=partial(answer, door, process_request), **settings)
+        visit = partial(Visit, controls=controls, limits=limits)
+        settings |= {"max_size": LARGEST, "logger": log, "create_connection": visit}
+        return serve(*args, process_request=partial(answer, door, limits, process_request), **settings)
 
     with PATCHING:
         websockets.asyncio.server.serve = guarded
@@ -220,7 +240,9 @@ def guarding(door: Door, controls: Controls) -> Iterator[list[bool]]:
             websockets.asyncio.server.serve = serve
 
 
-def answer(door: Door, served: Callable, connection: ServerConnection, request: Request) -> Response | None:
+def answer(
+    door: Door, limits: Limits, served: Callable, connection: ServerConnection, request: Request
+) -> Response | None:
     """Answer a request as viser does, if it may come in; None opens a visit."""
     address, port = connection.local_address[:2]
     refusal = door.refusal(request, address, port)
@@ -229,8 +251,8 @@ def answer(door: Door, served: Callable, connection: ServerConnection, request: 
     if request.headers.get_all("Upgrade"):
         if request.headers.get_all("Sec-WebSocket-Protocol") != [f"viser-v{viser.__version__}"]:
             return connection.respond(HTTPStatus.BAD_REQUEST, "This is no page of this server: load it again.\n")
-        if len(connection.server.connections) >= VISITORS:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{VISITORS} visitors look already.\n")
+        if len(connection.server.connections) >= limits.visitors:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{limits.visitors} visitors look already.\n")
     try:
         response = served(connection, request)
     except (OSError, ValueError):

@@ -50,7 +50,7 @@ POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0 (done), 1 (ran, but did not reach what was asked) or 2 (bad input)."""
-    arguments = _with_points(sys.argv[1:] if argv is None else argv)
+    arguments = with_points(sys.argv[1:] if argv is None else argv)
     asked = arguments[0] if arguments else None
     inner = INNER.get(asked or "", ())
     if inner and (len(arguments) == 1 or arguments[1] not in (*inner, "-h", "--help")):
@@ -102,7 +102,7 @@ def add_plugin(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _with_points(arguments: Sequence[str]) -> list[str]:
+def with_points(arguments: Sequence[str]) -> list[str]:
     """The arguments, with a point joined to the option before it: `--opening-at=-3,4,5`."""
     joined: list[str] = []
     for argument in arguments:

@@ -41,7 +41,7 @@ from .strategy.captured_frame import Frame
 from .strategy.extrapolation import moved_on, pushes_of, way_of
 from .strategy.frame_sequence import FrameSequence
 from .strategy.newton_correction import step_from
-from .strategy.plan import Step, local_solvers, plan_for
+from .strategy.plan import Plan, Step, local_solvers, plan_for
 from .strategy.strategy import Answer, Strategy
 from .strategy.time_steps import KEPT, Still, alike
 
@@ -108,17 +108,22 @@ class Fem:
         problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
         preconditioner = choose_preconditioner(problem, self.space, self._unsmoothed)
         fitting = fitting_batch(problem.rows, problem.device) if batch is None else at_least("batch", batch, 1)
-        self.plan = plan_for(problem, preconditioner, self.space, accuracy, fitting, live, avoid)
-        parts = local_solvers(self.plan, problem, preconditioner, self.effects, self.space)
+        plan = plan_for(problem, preconditioner, self.space, accuracy, fitting, live, avoid)
+        parts = local_solvers(plan, problem, preconditioner, self.effects, self.space)
         if problem.device.on_cuda:
             parts[0]()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
-        inversion = Inversion(self.space, problem.device)
         self._leak = Leak(anatomy, self.space, problem.device)
         bonded = (effect for effect in self.effects if isinstance(effect, Bonded))
         self._bond = next((Bond(effect, anatomy, self.space, problem.device) for effect in bonded), None)
-        self._strategy = Strategy(problem, preconditioner, inversion, accuracy, self.plan, *parts)
+        self.strategy = Strategy(problem, preconditioner, Inversion(self.space, problem.device), accuracy, plan, *parts)
+        """What solves a load: the plan's solvers, one after the other."""
         self._paced = lru_cache(KEPT)(self._strategy_over)
         self._resting = Resting(problem, preconditioner, accuracy.inner)
+
+    @property
+    def plan(self) -> Plan:
+        """Which solvers are tried, and in which order."""
+        return self.strategy.plan
 
     @property
     def batch(self) -> int:
@@ -133,7 +138,7 @@ class Fem:
     @property
     def problem(self) -> Problem:
         """What is minimised."""
-        return self._strategy.problem
+        return self.strategy.problem
 
     @property
     def anatomy(self) -> Anatomy:
@@ -155,11 +160,11 @@ class Fem:
         """
         check_causes(self.effects, loads)
         at = None if at is None else self._vertices(at)
-        if start is not None and self._following is not None:
-            answer = self._following.answer(loads, start, lambda: self.guess(loads, start))
+        if start is not None and self.following is not None:
+            answer = self.following.answer(loads, start, lambda: self.guess(loads, start))
             if answer is not None:
                 return answer if at is None else answer.at(at)
-        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._strategy.held)
+        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self.strategy.held)
         last = None if start is None else self.guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads)))
         if start is not None and last is not None:
@@ -177,24 +182,23 @@ class Fem:
     def _strategy_at(self, step: float) -> Strategy | Still:
         """Whose preconditioner knows the step in time [s]; of an infinite one, that of statics."""
         if step == 0.0 or step == math.inf:
-            return self._strategy if step else Still(self.problem, self._strategy.inversion)
+            return self.strategy if step else Still(self.problem, self.strategy.inversion)
         return self._paced(step)
 
     def _strategy_over(self, step: float) -> Strategy:
         preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed, step)
-        return Strategy(self.problem, preconditioner, self._strategy.inversion, self.accuracy, self.plan)
+        return Strategy(self.problem, preconditioner, self.strategy.inversion, self.accuracy, self.plan)
 
     def _batches(self, count: int) -> Iterator[slice]:
         """The rows of each batch, at least one."""
         return (slice(first, first + self.batch) for first in range(0, max(count, 1), self.batch))
 
     @cached_property
-    def _following(self) -> FrameSequence | None:
+    def following(self) -> FrameSequence | None:
         """Who answers frame after frame on CUDA. The CPU waits for nothing that this would spare it."""
-        return self._follower() if self.plan.frames else None
-
-    def _follower(self) -> FrameSequence:
-        strategy = self._strategy
+        if not self.plan.frames:
+            return None
+        strategy = self.strategy
         frame = Frame(self.problem, strategy.preconditioner, strategy.inversion, self._skin, self.accuracy.tolerance)
         return FrameSequence(self.problem, strategy.inversion, frame, self.lock, self.description)
 
@@ -240,11 +244,11 @@ class Fem:
         """
         self._check_static(loads)
         at = self._vertices(at)
-        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self._strategy.held)
+        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self.strategy.held)
         guess, cases = self.guess(loads, answer), Cases(loads, answer.time, answer.memory)
         parts = []
         for rows in self._batches(len(loads)):
-            step = step_from(self._strategy, cases.rows(rows), guess[:, rows])
+            step = step_from(self.strategy, cases.rows(rows), guess[:, rows])
             left = unstacked(self.problem.device, step.left, at)
             parts.append((self._answered(cases.rows(rows), step.answer, {}, None, step.seconds), step.before, left))
         answers, before, left = zip(*parts, strict=True)
@@ -261,7 +265,7 @@ class Fem:
         """
         nodes = self._vertices(nodes)
         device, rows = self.problem.device, (3 * nodes[:, None] + np.arange(3)).ravel()
-        check_fits(self.problem.rows, self.batch, len(modes), device, self._strategy.held)
+        check_fits(self.problem.rows, self.batch, len(modes), device, self.strategy.held)
         answers = np.empty((len(modes), self.problem.rows))
         for some in self._batches(len(modes)):
             force = np.zeros((self.problem.rows, len(modes[some])))
@@ -298,7 +302,7 @@ class Fem:
         widest = len(factors(sizes, orders))
         groups = min(len(loads) // sizes, max(1, self.batch // widest))
         columns = groups * widest
-        check_fits(self.problem.rows, columns, columns, self.problem.device, self._strategy.held)
+        check_fits(self.problem.rows, columns, columns, self.problem.device, self.strategy.held)
         edge = float(np.cbrt(self._anatomy.mesh.volumes.mean() * 6.0))
         found = np.empty((len(loads) // sizes, terms_of(sizes, orders), reading.count))
         # Threads of BLAS wait for one another, ages where something else runs on their cores.

@@ -5,6 +5,7 @@ from dataclasses import asdict
 
 import msgspec
 
+from scenes.commands.report import QUICK
 from scenes.report.reference import solve_beyond, solve_reference
 from scenes.report.row import Row
 from scenes.report.study import Study
@@ -27,7 +28,7 @@ def study_of(folder, box, count):
     fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     said = {"tissue": tissue_to_json(TISSUE), "element": "p1", "preset": "palpation"}
     simulate(folder / "data.h5", fem, draw("palpation", box, count, 0), said)
-    study = Study(folder / "data.h5", folder, "cpu", loads=2, beyond=12, timed=30)
+    study = Study(folder / "data.h5", folder, "cpu", loads=2, beyond=QUICK[2], timed=30)
     solve_reference(study, nothing)
     solve_beyond(study, nothing)
     return study

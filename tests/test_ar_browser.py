@@ -10,6 +10,7 @@ import pytest
 from visitor import Visitor, free_port, wait_for
 
 from ar.browser import Browser
+from ar.guard import LIMITS, Limits
 from ar.page_parts import Body, Choice, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
 from ar.page_sight import PICTURE, SAID, coded
 from ar.page_style import NOTE, PAGE, STATUS, style
@@ -22,7 +23,7 @@ def heard() -> dict[str, list]:
     return {"force": [], "deformer": [], "play": [], "frame": []}
 
 
-def open_page(heard: dict[str, list], port: int, host: str = "127.0.0.1") -> Browser:
+def open_page(heard: dict[str, list], port: int, host: str = "127.0.0.1", limits: Limits = LIMITS) -> Browser:
     bodies = [
         Body("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
         Body("brain", TRIANGLE, np.array([[0, 1, 2]]), opacity=0.3),
@@ -39,6 +40,7 @@ def open_page(heard: dict[str, list], port: int, host: str = "127.0.0.1") -> Bro
         port=port,
         size=(64, 48),
         signs=[Sign("R", np.array([0.1, 0.0, 0.0]))],
+        limits=limits,
     )
 
 
@@ -149,9 +151,8 @@ def test_several_visitors_see_the_page_and_are_heard(page, heard):
     narrow.wire.close()
 
 
-def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(heard, monkeypatch):
-    monkeypatch.setattr("ar.browser.PICTURES_PER_SECOND", 2000.0)
-    page = open_page(heard, free_port())
+def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(heard):
+    page = open_page(heard, free_port(), limits=Limits(sendings=2000.0))
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
     sought = list(range(50, 100)) * 4

@@ -5,7 +5,7 @@ import math
 import socket
 import threading
 import time
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from urllib.parse import urlsplit
 
 import msgspec
@@ -26,7 +26,7 @@ PROTOCOL = [f"viser-v{viser.__version__}"]
 class Page(Browser):
     """A page that notes what it is sent."""
 
-    def __init__(self, host="127.0.0.1", port=None):
+    def __init__(self, host="127.0.0.1", port=None, **limits):
         self.heard = []
         super().__init__(
             [],
@@ -40,6 +40,7 @@ class Page(Browser):
             host=host,
             port=free_port() if port is None else port,
             size=(64, 48),
+            limits=guard.Limits(**limits),
         )
 
     @property
@@ -48,8 +49,8 @@ class Page(Browser):
 
 
 @pytest.fixture(scope="module")
-def shared():
-    page = Page()
+def shared(request):
+    page = Page(**getattr(request, "param", {}))
     yield page
     page.close()
 
@@ -156,9 +157,11 @@ class TestDoor:
     def test_the_page_cannot_be_framed(self, page):
         assert "frame-ancestors 'self'" in ask(page)[1]["Content-Security-Policy"]
 
-    def test_a_crowd_waits_outside(self, page, monkeypatch):
-        monkeypatch.setattr(guard, "VISITORS", 1)
-        with connect(f"ws://127.0.0.1:{page.port}", subprotocols=PROTOCOL, max_size=None):
+    def test_a_crowd_waits_outside(self):
+        with (
+            closing(Page(visitors=1)) as page,
+            connect(f"ws://127.0.0.1:{page.port}", subprotocols=PROTOCOL, max_size=None),
+        ):
             assert knock(page) == 503
 
     def test_scanners_and_health_checks_leave_no_trace(self, page, capfd):
@@ -325,9 +328,8 @@ class TestMessages:
         said = capfd.readouterr().err
         assert "Traceback" not in said and len(said.splitlines()) <= 1
 
-    def test_a_flood_ends_that_visit_alone(self, page, visitor, monkeypatch):
-        monkeypatch.setattr(guard, "BURST", 50.0)
-        monkeypatch.setattr(guard, "PER_SECOND", 20.0)
+    @pytest.mark.parametrize("shared", [{"burst": 50.0, "per_second": 20.0}], indirect=True)
+    def test_a_flood_ends_that_visit_alone(self, page, visitor):
         hostile, begun = Visitor(page, 1200), time.monotonic()
         with pytest.raises(ConnectionClosed):
             for number in range(100000):

@@ -315,6 +315,18 @@ def test_names_say_what_things_are():
                 raise AssertionError(f"{name_of(path)}: an argument called {node.arg}: spell it out")
 
 
+def test_tests_set_no_constant_and_read_nothing_private():
+    """What a test must set is an argument, and what it must see is public."""
+    own = {name for path in FILES for name in re.findall(r"(?:def |class |self\.)(_[a-z]\w*)", path.read_text())}
+    private = re.compile(r"(?:(?<!\bself)\.|\bimport .*)\b(_[a-z]\w*)")
+    constant = re.compile(r"setattr\(\s*.*?[.\"]([A-Z][A-Z_\d]+)\",|^\s*[\w.]+\.([A-Z][A-Z_\d]+) = ", re.MULTILINE)
+    assert constant.search('setattr(a, "B' + 'C", 1)') and private.search("a." + "_b")
+    for path in sorted((HOUSE / "tests").glob("*.py")):
+        text = path.read_text()
+        found = [*constant.findall(text), *(name for name in private.findall(text) if name in own)]
+        assert not found, f"{path.name}: {found[0]}"
+
+
 def test_no_path_of_one_machine():
     machine = re.compile(r"(?<![\w.])/(?:home|root|Users|work|tmp|mnt|opt)/|[A-Z]:\\\\")
     texts = [*FILES, *(HOUSE / "tests").glob("*.py"), HOUSE / "pyproject.toml", HOUSE / "Makefile"]

@@ -134,10 +134,9 @@ class TestScenes:
             assert ("ToolForce" in row["effects"]) == (ToolForce() in find_scene(name).effects)
         assert "Resection" in reported["resection"]["effects"] and "milliseconds" not in reported["press"]
 
-    def test_pictures_and_a_sheet(self, anatomy, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr("scenes.script.scene.SCENES", ("press", "brain_shift"))
+    def test_pictures_and_a_sheet(self, anatomy, tmp_path, capsys):
         out = tmp_path / "new" / "sheet"
-        assert main(["scenes", "--anatomy", anatomy, "--device", "cpu", "--out", str(out)]) == 0
+        assert main(["scenes", "press", "brain_shift", "--anatomy", anatomy, "--device", "cpu", "--out", str(out)]) == 0
         assert "ms a frame by linear; the tumour moves" in capsys.readouterr().out
         assert sorted(path.name for path in out.iterdir()) == ["brain_shift.png", "press.png", "sheet.png"]
         whole, one = (cv2.imread(str(out / name)) for name in ("sheet.png", "press.png"))

@@ -64,15 +64,15 @@ def running(demo):
 
 def run_until(demo, monkeypatch, reached):
     """Let the loop run, once, until it has come to something."""
-    check = Demo._check
+    show = demo.browser.show
 
-    def checked(page, now):
-        check(page, now)
+    def shown(*known):
+        show(*known)
         if reached():
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Demo, "_check", checked)
+        patch.setattr(demo.browser, "show", shown)
         demo.run(60.0)
 
 
@@ -352,11 +352,11 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
         return answer(model, loads, start, at)
 
     moment = Moment()
-    demo._answer(moment)
+    demo.answer(moment)
     before = moment.picture
     monkeypatch.setattr(Learned, "deform", counted)
     demo.wish.set(style="contour")
-    demo._answer(moment)
+    demo.answer(moment)
     assert before is not None and (moment.picture != before).any() and asked == []
 
 

@@ -57,7 +57,6 @@ def test_a_batch_is_of_so_many_frames_and_cameras(box, monkeypatch):
 
 
 def test_the_command_says_the_size_and_every_stage(box, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(frame, "WARM_UP", 1)
     monkeypatch.setattr(frame, "batch_rate", partial(frame.batch_rate, seconds=0.01))
     words = ["bench", "frame", "--anatomy", str(put(theatre_of(box), tmp_path / "box.vtu")), "--device", "cpu"]
     words += ["--deformer", "linear", "--size", "160x120", "--frames", "2"]

@@ -8,7 +8,7 @@ import pytest
 
 from ar.screen import read_png
 from scenes.bench import scaling
-from scenes.bench.scaling import Row, Trial, measured, panels, rows, template_mesh
+from scenes.bench.scaling import LOADS, Row, Trial, measured, panels, rows, template_mesh
 from scenes.cli import main
 from sim.errors import InputError
 
@@ -23,10 +23,9 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_a_row_is_what_was_solved(folder, monkeypatch):
-    monkeypatch.setattr(scaling, "LOADS", 4)
+def test_a_row_is_what_was_solved(folder):
     row = measured(Trial("p1", "cpu", folder), 2000, 2)
-    assert (row.preconditioner, row.batch, row.loads, row.converged) == ("sparse factor", 2, 4, 4)
+    assert (row.preconditioner, row.batch, row.loads, row.converged) == ("sparse factor", 2, LOADS, LOADS)
     assert 1900 < row.nodes < 2100 and row.tets > 4 * row.nodes
     assert row.set_up > 0.0 and row.load > 0.0 and row.outer >= 1
     assert 0.05 < row.memory < 20.0 and row.card == 0.0

@@ -13,10 +13,10 @@ from plain_english import too_long
 from theatres import put, theatre_of
 
 from ar.screen import read_png, signature
-from scenes.cli import COMMANDS, _with_points, main, make_parsers
+from scenes.cli import COMMANDS, main, make_parsers, with_points
 from scenes.commands.guidance import EXAMPLES, NAMES, PLAYING
 from scenes.commands.placement_options import opened
-from scenes.commands.train import _warnings
+from scenes.commands.train import notes_on
 from scenes.play.reference import truth_of
 from scenes.script.scene import SCENES
 from sim.bodies.label_volume import volume_subject
@@ -73,15 +73,15 @@ def test_scenes_are_those_that_there_are():
 
 
 def test_a_point_may_begin_with_a_minus():
-    assert _with_points(["--opening-at", "-3,4.5,-6", "--nodes", "-3"]) == ["--opening-at=-3,4.5,-6", "--nodes", "-3"]
-    assert _with_points(["--out", "-x", "-1,2,3"]) == ["--out", "-x", "-1,2,3"]
+    assert with_points(["--opening-at", "-3,4.5,-6", "--nodes", "-3"]) == ["--opening-at=-3,4.5,-6", "--nodes", "-3"]
+    assert with_points(["--out", "-x", "-1,2,3"]) == ["--out", "-x", "-1,2,3"]
 
 
 def test_training_says_what_takes_long_and_what_too_few_loads_cannot_give():
     few, many = (SimpleNamespace(good=np.ones(count, bool)) for count in (20, 76))
-    series, bounds = _warnings(few, ["linear", "series-gp"])
+    series, bounds = notes_on(few, ["linear", "series-gp"])
     assert "minutes on a CPU" in series and "of 20 loads 5 are kept" in bounds and "--count 76" in bounds
-    assert _warnings(many, ["linear"]) == []
+    assert notes_on(many, ["linear"]) == []
 
 
 @pytest.mark.parametrize("learners", ["", "linear,,svr", " "])

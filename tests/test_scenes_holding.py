@@ -7,7 +7,7 @@ from theatres import small, theatre_of
 from visitor import Visitor, free_port, wait_for
 
 from scenes.play.deformers import Theatre
-from scenes.play.page import SCRIPT, Demo
+from scenes.play.page import READING, SCRIPT, Demo
 from scenes.play.page_referee import Referee
 from scenes.play.player import Player
 from scenes.play.tool_holder import holding
@@ -100,10 +100,9 @@ def test_a_load_that_is_refused_is_said_on_the_page_which_goes_on(running, monke
 
 
 def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd):
-    monkeypatch.setattr("scenes.play.page.READING", 0.2)
     refuse(monkeypatch, lambda number, touch: number == 5, IndexError("none such"))
     demo.wish.set(plays=True, number=4)
-    assert demo.run(2.0) > 1
+    assert demo.run(READING + 1.5) > 1
     assert demo.wish.number > 5
     said = capfd.readouterr().err
     assert said.count("\n") == 1 and "sulcus demo: a defect: IndexError, none such (line" in said

@@ -50,8 +50,7 @@ def test_the_tool_presses_where_it_moves(site):
     assert np.median(steps) == pytest.approx(20e-3 / 30.0, rel=0.01)
 
 
-def test_each_frame_starts_from_the_last_and_the_first_do_not_count(site, pretender, monkeypatch):
-    monkeypatch.setattr(live, "WARM_UP", 2)
+def test_each_frame_starts_from_the_last_and_the_first_do_not_count(site, pretender):
     starts = []
 
     class Watched:
@@ -61,7 +60,7 @@ def test_each_frame_starts_from_the_last_and_the_first_do_not_count(site, preten
 
     loads = loads_of(RIDES[0], SCENE, site_of(pretender.anatomy), 3)
     frames = list(frames_of(Watched(), loads))
-    assert [frame.loads for frame in frames] == loads[2:]
+    assert [frame.loads for frame in frames] == loads[WARM_UP:]
     assert starts[0] is None and all(start is not None for start in starts[1:])
     np.testing.assert_array_equal(starts[-1].displacement, frames[-2].answer.displacement)
     assert all(frame.seconds > 0.0 for frame in frames)
@@ -92,14 +91,13 @@ def test_the_tally_counts_what_happened(site, pretender):
 
 
 def test_the_command_tells_every_tool(site, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(live, "WARM_UP", 1)
     write_anatomy(tmp_path / "box.vtu", site.anatomy)
     words = ["bench", "live", "--anatomy", str(tmp_path / "box.vtu"), "--frames", "3", "--checked", "2"]
     assert main([*words, "--device", "cpu", "--json"]) == 0
     rides = json.loads(capsys.readouterr().out)["rides"]
     assert [item["ride"] for item in rides] == [ride.name for ride in RIDES]
     assert all(item["frames"] == 3 and item["checked"] == 2 and item["error"] <= 0.05 for item in rides)
-    monkeypatch.setattr(live, "PROMISED", 1e-12)
+    monkeypatch.setattr(live, "errors", lambda frames, *rest: np.full(len(frames), 1e-3))
     assert main([*words, "--device", "cpu"]) == 1
     assert "| palpation | 3 |" in capsys.readouterr().out
 

@@ -190,7 +190,9 @@ class TestEpisode:
     def test_a_full_disk_is_a_sentence(self, theatre, tmp_path, size, most, monkeypatch):
         """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
         resource = pytest.importorskip("resource")
-        monkeypatch.setattr("scenes.play.episode.PIXEL_BYTES", 0.0)  # as if there had been room at first
+        monkeypatch.setattr(
+            "scenes.play.episode.demand_space", lambda *asked: None
+        )  # as if there had been room at first
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         drawn = []
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))

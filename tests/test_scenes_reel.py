@@ -18,7 +18,7 @@ from scenes.play.page import Demo
 from scenes.play.page_referee import Referee
 from scenes.play.page_requests import HAND, SCRIPT
 from scenes.play.player import Player
-from scenes.play.replay import Reel, Session
+from scenes.play.replay import KEPT, Reel, Session
 from scenes.script.debulking import Debulking
 from scenes.script.head_posture import drained
 from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
@@ -27,7 +27,6 @@ from sim.deformation import Deformation
 from sim.effects import Elasticity, Gravity, Held, Inertia, remember
 from sim.material import Material
 
-FEW = 4
 # Forward, back, round, again, and far.
 ASKED = (0, 1, 5, 4, 12, 0, 7, 7, 3)
 
@@ -38,15 +37,9 @@ def theatre() -> Theatre:
     return Theatre(make_box(cells=(6, 6, 4), spacing=12e-3), None, {}, "cpu")
 
 
-@pytest.fixture(autouse=True)
-def few(monkeypatch):
-    """Thirteen frames are less than is kept."""
-    monkeypatch.setattr("scenes.play.replay.KEPT", FEW)
-
-
 def hasty(name: str, **values: object) -> Scene:
-    """Thirteen frames of a built-in scene, its tool soon 2 mm deep, on few pixels and linear elements."""
-    values = {"path": lay(depth=2e-3, rise=0.2), "duration": 0.4, "element": None} | values
+    """Nineteen frames, more than are kept, of a built-in scene: tool soon 2 mm deep, few pixels, linear elements."""
+    values = {"path": lay(depth=2e-3, rise=0.2), "duration": 0.6, "element": None} | values
     return replace(find_scene(name), viewpoint=Viewpoint(width=64, height=48), **values)
 
 
@@ -98,8 +91,8 @@ class TestReel:
             while reached != number:
                 reached, found = reel.towards(number)
                 assert found == tuple(range(reached + 1)) and reached <= number
-            assert ran.total() - before < (101 if number == 99 else -(-100 // FEW))
-        assert len(ran) == 100 and len(reel._kept) <= FEW
+            assert ran.total() - before < (101 if number == 99 else -(-100 // KEPT))
+        assert len(ran) == 100 and len(reel.kept) <= KEPT
 
     def test_one_call_takes_one_step_at_most(self) -> None:
         ran: list[int] = []
@@ -189,8 +182,8 @@ class TestPages:
         less = straight(theatre.player("fem", without(scene, Gravity())))
         assert not same(full[6], less[6])
         shown: dict[Demo, list] = {page: [] for page in pages}
-        show = Demo._show
-        monkeypatch.setattr(Demo, "_show", lambda page, frame, by: shown[page].append(frame) or show(page, frame, by))
+        show = Demo.show
+        monkeypatch.setattr(Demo, "show", lambda page, frame, by: shown[page].append(frame) or show(page, frame, by))
 
         def seen(page: Demo, **wishes: object) -> Deformation:
             before = len(shown[page])
@@ -204,14 +197,14 @@ class TestPages:
             assert same(seen(first, number=number), full[number])
             assert same(seen(second, number=12 - number, off=frozenset({"Gravity"})), less[12 - number])
         seen(first, touch=Touch(depth=3e-3), tool=HAND)
-        assert same(seen(first, tool=SCRIPT, number=6), full[6])
+        assert same(seen(first, tool=SCRIPT, number=12), full[12])
         assert same(seen(second, number=9, off=frozenset()), full[9])
         shown[first].clear()
         first.wish.set(plays=True)
         while len(shown[first]) < 20:
             first.run(0.1)
         assert all(same(frame.deformation, full[frame.number]) for frame in shown[first])
-        assert [frame.number for frame in shown[first][:9]] == [6, 7, 8, 9, 10, 11, 12, 0, 1]
+        assert [frame.number for frame in shown[first][:9]] == [*range(12, 19), 0, 1]
 
     def test_the_way_is_reported(self, pages, monkeypatch):
         said: list[str] = []

@@ -14,11 +14,9 @@ from studies import TISSUE, nothing, read_back, study_of
 from ar.screen import read_png
 from scenes.bench.process_memory import peak_memory
 from scenes.cli import main
-from scenes.commands import report as command
-from scenes.report import finite_elements
 from scenes.report.adaptation import debulked, debulked_study, simulate_debulked, simulating_seconds
 from scenes.report.artefact_time import series_seconds, tabulate_series
-from scenes.report.finite_elements import HALVED, OWN, Elements
+from scenes.report.finite_elements import HALVED, OWN, Elements, against
 from scenes.report.learner import Learner, counts, measure_learner
 from scenes.report.measure import measured
 from scenes.report.page import Section, write_report
@@ -112,7 +110,7 @@ def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, box, tmp_p
     truth = study.dataset.displacement(nodes)[study.dataset.good]
     path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
     monkeypatch.setattr("scenes.report.learner.counts", lambda most: [])
-    monkeypatch.setattr("scenes.report.learner._covered", lambda *known: {})
+    monkeypatch.setattr("scenes.report.learner.coverage_of", lambda *known: {})
     with one_thread():
         row, field = measure_learner(replace(study, data=path), Learner(name))
     lesson = Pushed(pushed.point[training], pushed.force[training], pushed.footprint[training])
@@ -179,7 +177,7 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     reported = []
     tabulate_series(study, lambda done, total: reported.append((done, total)))
     assert reported and reported[-1][0] == reported[-1][1]
-    monkeypatch.setattr("surrogate.training.shared_inputs.Expansion._fem", None)
+    monkeypatch.setattr("surrogate.training.shared_inputs.Expansion.fem", None)
     tabulate_series(study, lambda done, total: reported.append(None))
     assert None not in reported
     row = measured(replace(study), Learner("series"), tmp_path / "series.png")
@@ -256,12 +254,11 @@ def test_a_damaged_answer_is_named(study):
         path.unlink()
 
 
-def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path, monkeypatch):
+def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path):
     """On a coarse box halving every edge changes the motion by some percent, not by half."""
-    monkeypatch.setattr("scenes.report.reference.REFERENCE", TRAIN)
     one, fine = (replace(study, folder=tmp_path, loads=1, fine=fine) for fine in (False, True))
     for each in (one, fine):
-        solve_reference(each, nothing)
+        solve_reference(each, nothing, TRAIN)
     coarse, finer = reference_of(one).displacement, reference_of(fine).displacement
     off = np.linalg.norm(coarse - finer, axis=2).mean() / np.linalg.norm(finer, axis=2).mean()
     assert 1e-3 < off < 0.3
@@ -286,7 +283,7 @@ def test_what_lies_beyond_is_outside_the_envelope(study):
     size = np.linalg.norm(outside.force, axis=1)
     assert (size[::3] > 1.19 * np.linalg.norm(training.force, axis=1).max()).all()
     assert (study.patch.rim_distance(outside.point[2::3]) < outside.footprint[2::3]).all()
-    assert beyond_of(study).displacement.shape == (12, len(study.anatomy.tumour_nodes), 3)
+    assert beyond_of(study).displacement.shape == (study.beyond, len(study.anatomy.tumour_nodes), 3)
 
 
 def test_plans(study):
@@ -303,13 +300,13 @@ def test_plans(study):
 def test_what_has_the_reference_s_own_elements_is_off_by_its_tolerance_alone(study, fine):
     here = replace(study, fine=fine)
     said = {
-        (element, mesh): finite_elements._against(here, Elements("it", element=element, mesh=mesh))
+        (element, mesh): against(here, Elements("it", element=element, mesh=mesh))
         for element in ("p1", "p2")
         for mesh in (OWN, HALVED)
     }
     alone = ("p2", HALVED if fine else OWN)
     assert said.pop(alone) == TOLERANCE_ALONE and set(said.values()) == {ERROR}
-    assert finite_elements._against(here, Elements("it", "linear", *alone)) == DIFFERENCE
+    assert against(here, Elements("it", "linear", *alone)) == DIFFERENCE
 
 
 def test_what_cannot_be_had_is_a_row_that_says_why(study, tmp_path):
@@ -319,8 +316,8 @@ def test_what_cannot_be_had_is_a_row_that_says_why(study, tmp_path):
 
 def test_the_command_writes_the_page_and_says_when_a_row_is_lacking(study, found, monkeypatch, capsys):
     """Everything is solved already; the rows are those found."""
-    monkeypatch.setattr(command, "QUICK", (100, study.loads, study.beyond))
-    words = ["report", "--quick", "--data", str(study.data), "--out", str(study.folder), "--device", "cpu"]
+    words = ["report", "--quick", "--loads", str(study.loads), "--data", str(study.data), "--out", str(study.folder)]
+    words += ["--device", "cpu"]
     monkeypatch.setattr("scenes.report.rows.rows", lambda study, specs: iter(found))
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)

@@ -23,7 +23,7 @@ def study(tmp_path_factory):
 def test_no_answer_to_a_load_of_the_discs_reaches_a_row(study, tmp_path, name, monkeypatch):
     """Bit for bit, the table of the series made anew: wild answers to the loads of the discs change figures alone."""
     monkeypatch.setattr("scenes.report.learner.counts", lambda most: [])
-    monkeypatch.setattr("scenes.report.learner._covered", lambda *known: {})
+    monkeypatch.setattr("scenes.report.learner.coverage_of", lambda *known: {})
     path, _ = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
     found = []
     for data, folder in ((study.data, "as-it-is"), (path, "wild")):

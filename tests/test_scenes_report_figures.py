@@ -10,7 +10,7 @@ from conftest import make_box
 from studies import read_back
 
 from scenes.cli import main
-from scenes.commands import report as command
+from scenes.commands.report import QUICK
 from scenes.report.page import Section, write_report
 from scenes.report.plots import against_time, front
 from scenes.report.row import Row, figures_of, of_times
@@ -108,13 +108,12 @@ def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
 def test_a_command_without_data_makes_its_own(tmp_path, monkeypatch, capsys):
     """Neo-Hookean, smoothed; what it says goes elsewhere than the line for machines."""
     box = make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
-    monkeypatch.setattr(command, "QUICK", (30, 1, 3))
     monkeypatch.setattr("scenes.report.rows.rows", lambda study, specs: iter([]))
     write_anatomy(tmp_path / "box.vtu", box)
     words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device", "cpu"]
-    assert main([*words, "--json"]) == 0
+    assert main([*words, "--loads", "1", "--json"]) == 0
     (section,) = json.loads(capsys.readouterr().out)["sections"]
-    assert "30 palpation loads" in section["about"][0]
+    assert f"{QUICK[0]} palpation loads" in section["about"][0]
     data = read_dataset(tmp_path / "palpation.h5")
-    assert data.seconds("load", 30) > 0.0
+    assert data.seconds("load", QUICK[0]) > 0.0
     assert data.provenance["element"] == "smoothed" and "neo-hookean" in data.provenance["tissue"]

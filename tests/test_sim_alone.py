@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -102,7 +103,7 @@ def test_a_body_that_is_cut_shared_by_threads() -> None:
 def test_what_an_answer_left_on_the_device_is_its_own_while_others_answer() -> None:
     """Frame after frame, each thread on its own way; what is warm is read after others have moved on."""
     fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), LIVE, "cpu", element="p1")
-    fem._following = fem._follower()
+    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, frames=True))
 
     def work(thread: int) -> list[Deformation]:
         point, force = PLACES[thread], np.array([0.0, 0.05, -0.3])

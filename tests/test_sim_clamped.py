@@ -29,7 +29,7 @@ def pressed(down: float) -> Loads:
 
 def fem_and_elimination() -> tuple[Fem, ClampedElimination]:
     fem = Fem(BODY, EFFECTS, Accuracy(1e-8), "cpu", element="p2")
-    return fem, ClampedElimination(fem.problem, fem._strategy.preconditioner, EFFECTS, fem.space)
+    return fem, ClampedElimination(fem.problem, fem.strategy.preconditioner, EFFECTS, fem.space)
 
 
 def test_finds_the_equilibrium() -> None:

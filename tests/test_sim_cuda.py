@@ -184,7 +184,7 @@ def test_block_jacobi_reaches_what_the_inverse_reaches(box):
     reference = fem.deform(pushes()).displacement
     plain = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8, inner=4000), "cuda", element="p1")
     plan = replace(plain.plan, many=None)
-    plain._strategy = replace(plain._strategy, preconditioner=BlockJacobi(plain.problem.device), plan=plan)
+    plain.strategy = replace(plain.strategy, preconditioner=BlockJacobi(plain.problem.device), plan=plan)
     np.testing.assert_allclose(plain.deform(pushes()).displacement, reference, atol=1e-6 * np.abs(reference).max())
 
 
@@ -194,9 +194,9 @@ def test_a_near_part_is_solved_by_itself_and_the_batch_ends_where_the_whole_does
     effects, loads = (Elasticity(), Held(), Slide(), ToolForce()), draw("mixed", anatomy, 150, 3)
     fem = Fem(anatomy, effects, TRAIN, "cuda", element="p1")
     found = fem.deform(loads)
-    assert fem._strategy.near() is not None and all(outcome.good for outcome in found.outcome)
+    assert fem.strategy.near() is not None and all(outcome.good for outcome in found.outcome)
     assert (fem.residual(loads, found) <= 1.5 * TRAIN.tolerance).all()
-    fem._strategy = replace(fem._strategy, plan=replace(fem.plan, many=None))
+    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, many=None))
     plain = fem.deform(loads)
     assert np.median(found.iterations) < 0.7 * np.median(plain.iterations)
     largest = np.abs(plain.displacement).max(axis=(1, 2), keepdims=True)

@@ -116,7 +116,7 @@ def test_the_ladder_takes_it_for_batches_and_passes_on_what_it_leaves() -> None:
     assert near is not None
     for cycles in (12, 3):
         some = replace(near, limits=Limits(cycles=cycles))
-        fem._strategy = replace(fem._strategy, near=lambda some=some: some)
+        fem.strategy = replace(fem.strategy, near=lambda some=some: some)
         found = fem.deform(loads_of(many))
         assert all(outcome.good for outcome in found.outcome)
         assert (found.iterations != plain.iterations).any()

@@ -17,7 +17,7 @@ from sim.fem import Fem
 from sim.loads import Loads, push, stacked
 from sim.minimisers.lbfgs import LEARNT
 from sim.strategy import frame_sequence
-from sim.strategy.captured_frame import FRAME_EVALUATIONS
+from sim.strategy.captured_frame import FRAME_EVALUATIONS, Frame
 from sim.strategy.frame_sequence import Kept
 from sim.strategy.plan import can_follow
 
@@ -28,8 +28,8 @@ EFFECTS = (Elasticity(), Held(), ToolForce())
 def follower(accuracy: Accuracy = LIVE) -> Fem:
     """On the CPU, which by itself would not follow."""
     fem = Fem(BODY, EFFECTS, accuracy, "cpu", element="p1")
-    assert fem._following is None
-    fem._following = fem._follower()
+    assert not fem.plan.frames
+    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, frames=True))
     return fem
 
 
@@ -151,16 +151,17 @@ def test_a_body_of_another_element_or_a_small_budget_is_not_followed():
     assert not can_follow(linear, replace(LIVE, outer=5)) and not can_follow(quadratic, LIVE)
 
 
-def test_a_start_that_cannot_be_taken_leaves_no_state_behind(fem):
-    answers = ride(fem, 3)
-    expected = fem.deform(pushed(1.4e-3), replace(answers[1]))
-    last = fem.deform(pushed(1.4e-3), answers[1])
-    original = fem._following._frame.take
-    fem._following._frame.take = None
-    try:
-        with pytest.raises(TypeError):
-            fem.deform(pushed(2.1e-3), replace(answers[0]))
-    finally:
-        fem._following._frame.take = original
-    assert fem._following._last() is None
-    np.testing.assert_array_equal(last.displacement, expected.displacement)
+def test_a_start_that_cannot_be_taken_leaves_no_state_behind(fem, monkeypatch):
+    first, middle, last = ride(fem, 3)
+    expected, here = fem.deform(pushed(2.1e-3), last), fem.deform(pushed(1.4e-3), middle)
+    take = Frame.take
+
+    def interrupted(frame, u, past, learnt):
+        take(frame, u, past, learnt)
+        raise MemoryError
+
+    with monkeypatch.context() as patch, pytest.raises(MemoryError):
+        patch.setattr(Frame, "take", interrupted)
+        fem.deform(pushed(2.1e-3), replace(first))
+    np.testing.assert_array_equal(here.displacement, last.displacement)
+    assert same(fem.deform(pushed(2.1e-3), here), expected)

@@ -115,7 +115,7 @@ def test_history_travels_through_the_deformer() -> None:
     """Spring that creeps: with each call the body sinks further, as the same steps one by one in a batch of its own."""
     fem = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TIGHT, "cpu", batch=2, element="p1")
     terms = (*fem.problem.terms, Spring(fem.problem.device, ROWS, 40.0))
-    fem._strategy = replace(fem._strategy, problem=Problem(terms, fem.problem.constraint, fem.problem.device))
+    fem.strategy = replace(fem.strategy, problem=Problem(terms, fem.problem.constraint, fem.problem.device))
     total = np.array([[0.0, 0.0, -0.1], [0.05, 0.0, 0.02], [0.0, 0.0, -0.3]])
 
     def walk(rows: np.ndarray) -> list[np.ndarray]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from openings import FINE, TOTAL, begun, descent_of
+from openings import EFFECTS, FINE, OPENING, TOTAL, begun, descent_of
+from oracle import tissue
 
 from scenes.script.shipped_files import template_path
 from sim.accuracy import TRAIN
@@ -13,6 +14,9 @@ from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Outcome
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.fem import Fem
+from sim.linalg.multifrontal import Factor
+from sim.linalg.preconditioner import rest_solver
+from sim.local_solvers.patch import patch_of
 from sim.local_solvers.patch_elimination import NODES, PatchSize, patch_elimination
 from sim.minimisers.lbfgs_kernels import DONE
 from surrogate.data.tool_loads import draw
@@ -50,17 +54,17 @@ def test_the_next_frame_begins_with_the_patch_of_the_last() -> None:
 def test_a_patch_is_in_equilibrium_beside_a_body_at_rest() -> None:
     law = "stable-neo-hookean"
     problem, space = begun(law, total=TOTAL[3:4])
-    descent = descent_of(patch_elimination, problem, space, law)
-    patch, reach = descent._patch(np.unique(descent._table[:80]))
-    inner = reach[:, np.isin(descent._nodes, patch.nodes).repeat(3)]
-    pull = problem.device.zeros(problem.rows, 1)
-    pull.numpy()[patch.rows[-3:], 0] = [0.01, 0.0, -0.03]
-    e = reach @ pull.numpy()[descent._rows, 0]
+    chosen = OPENING[space.table].any(axis=1)
+    nodes, factor = np.unique(space.table[chosen]), rest_solver(problem)
+    assert isinstance(factor, Factor)
+    inner = factor.compliance((3 * nodes[:, None] + np.arange(3)).ravel())
+    patch = patch_of((Elasticity(tissue(law)), *EFFECTS), space, problem, chosen, inner)
+    e = inner @ np.where(OPENING[nodes, None], TOTAL[1] / OPENING.sum(), 0.0).ravel()
     share, force = patch.settled(np.zeros_like(e), e, 1e-10)
     assert share == 1.0 and np.abs(force).max() > 1e-4
     x = e + inner @ force
-    taken = -patch._excess(np.zeros_like(e), x)  # nothing is strained yet
-    np.testing.assert_allclose(patch._free(force), patch._free(taken), atol=1e-6 * np.abs(force).max())
+    taken = -patch.excess(np.zeros_like(e), x)  # nothing is strained yet
+    np.testing.assert_allclose(patch.free(force), patch.free(taken), atol=1e-6 * np.abs(force).max())
 
 
 def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest() -> None:
@@ -68,6 +72,6 @@ def test_on_a_fine_mesh_patches_are_made_of_what_is_nearest() -> None:
     problem, space = begun(law, total=TOTAL[1:2])
     whole = descent_of(patch_elimination, problem, space, law)
     part = descent_of(partial(patch_elimination, size=PatchSize(near=60)), problem, space, law)
-    assert len(part._nodes) < 0.8 * len(whole._nodes) and np.isin(part._nodes, whole._nodes).all()
+    assert len(part.nodes) < 0.8 * len(whole.nodes) and np.isin(part.nodes, whole.nodes).all()
     found = part.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 100)
     assert found.status[0] == DONE and found.residual[0] <= FINE

@@ -128,7 +128,7 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
         original = kind.descend
 
         def descend(self, start, tolerance, most, *rest, **named):
-            if kind is Lbfgs and self is not fem._strategy._lbfgs:  # that of a part
+            if kind is Lbfgs and self is not fem.strategy.lbfgs:  # that of a part
                 return original(self, start, tolerance, most, *rest, **named)
             assert most == left[-1]
             tried.append(kinds[kind])

@@ -59,7 +59,7 @@ def solver(accuracy: Accuracy) -> Fem:
 def parts() -> tuple[Fem, ContactDescent]:
     """A solver, and its descent."""
     fem = solver(Accuracy(1e-6))
-    found = fem._strategy._proximal
+    found = fem.strategy.contact
     assert found is not None
     return fem, found
 
@@ -135,7 +135,7 @@ def test_columns_are_what_the_preconditioner_does() -> None:
 
 def test_columns_are_the_same_bits_in_whatever_order_they_are_made() -> None:
     fem, descent = parts()
-    nodes, preconditioner = descent.barrier.touchable, fem._strategy.preconditioner
+    nodes, preconditioner = descent.barrier.touchable, fem.strategy.preconditioner
     assert len(nodes) > 3 * Columns().block
     one, other = (Compliance(fem.problem, preconditioner, nodes) for _ in range(2))
     every = np.ones(len(nodes), bool)
@@ -168,7 +168,7 @@ def test_the_reduced_barrier_is_the_whole_one(definite: bool) -> None:
 def test_what_is_touched_is_known_to_the_preconditioner() -> None:
     """It is the inverse of the rest stiffness and the barrier's curvature: that times it is what it was given."""
     fem, descent = parts()
-    problem, preconditioner = fem.problem, fem._strategy.preconditioner
+    problem, preconditioner = fem.problem, fem.strategy.preconditioner
     problem.begin(Cases(touching(DOWN), np.zeros(1)))
     problem.linearise(problem.device.zeros(problem.rows, 1), np.ones(1, bool))
     touched = ContactPreconditioner(preconditioner, descent.compliance, descent.barrier)
@@ -217,7 +217,7 @@ def test_forces_are_those_of_tools_where_nodes_go_under_them(drag: float, rough:
     A preconditioner in half precision rounds each of C's columns by itself.
     """
     fem, descent = parts()
-    whole, n, random = fem._strategy.preconditioner, len(descent.barrier.touchable), np.random.default_rng(5)
+    whole, n, random = fem.strategy.preconditioner, len(descent.barrier.touchable), np.random.default_rng(5)
 
     class Rough:
         def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:

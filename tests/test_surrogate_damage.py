@@ -180,11 +180,13 @@ class TestFinished:
             read_dataset(path)
         assert str(caught.value).startswith(str(path))
 
-    def test_no_array_is_larger_than_the_limit(self, whole, monkeypatch):
+    def test_no_array_is_larger_than_the_limit(self, whole):
         """Not one whose length the file alone decides."""
-        monkeypatch.setattr("surrogate.data.dataset.LARGEST_ARRAY", 10_000)
-        with pytest.raises(InputError, match=r"`anatomy/nodes` declares more than such a file holds"):
-            read_dataset(whole)
+        with h5py.File(whole) as file:
+            shape = stored(file, "anatomy/nodes", "f").shape
+            assert stored(file, "anatomy/nodes", "f", shape, 10_000).nbytes > 10_000
+            with pytest.raises(InputError, match=r"`anatomy/nodes` declares more than such a file holds"):
+                stored(file, "anatomy/nodes", "f", None, 10_000)
 
     def test_a_ball_has_a_radius(self, whole):
         data = read_dataset(whole)

@@ -227,20 +227,14 @@ def test_bad_model_files_are_sentences(box, tmp_path):
         load(tmp_path / "old.npz", box)
 
 
-def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("surrogate.model.npz_archive.LARGEST_MODEL", 1000)
+def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path):
     np.savez_compressed(tmp_path / "m.npz", few=np.zeros(10), many=np.zeros(1000))
     with (tmp_path / "m.npz").open("rb") as raw:
-        archive = Archive(raw)
-        assert len(archive.arrays(["few"])["few"]) == 10
-        with pytest.raises(InputError, match="MB are the most"):
-            archive.arrays(["few", "many"])
-        monkeypatch.setattr(
-            "surrogate.model.npz_archive.LARGEST_MODEL", 8_200
-        )  # more than each, less than both with their heads
-        assert len(archive.arrays(["many"])["many"]) == 1000
-        with pytest.raises(InputError, match="MB are the most"):
-            archive.arrays(["few", "many"])
+        for most, name, count in ((1000, "few", 10), (8200, "many", 1000)):  # less than both with their heads
+            archive = Archive(raw, most)
+            assert len(archive.arrays([name])[name]) == count
+            with pytest.raises(InputError, match="MB are the most"):
+                archive.arrays(["few", "many"])
 
 
 def test_an_array_of_more_bytes_than_its_member_is_refused_before_memory_is_taken(tmp_path):

@@ -19,6 +19,7 @@ from sim.errors import InputError
 from sim.loads import Loads, Pushed, Touching
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
+from surrogate.data.disc_split import APART
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.data.tool_poses import draw_poses
@@ -29,7 +30,7 @@ from surrogate.model.store import load, save
 from surrogate.model.tip_distance import TipModel
 from surrogate.model.training_range import measured
 from surrogate.training.tip_distance import CLASS, Measured, calibrated_distance, distance_errors
-from surrogate.training.train import train
+from surrogate.training.train import ENOUGH_APART, train
 
 
 @pytest.fixture(scope="module")
@@ -174,8 +175,11 @@ def test_how_its_bound_holds_in_the_discs_left_out_is_reported_of_a_model_that_k
     assert found.loads == len(discs) and found.held == pytest.approx(held.mean(axis=1))
 
 
-def test_where_many_loads_calibrate_one_in_three_tells_the_scale(data, monkeypatch):
-    monkeypatch.setattr("surrogate.training.train.ENOUGH_APART", 200)
+@pytest.mark.parametrize("count", [800, APART * ENOUGH_APART])
+def test_where_many_loads_calibrate_one_in_three_tells_the_scale(pretender, tmp_path, count):
+    """Of few loads the errors on the discs tell it."""
+    simulate(tmp_path / "data.h5", pretender, draw("palpation", pretender.anatomy, count, 0), {"preset": "palpation"})
+    data = read_dataset(tmp_path / "data.h5")
     trained = train(data, ["linear"])
     model, good = trained.models["linear"], data.loads.rows(np.flatnonzero(data.good))
     truth = data.displacement(data.anatomy.tumour_nodes)[data.good]
@@ -190,11 +194,8 @@ def test_where_many_loads_calibrate_one_in_three_tells_the_scale(data, monkeypat
     apart = np.arange(len(good))[-trained.calibrated :]
     features, _, error = rows_of(apart[::3])
     bounds = fitted_bound((features, error.max(axis=1)), *rows_of(np.delete(apart, np.s_[::3])))
-    assert model.bounds.weights == pytest.approx(bounds.weights) and model.bounds.quantile == pytest.approx(
-        bounds.quantile
-    )
-    monkeypatch.undo()  # of few loads the errors on the discs tell it
-    assert not np.allclose(train(data, ["linear"]).models["linear"].bounds.weights, bounds.weights)
+    pairs = ((model.bounds.weights, bounds.weights), (model.bounds.quantile, bounds.quantile))
+    assert [np.allclose(*pair) for pair in pairs] == 2 * [trained.calibrated >= ENOUGH_APART] == 2 * [count > 800]
 
 
 def test_the_correction_brings_distances_nearer(model, fresh):

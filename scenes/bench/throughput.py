@@ -162,7 +162,11 @@ def together(found: Sequence[Row]) -> list[Together]:
 
 
 def _double(fem: Fem, judge: Fem, loads: Loads) -> np.ndarray:
-    """The residuals in double precision (k,) of one load in a hundred, evenly picked, solved for every vertex."""
-    count = min(len(loads), max(LEAST_CHECKED, -(-len(loads) // CHECKED)))
-    chosen = loads.rows(np.linspace(0, len(loads) - 1, count).astype(int))
+    """The residuals in double precision (k,) of `checked` loads, solved for every vertex."""
+    chosen = loads.rows(checked(len(loads)))
     return judge.residual(chosen, fem.deform(chosen))
+
+
+def checked(count: int) -> np.ndarray:
+    """Which (k,) of so many loads are checked: one in a hundred, evenly picked."""
+    return np.linspace(0, count - 1, min(count, max(LEAST_CHECKED, -(-count // CHECKED)))).astype(int)

@@ -15,6 +15,7 @@ from .outputs import add_force, claimed, claimed_folder
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
     parser.add_argument(
         "--out", type=Path, help="draw and time each scene: folder for SCENE.png, and for all in sheet.png"
     )
@@ -34,17 +35,17 @@ def run(args: argparse.Namespace) -> int:
     from ..play.deformers import open_theatre
     from ..script.scene import SCENES, find_scene
 
+    scenes = {scene.name: scene for scene in map(find_scene, args.scenes or SCENES)}
     if args.out is not None:
         claimed_folder(args.out, "pictures")
-        for name in (*SCENES, "sheet"):
+        for name in (*scenes, "sheet"):
             claimed(args.out / f"{name}.png", ".png", "a picture of sulcus", args.force)
     theatre = open_theatre(args.anatomy, device=args.device)
     lines = sys.stderr if args.json else sys.stdout
     rows, pictures = [], []
-    drawing = tqdm(total=len(SCENES), unit="scene", leave=False, disable=args.out is None, file=sys.stderr)
+    drawing = tqdm(total=len(scenes), unit="scene", leave=False, disable=args.out is None, file=sys.stderr)
     with drawing as bar:
-        for name in SCENES:
-            scene = find_scene(name)
+        for name, scene in scenes.items():
             names = [type(effect).__name__ for effect in scene.effects_on(theatre.anatomy)]
             known = {"scene": name, "title": scene.title, "effects": names, "deformers": list(theatre.names(scene))}
             players = ", ".join(theatre.names(scene))
@@ -63,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         try:
             args.out.mkdir(parents=True, exist_ok=True)
-            for name, picture in zip(SCENES, pictures, strict=True):
+            for name, picture in zip(scenes, pictures, strict=True):
                 write_png(args.out / f"{name}.png", picture)
             write_png(args.out / "sheet.png", sheet(pictures))
         except OSError as error:

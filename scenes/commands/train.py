@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     with stage("read the data"):
         data = read_dataset(args.data)
     learners = asked or list(learners_for(data))
-    for note in _warnings(data, learners):
+    for note in notes_on(data, learners):
         print(f"sulcus train: {note}", file=sys.stderr)
     with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
         expansion = Expansion(
@@ -74,7 +74,7 @@ def asked_learners(words: str) -> list[str]:
     return names
 
 
-def _warnings(data: Dataset, learners: Sequence[str]) -> list[str]:
+def notes_on(data: Dataset, learners: Sequence[str]) -> list[str]:
     """What takes long, and what too few loads cannot give, in sentences."""
     notes, good = [], int(data.good.sum())
     expanded = [name for name in learners if name in EXPANDED]

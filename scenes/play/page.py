@@ -125,7 +125,7 @@ class Demo:
             if self.wish.scene != self.stage.scene.name:
                 self._change(self.wish.scene)
                 now = Moment()
-            new = self._answer(now)
+            new = self.answer(now)
             self.browser.plays(self.wish.plays)
             if new is None:
                 continue
@@ -180,7 +180,7 @@ class Demo:
         self.dismissed.append(self.referee)
         self.referee = Referee(self.theatre, scene)
 
-    def _answer(self, now: Moment) -> int | None:
+    def answer(self, now: Moment) -> int | None:
         """Bring the page nearer to what is wished: 1 where a frame was drawn, 0 where all is shown, None on the way."""
         begun, scene, style = clock.perf_counter(), self.stage.scene, self.wish.style
         number, name, touch, off = asked = self.asked = self.wish.now()
@@ -210,7 +210,7 @@ class Demo:
         if not off:
             self.tally.took(name, now.load, answer.cost.total)
         now.picture = pictured(frame)
-        self._show(frame, player)
+        self.show(frame, player)
         return 1
 
     def _work(self, number: int, name: str, touch: Touch | None) -> str:
@@ -344,7 +344,8 @@ class Demo:
         eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
         return Viewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
 
-    def _show(self, frame: Frame, player: Player) -> None:
+    def show(self, frame: Frame, player: Player) -> None:
+        """Put the bodies of the 3-D view where a frame has them."""
         positions = player.positions(frame.deformation)
         stage = self.stage.at(frame.loads)
         for layer in (stage.cortex(positions), stage.tumour(positions)):

@@ -30,18 +30,19 @@ class Reel(Generic[T]):
 
     def __init__(self, frames: int, step: Callable[[int, T | None], T]) -> None:
         self._every, self._step = -(-frames // KEPT), step
-        self._kept: dict[int, T] = {}
+        self.kept: dict[int, T] = {}
+        """Frames that are not run again, by number."""
         self._last: dict[int, T] = {}
 
     def towards(self, number: int) -> tuple[int, T]:
         """The frame, or one nearer to it, and its number: a call takes one step at most."""
-        known = self._kept | self._last
+        known = self.kept | self._last
         nearest = max((other for other in known if other <= number), default=-1)
         if nearest < number:
             before, nearest = known.get(nearest), nearest + 1
             known = {nearest: self._step(nearest, before)}
             if nearest % self._every == 0:
-                self._kept |= known
+                self.kept |= known
         self._last = {nearest: known[nearest]}
         return nearest, known[nearest]
 

@@ -74,7 +74,7 @@ def measure_elements(study: Study, spec: Elements) -> tuple[Row, np.ndarray]:
     row = Row(
         spec.name,
         "finite elements",
-        against=_against(study, spec),
+        against=against(study, spec),
         reference=against_reference(study, field, np.array(good), own.tumour_nodes),
         failed=good.count(False),
         set_up=set_up,
@@ -97,7 +97,7 @@ def _fem(study: Study, spec: Elements, body: Anatomy) -> Fem:
     return Fem(body, effects, spec.accuracy, study.device, None, spec.element or study.element, live=True)
 
 
-def _against(study: Study, spec: Elements) -> str:
+def against(study: Study, spec: Elements) -> str:
     """What the distance from the reference is."""
     if tissue_of(study.tissue, spec.law) != study.tissue:
         return DIFFERENCE

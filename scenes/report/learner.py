@@ -72,7 +72,7 @@ def measure_learner(study: Study, spec: Learner) -> tuple[Row, np.ndarray]:
         "beyond": _held(model, outside, beyond.displacement[beyond.good][:, known], nodes),
     }
     field = model.deform(study.played, at=nodes).displacement
-    covered = _covered(study, spec, outside, beyond.displacement[beyond.good])
+    covered = coverage_of(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _adapted(study, spec)
     held_out = study.converged.rows(np.flatnonzero(discs.test))
     bare = bare_microseconds(model, held_out)
@@ -103,7 +103,7 @@ def counts(most: int) -> list[int]:
     return [FEWEST_LOADS << k for k in range(20) if FEWEST_LOADS << k < most]
 
 
-def _covered(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) -> dict[str, float]:
+def coverage_of(study: Study, spec: Learner, outside: Loads, truth: np.ndarray) -> dict[str, float]:
     """How often bounds at 0.95 hold where nothing is promised; `truth` (B, n, 3) [m] of the loads `outside`."""
     if spec.name in MACHINES:
         return {}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.accuracy import REFERENCE, TRAIN
+from sim.accuracy import REFERENCE, TRAIN, Accuracy
 from sim.bodies.refine import refined
 from sim.effects import pushed_effects
 from sim.fem import Fem
@@ -32,15 +32,15 @@ class Truth:
     seconds: np.ndarray
 
 
-def solve_reference(study: Study, progress: Callable[[int], object]) -> None:
-    """Solve the played loads with quadratic tetrahedra to 1e-8 in double precision, and keep each at `study.drawn`.
+def solve_reference(study: Study, progress: Callable[[int], object], accuracy: Accuracy = REFERENCE) -> None:
+    """Solve the played loads with quadratic tetrahedra, and keep each at `study.drawn`.
 
     `progress` is given how many more are done. What is kept already is not solved again.
     """
 
     def made() -> tuple[Fem, Located]:
         body = refined(study.anatomy) if study.fine else study.anatomy
-        fem = Fem(body, pushed_effects(body, study.tissue), REFERENCE, study.device, None, "p2")
+        fem = Fem(body, pushed_effects(body, study.tissue), accuracy, study.device, None, "p2")
         return fem, locate(body.mesh, study.anatomy.mesh.nodes[study.drawn])
 
     _solve(study, "reference", study.played, made, progress)

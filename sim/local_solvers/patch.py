@@ -73,8 +73,8 @@ class Patch:
         forces = changes = np.zeros((0, len(e)), e.dtype)  # C^-1 s of the pairs' steps s, and C^-1 w of their w = C y
         share = self._longest(u, e)
         x, beside, tried = share * e, np.zeros_like(e), 1  # beside: C^-1 (x - s e)
-        start = self._excess(u, beside)
-        g = self._free(self._excess(u, x) - start)
+        start = self.excess(u, beside)
+        g = self.free(self.excess(u, x) - start)
         z = self._answered(g)
         while tried < limits.evaluations and np.linalg.norm(g) > force:
             weights = pairs.weights(g)
@@ -88,7 +88,7 @@ class Patch:
             for _ in range(limits.cuts):
                 tried += 1
                 moved = x + t * d
-                new = self._free(beside + t * pull + self._excess(u, moved) - start)
+                new = self.free(beside + t * pull + self.excess(u, moved) - start)
                 slope = float(new @ d)
                 if not goes_too_far(slope, promised):
                     break
@@ -109,7 +109,7 @@ class Patch:
         """C force (m,) [m], of a force (m,) [N]."""
         return self._product(1.0, self._compliance.T, force).astype(force.dtype)
 
-    def _excess(self, u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def excess(self, u: np.ndarray, x: np.ndarray) -> np.ndarray:
         """n(u + x) - K x (m,)."""
         np.add(u, x, out=self._place_host)
         np.negative(x, out=self._way_host)
@@ -124,7 +124,7 @@ class Patch:
         self._place_host[:], self._way_host[:] = u, d
         return float(self._part.longest_step(self._place, self._way)[0])
 
-    def _free(self, g: np.ndarray) -> np.ndarray:
+    def free(self, g: np.ndarray) -> np.ndarray:
         """The gradient (m,) along motions that the constraints leave free."""
         if not self._bound:
             return g

@@ -81,8 +81,9 @@ class PatchElimination:
         self._problem, self._factor, self._effects, self._space = problem, factor, tuple(effects), space
         self._limits, self._size = limits, size
         self._near, self._table = np.flatnonzero(near), space.table[near]
-        self._nodes = np.unique(self._table)
-        self._rows = (3 * self._nodes[:, None] + np.arange(3)).ravel()
+        self.nodes = np.unique(self._table)
+        """Those (n,) that a patch may be made of, ascending."""
+        self._rows = (3 * self.nodes[:, None] + np.arange(3)).ravel()
         self._last: tuple[np.ndarray, Patch, np.ndarray] | None = None
         self._compliance = factor.compliance(self._rows)
         # A patch's rows of it, and its own columns of these: the last patch stands there.
@@ -158,7 +159,7 @@ class PatchElimination:
     def _known(self, learnt: Mapping[str, np.ndarray] | None) -> np.ndarray | None:
         """The nodes of a patch that served before, if that was here."""
         nodes = (learnt or {}).get(NODES)
-        if nodes is None or nodes.shape[1] > self._size.largest or not np.isin(nodes, self._nodes).all():
+        if nodes is None or nodes.shape[1] > self._size.largest or not np.isin(nodes, self.nodes).all():
             return None
         return nodes[0]
 
@@ -167,7 +168,7 @@ class PatchElimination:
         if self._last is None or not np.array_equal(self._last[0], nodes):
             chosen = np.zeros(len(self._space.table), bool)
             chosen[self._near] = np.isin(self._table, nodes).all(axis=1)
-            place = np.searchsorted(self._nodes, np.unique(self._space.table[chosen]))
+            place = np.searchsorted(self.nodes, np.unique(self._space.table[chosen]))
             rows = (3 * place[:, None] + np.arange(3)).ravel()
             self._last = None
             reach, own = self._room[0][: len(rows)], self._room[1][: len(rows) ** 2].reshape(len(rows), len(rows))

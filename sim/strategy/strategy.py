@@ -101,11 +101,13 @@ class Strategy:
     gaps: Gaps = GAPS
 
     @cached_property
-    def _lbfgs(self) -> Lbfgs:
+    def lbfgs(self) -> Lbfgs:
+        """L-BFGS on the whole body, with what it keeps from batch to batch."""
         return Lbfgs(self.problem, self.preconditioner)
 
     @cached_property
-    def _proximal(self) -> ContactDescent | None:
+    def contact(self) -> ContactDescent | None:
+        """What solves the nodes that tools touch apart from the tissue; None where the plan does not."""
         if self.plan.contact is not Step.CONTACT:
             return None
         (barrier,) = self.problem.barriers
@@ -120,17 +122,15 @@ class Strategy:
     @cached_property
     def _touched(self) -> Preconditioner:
         """The preconditioner that knows contact: on CUDA half precision is rougher than contact is stiff."""
-        touch = None if self.problem.device.on_cuda else self._proximal
-        return (
-            ContactPreconditioner(self.preconditioner, touch.compliance, touch.barrier)
-            if touch
-            else self.preconditioner
-        )
+        touch = None if self.problem.device.on_cuda else self.contact
+        if touch is None:
+            return self.preconditioner
+        return ContactPreconditioner(self.preconditioner, touch.compliance, touch.barrier)
 
     @property
     def held(self) -> int:
         """Bytes that L-BFGS keeps for the next batch to stand in."""
-        return self._lbfgs.held
+        return self.lbfgs.held
 
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> Answer:
         """The equilibria of B cases, each from the first of its guesses (3N, B) [m] that will do; from rest without.
@@ -220,11 +220,11 @@ class Strategy:
             learnt = None
         if Step.LBFGS not in self.plan.steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
-        descents: list[tuple[LocalSolver | Lbfgs, Mapping[str, np.ndarray] | None]] = [(self._lbfgs, learnt)]
+        descents: list[tuple[LocalSolver | Lbfgs, Mapping[str, np.ndarray] | None]] = [(self.lbfgs, learnt)]
         near = self.local(count)
         if near is not None:
             patch = {NODES: cases.warm[NODES]} if NODES in cases.warm else {}
-            descents = [(near, patch), (self._lbfgs, None)]
+            descents = [(near, patch), (self.lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
         answer = Answer(
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
@@ -252,7 +252,7 @@ class Strategy:
 
         On the CPU Newton has them one by one: the preconditioner of a single one knows what it touches.
         """
-        problem, touch, device = self.problem, self._proximal, self.problem.device
+        problem, touch, device = self.problem, self.contact, self.problem.device
         problem.begin(cases)
         if touch is None or problem.constraint.imposes or problem.gap(start)[1].any():
             return self._closed(cases, start, outer, gaps)

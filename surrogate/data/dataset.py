@@ -328,8 +328,16 @@ def read_outcomes(file: h5py.File, group: str) -> tuple[Outcome, ...]:
     return tuple(Outcome[name.decode()] for name in stored(file, f"{group}/outcome", "S")[:])
 
 
-def stored(file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...] | None = None) -> h5py.Dataset:
+def stored(
+    file: h5py.File,
+    name: str,
+    kinds: str,
+    shape: tuple[int | None, ...] | None = None,
+    largest: int = LARGEST_ARRAY,
+) -> h5py.Dataset:
     """An array in the file, of one of the NumPy `kinds`, and of a shape where it is given (None: any length).
+
+    Without a shape the file alone decides how long it is: then it has at most the `largest` bytes.
 
     Raises
     ------
@@ -354,6 +362,6 @@ def stored(file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...]
         measured = " x ".join(map(str, found.shape))
         raise InputError(f"{file.filename}: `{name}` measures {measured}, not {want}: it is damaged. {REMEDY}")
     most = INFLATION * max(Path(file.filename).stat().st_size, 4096)  # a file that is being written has no size yet
-    if found.nbytes > most or (shape is None and found.nbytes > LARGEST_ARRAY):
+    if found.nbytes > most or (shape is None and found.nbytes > largest):
         raise InputError(f"{file.filename}: `{name}` declares more than such a file holds: it is damaged. {REMEDY}")
     return found

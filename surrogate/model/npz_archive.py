@@ -18,10 +18,13 @@ LONGEST = 10_000
 
 
 class Archive:
-    """The arrays of an open `.npz` file; reading the wrong kind of file raises what `zipfile` and NumPy raise."""
+    """The arrays of an open `.npz` file, of at most `largest` bytes together.
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._zip = zipfile.ZipFile(file)
+    Reading the wrong kind of file raises what `zipfile` and NumPy raise.
+    """
+
+    def __init__(self, file: BinaryIO, largest: int = LARGEST_MODEL) -> None:
+        self._zip, self._largest = zipfile.ZipFile(file), largest
 
     def text(self, name: str) -> str:
         """An array of one text.
@@ -43,7 +46,7 @@ class Archive:
             Arrays that are missing, or larger in all than they may be.
         """
         wanted = sorted(set(names))
-        self._demand(wanted, LARGEST_MODEL)
+        self._demand(wanted, self._largest)
         return {name: self._array(name) for name in wanted}
 
     def _demand(self, names: list[str], most: int) -> None:

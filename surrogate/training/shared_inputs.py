@@ -158,7 +158,7 @@ class Expansion:
             Data that do not state what tissue they are of.
         """
         begun = time.perf_counter()
-        contact, bases = condensed(self._fem(), self._known)
+        contact, bases = condensed(self.fem(), self._known)
         return contact, bases, time.perf_counter() - begun
 
     def compliance(self, nodes: np.ndarray, left_out: np.ndarray | None = None) -> Part:
@@ -191,7 +191,7 @@ class Expansion:
                 bases = [Basis(nodes, file[f"modes{k}"]) for k, nodes in enumerate(self._known)]
                 return Tabulated(bases, file["table"], float(file["seconds"]))
         begun = time.perf_counter()
-        bases, table = self._tabulate(self._fem())
+        bases, table = self._tabulate(self.fem())
         found = Tabulated(bases, table, time.perf_counter() - begun)
         if self.kept is not None:
             modes = {f"modes{k}": basis.modes for k, basis in enumerate(bases)}
@@ -235,7 +235,14 @@ class Expansion:
         footprint = only_pushed(self.data.loads).footprint
         return radii_between(float(footprint.min()), float(footprint.max()))
 
-    def _fem(self) -> Fem:
+    def fem(self) -> Fem:
+        """Make the data's finite elements, in double precision.
+
+        Raises
+        ------
+        InputError
+            Data that do not state what tissue they are of.
+        """
         stated = self.data.provenance
         if "tissue" not in stated:
             raise InputError(
