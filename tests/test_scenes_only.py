@@ -35,17 +35,17 @@ def cost(modules: str = "", kernels: str = "", classes: str = "") -> Cost:
 
 TOOLS = cost(
     "contact.barrier contact.enclosure contact.reduced contact.tool_blocks contact.tool_contact contact.tool_functions "
-    "contact.tool_kernels contact.tool_path",
+    "contact.tool_kernels contact.tool_path strain_kernels",
     "contact.enclosure:add_angle contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction "
-    "contact.tool_kernels:clearance",
+    "contact.tool_kernels:clearance strain_kernels:strain",
     "Contact Functions Reduced Touch",
 )
 # A new effect adds one line.
 OF_EFFECT = {
     "Elasticity": cost(
-        "elasticity element_kernels laws.invariants laws.law state_source",
+        "elasticity element_functions element_kernels laws.invariants laws.law state_source",
         "element_kernels:add_gradient",
-        "Elasticity Kernels Law _Part",
+        "Elasticity Functions Kernels Law _Part",
     ),
     "Held": cost(),
     "Bonded": cost(),
@@ -83,6 +83,7 @@ ANY = {f"element_kernels:{name}" for name in ("add_energy", "add_curvature", "ad
     "inertia:add_energy",
     "inertia:add_blocks",
     "contact.tool_kernels:add_matrix",
+    "strain_kernels:stiffen",
     *(
         f"{name}:{kernel}"
         for name in ("contact.tool_kernels", "contact.skull_contact")

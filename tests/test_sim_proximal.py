@@ -64,6 +64,17 @@ def parts() -> tuple[Fem, ContactDescent]:
     return fem, found
 
 
+class Rough:
+    """What a preconditioner does, each number off by up to a share; it makes all columns by itself."""
+
+    def __init__(self, whole: Preconditioner, share: float):
+        self._whole, self._share, self._random = whole, share, np.random.default_rng(5)
+
+    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+        self._whole.apply(r, live, out)
+        out.assign(out.numpy() * (1.0 + self._share * self._random.uniform(-1.0, 1.0, out.shape)))
+
+
 def bfgs(inverse: np.ndarray, steps: np.ndarray, changes: np.ndarray) -> np.ndarray:
     """Nocedal, Wright 2006, equation 6.17, pair after pair."""
     for s, y in zip(steps, changes, strict=True):
@@ -118,8 +129,9 @@ def test_each_column_learns_and_forgets_by_itself() -> None:
 
 def test_columns_are_what_the_preconditioner_does() -> None:
     fem, descent = parts()
-    nodes, rng = descent.barrier.touchable, np.random.default_rng(1)
-    soft = descent.compliance
+    soft, rng = descent.compliance, np.random.default_rng(1)
+    nodes = soft.nodes
+    assert np.array_equal(nodes[: len(descent.barrier.touchable)], descent.barrier.touchable)
     force = np.zeros((len(nodes), 3, 2))
     some = rng.permutation(len(nodes))[:5]
     force[some] = rng.normal(size=(5, 3, 2))
@@ -131,11 +143,12 @@ def test_columns_are_what_the_preconditioner_does() -> None:
     np.testing.assert_allclose(soft.spread(force), expected, atol=1e-6 * size)
     between = soft.between(np.isin(np.arange(len(nodes)), some))
     np.testing.assert_allclose(between @ force, expected[soft.rows], atol=1e-6 * size)
+    np.testing.assert_allclose(soft.moved(force), expected[soft.rows], atol=1e-6 * size)
 
 
 def test_columns_are_the_same_bits_in_whatever_order_they_are_made() -> None:
     fem, descent = parts()
-    nodes, preconditioner = descent.barrier.touchable, fem.strategy.preconditioner
+    nodes, preconditioner = descent.barrier.touchable, cast(Preconditioner, Rough(fem.strategy.preconditioner, 0.0))
     assert len(nodes) > 3 * Columns().block
     one, other = (Compliance(fem.problem, preconditioner, nodes) for _ in range(2))
     every = np.ones(len(nodes), bool)
@@ -151,7 +164,7 @@ def test_the_reduced_barrier_is_the_whole_one(definite: bool) -> None:
     problem.begin(Cases(touching(DOWN), np.zeros(1)))
     rng = np.random.default_rng(2)
     u = 1e-4 * rng.normal(size=(problem.rows, 1))
-    rows, place = descent.compliance.rows, problem.device.array(u)
+    rows, place = descent.compliance.rows[: 3 * len(nodes)], problem.device.array(u)
     expected = problem.device.zeros(problem.rows, 1)
     term.add_gradient(place, expected)
     barrier = term.reduced(np.zeros(1, int))
@@ -217,14 +230,9 @@ def test_forces_are_those_of_tools_where_nodes_go_under_them(drag: float, rough:
     A preconditioner in half precision rounds each of C's columns by itself.
     """
     fem, descent = parts()
-    whole, n, random = fem.strategy.preconditioner, len(descent.barrier.touchable), np.random.default_rng(5)
+    whole, n = fem.strategy.preconditioner, len(descent.barrier.touchable)
 
-    class Rough:
-        def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-            whole.apply(r, live, out)
-            out.assign(out.numpy() * (1.0 + rough * random.uniform(-1.0, 1.0, out.shape)))
-
-    soft = Compliance(fem.problem, cast(Preconditioner, Rough()), descent.barrier.touchable)
+    soft = Compliance(fem.problem, cast(Preconditioner, Rough(whole, rough)), descent.barrier.touchable)
     device = replace(fem.problem.device, precision="float64")
     shallow = (at(0.031, 0.028, HEIGHT - 3e-4), at(0.02, 0.02, HEIGHT - 2e-4), at(0.0, 0.0, 0.2))
     fem.problem.begin(Cases(touching(*shallow), np.zeros(3)))

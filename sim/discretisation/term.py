@@ -182,6 +182,28 @@ class Remembering(Term, Protocol):
         ...
 
 
+@runtime_checkable
+class Strained(Term, Protocol):
+    """A Term of elements, which resist more or less where they are strained; H is the displacement gradient."""
+
+    def elements_on(self, nodes: np.ndarray) -> np.ndarray:
+        """Those elements (k,) that lie wholly on some nodes (N,) bool."""
+        ...
+
+    def raise_strain(self, some: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
+        """Raise out (N, k) to |H| at the nodes of some elements (m,) int32, in some columns (k,) int32 of u (3N, b)."""
+        ...
+
+    def add_stiffening(
+        self, some: wp.array, u: wp.array, columns: wp.array, least: wp.array, place: wp.array, out: wp.array
+    ) -> None:
+        """Add what the curvature at u is more than at rest [N/m], of the same, to out (k, p, p) float64.
+
+        Only where |H| is more than the `least` (k,) of its column. Rows 3 `place` (N, k) of out are a node's first.
+        """
+        ...
+
+
 class Barrier(Term, Protocol):
     """A Term of bodies that tissue touches: they keep a gap, which a descent may open first; some move, as tools do."""
 
@@ -264,6 +286,10 @@ class Local(Barrier, Protocol):
     @property
     def touchable(self) -> np.ndarray:
         """These nodes (n,), ascending."""
+        ...
+
+    def around(self, most: int) -> np.ndarray:
+        """Nodes (k,), so many at most beside the touchable: these first, then the nearest to them."""
         ...
 
     def reduced(self, columns: np.ndarray) -> Reduction | None:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..discretisation.problem import Problem
-from ..runtime.views import like, on_host, placed, view
+from ..runtime.views import doubled, like, on_host, placed, view
+from .multifrontal import Factor
 from .pcg import Preconditioner
 
 
@@ -50,7 +51,7 @@ class Compliance:
         self, problem: Problem, preconditioner: Preconditioner, nodes: np.ndarray, columns: Columns = Columns()
     ):
         device = problem.device
-        self._problem, self._preconditioner = problem, preconditioner
+        self._problem, self._preconditioner, self.nodes = problem, preconditioner, nodes
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
         self._width = 3 * columns.block
         self.columns = view(replace(device, precision="float64").zeros(len(self.rows), len(self.rows)))
@@ -69,12 +70,18 @@ class Compliance:
         return view(out)
 
     def spread(self, force: Any) -> Any:
-        """Motion (3N, b) [m] of all nodes under forces (3n, b) [N] on these n."""
+        """Motion (3N, b) [m] of all nodes under forces (3n, b) [N] on the first n."""
         out = view(self._problem.device.zeros(self._problem.rows, force.shape[1]))
         force = like(out, force)
         for block in self._acting(on_host((force != 0.0).any(1))):
-            out += self._block(block) @ force[self._rows(block)]
+            some = force[self._rows(block)]
+            out += self._block(block)[:, : len(some)] @ some
         return out
+
+    def moved(self, force: Any) -> Any:
+        """Motion (3n, b) [m] of all its nodes under forces (3m, b) [N] on the first m, all of them known."""
+        acting = np.flatnonzero(on_host((force != 0.0).any(1)))
+        return self.columns[acting].T @ doubled(force[acting])
 
     def between(self, acting: np.ndarray) -> Any:
         """H (3n, 3n) [m/N] between these n nodes: at least its columns at those that are `acting` (n,) bool."""
@@ -83,6 +90,9 @@ class Compliance:
 
     def know(self, acting: np.ndarray) -> None:
         """See to it that at least the `columns`, here rows, at `acting` (n,) nodes are `known` (n,)."""
+        missing = acting & ~self.known
+        if missing.any() and isinstance(self._preconditioner, Factor):
+            self.columns[:], self.known[:] = self._preconditioner.compliance(self.rows).T, True
         for block in self._acting(np.repeat(acting & ~self.known, 3)):
             self._block(block)
 
@@ -99,5 +109,6 @@ class Compliance:
         unit = np.zeros((self._problem.rows, self._width))
         unit[self.rows[own], np.arange(len(self.rows[own]))] = 1.0
         whole = self.answered(placed(self._problem.device, unit))[:, : len(self.rows[own])]
-        self.columns[own], self.known[own.start // 3 : own.stop // 3] = whole[self.rows].T, True
+        if not self.known[own.start // 3 : own.stop // 3].all():
+            self.columns[own], self.known[own.start // 3 : own.stop // 3] = whole[self.rows].T, True
         return whole

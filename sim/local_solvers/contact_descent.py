@@ -24,15 +24,18 @@ from ..discretisation.problem import Problem
 from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
+from ..linalg.preconditioner import is_exact
 from ..minimisers.compact_lbfgs import PairsOfColumns
 from ..minimisers.lbfgs import Descended
 from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from ..minimisers.line_search import goes_too_far, kept_of
-from ..minimisers.residual import Judge, judge_of, relative
+from ..minimisers.residual import Judge, judge_of
 from ..runtime.device import Device
-from ..runtime.views import doubled, from_view, in_order, on_host, placed, view
+from ..runtime.views import doubled, from_view, in_order, like, on_host, placed, view
+from .contact_batch import Batch, State
 from .contact_forces import BENT, FORCES, ForceLimits, Softness, scratch_of, settled
 from .contact_structs import Scratch
+from .strained_part import STRAINS, StrainedPart, Strains
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,8 @@ class ContactLimits:
         A step that is cut to less than this is not taken if what was learnt may have misled it.
     least
         A step so short is taken as it is.
+    stale
+        A model of strained tissue that left more than this share of the free force is made anew.
     felt
         [J] A step that is worth less is round-off, and nothing is learnt from it.
     drag, growth, times
@@ -64,80 +69,11 @@ class ContactLimits:
     patience: int = 10
     shortest: float = 0.1
     least: float = 1e-3
+    stale: float = 0.5
     felt: float = 1e-60
     drag: float = 0.3
     growth: float = 3.0
     times: int = 5
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """u (3N, b) [m]; free gradients (3N, b) [N] of all that is smooth, and of all; 2-norms (b,), and scales (b,)."""
-
-    u: Any
-    smooth: Any
-    whole: Any
-    free: np.ndarray
-    scale: np.ndarray
-
-    @property
-    def relative(self) -> np.ndarray:
-        """The relative residuals (b,)."""
-        return relative(self.free, self.scale)
-
-    @property
-    def finite(self) -> np.ndarray:
-        """(b,) bool: whether each is a state at all. Forces that overflow have no scale."""
-        return np.isfinite(self.free) & np.isfinite(self.scale)
-
-    def rows(self, stay: np.ndarray) -> State:
-        """Some of the columns (k,)."""
-        parts = (self.u[:, stay], self.smooth[:, stay], self.whole[:, stay])
-        return State(*parts, self.free[stay], self.scale[stay])
-
-    def put(self, columns: np.ndarray, other: State) -> None:
-        """Write some columns (k,) of another state over these."""
-        for mine, its in ((self.u, other.u), (self.smooth, other.smooth), (self.whole, other.whole)):
-            mine[:, columns] = its[:, columns]
-        self.free[columns], self.scale[columns] = other.free[columns], other.scale[columns]
-
-
-@dataclass(eq=False)
-class Batch:
-    """Columns on their way. Arrays (.., b) last; each column aims, tries, and is cut, by itself.
-
-    judge, now
-        What measures them, and where they are.
-    pairs
-        What they have learnt.
-    force, rest
-        (3n, b) [N] the tools' as the model has them; (3N, b) [m] what the body at rest answers what is out of balance
-        under these.
-    x, length, promised
-        (3N, b) [m] the direction, and (b,) the step along it that is tried; what it promises.
-    drag, slow, steps
-        (b,).
-    """
-
-    judge: Judge
-    now: State
-    pairs: PairsOfColumns
-    force: Any
-    rest: Any
-    x: Any
-    length: np.ndarray
-    promised: np.ndarray
-    drag: np.ndarray
-    slow: np.ndarray
-    steps: np.ndarray
-
-    def keep(self, stay: np.ndarray) -> None:
-        """Keep these columns (k,)."""
-        self.judge, self.now = self.judge.rows(stay), self.now.rows(stay)
-        self.pairs.keep(stay)
-        self.force, self.rest, self.x = self.force[:, stay], self.rest[:, stay], self.x[:, stay]
-        for name in ("length", "promised", "drag", "slow", "steps"):
-            setattr(self, name, getattr(self, name)[stay])
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,17 +88,34 @@ class ContactDescent:
         Its only one.
     limits
         When it goes on, and when it gives up.
+    strains
+        Which tissue counts as strained.
     """
 
     problem: Problem
     preconditioner: Preconditioner
     barrier: Local
     limits: ContactLimits = ContactLimits()
+    strains: Strains = STRAINS
 
     @cached_property
     def compliance(self) -> Compliance:
-        """At the nodes that can be touched."""
-        return Compliance(self.problem, self.preconditioner, self.barrier.touchable)
+        """At the nodes that can be touched; after them those that may be strained, if they have a model."""
+        exact = is_exact(self.preconditioner)
+        nodes = self.barrier.around(self.strains.near) if exact else self.barrier.touchable
+        return Compliance(self.problem, self.preconditioner, nodes)
+
+    @cached_property
+    def _strained(self) -> StrainedPart | None:
+        """Makes models of strained tissue; levels, whose columns take long, learn from steps instead."""
+        if not is_exact(self.preconditioner):
+            return None
+        return StrainedPart(self.problem, self.compliance, len(self.barrier.touchable), self.strains)
+
+    @cached_property
+    def _rows(self) -> np.ndarray:
+        """Those (3n,) of the nodes that can be touched."""
+        return self.compliance.rows[: 3 * len(self.barrier.touchable)]
 
     @cached_property
     def _room(self) -> Callable[[int, int, int], Scratch]:
@@ -205,8 +158,12 @@ class ContactDescent:
         force, none = self._felt(now), np.zeros(count)
         pairs = PairsOfColumns(self.problem.device, self.problem.rows, count)
         rest = self._answered(now.smooth, force)
+        model = None if self._strained is None else self._strained.model(start, np.arange(count))
         numbers = np.zeros((2, count), int)
-        return Batch(judge, now, pairs, force, rest, 0.0 * rest, none, none, none.copy(), *numbers)
+        stale = np.zeros(count, bool)
+        return Batch(
+            judge, now, pairs, model, stale, force, rest, force + 0.0, 0.0 * rest, none, none, none.copy(), *numbers
+        )
 
     def _aimed(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
         """Give the columns that are `wanted` (b,) bool a direction; which columns (b,) have one, or had one before.
@@ -214,19 +171,27 @@ class ContactDescent:
         A column whose model has no equilibrium forgets what it has learnt. Then one will do in which it is not convex.
         """
         now = batch.now
+        renewed = np.flatnonzero(wanted & batch.stale)
+        if batch.model is not None and self._strained is not None and len(renewed):
+            fresh = self._strained.model(from_view(self.problem.device, now.u), renewed)
+            batch.model, batch.stale = batch.model.with_columns(renewed, fresh), batch.stale & ~wanted
         force, found = self._forces(batch, wanted, tolerance, FORCES)
         for limits in (FORCES, BENT):
             if found.all():
                 break
             missing = ~found
-            batch.pairs.forget(np.flatnonzero(missing))
+            batch.forget(np.flatnonzero(missing))
             batch.drag = np.where(found, batch.drag, 0.0)
             again, found = self._forces(batch, missing, tolerance, limits)
             force[:, missing] = again[:, missing]
         some = np.flatnonzero(wanted & found)
-        batch.rest[:, some] += self.compliance.spread((force - batch.force)[:, some])
-        batch.force[:, some] = force[:, some]
-        batch.x[:, some] = -batch.rest[:, some]
+        if batch.model is None:
+            batch.rest[:, some] += self.compliance.spread((force - batch.force)[:, some])
+            batch.force[:, some] = force[:, some]
+            batch.x[:, some] = -batch.rest[:, some]
+        else:
+            batch.aimed[:, some] = force[:, some]
+            batch.x[:, some] = -batch.rest[:, some] - self.compliance.answered(self._bent(batch, force)[0])[:, some]
         if batch.pairs.most:
             learnt = batch.pairs.of(some)
             batch.x[:, some] -= learnt.motion(learnt.weights(self._pull(now.smooth, force)[:, some]))
@@ -243,15 +208,16 @@ class ContactDescent:
 
         The drag is raised as often as that takes. The second, (b,) bool, is false where it has none.
         """
-        limits, rows, now = self.limits, self.compliance.rows, batch.now
+        limits, rows, now = self.limits, self._rows, batch.now
         force, missing = batch.force + 0.0, np.flatnonzero(wanted)
+        bent = 0.0 if batch.model is None or not batch.model.wide else self._bent(batch, batch.force)[1]
         exact = np.maximum(limits.forcing * np.minimum(now.relative, 1.0), limits.enough * tolerance)
         for _ in range(limits.times):
             barrier = self.barrier.reduced(missing)
             if barrier is None or not len(missing):
                 missing = missing[:0]
                 break
-            soft, free = Softness(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows]
+            soft, free = Softness(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows] - bent
             free, here, known = free[:, missing], doubled(now.u[rows][:, missing]), batch.force[:, missing]
             if batch.pairs.most:
                 learnt = batch.pairs.of(missing)
@@ -259,6 +225,8 @@ class ContactDescent:
                 soft = replace(soft, learnt=own, middle=doubled(learnt.middle))
                 weights = learnt.weights(self._pull(now.smooth, batch.force)[:, missing])
                 free = free - (doubled(weights).mT @ own)[:, 0].T
+            if batch.model is not None and batch.model.wide:
+                soft = replace(soft, own=batch.model.own[missing])
             one, solved = settled(barrier, soft, here, doubled(free), known, exact[missing], batch.drag[missing], most)
             force[:, missing[solved]] = one[:, solved]
             missing = missing[~solved]
@@ -266,6 +234,20 @@ class ContactDescent:
         found = np.ones(len(wanted), bool)
         found[missing] = False
         return force, found
+
+    def _bent(self, batch: Batch, force: Any) -> tuple[Any, Any]:
+        """Forces (3N, b) [N] that the body at rest is to follow beside: those of tools that are new, and of a model.
+
+        The second is how the nodes that can be touched move (3n, b) [m] with what the model adds.
+        """
+        assert batch.model is not None
+        device, compliance = self.problem.device, self.compliance
+        out, change = view(device.zeros(*batch.rest.shape)), force - batch.force
+        near = batch.rest[compliance.rows] + like(batch.rest, compliance.moved(change))
+        own = view(batch.model.pressed(device, from_view(device, near)))
+        out[self._rows] = like(out, change)
+        out[compliance.rows] += own
+        return out, like(batch.rest, compliance.moved(own)[: len(self._rows)])
 
     def _harder(self, drag: np.ndarray) -> np.ndarray:
         return np.maximum(self.limits.drag, self.limits.growth * drag)
@@ -283,14 +265,15 @@ class ContactDescent:
         ahead = np.where(new.finite, _dots(new.whole, batch.x), np.inf)
         far = goes_too_far(ahead, batch.promised) & (t > limits.least)
         batch.length = np.where(far, t * kept_of(ahead, batch.promised), t)
-        misled = far & (batch.length < limits.shortest) & (batch.pairs.count > 0)
+        misled = far & (batch.length < limits.shortest) & batch.learnt
         taken, well = np.flatnonzero(~far), (t > limits.long) & (new.free <= limits.left * now.free)
         eased = np.where(batch.drag >= limits.drag, batch.drag / limits.growth, 0.0)
         worse = (t < limits.long) | (new.free > now.free)
         drag = np.where(~far & well, eased, np.where(misled | (~far & worse), self._harder(batch.drag), batch.drag))
         batch.drag, batch.steps = drag, batch.steps + (misled | ~far)
+        batch.stale |= ~far & (new.free > limits.stale * now.free)
         batch.slow = np.where(~far & well, 0, batch.slow + (misled | ~far))
-        batch.pairs.forget(np.flatnonzero(misled))
+        batch.forget(np.flatnonzero(misled))
         if len(taken):
             self._learn(batch, new, taken)
             now.put(taken, new)
@@ -300,16 +283,20 @@ class ContactDescent:
         """From steps that some columns (k,) have taken to a new state."""
         now = batch.now
         moved, change = new.u[:, taken] - now.u[:, taken], new.smooth[:, taken] - now.smooth[:, taken]
+        if batch.model is not None:
+            batch.force[:, taken] = batch.aimed[:, taken]
         rest = self._answered(new.smooth[:, taken], batch.force[:, taken])
         way = rest - batch.rest[:, taken]
         batch.rest[:, taken] = rest
+        if batch.model is not None:
+            return
         some = np.flatnonzero((_dots(moved, change) > self.limits.felt) & new.finite[taken])
         if len(some):
             batch.pairs.learn(taken[some], moved[:, some], change[:, some], way[:, some])
 
     def _felt(self, now: State) -> Any:
         """Forces (3n, b) that balance all that is smooth, where tools touch."""
-        barrier, rows = self.barrier.reduced(np.arange(len(now.free))), self.compliance.rows
+        barrier, rows = self.barrier.reduced(np.arange(len(now.free))), self._rows
         own = doubled(now.smooth[rows])
         if barrier is None:
             return 0.0 * own
@@ -321,7 +308,7 @@ class ContactDescent:
     def _pull(self, smooth: Any, force: Any) -> Any:
         """Smooth gradients (3N, b) and forces (3n, b) on the touchable nodes, together (3N, b)."""
         out = smooth + 0.0
-        out[self.compliance.rows] += force
+        out[self._rows] += force
         return out
 
     def _judged(self, judge: Judge, u: Any) -> State:

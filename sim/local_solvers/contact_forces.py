@@ -66,8 +66,8 @@ BENT = ForceLimits(late=FORCES.iterations)
 class Softness:
     """C of a model: what a body at rest does, and what b columns have learnt since, at the n nodes of the compliance.
 
-    `learnt` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision; none where nothing was learnt yet. `room` is
-    `scratch_of`, which may be kept.
+    `learnt` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision; none where nothing was learnt yet. `own`
+    (b, 3n, 3n) in single precision is what strained tissue changes. `room` is `scratch_of`, which may be kept.
     """
 
     rest: Compliance
@@ -75,15 +75,24 @@ class Softness:
     room: Callable[[int, int, int], Scratch]
     learnt: Any = None
     middle: Any = None
+    own: Any = None
+
+    def know(self, acting: np.ndarray) -> None:
+        """See to it that the compliance at `acting` (n,) of its first nodes is known."""
+        every = np.zeros(len(self.rest.nodes), bool)
+        every[: len(acting)] = acting
+        self.rest.know(every)
 
     def model(self, columns: np.ndarray, rounded: float) -> Model:
         """Of some columns (k,)."""
-        out, n = Model(), len(self.rest.rows)
+        out, n, count = Model(), len(self.rest.rows), len(columns)
         out.rest, out.known = from_view(self.device, self.rest.columns), self.device.array(self.rest.known, wp.int32)
         if self.learnt is None:
-            out.learnt, out.middle = (self.device.zeros(len(columns), 0, size) for size in (n, 0))
+            out.learnt, out.middle = (self.device.zeros(count, 0, size) for size in (n, 0))
         else:
             out.learnt, out.middle = (from_view(self.device, x[columns]) for x in (self.learnt, self.middle))
+        none = wp.zeros((count, 0, 0), dtype=wp.float32, device=self.device.name)
+        out.own = none if self.own is None else from_view(self.device, self.own[columns])
         out.rounded = rounded
         return out
 
@@ -105,7 +114,7 @@ def settled(
     `tolerance` (b,), relative. `drag` (b,) is d in units of how stiff a touched node is.
     """
     out, status = known + 0.0, np.full(here.shape[1], OPEN)
-    soft.rest.know(on_host((known != 0.0).any(1)).reshape(-1, 3).max(axis=1))
+    soft.know(on_host((known != 0.0).any(1)).reshape(-1, 3).max(axis=1))
     for room in (limits.few, limits.most):
         status[status == CROWDED] = OPEN
         each = max(1, limits.bytes // (4 * 8 * (3 * room) ** 2))
@@ -117,7 +126,7 @@ def settled(
             out[:, ready] = force[:, np.isin(some, ready)]
             lacking = status[some] == UNKNOWN
             if lacking.any():
-                soft.rest.know(touched[:, lacking].max(axis=1) >= 0)
+                soft.know(touched[:, lacking].max(axis=1) >= 0)
                 status[some[lacking]] = OPEN
     return out, status == FOUND
 

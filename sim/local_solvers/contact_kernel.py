@@ -98,9 +98,17 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         wait()
 
     @wp.func
-    def between(model: Model, i: int, j: int) -> wp.float64:
-        """The compliance at rest between touched nodes, symmetric: half precision may have rounded its columns."""
-        return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i])
+    def changed(model: Model, c: int, i: int, j: int) -> wp.float64:
+        """What strained tissue changes of the compliance."""
+        own = wp.float64(0.0)
+        if model.own.shape[1] > 0:
+            own = wp.float64(model.own[c, i, j])
+        return own
+
+    @wp.func
+    def between(model: Model, c: int, i: int, j: int) -> wp.float64:
+        """The compliance between touched nodes, symmetric: half precision may have rounded its columns at rest."""
+        return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + changed(model, c, i, j)
 
     @wp.func
     def give(
@@ -137,9 +145,9 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                     share = f[j, c]
                     for q in range(WIDE):
                         i = wp.min(first + q * threads, size - 1)
-                        soft = model.rest[j, i]
+                        soft = model.rest[j, i] + changed(model, c, j, i)
                         if s.place[i // 3, c] >= 0:
-                            soft = between(model, i, j)
+                            soft = between(model, c, i, j)
                         sums[q] += soft * share
             for p in range(pairs):
                 share = s.y[c, p]
@@ -165,7 +173,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         for i in range(me // across, 3 * m, down):
             first = 3 * s.touched[c, i // 3] + i % 3
             for j in range(i + me % across, 3 * m, across):
-                own = between(model, first, 3 * s.touched[c, j // 3] + j % 3)
+                own = between(model, c, first, 3 * s.touched[c, j // 3] + j % 3)
                 for p in range(pairs):
                     own += model.learnt[c, p, first] * s.learnt[c, p, j]
                 s.soft[c, i, j] = own

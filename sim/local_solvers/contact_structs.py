@@ -10,14 +10,16 @@ OPEN, FOUND, NONE, CROWDED, UNKNOWN = (wp.constant(number) for number in range(5
 class Model:
     """How nodes give way: the compliance at rest, transposed (3n, 3n), and what b columns have learnt since.
 
-    `known` (n,): whether a node's column is; `learnt` (b, p, 3n), `middle` (b, p, p). A compliance between touched
-    nodes is `rounded`: that share of its mean makes it definite.
+    `known` (n,): whether a node's column is; `learnt` (b, p, 3n), `middle` (b, p, p). `own` (b, 3n, 3n) is what
+    strained tissue changes of the compliance, or (b, 0, 0). One between touched nodes is `rounded`: that share of its
+    mean makes it definite.
     """
 
     rest: wp.array2d(dtype=wp.float64)
     known: wp.array(dtype=wp.int32)
     learnt: wp.array3d(dtype=wp.float64)
     middle: wp.array3d(dtype=wp.float64)
+    own: wp.array3d(dtype=wp.float32)
     rounded: wp.float64
 
 

@@ -43,6 +43,17 @@ def like(other: Any, values: Any) -> Any:
     return values.astype(other.dtype) if isinstance(values, np.ndarray) else values.to(other.dtype)
 
 
+def padded(values: Any, more: tuple[int, ...]) -> Any:
+    """The same with so many more zeros at the end of each of the last axes."""
+    shape = (
+        *values.shape[: -len(more)],
+        *(old + new for old, new in zip(values.shape[-len(more) :], more, strict=True)),
+    )
+    out = np.zeros(shape, values.dtype) if isinstance(values, np.ndarray) else values.new_zeros(shape)
+    out[tuple(slice(length) for length in values.shape)] = values
+    return out
+
+
 def placed(device: Device, values: np.ndarray) -> Any:
     """The library's array with the same numbers; on the CPU they are these themselves."""
     return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values

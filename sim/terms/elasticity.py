@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -76,12 +77,13 @@ class Elasticity:
         for source in sources:
             law, count = source.law(law, count), count + source.count
         self._kernels = kernels_of(law, device, size, count)
-        shape = [
+        self._of = law, device, size, count
+        shape = self._shape = [
             device.array(sizes, wp.int32),
             device.array(elements.table, wp.int32),
             device.array(elements.gradient, device.vector),
         ]
-        weight = device.array(elements.weight)
+        weight = self._weight = device.array(elements.weight)
         constants = device.array(coefficients, wp.types.vector(length=own, dtype=device.scalar))
         self._constants = device.array(coefficients) if sources else constants
         points = elements.weight.shape
@@ -175,6 +177,47 @@ class Elasticity:
         table = np.arange(elements.table.size, dtype=np.int32).reshape(elements.table.shape)
         apart = replace(elements, table=table, nodes=table.size)
         return Elasticity(self.name, law, apart, coefficients, np.column_stack(self._rest[1:]), self._device)
+
+    def elements_on(self, nodes: np.ndarray) -> np.ndarray:
+        """Those elements (k,) that lie wholly on some nodes (N,) bool."""
+        elements = self._rest[0]
+        places = np.arange(elements.table.shape[1])
+        used = places < (len(places) if elements.size is None else elements.size[:, None])
+        return np.flatnonzero((nodes[elements.table] | ~used).all(axis=1))
+
+    @cached_property
+    def _strain_kernels(self) -> Any:
+        from .strain_kernels import kernels_of
+
+        return kernels_of(*self._of)
+
+    def raise_strain(self, some: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
+        """As `Strained.raise_strain`."""
+        inputs = [u, columns, *self._shape]
+        self._of_some(self._strain_kernels.strain, some, inputs, out, np.maximum)
+
+    def add_stiffening(
+        self, some: wp.array, u: wp.array, columns: wp.array, least: wp.array, place: wp.array, out: wp.array
+    ) -> None:
+        """As `Strained.add_stiffening`."""
+        coefficients = self._numbers.of(u.shape[1]) if self._sources else self._constants
+        inputs = [u, columns, least, place, *self._shape, self._weight, coefficients]
+        self._of_some(self._strain_kernels.stiffen, some, inputs, out, np.add)
+
+    def _of_some(self, kernel: wp.Kernel, some: wp.array, inputs: list, out: wp.array, joined: np.ufunc) -> None:
+        """Some elements (k,), in as many parts as run at the same time, each into an output of its own."""
+        ends = np.linspace(0, len(some), len(self._parts) + 1).astype(int).tolist()
+        parts = [some[first:stop] for first, stop in pairwise(ends)]
+        outputs = [out, *(wp.zeros_like(out) for _ in parts[1:])]
+        columns = len(inputs[1])
+        together(
+            [
+                partial(self._device.launch, kernel, (len(part), columns), [part, *inputs], [own])
+                for part, own in zip(parts, outputs, strict=True)
+            ]
+        )
+        for other in outputs[1:]:
+            joined(out.numpy(), other.numpy(), out=out.numpy())
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
         """Bound the step where the law needs J > 0."""

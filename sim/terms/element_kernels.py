@@ -6,6 +6,7 @@ from functools import cache
 import warp as wp
 
 from ..runtime.device import Device, forward_kernel
+from .element_functions import functions_of
 from .laws.invariants import cofactor
 from .laws.law import Law
 
@@ -54,49 +55,8 @@ def kernels_of(law: Law, device: Device, size: int, count: int) -> Kernels:
     constants = wp.types.vector(length=count, dtype=scalar)
     stress, stress_change, density = law.stress, law.stress_change, law.energy
     kept = VOLUME_KEPT
-    varies = law.at_rest is not None
-    numbers = wp.array4d(dtype=scalar) if varies else wp.array(dtype=constants)
-
-    @wp.func
-    def of_element(coefficients: wp.array(dtype=constants), e: int, q: int, c: int):
-        """Of the whole element, in every case."""
-        return coefficients[e]
-
-    @wp.func
-    def of_point(coefficients: wp.array4d(dtype=scalar), e: int, q: int, c: int):
-        """Of one point in one case."""
-        k = constants()
-        for i in range(count):
-            k[i] = coefficients[e, q, i, c]
-        return k
-
-    @wp.func
-    def same(k: constants):
-        """Nothing varies: at rest they are what they are."""
-        return k
-
-    at, at_rest = (of_element, same) if law.at_rest is None else (of_point, law.at_rest)
-
-    # Loops over nodes are unrolled where `size` is a constant, a fifth less time on the CPU; over points too, they take
-    # thrice as long to compile. Shape gradients sum to zero: only how far nodes moved from node 0 counts.
-    @wp.func
-    def gradient_of(
-        u: wp.array2d(dtype=scalar),
-        sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        e: int,
-        q: int,
-        c: int,
-    ):
-        """H = sum over nodes of (u_a - u_0) (x) grad N_a."""
-        H = mat()
-        i = 3 * table[e, 0]
-        origin = vec(u[i, c], u[i + 1, c], u[i + 2, c])
-        for a in range(1, size if size else sizes[e]):
-            i = 3 * table[e, a]
-            H += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]) - origin, gradient[e, q, a])
-        return H
+    functions = functions_of(law, device, size, count)
+    gradient_of, at, at_rest, numbers = functions.gradient, functions.at, functions.at_rest, functions.numbers
 
     @wp.func
     def spread(

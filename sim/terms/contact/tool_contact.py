@@ -6,6 +6,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import warp as wp
+from scipy.spatial import KDTree
 
 from ...anatomy import Anatomy
 from ...discretisation.space import Discretisation
@@ -169,6 +170,14 @@ class Contact:
     def touchable(self) -> np.ndarray:
         """The nodes (n,), ascending, of the surface that tools can touch."""
         return np.unique(self._triangles)
+
+    def around(self, most: int) -> np.ndarray:
+        """As `Local.around`."""
+        own = self.touchable
+        far, _ = KDTree(self._nodes[own]).query(self._nodes)
+        far[own] = -1.0
+        others = np.argsort(far, kind="stable")[len(own) : max(most, len(own))]
+        return np.concatenate([own, np.sort(others)])
 
     @cached_property
     def _alone(self) -> "tuple[Contact, Reduced]":

@@ -1,0 +1,237 @@
+"""A model that is right where tissue is strained: there as stiff as it is now, elsewhere as at rest.
+
+    (K0 + E D E')^-1 = H + H E M E' H,    M = -(1 + D C)^-1 D,    H = K0^-1,  C = E' H E:
+
+Woodbury 1950. D is by how much strained elements are stiffer than at rest, on their nodes alone. K0 takes tissue under
+a deep press for a third as stiff as it is, and a step that follows K0 goes three times too far.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..discretisation.problem import Problem
+from ..discretisation.term import Strained
+from ..linalg.compliance import Compliance
+from ..runtime.device import Device, forward_kernel
+from ..runtime.views import from_view, library, like, on_host, padded, placed, view
+
+
+@dataclass(frozen=True)
+class Strains:
+    """Which tissue counts as strained.
+
+    Parameters
+    ----------
+    least
+        |H|, H the displacement gradient: tissue that is strained less is as stiff as at rest.
+    nodes
+        Most nodes that have it, those with the largest |H| first.
+    near
+        Most nodes that are looked at: those that can be touched, and the nearest to them. Their compliance has three
+        times as many rows.
+    bytes
+        Of the matrices that are inverted at once.
+    """
+
+    least: float = 0.15
+    nodes: int = 160
+    near: int = 800
+    bytes: int = 2**31
+
+
+STRAINS = Strains()
+
+
+@cache
+def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
+    """Kernels that choose each column's nodes, and multiply by its matrix."""
+    scalar = device.scalar
+
+    @forward_kernel(module="unique")
+    def choose(
+        strain: wp.array2d(dtype=scalar),
+        near: wp.array(dtype=wp.int32),
+        least: scalar,
+        most: int,
+        # outputs
+        limit: wp.array(dtype=scalar),
+        place: wp.array2d(dtype=wp.int32),
+        nodes: wp.array2d(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+    ):
+        """The least limit that leaves at most so many nodes above it; these, and how many."""
+        c = wp.tid()
+        low, high = least + scalar(0.0), least + scalar(0.0)
+        for i in range(near.shape[0]):
+            high = wp.max(high, strain[near[i], c])
+        for halving in range(16):
+            number = wp.int32(0)
+            for i in range(near.shape[0]):
+                if strain[near[i], c] > low:
+                    number += 1
+            if number <= most and halving == 0:
+                high = low
+            middle = scalar(0.5) * (low + high)
+            number = wp.int32(0)
+            for i in range(near.shape[0]):
+                if strain[near[i], c] > middle:
+                    number += 1
+            if number <= most:
+                high = middle
+            else:
+                low = middle
+        number = wp.int32(0)
+        for i in range(near.shape[0]):
+            if strain[near[i], c] > high:
+                place[near[i], c] = number
+                nodes[c, number] = i
+                number += 1
+        limit[c] = high
+        count[c] = number
+
+    @forward_kernel(module="unique")
+    def press(
+        matrix: wp.array3d(dtype=wp.float64),
+        nodes: wp.array2d(dtype=wp.int32),
+        motion: wp.array2d(dtype=scalar),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out = E M E' motion."""
+        i, c = wp.tid()
+        total = wp.float64(0.0)
+        for j in range(matrix.shape[2]):
+            total += matrix[c, i, j] * wp.float64(motion[3 * nodes[c, j // 3] + j % 3, c])
+        wp.atomic_add(out, 3 * nodes[c, i // 3] + i % 3, c, scalar(total))
+
+    return choose, press
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What b columns have beside the rest: arrays of `views.library`.
+
+    nodes (b, k) are places in the compliance, matrix (b, 3k, 3k) is M [N/m], of zeros where a column has fewer nodes.
+    own (b, 3n, 3n) [m/N] is what it changes of the compliance between the n nodes that can be touched.
+    """
+
+    nodes: Any
+    matrix: Any
+    own: Any
+
+    @property
+    def wide(self) -> bool:
+        """Whether any column has strained nodes."""
+        return self.nodes.shape[1] > 0
+
+    @property
+    def bent(self) -> np.ndarray:
+        """Which columns (b,) have."""
+        return on_host((self.matrix != 0.0).any(-1).any(-1))
+
+    def rows(self, columns: np.ndarray) -> Model:
+        """Of some columns (k,)."""
+        return Model(self.nodes[columns], self.matrix[columns], self.own[columns])
+
+    def forget(self, columns: np.ndarray) -> None:
+        """Of some columns (k,) only the rest is left."""
+        self.matrix[columns], self.own[columns] = 0.0, 0.0
+
+    def with_columns(self, columns: np.ndarray, other: Model) -> Model:
+        """With another model's as some columns (k,)."""
+        most = max(self.nodes.shape[1], other.nodes.shape[1])
+        mine, its = self._widened(most), other._widened(most)
+        for one, two in ((mine.nodes, its.nodes), (mine.matrix, its.matrix), (mine.own, its.own)):
+            one[columns] = two
+        return mine
+
+    def _widened(self, most: int) -> Model:
+        """With places for so many nodes."""
+        missing = most - self.nodes.shape[1]
+        nodes, matrix = padded(self.nodes, (missing,)), padded(self.matrix, (3 * missing, 3 * missing))
+        return Model(nodes, matrix, self.own)
+
+    def pressed(self, device: Device, motion: wp.array) -> wp.array:
+        """E M E' motion (3n, b) [N], of motions (3n, b) [m] of the nodes of the compliance."""
+        out, (count, size) = wp.zeros_like(motion), self.matrix.shape[:2]
+        inputs = [from_view(device, self.matrix), from_view(device, self.nodes), motion]
+        device.launch(kernels_of(device)[1], (size, count), inputs, [out])
+        return out
+
+
+class StrainedPart:
+    """Makes models for the columns of one problem.
+
+    Parameters
+    ----------
+    problem
+        Whose body it is.
+    compliance
+        At the nodes near what can be touched: those that can be come first.
+    touchable
+        How many these are.
+    strains
+        Which tissue counts as strained.
+    """
+
+    def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: Strains = STRAINS):
+        device, nodes = problem.device, compliance.nodes
+        self._problem, self._compliance, self._touchable, self._strains = problem, compliance, touchable, strains
+        self._near = device.array(nodes, wp.int32)
+        near = np.zeros(problem.rows // 3, bool)
+        near[nodes] = True
+        found = [(term, term.elements_on(near)) for term in problem.terms if isinstance(term, Strained)]
+        self._elements = [(term, device.array(some, wp.int32)) for term, some in found]
+
+    def model(self, u: wp.array, columns: np.ndarray) -> Model:
+        """Of some columns (k,) of those at u (3N, b) [m], which the problem has begun."""
+        device, count, most = self._problem.device, len(columns), self._strains.nodes
+        picked = device.array(columns, wp.int32)
+        strain = device.zeros(self._problem.rows // 3, count)
+        for term, some in self._elements:
+            term.raise_strain(some, u, picked, strain)
+        limit = device.zeros(count)
+        place = wp.full((len(strain), count), -1, dtype=wp.int32, device=device.name)
+        nodes = wp.zeros((count, most), dtype=wp.int32, device=device.name)
+        numbers = wp.zeros(count, dtype=wp.int32, device=device.name)
+        inputs = [strain, self._near, device.scalar(self._strains.least), most]
+        device.launch(kernels_of(device)[0], (count,), inputs, [limit, place, nodes, numbers])
+        wide = int(numbers.numpy().max(initial=0))
+        stiffer = wp.zeros((count, 3 * wide, 3 * wide), dtype=wp.float64, device=device.name)
+        if wide:
+            for term, some in self._elements:
+                term.add_stiffening(some, u, picked, limit, place, stiffer)
+        return self._bent(view(nodes)[:, :wide], view(stiffer))
+
+    def _bent(self, nodes: Any, stiffer: Any) -> Model:
+        """Of D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""
+        self._compliance.know(np.ones(len(self._compliance.nodes), bool))
+        device, count, size = self._problem.device, len(nodes), stiffer.shape[1]
+        # One more row and column take what is of nodes that cannot be touched.
+        shape = count, 3 * self._touchable + 1, 3 * self._touchable + 1
+        own = view(wp.zeros(shape, dtype=wp.float32, device=device.name))
+        matrix, axes = 0.0 * stiffer, placed(device, np.arange(3))
+        each = max(1, self._strains.bytes // (6 * 8 * max(size, 1) ** 2))
+        for first in range(0, count if size else 0, each):
+            some = slice(first, first + each)
+            rows = (3 * nodes[some][:, :, None] + axes).reshape(-1, size)
+            soft = self._compliance.columns[rows[:, :, None], rows[:, None, :]]
+            soft = 0.5 * (soft + soft.mT)
+            system = stiffer[some] @ soft
+            diagonal = range(size)
+            system[:, diagonal, diagonal] += 1.0
+            found = library(device).linalg.solve(system, stiffer[some])
+            matrix[some] = -0.5 * (found + found.mT)
+            # Those that can be touched come first in every list of nodes.
+            most = 3 * int((nodes[some] < self._touchable).sum(-1).max())
+            reach = soft[:, :, :most]
+            place = rows[:, :most].clip(max=own.shape[1] - 1)
+            columns = like(nodes, placed(device, np.arange(count)))[some][:, None, None]
+            own[columns, place[:, :, None], place[:, None, :]] = like(own, reach.mT @ (matrix[some] @ reach))
+        return Model(nodes, matrix, own)
