@@ -15,6 +15,7 @@ import warp as wp
 from ..loads import Loads
 from ..runtime.columns import combined, norms
 from ..runtime.device import Device
+from ..runtime.views import in_order, library, on_host, view
 from .constraint import Constraint
 from .term import Barrier, Cases, Paced, Term
 
@@ -128,7 +129,9 @@ class Problem:
         What round-off leaves open counts as closed, and its motion is zero.
         """
         gap, size = self.constraint.close_gap(u)
-        off = size > self.closed * np.finfo(self.device.precision).eps * np.abs(u.numpy()).max(axis=0, initial=0.0)
+        with in_order(self.device):
+            largest = on_host(library(self.device).amax(abs(view(u)), 0)) if u.size else np.zeros(u.shape[1])
+        off = size > self.closed * np.finfo(self.device.precision).eps * largest
         return combined(self.device, gap, off - 1.0, gap, gap), off
 
     def linearise(self, u: wp.array, definite: np.ndarray) -> None:

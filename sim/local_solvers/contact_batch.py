@@ -60,6 +60,8 @@ class Batch:
         (3N, b) [m] the direction, and (b,) the step along it that is tried; what it promises.
     drag, slow, steps
         (b,).
+    failed, waiting
+        (b,) how often in a row no forces of the tools were found; which (b,) bool are to be tried again.
     """
 
     judge: Judge
@@ -76,6 +78,8 @@ class Batch:
     drag: np.ndarray
     slow: np.ndarray
     steps: np.ndarray
+    failed: np.ndarray
+    waiting: np.ndarray
 
     def keep(self, stay: np.ndarray) -> None:
         """Keep these columns (k,)."""
@@ -84,7 +88,7 @@ class Batch:
         self.model = self.model and self.model.rows(stay)
         self.force, self.aimed = self.force[:, stay], self.aimed[:, stay]
         self.rest, self.x = self.rest[:, stay], self.x[:, stay]
-        for name in ("stale", "length", "promised", "drag", "slow", "steps"):
+        for name in ("stale", "length", "promised", "drag", "slow", "steps", "failed", "waiting"):
             setattr(self, name, getattr(self, name)[stay])
 
     @property

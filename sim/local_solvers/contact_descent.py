@@ -139,7 +139,7 @@ class ContactDescent:
                 done = ready & (batch.now.relative <= tolerance[live])
                 over = done | (ready & ((batch.slow >= limits.patience) | (batch.steps >= most) | ~batch.now.finite))
                 if (ready & ~over).any():
-                    over |= ~self._aimed(batch, ready & ~over, tolerance[live])
+                    over |= self._aimed(batch, ready & ~over, tolerance[live])
                 if over.any():
                     leave, stay = np.flatnonzero(over), np.flatnonzero(~over)
                     there = live[leave]
@@ -159,32 +159,42 @@ class ContactDescent:
         pairs = PairsOfColumns(self.problem.device, self.problem.rows, count)
         rest = self._answered(now.smooth, force)
         model = None if self._strained is None else self._strained.model(start, np.arange(count))
-        numbers = np.zeros((2, count), int)
-        stale = np.zeros(count, bool)
+        slow, steps, failed = np.zeros((3, count), int)
+        stale, waiting = np.zeros((2, count), bool)
         return Batch(
-            judge, now, pairs, model, stale, force, rest, force + 0.0, 0.0 * rest, none, none, none.copy(), *numbers
-        )
+            judge, now, pairs, model, stale, force, rest, force + 0.0, 0.0 * rest, none, none.copy(), none.copy(),
+            slow, steps, failed, waiting,
+        )  # fmt: skip
 
     def _aimed(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
-        """Give the columns that are `wanted` (b,) bool a direction; which columns (b,) have one, or had one before.
+        """Give the columns that are `wanted` (b,) bool a direction; which (b,) have none, whatever was tried.
 
-        A column whose model has no equilibrium forgets what it has learnt. Then one will do in which it is not convex.
+        One whose model has no equilibrium waits for the next time, dragged more; then it forgets what it has learnt. At
+        last a model will do that is not convex. Others need not wait for it.
         """
-        now = batch.now
+        now, times = batch.now, self.limits.times
         renewed = np.flatnonzero(wanted & batch.stale)
         if batch.model is not None and self._strained is not None and len(renewed):
             fresh = self._strained.model(from_view(self.problem.device, now.u), renewed)
             batch.model, batch.stale = batch.model.with_columns(renewed, fresh), batch.stale & ~wanted
-        force, found = self._forces(batch, wanted, tolerance, FORCES)
-        for limits in (FORCES, BENT):
-            if found.all():
-                break
-            missing = ~found
-            batch.forget(np.flatnonzero(missing))
-            batch.drag = np.where(found, batch.drag, 0.0)
-            again, found = self._forces(batch, missing, tolerance, limits)
-            force[:, missing] = again[:, missing]
-        some = np.flatnonzero(wanted & found)
+        force, found = batch.force + 0.0, np.zeros(len(wanted), bool)
+        bent = batch.failed >= 2 * times
+        for some, limits in ((np.flatnonzero(wanted & ~bent), FORCES), (np.flatnonzero(wanted & bent), BENT)):
+            if len(some):
+                force[:, some], found[some] = self._forces(batch, some, tolerance, limits)
+        batch.waiting = wanted & ~found
+        batch.failed = np.where(batch.waiting, batch.failed + 1, 0)
+        fresh = batch.waiting & (batch.failed % times == 0)
+        batch.forget(np.flatnonzero(fresh))
+        batch.drag = np.where(fresh, 0.0, np.where(batch.waiting, self._harder(batch.drag), batch.drag))
+        some = np.flatnonzero(found)
+        if len(some):
+            self._direct(batch, some, force)
+        return batch.failed >= 3 * times
+
+    def _direct(self, batch: Batch, some: np.ndarray, force: Any) -> None:
+        """The directions of some columns (k,) under the tools' forces (3n, b)."""
+        now = batch.now
         if batch.model is None:
             batch.rest[:, some] += self.compliance.spread((force - batch.force)[:, some])
             batch.force[:, some] = force[:, some]
@@ -197,43 +207,30 @@ class ContactDescent:
             batch.x[:, some] -= learnt.motion(learnt.weights(self._pull(now.smooth, force)[:, some]))
         device = self.problem.device
         longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.x))
-        batch.length = np.where(wanted, longest, batch.length)
-        batch.promised = np.where(wanted, -_dots(now.whole, batch.x), batch.promised)
-        return found
+        batch.length[some] = longest[some]
+        batch.promised[some] = -_dots(now.whole[:, some], batch.x[:, some])
 
     def _forces(
-        self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray, most: ForceLimits
+        self, batch: Batch, some: np.ndarray, tolerance: np.ndarray, most: ForceLimits
     ) -> tuple[Any, np.ndarray]:
-        """The tools' forces (3n, b) where the model is in equilibrium, of the columns that are `wanted` (b,) bool.
-
-        The drag is raised as often as that takes. The second, (b,) bool, is false where it has none.
-        """
+        """The tools' forces (3n, k) where the model of some columns (k,) is in equilibrium, and which (k,) have one."""
         limits, rows, now = self.limits, self._rows, batch.now
-        force, missing = batch.force + 0.0, np.flatnonzero(wanted)
-        bent = 0.0 if batch.model is None or not batch.model.wide else self._bent(batch, batch.force)[1]
-        exact = np.maximum(limits.forcing * np.minimum(now.relative, 1.0), limits.enough * tolerance)
-        for _ in range(limits.times):
-            barrier = self.barrier.reduced(missing)
-            if barrier is None or not len(missing):
-                missing = missing[:0]
-                break
-            soft, free = Softness(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows] - bent
-            free, here, known = free[:, missing], doubled(now.u[rows][:, missing]), batch.force[:, missing]
-            if batch.pairs.most:
-                learnt = batch.pairs.of(missing)
-                own = doubled(learnt.sw[:, :, rows])
-                soft = replace(soft, learnt=own, middle=doubled(learnt.middle))
-                weights = learnt.weights(self._pull(now.smooth, batch.force)[:, missing])
-                free = free - (doubled(weights).mT @ own)[:, 0].T
-            if batch.model is not None and batch.model.wide:
-                soft = replace(soft, own=batch.model.own[missing])
-            one, solved = settled(barrier, soft, here, doubled(free), known, exact[missing], batch.drag[missing], most)
-            force[:, missing[solved]] = one[:, solved]
-            missing = missing[~solved]
-            batch.drag[missing] = self._harder(batch.drag[missing])
-        found = np.ones(len(wanted), bool)
-        found[missing] = False
-        return force, found
+        barrier, known = self.barrier.reduced(some), batch.force[:, some]
+        if barrier is None:
+            return known, np.ones(len(some), bool)
+        exact = np.maximum(limits.forcing * np.minimum(now.relative, 1.0), limits.enough * tolerance)[some]
+        soft, free = Softness(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows]
+        if batch.model is not None:
+            free = free - self._bent(batch, batch.force)[1]
+            soft = replace(soft, own=batch.model.own[some])
+        free, here = free[:, some], doubled(now.u[rows][:, some])
+        if batch.pairs.most:
+            learnt = batch.pairs.of(some)
+            own = doubled(learnt.sw[:, :, rows])
+            soft = replace(soft, learnt=own, middle=doubled(learnt.middle))
+            weights = learnt.weights(self._pull(now.smooth, batch.force)[:, some])
+            free = free - (doubled(weights).mT @ own)[:, 0].T
+        return settled(barrier, soft, here, doubled(free), known, exact, batch.drag[some], most)
 
     def _bent(self, batch: Batch, force: Any) -> tuple[Any, Any]:
         """Forces (3N, b) [N] that the body at rest is to follow beside: those of tools that are new, and of a model.
@@ -253,31 +250,33 @@ class ContactDescent:
         return np.maximum(self.limits.drag, self.limits.growth * drag)
 
     def _tried(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
-        """Try every column's step; which columns (b,) want another direction.
+        """Try the step of every column that does not wait; which columns (b,) want another direction.
 
         They have taken it, as the energy still falls there, or about so. Or hardly anything is left of it after cuts:
         then they have not moved, and forget what has misled them.
         """
-        limits, now, t = self.limits, batch.now, batch.length
+        limits, now, t, going = self.limits, batch.now, np.where(batch.waiting, 0.0, batch.length), ~batch.waiting
+        if not going.any():
+            return batch.waiting
         new = self._judged(
             batch.judge, now.u + placed(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
         )
         ahead = np.where(new.finite, _dots(new.whole, batch.x), np.inf)
-        far = goes_too_far(ahead, batch.promised) & (t > limits.least)
-        batch.length = np.where(far, t * kept_of(ahead, batch.promised), t)
+        far = going & goes_too_far(ahead, batch.promised) & (t > limits.least)
+        batch.length, there = np.where(far, t * kept_of(ahead, batch.promised), t), going & ~far
         misled = far & (batch.length < limits.shortest) & batch.learnt
-        taken, well = np.flatnonzero(~far), (t > limits.long) & (new.free <= limits.left * now.free)
+        taken, well = np.flatnonzero(there), (t > limits.long) & (new.free <= limits.left * now.free)
         eased = np.where(batch.drag >= limits.drag, batch.drag / limits.growth, 0.0)
         worse = (t < limits.long) | (new.free > now.free)
-        drag = np.where(~far & well, eased, np.where(misled | (~far & worse), self._harder(batch.drag), batch.drag))
-        batch.drag, batch.steps = drag, batch.steps + (misled | ~far)
-        batch.stale |= ~far & (new.free > limits.stale * now.free)
-        batch.slow = np.where(~far & well, 0, batch.slow + (misled | ~far))
+        drag = np.where(there & well, eased, np.where(misled | (there & worse), self._harder(batch.drag), batch.drag))
+        batch.drag, batch.steps = drag, batch.steps + (misled | there)
+        batch.stale |= there & (new.free > limits.stale * now.free)
+        batch.slow = np.where(there & well, 0, batch.slow + (misled | there))
         batch.forget(np.flatnonzero(misled))
         if len(taken):
             self._learn(batch, new, taken)
             now.put(taken, new)
-        return misled | ~far
+        return misled | there | batch.waiting
 
     def _learn(self, batch: Batch, new: State, taken: np.ndarray) -> None:
         """From steps that some columns (k,) have taken to a new state."""
