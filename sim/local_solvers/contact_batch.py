@@ -84,8 +84,10 @@ class Batch:
     def keep(self, stay: np.ndarray) -> None:
         """Keep these columns (k,)."""
         self.judge, self.now = self.judge.rows(stay), self.now.rows(stay)
-        self.pairs.keep(stay)
-        self.model = self.model and self.model.rows(stay)
+        if self.model is None:
+            self.pairs.keep(stay)
+        else:
+            self.model = self.model.rows(stay)
         self.force, self.aimed = self.force[:, stay], self.aimed[:, stay]
         self.rest, self.x = self.rest[:, stay], self.x[:, stay]
         for name in ("stale", "length", "promised", "drag", "slow", "steps", "failed", "waiting"):

@@ -156,9 +156,9 @@ class ContactDescent:
         judge, count = judge_of(self.problem, start), start.shape[1]
         now = self._judged(judge, view(start) + 0.0)
         force, none = self._felt(now), np.zeros(count)
-        pairs = PairsOfColumns(self.problem.device, self.problem.rows, count)
         rest = self._answered(now.smooth, force)
         model = None if self._strained is None else self._strained.model(start, np.arange(count))
+        pairs = PairsOfColumns(self.problem.device, self.problem.rows, count if model is None else 0)
         slow, steps, failed = np.zeros((3, count), int)
         stale, waiting = np.zeros((2, count), bool)
         return Batch(

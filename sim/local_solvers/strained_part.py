@@ -226,7 +226,10 @@ class StrainedPart:
             system = stiffer[some] @ soft
             diagonal = range(size)
             system[:, diagonal, diagonal] += 1.0
-            found = library(device).linalg.solve(system, stiffer[some])
+            try:
+                found = library(device).linalg.solve(system, stiffer[some])
+            except library(device).linalg.LinAlgError:
+                continue  # as stiff as at rest
             matrix[some] = -0.5 * (found + found.mT)
             # Those that can be touched come first in every list of nodes.
             most = 3 * int((nodes[some] < self._touchable).sum(-1).max())

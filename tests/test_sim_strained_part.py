@@ -1,0 +1,194 @@
+"""The model that knows how stiff strained tissue is: each part against the same by other means."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import warp as wp
+from boxes import base_held, box
+
+from sim.accuracy import Accuracy
+from sim.discretisation.problem import Problem
+from sim.discretisation.term import Cases, Strained
+from sim.effects import Elasticity, Held, ToolContact
+from sim.fem import Fem
+from sim.loads import Loads, Touching
+from sim.local_solvers.contact_descent import ContactDescent
+from sim.local_solvers.strained_part import STRAINS, Model, StrainedPart, Strains
+from sim.material import Material
+from sim.terms.elasticity import Elasticity as ElasticityTerm
+from sim.tools import Ball
+
+SIDE, HEIGHT, RADIUS = 0.06, 0.03, 6e-3
+BODY = base_held(box((6, 6, 3), SIDE))
+EVERY = Strains(least=0.0, nodes=10**4)
+BOTH = np.arange(2)
+TISSUES = {
+    "plain": Material("neo-hookean", 3000.0, 0.45),
+    "relaxing": Material("neo-hookean", 3000.0, 0.45, prony=((0.4, 2.0),)),
+}
+
+
+def down(*depths: float) -> Loads:
+    """A ball over the middle of the box, so deep in it."""
+    T = np.repeat(np.eye(4)[None, None], len(depths), axis=0)
+    T[:, 0, :2, 3], T[:, 0, 2, 3] = (0.031, 0.028), HEIGHT - np.array(depths)
+    return Loads((Touching(T),), np.ones(len(depths)))
+
+
+@cache
+def solver(
+    element: str = "p1", tissue: str = "plain", strains: Strains = STRAINS, tolerance: float = 1e-8
+) -> tuple[Fem, ContactDescent]:
+    """Finite elements under a ball, in double precision, whose descent has these settings."""
+    effects = [Elasticity(TISSUES[tissue]), Held(), ToolContact((Ball(RADIUS),))]
+    fem = Fem(BODY, effects, Accuracy(tolerance), "cpu", element=element)
+    assert fem.strategy.contact is not None
+    descent = replace(fem.strategy.contact, strains=strains)
+    fem.strategy.__dict__["contact"] = descent
+    return fem, descent
+
+
+def bent(problem: Problem, size: float) -> wp.array:
+    """Two columns: nodes moved at random, and a quarter as far."""
+    motion = problem.device.array(size * np.random.default_rng(3).normal(size=(problem.rows, 1)) * [[1.0, 0.25]])
+    problem.constraint.project_nodes(motion)
+    return motion
+
+
+def stiffer(fem: Fem, u: wp.array, column: int) -> np.ndarray:
+    """K(u) - K(0) (3N, 3N) [N/m] of one column, assembled from the terms' own curvature."""
+    problem, parts = fem.problem, []
+    problem.begin(Cases(down(1e-3), np.zeros(1)))
+    for definite in (False, True):
+        problem.linearise(problem.device.array(u.numpy()[:, [column]]), np.array([definite]))
+        parts.append(np.zeros((problem.rows, problem.rows)))
+        for first in range(problem.rows):
+            p, out = problem.device.zeros(problem.rows, 1), problem.device.zeros(problem.rows, 1)
+            p.numpy()[first] = 1.0
+            for term in problem.terms:
+                if isinstance(term, ElasticityTerm):
+                    term.add_curvature(p, out)
+            parts[-1][:, first] = out.numpy()[:, 0]
+    return parts[0] - parts[1]
+
+
+@pytest.mark.parametrize(("element", "tissue"), [("p1", "plain"), ("smoothed", "plain"), ("p1", "relaxing")])
+def test_what_is_added_is_what_the_curvature_is_more_than_at_rest(element: str, tissue: str) -> None:
+    """Of all elements, whatever their number of nodes and points, and of some columns alone."""
+    fem, _ = solver(element, tissue)
+    problem, count = fem.problem, fem.space.count
+    u = bent(problem, 4e-4)
+    expected = stiffer(fem, u, 0)
+    problem.begin(Cases(down(1e-3, 1e-3), np.zeros(2)))
+    every, first = np.ones(count, bool), problem.device.array(np.zeros(1), wp.int32)
+    place = problem.device.array(np.arange(count)[:, None], wp.int32)
+    out = wp.zeros((1, 3 * count, 3 * count), dtype=wp.float64, device="cpu")
+    terms = [term for term in problem.terms if isinstance(term, Strained)]
+    assert terms
+    for term in terms:
+        some = problem.device.array(term.elements_on(every), wp.int32)
+        term.add_stiffening(some, u, first, problem.device.zeros(1), place, out)
+    np.testing.assert_allclose(out.numpy()[0], expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_strain_is_the_largest_round_each_node() -> None:
+    """Of elements that lie wholly on the nodes that are asked for."""
+    fem, _ = solver()
+    problem, table = fem.problem, fem.space.table
+    u = bent(problem, 4e-4)
+    moved = u.numpy()[:, 0].reshape(-1, 3)[table]
+    corners = fem.space.nodes[table]
+    H = np.linalg.solve(corners[:, 1:] - corners[:, :1], moved[:, 1:] - moved[:, :1])
+    size = np.linalg.norm(H, axis=(1, 2))
+    nodes = np.zeros(fem.space.count, bool)
+    nodes[: fem.space.count // 2] = True
+    inside = nodes[table].all(axis=1)
+    expected = np.zeros(fem.space.count)
+    np.maximum.at(expected, table[inside].ravel(), np.repeat(size[inside], 4))
+    found = problem.device.zeros(fem.space.count, 1)
+    for term in problem.terms:
+        if isinstance(term, Strained):
+            some = problem.device.array(term.elements_on(nodes), wp.int32)
+            term.raise_strain(some, u, problem.device.array(np.zeros(1), wp.int32), found)
+    assert expected.max() > 0.1
+    np.testing.assert_allclose(found.numpy()[:, 0], expected, rtol=1e-9)
+
+
+def model_of(strains: Strains) -> tuple[Fem, ContactDescent, wp.array, Model]:
+    """Of two columns that are bent."""
+    fem, descent = solver(strains=strains)
+    u = bent(fem.problem, 4e-4)
+    part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable), strains)
+    return fem, descent, u, part.model(u, BOTH)
+
+
+def test_the_model_is_the_inverse_of_the_stiffness_now() -> None:
+    """H + H E M E' H, against K0 + D over the free motions; and what it changes between the nodes that are touched."""
+    fem, descent, u, model = model_of(EVERY)
+    problem, basis = fem.problem, fem.problem.constraint.basis()
+    force = np.random.default_rng(4).normal(size=(problem.rows, 2))
+    rest = descent.compliance.answered(force)
+    near = rest[descent.compliance.rows]
+    own = np.zeros_like(force)
+    own[descent.compliance.rows] = model.pressed(problem.device, problem.device.array(near)).numpy()
+    found = rest + descent.compliance.answered(own)
+    touched = descent.compliance.rows[: 3 * len(descent.barrier.touchable)]
+    for column in range(2):
+        whole = problem.rest_curvature().toarray() + stiffer(fem, u, column)
+        inverse = basis @ np.linalg.solve(basis.T @ whole @ basis, basis.T.toarray())
+        expected = inverse @ force[:, column]
+        np.testing.assert_allclose(found[:, column], expected, atol=2e-5 * np.abs(expected).max())
+        at_rest = descent.compliance.between(np.ones(len(descent.compliance.nodes), bool))[: len(touched)]
+        now = at_rest[:, : len(touched)] + model.own[column, :-1, :-1]
+        np.testing.assert_allclose(now, inverse[np.ix_(touched, touched)], atol=2e-5 * np.abs(inverse).max())
+
+
+def test_those_are_chosen_that_are_strained_most() -> None:
+    """As many as there is room for, and none that is hardly strained."""
+    fem, descent, u, model = model_of(Strains(least=0.08, nodes=20))
+    strain = fem.problem.device.zeros(fem.space.count, 2)
+    every, columns = np.ones(fem.space.count, bool), fem.problem.device.array(BOTH, wp.int32)
+    for term in fem.problem.terms:
+        if isinstance(term, Strained):
+            some = fem.problem.device.array(term.elements_on(every), wp.int32)
+            term.raise_strain(some, u, columns, strain)
+    assert model.nodes.shape[1] <= 20
+    for column in range(2):
+        own = model.matrix[column].any(axis=1).reshape(-1, 3).any(axis=1)
+        chosen = descent.compliance.nodes[model.nodes[column][own]]
+        others = np.setdiff1d(np.arange(fem.space.count), chosen)
+        assert len(chosen) >= (10 if column == 0 else 0)
+        if len(chosen):
+            assert strain.numpy()[chosen, column].min() > max(0.08, 0.97 * strain.numpy()[others, column].max())
+
+
+def test_columns_of_different_widths_go_together() -> None:
+    _, _, _, narrow = model_of(Strains(least=0.08, nodes=20))
+    _, _, _, wide = model_of(EVERY)
+    both = narrow.with_columns(np.array([1]), wide.rows(np.array([0])))
+    size = narrow.matrix.shape[1]
+    np.testing.assert_array_equal(both.matrix[0, :size, :size], narrow.matrix[0])
+    assert not both.matrix[0, size:].any() and not both.matrix[0, :, size:].any()
+    np.testing.assert_array_equal(both.matrix[1], wide.matrix[0])
+    np.testing.assert_array_equal(both.own[1], wide.own[0])
+    both.forget(np.array([1]))
+    assert both.bent.tolist() == [True, False] and not both.own[1].any()
+
+
+def test_deep_poses_take_fewer_steps_to_the_same_end() -> None:
+    """A ball goes down step by step, each from where the last one ended."""
+    ends, steps = [], []
+    for strains in (STRAINS, Strains(least=np.inf)):
+        fem, _ = solver("smoothed", "plain", strains, 1e-3)
+        answers = [fem.deform(down(1e-3))]
+        for depth in np.arange(2, 9) * 1e-3:
+            answers.append(fem.deform(down(depth), answers[-1]))
+        assert all(answer.outcome[0].good for answer in answers)
+        steps.append(sum(int(answer.iterations[0]) for answer in answers))
+        ends.append(answers[-1].displacement)
+    assert steps[0] < 0.85 * steps[1]
+    np.testing.assert_allclose(ends[0], ends[1], atol=2e-3 * np.abs(ends[1]).max())
