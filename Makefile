@@ -9,7 +9,7 @@ PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py
 QUICK := house sim_reference sim_material sim_physics sim_plan sim_warm sim_loads sim_term sim_given sim_meshfile sim_solve \
 	sim_readme surrogate_bound surrogate_store ar_camera ar_raster ar_overlay scenes_tissue scenes_output
 
-.PHONY: demo quick test docs lint template clean
+.PHONY: demo quick test docs lint template bench-check clean
 
 demo: $(STAMP)
 	$(VENV)/bin/sulcus demo
@@ -31,6 +31,13 @@ template: $(STAMP)
 	$(VENV)/bin/sulcus anatomy --out scenes/data/template.vtu
 	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --count 5000 --out build/template.h5
 	$(VENV)/bin/sulcus train build/template.h5 --learners linear,ann,svr,series,series-gp --most 2000 --out scenes/data/template.model.npz
+
+# What got slower by more than 10 %: `make bench-check OLD=old.json` measures now, and with NEW=new.json it only compares.
+OLD ?= $(word 1,$(filter %.json,$(MAKECMDGOALS)))
+NEW ?= $(word 2,$(filter %.json,$(MAKECMDGOALS)))
+bench-check: $(STAMP)
+	$(if $(OLD),,$(error give OLD=old.json, a record of `sulcus bench all`))
+	$(VENV)/bin/sulcus bench all --against '$(OLD)' $(if $(NEW),--from '$(NEW)',--json build/bench.json)
 
 # The pages for the browser, from docs/: open build/docs/index.html. Warnings are errors.
 docs: $(STAMP)

@@ -6,7 +6,6 @@ Every engine has a process of its own and they take turns, load by load: whateve
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -26,10 +25,10 @@ from sim.loads import Loads, Nodal, Pushed
 from sim.material import Material
 from surrogate.data.tool_loads import draw
 
+from .child_process import HOUSE, package_environment
 from .engine_process import READY, Case, answer_path, write_case
 from .engine_sulcus import fem_of
 
-HOUSE = Path(__file__).parents[2]
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 TOLERANCE = 1e-6
 FINEST, LEAST = 1e-11, 1e-10
@@ -239,8 +238,6 @@ class _Process:
     """An engine at work."""
 
     def __init__(self, engine: Engine, folder: Path, threads: int):
-        paths = [str(HOUSE), *filter(None, [os.environ.get("PYTHONPATH")])]
-        environment = {**os.environ, **dict.fromkeys(THREADS, str(threads)), "PYTHONPATH": os.pathsep.join(paths)}
         self._complaints = folder / "complaints.txt"
         with open(self._complaints, "w") as complaints:
             self._child = subprocess.Popen(
@@ -249,7 +246,7 @@ class _Process:
                 stdout=subprocess.PIPE,
                 stderr=complaints,
                 text=True,
-                env=environment,
+                env=package_environment(dict.fromkeys(THREADS, str(threads))),
             )
         assert self._child.stdin is not None and self._child.stdout is not None
         self._ask, self._hear = self._child.stdin, self._child.stdout

@@ -17,6 +17,7 @@ BENCHES = {
     "published": "how far the published learners are off, one force position left out at a time",
     "shortcuts": "how much time each shortcut of the solver saves on typical loads",
     "solver": "time of the first load on a mesh and of a further one, compared with other packages",
+    "all": "every figure of the performance pages in one go: a record, its tables, and what got slower",
 }
 
 

@@ -19,6 +19,7 @@ from sim.discretisation.space import ELEMENTS, RECOMMENDED
 from sim.material import LAWS, Material
 from surrogate.data.tool_loads import PRESETS
 
+from ..bench.figure_tables import three_digits
 from ..script.shipped_files import template_path
 
 if TYPE_CHECKING:
@@ -115,8 +116,8 @@ def _header(row: Row, batch: int, repeats: int) -> str:
 def _line(row: Row) -> str:
     cells = (
         row.law, f"{row.poisson:g}", row.element, row.nodes, row.preset, row.loads, row.converged,
-        f"{row.steps_median:g}", f"{row.steps_p99:g}", _whole(row.rate), _whole(1e6 / row.rate),
-        _whole(row.loads / row.draw_seconds), f"<= {row.double:.1e} of {row.checked}",
+        f"{row.steps_median:g}", f"{row.steps_p99:g}", three_digits(row.rate), three_digits(1e6 / row.rate),
+        three_digits(row.loads / row.draw_seconds), f"<= {row.double:.1e} of {row.checked}",
     )  # fmt: skip
     return f"| {' | '.join(map(str, cells))} |"
 
@@ -125,13 +126,9 @@ def _sentence(item: Together) -> str:
     tissue = f"{item.law}, nu {item.poisson:g}: set-up {item.set_up:.3g} s"
     if item.rate is None:
         return tissue
-    names = ", ".join(item.presets)
+    names, rate = ", ".join(item.presets), three_digits(item.rate)
+    drawing = three_digits(item.loads / (item.seconds + item.draw_seconds))
     return (
         f"{tissue}; the tools together ({names}): {item.loads} loads in {item.seconds:.3g} s, "
-        f"{_whole(item.rate)} solves/s; {_whole(item.loads / (item.seconds + item.draw_seconds))} with drawing them"
+        f"{rate} solves/s; {drawing} with drawing them"
     )
-
-
-def _whole(value: float) -> str:
-    """Whole thousands apart; three digits where it is small."""
-    return f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"

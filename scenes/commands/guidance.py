@@ -55,6 +55,7 @@ next: open the table in a spreadsheet""",
   sulcus bench
   sulcus bench throughput
   sulcus bench solver --peers tled --tolerance 1e-4 1e-6
+  sulcus bench all --json new.json
 next: sulcus report --quick""",
     "report": """example:
   sulcus report --quick --out report

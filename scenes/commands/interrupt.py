@@ -6,13 +6,15 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 
 # What Ctrl-C and SIGTERM make of a command's exit code: a visit's ordinary end, and the shell's word for the other.
 CODES = {signal.SIGINT: 0, signal.SIGTERM: 128 + signal.SIGTERM}
+# The exit code of a command that Ctrl-C stops in its work, and that goes on when it is given again.
+INTERRUPTED = 128 + signal.SIGINT
 # How long cleaning up may take after a signal [s].
 PATIENCE = 0.3
 # How often the main thread looks for a signal [s]: the system may give one to another thread, which does not wake it.
@@ -64,6 +66,19 @@ def until_ended(work: Callable[[ExitStack], int]) -> int:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Do at SIGTERM what Ctrl-C does: clean up, and end what was started."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def leave(number: int, frame: FrameType | None) -> None:

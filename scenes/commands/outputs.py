@@ -169,6 +169,12 @@ def _is_scan(path: Path) -> bool:
     return is_sidecar(path)
 
 
+def _is_record(path: Path) -> bool:
+    from ..bench.figure_record import read_record
+
+    return bool(read_record(path))
+
+
 KINDS: dict[str, Callable[[Path], bool]] = {
     "an anatomy of sulcus": lambda path: {b"region", b"held", b"slide_normal", b"craniotomy"} <= _names(path),
     "a scan that sulcus put beside an anatomy": _is_scan,
@@ -180,6 +186,7 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "a table of `sulcus sensitivity`": _begins(b"what,default,now,"),
     "a table of `sulcus sensitivity --factorial`": _begins(b"opening [mm],depth [mm],"),
     "a page of `sulcus report`": _begins(b"<title>What accuracy costs in time</title>"),
+    "a record of `sulcus bench all`": _is_record,
     "a picture of sulcus": _is_picture,
     "a film of `sulcus render`": _is_film,
 }

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from sim.errors import InputError
 
+from .interrupt import INTERRUPTED
 from .outputs import add_force, claimed
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
 # Loads of the data that is made where none is given; loads held against the reference; loads beyond the training range.
 QUICK, WHOLE = (256, 8, 24), (3000, 64, 120)
-INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -30,10 +30,10 @@ from surrogate.data.tool_poses import ball_of, draw_poses
 
 from ..script.shipped_files import template_path
 from .companion_files import remove_data
+from .interrupt import INTERRUPTED
 from .outputs import add_force, claimed
 from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
 
-INTERRUPTED = 130
 DATA = "a data set of `sulcus simulate`"
 
 

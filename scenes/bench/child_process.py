@@ -1,0 +1,70 @@
+"""Processes of their own: a crash, or memory that runs out, ends only them."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+HOUSE = Path(__file__).parents[2]
+POLL = 0.5
+"""How often what a process says is looked at [s]."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A process that ended: its exit code, its output, the last line of its complaints, and its seconds."""
+
+    code: int
+    output: str
+    complaint: str
+    seconds: float
+
+
+def package_environment(more: Mapping[str, str] | None = None) -> dict[str, str]:
+    """The environment of a process that imports this very package, with `more` variables."""
+    paths = [str(HOUSE), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, **(more or {}), "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def run_to_end(command: Sequence[str], folder: Path, heard: Callable[[str], object]) -> Ended:
+    """Run a command in a folder to its end, and end then what it has started.
+
+    Parameters
+    ----------
+    heard
+        Is given each line that the command writes to its standard error; an empty one says only that it still runs.
+    """
+    begun, complaint, left = time.perf_counter(), "", ""
+    output, complaints = folder / "output.txt", folder / "complaints.txt"
+    with output.open("wb") as out, complaints.open("wb") as err, complaints.open(errors="replace") as said:
+        child = subprocess.Popen(
+            command,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=err,
+            env=package_environment({"TQDM_MININTERVAL": "10"}),
+            start_new_session=True,
+        )
+        try:
+            running = True
+            while running:
+                with suppress(subprocess.TimeoutExpired):
+                    child.wait(POLL)
+                    running = False
+                *lines, left = re.split(r"[\r\n]", left + said.read() + "\n" * (not running))
+                for line in ["", *filter(str.strip, lines)]:
+                    heard(line)
+                    complaint = line.strip() or complaint
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+    return Ended(child.returncode, output.read_text(errors="replace"), complaint, time.perf_counter() - begun)

@@ -1,0 +1,101 @@
+"""Two records of figures side by side: what got worse."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from sim.errors import InputError
+
+from .figure_record import Entry, Record, Value
+from .figure_tables import three_digits
+
+MARGIN = 1.1
+"""What is worse by more than this factor is named."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A number that both records have."""
+
+    name: str
+    old: Value
+    new: Value
+
+    @property
+    def ratio(self) -> float:
+        """New over old."""
+        if self.old.value == self.new.value:
+            return 1.0
+        return self.new.value / self.old.value if self.old.value else math.inf
+
+    @property
+    def worse(self) -> bool:
+        """Whether it is worse by more than the margin."""
+        grown, shrunk = self.ratio > MARGIN, self.ratio < 1.0 / MARGIN
+        return {"smaller": grown, "larger": shrunk, "same": grown or shrunk}[self.new.better]
+
+    @property
+    def line(self) -> str:
+        """Its line of the table."""
+        numbers = " | ".join(three_digits(one.value) for one in (self.old, self.new))
+        ratio = f"**{self.ratio:.2f}**" if self.worse else f"{self.ratio:.2f}"
+        return f"| {self.name} | {numbers} | {self.new.unit} | {ratio} |"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Changes, figures that were measured and no longer are, and sentences on what differs besides."""
+
+    changes: tuple[Change, ...]
+    lost: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def worse(self) -> tuple[Change, ...]:
+        """The changes for the worse."""
+        return tuple(change for change in self.changes if change.worse)
+
+
+def compared(old: Record, new: Record) -> Comparison:
+    """Compare the figures that both have, measured by the same command on the same anatomy.
+
+    Raises
+    ------
+    InputError
+        Records without such a figure.
+    """
+    before = {entry.name: entry for entry in old.rows if entry.values}
+    both = [(before[entry.name], entry) for entry in new.rows if entry.name in before]
+    same = [pair for pair in both if _alike(*pair)]
+    changes = tuple(change for pair in same for change in _changes(*pair))
+    lost = tuple(f"{mine.name}: {mine.reason}" for theirs, mine in same if _lost(theirs, mine))
+    if not changes and not lost:
+        raise InputError("the two records have no figure in common that one command measured on one anatomy.")
+    return Comparison(changes, lost, tuple(dict.fromkeys(note for pair in both for note in _notes(*pair))))
+
+
+def _alike(old: Entry, new: Entry) -> bool:
+    return old.command == new.command and old.origin.anatomy == new.origin.anatomy
+
+
+def _lost(old: Entry, new: Entry) -> bool:
+    return new.state == "failed" or (new.state == "missed" and old.state == "measured")
+
+
+def _changes(old: Entry, new: Entry) -> list[Change]:
+    known = {value.name: value for value in old.values}
+    return [
+        Change(f"{new.name}, {value.name}", known[value.name], value) for value in new.values if value.name in known
+    ]
+
+
+def _notes(old: Entry, new: Entry) -> list[str]:
+    if not _alike(old, new):
+        return [f"{new.name} is not compared: it was measured by another command, or on another anatomy."]
+    notes = [f"{new.name} is not compared: {new.reason}."] if new.state == "skipped" else []
+    for what in ("version", "machine"):
+        was, now = (getattr(entry.origin, what) for entry in (old, new))
+        if was != now:
+            notes.append(f"The {what} differs. Before: {was}. Now: {now}.")
+    return notes

@@ -1,0 +1,173 @@
+"""Where the numbers of a figure stand in the JSON of each bench, and which way they are better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sim.arguments import LARGEST
+
+Place = tuple[str | int | Mapping[str, str | float], ...]
+"""The way to a number in the JSON of a bench.
+
+A text or a whole number is a key or an index. A mapping picks from a list the one item whose fields are these.
+"""
+Better = Literal["smaller", "larger", "same"]
+"""Which way a number is better; "same": it should not change at all."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One number of a figure: what it is called, its unit, which way it is better, and where it stands."""
+
+    name: str
+    unit: str
+    better: Better
+    place: Place
+
+
+def number_at(said: Any, place: Place) -> float | None:
+    """The number at a place in what a bench said; None if none, several or no number from 0 up stands there."""
+    try:
+        for step in place:
+            if isinstance(step, Mapping):
+                (said,) = (item for item in said if all(_fits(item[key], wanted) for key, wanted in step.items()))
+            else:
+                said = said[step]
+        number = math.nan if isinstance(said, bool) else float(said)
+    except (LookupError, TypeError, ValueError, OverflowError):
+        return None
+    return number if 0.0 <= number <= LARGEST else None
+
+
+def _fits(value: object, wanted: str | float) -> bool:
+    """Whether a field is what is wanted; a name may have its version behind it."""
+    return value == wanted or (isinstance(value, str) and value.startswith(f"{wanted} "))
+
+
+def _smaller(name: str, unit: str, *place: str | int | Mapping[str, str | float]) -> Reading:
+    return Reading(name, unit, "smaller", place)
+
+
+def _larger(name: str, unit: str, *place: str | int | Mapping[str, str | float]) -> Reading:
+    return Reading(name, unit, "larger", place)
+
+
+def _same(name: str, unit: str, *place: str | int | Mapping[str, str | float]) -> Reading:
+    return Reading(name, unit, "same", place)
+
+
+def rates(*presets: str) -> tuple[Reading, ...]:
+    """Loads a second of `bench throughput`."""
+    return tuple(_larger(name, "loads/s", "rows", {"preset": name}, "rate") for name in presets)
+
+
+def steps(*presets: str) -> tuple[Reading, ...]:
+    """The solver's steps in `bench throughput`."""
+    return tuple(
+        _smaller(f"{name}, {kind}", "steps", "rows", {"preset": name}, f"steps_{kind}")
+        for name in presets
+        for kind in ("median", "p99")
+    )
+
+
+TOGETHER = (
+    _larger("the tools together", "loads/s", "tools", 0, "rate"),
+    _smaller("set-up", "s", "tools", 0, "set_up"),
+)
+"""All tools of `bench throughput` on its first tissue."""
+
+LIVE = tuple(
+    _smaller(f"{ride}: {name}", unit, "rides", {"ride": ride}, field)
+    for ride in ("palpation", "spatula")
+    for name, unit, field in (("median", "ms", "median"), ("p99", "ms", "p99"), ("off", "mm", "error"))
+)
+"""Of `bench live`."""
+
+STAGES = tuple(
+    _smaller(f"{name}: {kind}", "ms", "rows", {"name": row}, kind)
+    for name, row in (("a load from rest", "FEM, a single load"), ("a frame from the last", "FEM, live"))
+    for kind in ("median", "p95")
+)
+"""Of `bench stages`."""
+
+PICTURE = (
+    *(
+        _smaller(stage, "ms", "rows", {"stage": stage}, "median")
+        for stage in ("load", "deform", "render", "composite", "encode", "send", "frame")
+    ),
+    _smaller("frame, p95", "ms", "rows", {"stage": "frame"}, "p95"),
+    _larger("together", "pictures/s", "pictures_per_second"),
+)
+"""Of `bench frame`."""
+
+
+def shortcuts(*pairs: tuple[str, str]) -> tuple[Reading, ...]:
+    """The medians of `bench shortcuts` with each shortcut at its work, and without."""
+    return tuple(
+        _smaller(f"{shortcut}, {work}: {kind}", "ms", "rows", {"shortcut": shortcut, "work": work}, field)
+        for shortcut, work in pairs
+        for kind, field in (("with", "median"), ("without", "median_without"))
+    )
+
+
+def growth(*batches: str) -> tuple[Reading, ...]:
+    """One size of `bench growth`, with batches of so many loads; 1 is among them."""
+    return (
+        _smaller("set-up", "s", "rows", {"asked": 1}, "set_up"),
+        *(_smaller(f"a load of {count}", "s", "rows", {"asked": int(count)}, "load") for count in batches),
+        _smaller("memory", "GiB", "rows", {"asked": 1}, "memory"),
+    )
+
+
+def beside(tolerances: Sequence[str], peers: Sequence[str]) -> tuple[Reading, ...]:
+    """Our seconds in `bench solver`, and how often as long each peer takes."""
+    loads = (("first load", "first", "first_ratio"), ("a further one", "further", "ratio"))
+    found = []
+    for tolerance in tolerances:
+        mesh = ("meshes", {"tolerance": float(tolerance)}, "rows")
+        for name, ours, ratio in loads:
+            found.append(_smaller(f"to {tolerance}, {name}", "s", *mesh, {"engine": "sulcus"}, ours))
+            found += [
+                _larger(f"to {tolerance}, {name} by {peer}", "times as long", *mesh, {"engine": peer}, ratio)
+                for peer in peers
+            ]
+    return tuple(found)
+
+
+def robust(*presets: str) -> tuple[Reading, ...]:
+    """Of `bench robust`."""
+    found = []
+    for name in presets:
+        found.append(_larger(f"{name}: converged", "loads", "sets", {"preset": name}, "converged"))
+        found += [
+            _smaller(f"{name}, {kind}", "steps", "sets", {"preset": name}, f"outer_{kind}")
+            for kind in ("median", "p99")
+        ]
+    return tuple(found)
+
+
+def skulls(*names: str) -> tuple[Reading, ...]:
+    """Of `bench skull` with one mesh and one Poisson's ratio."""
+    found = []
+    for name in names:
+        found.append(_same(f"{name}: tumour moves", "mm", "rows", {"skull": name}, "motion"))
+        found.append(_smaller(f"{name}: a load", "s", "rows", {"skull": name}, "seconds"))
+    return tuple(found)
+
+
+def elements(names: Sequence[str], poissons: Sequence[float]) -> tuple[Reading, ...]:
+    """Of `bench elements --coarse` with one mesh."""
+    found = []
+    for name in names:
+        for nu in poissons:
+            row = ("rows", {"element": name, "poisson": nu})
+            found.append(_same(f"{name}, nu {nu:g}: tumour moves", "mm", *row, "motion"))
+            found.append(_smaller(f"{name}, nu {nu:g}: a solve", "s", *row, "solve"))
+    return tuple(found)
+
+
+LIMIT = (_same("limit of fine meshes, nu 0.495", "mm", "limit_mm", "0.495"),)
+"""Of `bench elements --poisson 0.495`."""

@@ -1,0 +1,97 @@
+"""Figures as Markdown tables, printed or written between two marks of a page."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import read_as
+
+from .figure_record import Entry, Record
+from .figures import NAMED, command_of
+
+BEGIN, END = "<!-- bench:", "<!-- end -->"
+MARKED = re.compile(rf"({BEGIN} ([^\n]*?) -->\n)(.*?)({END})", re.DOTALL)
+HEAD = "| figure | measured | command |\n|---|---|---|"
+NOT_HERE = "not measured here"
+
+
+def three_digits(value: float) -> str:
+    """A number in three digits; from 100 up, whole with its thousands apart."""
+    return f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"
+
+
+def table(entries: Sequence[Entry]) -> str:
+    """One line for each figure: its numbers, or why it has none. Below, where and when they were measured."""
+    lines = [_line(it.name, _numbers(it) or f"{it.state}: {it.reason}", it.command) for it in entries]
+    return _with_origins(lines, [it for it in entries if it.values])
+
+
+def _with_origins(lines: Sequence[str], entries: Sequence[Entry]) -> str:
+    places: dict[str, list[str]] = {}
+    for entry in entries:
+        places.setdefault(f"Measured on {entry.origin.machine}; {entry.origin.date}", []).append(f"`{entry.name}`")
+    said = [f"{place}." if len(places) == 1 else f"{place}: {', '.join(some)}." for place, some in places.items()]
+    return "\n\n".join(("\n".join((HEAD, *lines)), *said))
+
+
+def _line(name: str, cell: str, command: str) -> str:
+    return f"| `{name}` | {cell.replace('|', '&#124;')} | `{command}` |"
+
+
+def _numbers(entry: Entry) -> str:
+    said = "; ".join(f"{one.name} {three_digits(one.value)} {one.unit}" for one in entry.values)
+    return f"{said} ({entry.reason})" if said and entry.reason else said
+
+
+def read_page(path: Path) -> str:
+    """The text of a page that has marks.
+
+    Raises
+    ------
+    InputError
+        A page without marks, with a mark that has no end, or of figures that are none.
+    """
+    with read_as(path, "a page in Markdown", "Give a page of the documentation, such as docs/figures.md."):
+        text = path.read_bytes().decode()
+        if path.suffix != ".md":
+            raise InputError("is no page in Markdown: give a name that ends in .md.")
+        blocks = MARKED.findall(text)
+        if not blocks or len(blocks) != text.count(BEGIN):
+            raise InputError(f"has no `{BEGIN} NAME ... -->` with an `{END}` for each: put these round the table.")
+        asked = [name for block in blocks for name in block[1].split()]
+        if wrong := [name for name in asked if name not in NAMED]:
+            raise InputError(f"asks for {wrong[0]!r}, which is no figure: choose from {', '.join(NAMED)}.")
+        return text
+
+
+def write_page(path: Path, record: Record) -> bool:
+    """Write the tables of a page anew; whether that changes anything.
+
+    Raises
+    ------
+    InputError
+        As `read_page`; a page that cannot be written.
+    """
+    before = read_page(path)
+    after = MARKED.sub(lambda block: f"{block[1]}\n{_marked(block[2].split(), record)}\n\n{block[4]}", before)
+    if after != before:
+        with written_whole(path, ".md") as partial:
+            partial.write_bytes(after.encode())
+    return after != before
+
+
+def _marked(names: Sequence[str], record: Record) -> str:
+    """The table of some figures, whether they were measured or not."""
+    known = {entry.name: entry for entry in record.rows if entry.values}
+    there = {name: known[name] for name in names if name in known}
+    lines = [
+        _line(name, _numbers(there[name]), there[name].command)
+        if name in there
+        else _line(name, NOT_HERE, command_of(NAMED[name]))
+        for name in names
+    ]
+    return _with_origins(lines, list(there.values()))

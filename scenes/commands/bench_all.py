@@ -1,0 +1,125 @@
+"""`sulcus bench all`: every figure of the performance pages in one go, their tables, and what got slower."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from sim.errors import InputError
+
+from ..bench.figures import NAMED
+from ..script.shipped_files import template_path
+from .interrupt import INTERRUPTED, terminated_as_interrupted
+from .outputs import add_force, claimed, recognised
+
+if TYPE_CHECKING:
+    from ..bench.figure_record import Record
+
+OUT = Path("bench.json")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.epilog = f"figures: {', '.join(NAMED)}"
+    parser.add_argument(
+        "--json", type=Path, metavar="OUT.json",
+        help=f"the record, written after every figure; an unfinished run goes on (default {OUT})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--only", nargs="+", choices=NAMED, default=list(NAMED), metavar="NAME",
+        help="these figures (default: all; their names stand below)",
+    )  # fmt: skip
+    parser.add_argument("--again", action="store_true", help="measure also what the record has already")
+    parser.add_argument("--quick", action="store_true", help="small counts: whether all runs, not how fast it is")
+    parser.add_argument("--anatomy", type=Path, help="measure on this .vtu instead of the template where a bench can")
+    parser.add_argument(
+        "--from", dest="source", type=Path, metavar="NEW.json", help="measure nothing: take this record"
+    )
+    parser.add_argument(
+        "--tables", nargs="+", type=Path, default=[], metavar="PAGE.md",
+        help="then write the tables between `<!-- bench: NAME ... -->` and `<!-- end -->` of these pages anew",
+    )  # fmt: skip
+    parser.add_argument(
+        "--against", type=Path, metavar="OLD.json",
+        help="then compare with this record, and exit with 1 if a number is worse by more than 10 percent",
+    )  # fmt: skip
+    add_force(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, write tables, compare; 1 if a figure failed, missed what it was asked, or got worse."""
+    from ..bench.figure_record import read_record
+    from ..bench.figure_tables import read_page, table, write_page
+
+    if args.source and (args.json or args.again or args.quick or args.anatomy):
+        raise InputError("--from measures nothing: leave out --json, --again, --quick and --anatomy beside it.")
+    if args.source and not (args.tables or args.against):
+        raise InputError("--from alone does nothing: give --tables or --against with it.")
+    old = read_record(args.against) if args.against else None
+    for path in args.tables:
+        read_page(path)
+    try:
+        with terminated_as_interrupted():
+            record = read_record(args.source) if args.source else _measured(args)
+    except KeyboardInterrupt:
+        print(f"stopped; the same command goes on from {args.json or OUT}", file=sys.stderr)
+        return INTERRUPTED
+    record = replace(record, rows=tuple(entry for entry in record.rows if entry.name in args.only))
+    code = 0
+    if not args.source:
+        print(table(record.rows))
+        code = int(any(entry.state in ("failed", "missed") for entry in record.rows))
+    for path in args.tables:
+        print(f"{path}: {'written' if write_page(path, record) else 'these numbers stand there already'}")
+    return max(code, _compared(old, record)) if old else code
+
+
+def _measured(args: argparse.Namespace) -> Record:
+    """The record, with what it lacked of the figures that were asked for."""
+    from sim.bodies.meshfile import read_anatomy
+
+    from ..bench.figure_record import KIND, read_record, record_of, write_record
+    from ..bench.figure_runs import Run, entry_of, version_here
+
+    out = claimed(args.json or OUT, ".json", KIND, args.force, [args.anatomy, args.against, *args.tables])
+    body = read_anatomy(args.anatomy or template_path()).digest
+    run = Run(version_here(), body, args.anatomy, args.quick, args.again)
+    found = {entry.name: entry for entry in read_record(out).rows} if recognised(out, KIND) else {}
+    with tqdm(total=len(args.only), unit="figure", file=sys.stderr) as bar:
+
+        def heard(line: str) -> None:
+            if line:
+                bar.write(line, file=sys.stderr)
+            elif sys.stderr.isatty():  # the clock goes on
+                bar.refresh()
+
+        for name in args.only:
+            bar.set_description(name)
+            before = found.get(name)
+            entry = found[name] = entry_of(NAMED[name], run, before, heard)
+            heard(f"{name}: {'kept' if entry is before else entry.state}{entry.reason and ': '}{entry.reason}")
+            write_record(out, record_of(run.origin("auto"), list(found.values())))
+            bar.update()
+    return read_record(out)
+
+
+def _compared(old: Record, new: Record) -> int:
+    """Print what changed, and return 1 if something got worse."""
+    from ..bench.figure_comparison import MARGIN, compared
+
+    found = compared(old, new)
+    print("| number | old | new | unit | new / old |\n|---|---|---|---|---|")
+    print("\n".join(change.line for change in found.changes))
+    print("", *found.notes, sep="\n")
+    for reason in found.lost:
+        print(f"no longer measured as before: {reason}")
+    for change in found.worse:
+        print(f"worse by more than {MARGIN - 1.0:.0%}: {change.name} ({change.ratio:.2f} times)")
+    if not found.worse and not found.lost:
+        print(f"nothing is worse by more than {MARGIN - 1.0:.0%}")
+    return int(bool(found.worse or found.lost))

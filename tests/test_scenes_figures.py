@@ -1,0 +1,86 @@
+"""The list of figures: every command parses, its numbers are what its bench gives, no bench of a page is missing."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from conftest import make_box
+
+from scenes.bench import (
+    elements,
+    frame,
+    live,
+    peers,
+    robustness,
+    scaling,
+    shortcuts,
+    skull_models,
+    stages,
+    throughput,
+)
+from scenes.bench.figure_readings import LIVE, STAGES
+from scenes.bench.figures import FIGURES, NAMED, SHORTCUTS, words_of
+from scenes.cli import make_parsers
+from scenes.commands.bench import BENCHES
+from scenes.script.site import site_of
+from surrogate.data.tool_loads import PRESETS
+
+HOUSE = Path(__file__).parents[1]
+ROWS = {
+    "throughput": throughput.Row,
+    "live": live.Tally,
+    "stages": stages.Row,
+    "frame": frame.Spent,
+    "shortcuts": shortcuts.Row,
+    "growth": scaling.Row,
+    "solver": peers.Row,
+    "robust": robustness.Tally,
+    "skull": skull_models.Row,
+    "elements": elements.Row,
+}
+"""What each bench has in the lists of its JSON."""
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_every_command_parses(name):
+    parser, figure = make_parsers("bench")[0], NAMED[name]
+    for quick in (False, True):
+        for anatomy in (None, "brain.vtu"):
+            args = parser.parse_args(["bench", *words_of(figure, quick, anatomy), "--json"])
+            given = next((getattr(args, key) for key in ("anatomy", "anatomies", "mesh") if hasattr(args, key)), None)
+            assert args.device == figure.device and args.json
+            taken = anatomy is not None and figure.body is not None
+            assert bool(given) == taken and (not taken or "brain.vtu" in str(given))
+
+
+def test_every_number_is_a_field_of_its_bench():
+    """The commands parse; here, what is read of their answers is what they answer."""
+    for figure in FIGURES:
+        row = ROWS[figure.command.split()[0]]
+        known = {field.name for field in fields(row)} | {
+            key for key, it in vars(row).items() if isinstance(it, property)
+        }
+        for reading in figure.readings:
+            if isinstance(reading.place[-2] if len(reading.place) > 1 else None, dict):
+                assert {reading.place[-1], *reading.place[-2]} <= known, f"{figure.name}: {reading.name}"
+    assert {it.place[1]["ride"] for it in LIVE} == {ride.name for ride in live.RIDES}
+    text = Path(stages.__file__).read_text()
+    assert all(f'"{it.place[1]["name"]}"' in text for it in STAGES)
+    presets = [step["preset"] for it in FIGURES for r in it.readings for step in r.place if "preset" in str(step)]
+    assert presets and set(presets) <= {*PRESETS, *robustness.SETS}
+    stated = [step for it in FIGURES for r in it.readings for step in r.place if "shortcut" in str(step)]
+    done = [{"shortcut": work.shortcut, "work": work.name} for work in shortcuts.works(site_of(make_box()), 1, False)]
+    assert len(stated) == 2 * len(SHORTCUTS) + 2 and not [pair for pair in stated if pair not in done]
+
+
+def test_every_bench_that_the_pages_state_is_a_figure():
+    measured = {figure.command.split()[0] for figure in FIGURES}
+    stated = set()
+    for name in ("figures.md", "floor.md"):
+        text = re.sub(r"<!-- bench.*?<!-- end -->", "", (HOUSE / "docs" / name).read_text(), flags=re.DOTALL)
+        stated |= {*re.findall(r"`(?:\w+=\w+ )?sulcus bench\s+(\w+)", text)} & set(BENCHES)
+    assert len(stated) > 8 and stated - {"all"} <= measured
+    assert len({figure.name for figure in FIGURES}) == len(FIGURES)
