@@ -157,7 +157,9 @@ class ContactDescent:
         now = self._judged(judge, view(start) + 0.0)
         force, none = self._felt(now), np.zeros(count)
         rest = self._answered(now.smooth, force)
-        model = None if self._strained is None else self._strained.model(start, np.arange(count))
+        model = None
+        if self._strained is not None and count <= self.strains.columns:
+            model = self._strained.model(start, np.arange(count))
         pairs = PairsOfColumns(self.problem.device, self.problem.rows, count if model is None else 0)
         slow, steps, failed = np.zeros((3, count), int)
         stale, waiting = np.zeros((2, count), bool)
@@ -176,7 +178,9 @@ class ContactDescent:
         renewed = np.flatnonzero(wanted & batch.stale)
         if batch.model is not None and self._strained is not None and len(renewed):
             fresh = self._strained.model(from_view(self.problem.device, now.u), renewed)
-            batch.model, batch.stale = batch.model.with_columns(renewed, fresh), batch.stale & ~wanted
+            batch.stale &= ~wanted
+            if fresh is not None:
+                batch.model = batch.model.with_columns(renewed, fresh)
         force, found = batch.force + 0.0, np.zeros(len(wanted), bool)
         bent = batch.failed >= 2 * times
         for some, limits in ((np.flatnonzero(wanted & ~bent), FORCES), (np.flatnonzero(wanted & bent), BENT)):

@@ -32,16 +32,24 @@ class Strains:
         |H|, H the displacement gradient: tissue that is strained less is as stiff as at rest.
     nodes
         Most nodes that have it, those with the largest |H| first.
+    cut
+        Where the room leaves out tissue that is strained by more than this there is no model: it would be right in
+        patches only.
     near
         Most nodes that are looked at: those that can be touched, and the nearest to them. Their compliance has three
         times as many rows.
+    columns
+        Wider batches have no models, but learn from their steps. They are not faster with them: a launch lasts as long
+        as its slowest column, and the better model makes the forces of tools harder to find.
     bytes
         Of the matrices that are inverted at once.
     """
 
     least: float = 0.15
     nodes: int = 160
+    cut: float = 0.3
     near: int = 800
+    columns: int = 8
     bytes: int = 2**31
 
 
@@ -189,8 +197,8 @@ class StrainedPart:
         found = [(term, term.elements_on(near)) for term in problem.terms if isinstance(term, Strained)]
         self._elements = [(term, device.array(some, wp.int32)) for term, some in found]
 
-    def model(self, u: wp.array, columns: np.ndarray) -> Model:
-        """Of some columns (k,) of those at u (3N, b) [m], which the problem has begun."""
+    def model(self, u: wp.array, columns: np.ndarray) -> Model | None:
+        """Of some columns (k,) of those at u (3N, b) [m], which the problem has begun; None where there is none."""
         device, count, most = self._problem.device, len(columns), self._strains.nodes
         picked = device.array(columns, wp.int32)
         strain = device.zeros(self._problem.rows // 3, count)
@@ -202,6 +210,8 @@ class StrainedPart:
         numbers = wp.zeros(count, dtype=wp.int32, device=device.name)
         inputs = [strain, self._near, device.scalar(self._strains.least), most]
         device.launch(kernels_of(device)[0], (count,), inputs, [limit, place, nodes, numbers])
+        if limit.numpy().max(initial=0.0) > max(self._strains.cut, self._strains.least):
+            return None
         wide = int(numbers.numpy().max(initial=0))
         stiffer = wp.zeros((count, 3 * wide, 3 * wide), dtype=wp.float64, device=device.name)
         if wide:
