@@ -125,7 +125,10 @@ def test_what_went_before_counts(theatre):
 
 
 def test_a_hand_goes_on_from_the_last_answer_a_frame_later(theatre):
-    """Whichever frame its number says: held where it is, tissue goes on relaxing under the tool, and never back."""
+    """Whichever frame its number says: held where it is, tissue goes on relaxing under the tool, and never back.
+
+    It stays where it is in a frame that begins within the tolerance.
+    """
     player = theatre.player("fem", REMEMBERING["tissue that relaxes under a blade"])
     session = Session(player)
     run = answer(session, 12)
@@ -134,7 +137,7 @@ def test_a_hand_goes_on_from_the_last_answer_a_frame_later(theatre):
         found = answer(session, number, held)
         assert found.outcome[0].good
         reads.append(np.linalg.norm(found.reaction[0, 0, :3]))
-    assert (np.diff(reads) < 0.0).all()
+    assert (np.diff(reads) <= 0.0).all() and reads[-1] < 0.97 * reads[0]
     once = replace(run, time=run.time - 1.0 / player.scene.frames_per_second)
     assert same(answer(Session(player), 12), run)
     first = player.answer(player.loads(12, held), once)
