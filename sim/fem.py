@@ -71,8 +71,7 @@ class Fem:
     element
         One of `space.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
     live
-        Loads will be asked for one at a time. With linear tetrahedra on the CPU it takes a second more to set up, and
-        each load two thirds as long.
+        Loads come one at a time. On the CPU the first takes a second more, the others a third to two thirds as long.
     avoid
         Solvers that are not tried, as where one is measured or doubted. Newton-CG always is.
 
@@ -115,7 +114,8 @@ class Fem:
         self._leak = Leak(anatomy, self.space, problem.device)
         bonded = (effect for effect in self.effects if isinstance(effect, Bonded))
         self._bond = next((Bond(effect, anatomy, self.space, problem.device) for effect in bonded), None)
-        self.strategy = Strategy(problem, preconditioner, Inversion(self.space, problem.device), accuracy, plan, *parts)
+        inversion = Inversion(self.space, problem.device, problem.bounded)
+        self.strategy = Strategy(problem, preconditioner, inversion, accuracy, plan, *parts)
         """What solves a load: the plan's solvers, one after the other."""
         self._paced = lru_cache(KEPT)(self._strategy_over)
         self._resting = Resting(problem, preconditioner, accuracy.inner)

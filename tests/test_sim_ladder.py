@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import openings
 import pytest
 from boxes import base_held, box, top_forces
 from oracle import internal_forces, tissue
@@ -114,6 +115,30 @@ def test_from_rest_what_lies_inside_out_is_the_loads_doing_and_counted() -> None
     assert found.inverted[0] > 0
     assert warm.outcome[0] is Outcome.CONVERGED_ANEW
     np.testing.assert_array_equal(warm.displacement, found.displacement)
+
+
+@pytest.mark.parametrize(("law", "followed"), [("neo-hookean", True), ("stable-neo-hookean", False)])
+def test_single_tetrahedra_that_averages_leave_inside_out_are_followed(law: str, followed: bool) -> None:
+    """Where the law is infinite before an average turns over: a deep press turns some, from wherever it is solved."""
+    effects = (Elasticity(tissue(law)), *openings.EFFECTS)
+    deep = 8.0 * np.array([[0.2, 0.1, -1.0]])
+    solver = Fem(openings.body()[0], effects, Accuracy(tolerance=1e-6), "cpu", element="smoothed")
+    before, rest = (solver.deform(openings.loads_of(share * deep)) for share in (0.98, 1.0))
+    found = solver.deform(openings.loads_of(deep), before)
+    assert before.inverted[0] > 0 and rest.inverted[0] > 0 and found.inverted[0] == rest.inverted[0]
+    assert found.outcome[0] is (Outcome.CONVERGED if followed else Outcome.CONVERGED_ANEW)
+    size = np.abs(rest.displacement).max()
+    np.testing.assert_allclose(found.displacement, rest.displacement, atol=1e-4 * size)
+
+
+def test_a_start_whose_averages_are_inside_out_is_left_for_rest() -> None:
+    effects = (Elasticity(tissue("neo-hookean")), *openings.EFFECTS)
+    solver = Fem(openings.body()[0], effects, ACCURACY, "cpu", element="smoothed")
+    mesh, load = openings.MESH, openings.loads_of(openings.TOTAL[1:2])
+    rest = solver.deform(load)
+    found = solver.deform(load, guess((mesh.nodes * [0.0, 0.0, -1.5])[None]))
+    assert found.outcome[0] is Outcome.CONVERGED_ANEW
+    np.testing.assert_array_equal(found.displacement, rest.displacement)
 
 
 @pytest.mark.parametrize("element", ELEMENTS)

@@ -17,6 +17,7 @@ from sim.fem import Fem
 from sim.local_solvers.batch_elimination import BatchElimination
 from sim.local_solvers.clamped_elimination import ClampedElimination
 from sim.local_solvers.patch_elimination import PatchElimination
+from sim.local_solvers.strained_descent import StrainedDescent
 from sim.minimisers.lbfgs import Lbfgs
 from sim.strategy import strategy
 from sim.strategy.plan import EVALUATIONS, FEWEST, WORTH, Plan, Step
@@ -39,7 +40,7 @@ def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accura
         ({}, LAST, LAST, (Step.NEAR, *LAST)),
         ({"element": "smoothed"}, LAST, LAST, (Step.NEAR, *LAST)),
         ({"live": True}, (Step.PATCH, *LAST), LAST, (Step.NEAR, *LAST)),
-        ({"element": "smoothed", "live": True}, LAST, LAST, (Step.NEAR, *LAST)),
+        ({"element": "smoothed", "live": True}, (Step.STRAINED, *LAST), LAST, (Step.NEAR, *LAST)),
         ({"element": "p2"}, (Step.CLAMPED, *LAST), LAST, LAST),
         ({"element": "p2", "live": True}, (Step.CLAMPED, *LAST), LAST, LAST),
         ({**WIDE, "live": True}, LAST, LAST, LAST),
@@ -112,7 +113,14 @@ def test_quadratic_loads_go_one_by_one():
 
 
 @pytest.mark.parametrize(
-    ("count", "more"), [(1, {"live": True}), (2, {"live": True}), (WORTH, {}), (1, {"element": "p2"})]
+    ("count", "more"),
+    [
+        (1, {"live": True}),
+        (1, {"live": True, "element": "smoothed"}),
+        (2, {"live": True}),
+        (WORTH, {}),
+        (1, {"element": "p2"}),
+    ],
 )
 def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     """Each step that is asked passes every load on, so that all are heard."""
@@ -120,6 +128,7 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     kinds = {
         BatchElimination: Step.NEAR,
         PatchElimination: Step.PATCH,
+        StrainedDescent: Step.STRAINED,
         ClampedElimination: Step.CLAMPED,
         Lbfgs: Step.LBFGS,
     }

@@ -100,6 +100,7 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
     yield Work("contact solved apart", f"{POSES} poses of a ball together", Step.CONTACT, together, tool)
     for scene, step, shortcut in (
         ("press", Step.PATCH, "nonlinear elimination of a patch"),
+        ("press", Step.STRAINED, "a stiffness that knows strained tissue"),
         ("palpate", Step.CONTACT, "contact solved apart"),
         ("press", None, "curvature of the last frame"),
         ("press", Step.FRAME, "frame as one captured graph"),

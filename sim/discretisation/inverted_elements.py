@@ -44,15 +44,21 @@ class Inversion:
 
     Linear tetrahedra have one point, quadratic ones eight. Smoothed strains are averages: there too every tetrahedron
     is looked at by itself. A volume below the share `collapsed` of its rest value is collapsed: round-off decides on
-    which side of zero it lies.
+    which side of zero it lies. `bounded`: the law is infinite where what it sees is inside out.
     """
 
-    def __init__(self, space: Discretisation, device: Device, collapsed: float = 1e-6):
+    def __init__(self, space: Discretisation, device: Device, bounded: bool = False, collapsed: float = 1e-6):
         every = np.ones(len(space.mesh.tets), bool)
         quadratic = space.element == "p2"
         elements = (
             quadratic_elements(space.nodes, space.table, every) if quadratic else linear_elements(space.mesh, every)
         )
+        self.telling = not (bounded and space.element == "smoothed")
+        """Whether one that lies inside out makes an equilibrium doubtful, as the body may be turned over.
+
+        Not where the law sees averages alone, and no descent can take these through its infinity. There a strong load
+        may turn single tetrahedra, from rest as from any other start.
+        """
         self._device, self._collapsed = device, collapsed
         self._table = device.array(elements.table, wp.int32)
         self._gradient = device.array(elements.gradient, device.vector)

@@ -17,7 +17,7 @@ from ..runtime.columns import combined, norms
 from ..runtime.device import Device
 from ..runtime.views import in_order, library, on_host, view
 from .constraint import Constraint
-from .term import Barrier, Cases, Paced, Term
+from .term import Barrier, Cases, Paced, Strained, Term
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +60,11 @@ class Problem:
     def plain(self) -> bool:
         """Whether forces that stay as they are act on what only ever resists: what shortcuts are made for."""
         return self.elastic and all(term.constant or term.passive for term in self.terms)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether all that is elastic is infinite where its elements are inside out."""
+        return self.elastic and all(term.bounded for term in self.terms if isinstance(term, Strained))
 
     @property
     def steep(self) -> bool:

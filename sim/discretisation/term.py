@@ -186,6 +186,11 @@ class Remembering(Term, Protocol):
 class Strained(Term, Protocol):
     """A Term of elements, which resist more or less where they are strained; H is the displacement gradient."""
 
+    @property
+    def bounded(self) -> bool:
+        """Whether it is infinite where its elements are inside out."""
+        ...
+
     def elements_on(self, nodes: np.ndarray) -> np.ndarray:
         """Those elements (k,) that lie wholly on some nodes (N,) bool."""
         ...

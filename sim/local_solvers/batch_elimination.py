@@ -124,17 +124,17 @@ class BatchElimination:
 
 def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
     """Whether a part of the surface is free, and no large one."""
-    return 0 < len(_free(space, constraint)) <= NEAR.largest_opening * len(np.unique(space.mesh.surface))
+    return 0 < len(open_vertices(space, constraint)) <= NEAR.largest_opening * len(np.unique(space.mesh.surface))
 
 
 def near_tetrahedra(space: Discretisation, constraint: Constraint, share: float = NEAR.share) -> np.ndarray:
     """(T,) bool: the share nearest to where the surface is free."""
     mesh = space.mesh
-    distance, _ = KDTree(mesh.nodes[_free(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
+    distance, _ = KDTree(mesh.nodes[open_vertices(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
     return distance <= np.quantile(distance, share)
 
 
-def _free(space: Discretisation, constraint: Constraint) -> np.ndarray:
+def open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:
     """Vertices (n,) of the surface that neither are held nor slide."""
     surface = np.unique(space.mesh.surface)
     return surface[~constraint.held[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]

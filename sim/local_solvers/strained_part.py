@@ -199,6 +199,14 @@ class StrainedPart:
 
     def model(self, u: wp.array, columns: np.ndarray) -> Model | None:
         """Of some columns (k,) of those at u (3N, b) [m], which the problem has begun; None where there is none."""
+        found = self.stiffening(u, columns)
+        return None if found is None else self._bent(*found)
+
+    def stiffening(self, u: wp.array, columns: np.ndarray) -> tuple[Any, Any] | None:
+        """Places in the compliance (k, n) of the nodes that are strained most, and D (k, 3n, 3n) [N/m] between them.
+
+        D has zeros where a column has fewer nodes. None where the room leaves out what is strained by more than `cut`.
+        """
         device, count, most = self._problem.device, len(columns), self._strains.nodes
         picked = device.array(columns, wp.int32)
         strain = device.zeros(self._problem.rows // 3, count)
@@ -217,7 +225,7 @@ class StrainedPart:
         if wide:
             for term, some in self._elements:
                 term.add_stiffening(some, u, picked, limit, place, stiffer)
-        return self._bent(view(nodes)[:, :wide], view(stiffer))
+        return view(nodes)[:, :wide], view(stiffer)
 
     def _bent(self, nodes: Any, stiffer: Any) -> Model:
         """Of D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""

@@ -107,7 +107,7 @@ class FrameSequence:
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
         self._last = self._here = _gone
         found = self._frame.push(point, radius, force, share)
-        if found[STATUS] != DONE or found[INVERTED]:
+        if found[STATUS] != DONE or (found[INVERTED] and self._inversion.telling):
             return None
         warm = Kept(way, self._frame.state, self._lock)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
@@ -124,7 +124,7 @@ class FrameSequence:
             warm=warm,
             cost=Cost({"equilibrium": time.perf_counter() - clock}),
             reached=np.ones(1),
-            inverted=np.zeros(1, int),
+            inverted=found[INVERTED : INVERTED + 1].astype(int),
             source=self._source,
         )
         self._last, self._here = ref(answer), ref(warm)
@@ -135,7 +135,7 @@ class FrameSequence:
         cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
         u = self._problem.device.array(last)
-        if self._problem.gap(u)[1].any() or self._inversion.count(u).any():
+        if self._problem.gap(u)[1].any() or (self._inversion.telling and self._inversion.count(u).any()):
             return False
         here = self._here()
         if here is not None:

@@ -21,8 +21,11 @@ from ..linalg.preconditioner import is_exact, name_of
 from ..local_solvers.batch_elimination import BatchElimination, batch_elimination, has_small_opening
 from ..local_solvers.clamped_elimination import ClampedElimination
 from ..local_solvers.patch_elimination import PatchElimination, patch_elimination
+from ..local_solvers.strained_descent import StrainedDescent, strained_descent
 from .captured_frame import FRAME_EVALUATIONS
 
+Alone = PatchElimination | ClampedElimination | StrainedDescent
+"""What solves a single load by itself."""
 # So many load cases are worth the set-up of a local problem that they share.
 WORTH = 16
 # Evaluations of the whole body before Newton. On CUDA, where few columns cost hardly less than one, it comes last.
@@ -36,6 +39,7 @@ class Step(Enum):
 
     NEAR = "nonlinear elimination: the tissue near the opening, which all loads share, is solved by itself"
     PATCH = "nonlinear elimination: the few hundred nodes that the load strains most are solved by themselves"
+    STRAINED = "L-BFGS from a stiffness that knows the few hundred nodes that the load strains most"
     CLAMPED = "nonlinear elimination: the tissue near the load, clamped at its rim, is solved by itself"
     CONTACT = "proximal quasi-Newton: the nodes that tools touch are solved apart from the tissue"
     FRAME = "a live frame: one graph that was captured on the card"
@@ -136,8 +140,9 @@ def plan_for(
     if elastic and not cuda:
         if space.element == "p2" and isinstance(preconditioner, TwoLevel):
             single = Step.CLAMPED
-        elif live and small and space.element == "p1" and isinstance(preconditioner, Factor):
-            single = Step.PATCH  # of smoothed elements a patch takes longer to solve than it spares the whole
+        elif live and small and isinstance(preconditioner, Factor):
+            # Of smoothed elements a patch takes longer to solve than it spares the whole.
+            single = Step.PATCH if space.element == "p1" else Step.STRAINED
     contact = None
     if problem.barriers:
         # The model of contact knows one barrier, and needs a preconditioner that is alike at every state.
@@ -170,7 +175,7 @@ def can_follow(space: Discretisation, accuracy: Accuracy) -> bool:
 
 def local_solvers(
     plan: Plan, problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
-) -> tuple[Callable[[], BatchElimination | None], PatchElimination | ClampedElimination | None]:
+) -> tuple[Callable[[], BatchElimination | None], Alone | None]:
     """What a plan solves by itself: for many loads, made when it is asked for first, and for a single one."""
     near = cache(partial(batch_elimination, problem, preconditioner, effects, space) if plan.many else lambda: None)
     if plan.single is Step.CLAMPED:
@@ -178,4 +183,7 @@ def local_solvers(
     if plan.single is Step.PATCH:
         assert isinstance(preconditioner, Factor)
         return near, patch_elimination(problem, preconditioner, effects, space)
+    if plan.single is Step.STRAINED:
+        assert isinstance(preconditioner, Factor)
+        return near, strained_descent(problem, preconditioner, space)
     return near, None

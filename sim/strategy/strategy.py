@@ -17,10 +17,8 @@ from ..discretisation.problem import Problem
 from ..discretisation.term import Cases, Local
 from ..linalg.pcg import Preconditioner
 from ..local_solvers.batch_elimination import BatchElimination
-from ..local_solvers.clamped_elimination import ClampedElimination
 from ..local_solvers.contact_descent import ContactDescent
 from ..local_solvers.contact_preconditioner import ContactPreconditioner
-from ..local_solvers.patch_elimination import NODES, PatchElimination
 from ..minimisers.lbfgs import Lbfgs, learnt_from
 from ..minimisers.lbfgs_kernels import BROKEN, DONE
 from ..minimisers.newton import find_equilibrium
@@ -29,10 +27,9 @@ from ..minimisers.residual import shortfall
 from ..runtime.columns import gathered, scattered
 from ..runtime.device import Device
 from ..runtime.views import in_order, on_host, view
-from .plan import Plan, Step
+from .plan import Alone, Plan, Step
 from .stepping import GAPS, STEPPING, Gaps, Stepping
 
-LocalSolver = BatchElimination | PatchElimination | ClampedElimination
 NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
@@ -96,7 +93,7 @@ class Strategy:
     accuracy: Accuracy
     plan: Plan
     near: Callable[[], BatchElimination | None] = lambda: None
-    alone: PatchElimination | ClampedElimination | None = None
+    alone: Alone | None = None
     stepping: Stepping = STEPPING
     gaps: Gaps = GAPS
 
@@ -114,7 +111,7 @@ class Strategy:
         assert isinstance(barrier, Local)
         return ContactDescent(self.problem, self.preconditioner, barrier)
 
-    def local(self, count: int) -> LocalSolver | None:
+    def local(self, count: int) -> BatchElimination | Alone | None:
         """What solves a part by itself for so many loads, if anything does."""
         step = self.plan.local(count)
         return None if step is None else self.near() if step is Step.NEAR else self.alone
@@ -152,7 +149,7 @@ class Strategy:
                 cases = replace(cases, anew=astray.copy())
                 problem.begin(cases)
             answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
-            lost = np.where(answer.good, answer.inverted > 0, self._lost(answer))
+            lost = np.where(answer.good, self.inversion.telling & (answer.inverted > 0), self._lost(answer))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
@@ -189,14 +186,14 @@ class Strategy:
         return start
 
     def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The first of some guesses (3N, B) [m] of each case that is not inside out; which cases (B,) have none."""
+        """Of some guesses (3N, B) [m] each case's first of the fewest inside out; which cases (B,) have none."""
         device = self.problem.device
-        guess, astray = guesses[0], self.inversion.count(device.array(guesses[0])) > 0
+        guess, inverted = guesses[0], self.inversion.count(device.array(guesses[0]))
         for other in guesses[1:]:
-            if astray.any():
-                guess = np.where(astray, other, guess)
-                astray = self.inversion.count(device.array(guess)) > 0
-        return guess, astray
+            if inverted.any():
+                fewer = self.inversion.count(device.array(other))
+                guess, inverted = np.where(fewer < inverted, other, guess), np.minimum(fewer, inverted)
+        return guess, self.inversion.telling & (inverted > 0)
 
     def _lost(self, answer: Answer) -> np.ndarray:
         """Which cases (B,) another solver may save: at round-off none is nearer to equilibrium."""
@@ -220,11 +217,12 @@ class Strategy:
             learnt = None
         if Step.LBFGS not in self.plan.steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
-        descents: list[tuple[LocalSolver | Lbfgs, Mapping[str, np.ndarray] | None]] = [(self.lbfgs, learnt)]
+        descents: list[tuple[BatchElimination | Alone | Lbfgs, Mapping[str, np.ndarray] | None]] = [
+            (self.lbfgs, learnt)
+        ]
         near = self.local(count)
         if near is not None:
-            patch = {NODES: cases.warm[NODES]} if NODES in cases.warm else {}
-            descents = [(near, patch), (self.lbfgs, None)]
+            descents = [(near, cases.warm), (self.lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
         answer = Answer(
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0

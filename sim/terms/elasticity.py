@@ -116,6 +116,11 @@ class Elasticity:
         """Of what a source remembers."""
         return max((source.width for source in self._sources), default=0)
 
+    @property
+    def bounded(self) -> bool:
+        """Whether the law needs J > 0."""
+        return self._kernels.bound_step is not None
+
     def begin(self, cases: Cases) -> None:
         """Take what varies, if anything does."""
         if self._sources:
@@ -206,8 +211,10 @@ class Elasticity:
 
     def _of_some(self, kernel: wp.Kernel, some: wp.array, inputs: list, out: wp.array, joined: np.ufunc) -> None:
         """Some elements (k,), in as many parts as run at the same time, each into an output of its own."""
+        if not len(some):
+            return
         ends = np.linspace(0, len(some), len(self._parts) + 1).astype(int).tolist()
-        parts = [some[first:stop] for first, stop in pairwise(ends)]
+        parts = [some[first:stop] for first, stop in pairwise(ends) if first < stop]
         outputs = [out, *(wp.zeros_like(out) for _ in parts[1:])]
         columns = len(inputs[1])
         together(

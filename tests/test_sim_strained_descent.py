@@ -1,0 +1,205 @@
+"""Single loads whose descent knows strained tissue: where it ends, how soon, and what the next frame takes over."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import warp as wp
+from openings import EFFECTS, FINE, OPENING, TOTAL, begun, body, equilibria, loads_of
+from oracle import tissue
+
+from sim.accuracy import LIVE
+from sim.deformation import Deformation, Outcome
+from sim.discretisation.problem import Problem
+from sim.discretisation.space import Discretisation
+from sim.effects import Elasticity
+from sim.fem import Fem
+from sim.linalg.multifrontal import Factor
+from sim.linalg.preconditioner import rest_solver
+from sim.local_solvers.strained_descent import (
+    LEARNT,
+    SINGLE,
+    Renewal,
+    StiffenedPreconditioner,
+    Stiffening,
+    StrainedDescent,
+    strained_descent,
+)
+from sim.local_solvers.strained_part import Strains
+from sim.minimisers.lbfgs import Lbfgs
+from sim.minimisers.lbfgs_kernels import BROKEN, DONE
+from sim.minimisers.lbfgs_kernels import LIVE as GOING
+from sim.strategy.plan import Step
+
+LAW, HARD = "neo-hookean", np.array([[1.0, 0.5, -5.0]])
+EVERY = Strains(least=0.0, nodes=10**4, cut=np.inf, near=10**4)
+
+
+def factor_of(problem: Problem) -> Factor:
+    found = rest_solver(problem)
+    assert isinstance(found, Factor)
+    return found
+
+
+def hard(element: str = "smoothed") -> tuple[Problem, Discretisation, wp.array]:
+    """A hard pull on the opening, and rest."""
+    problem, space = begun(LAW, element, HARD)
+    return problem, space, problem.device.zeros(problem.rows, 1)
+
+
+@pytest.mark.parametrize("element", ["p1", "smoothed"])
+def test_it_ends_where_the_whole_does(element: str) -> None:
+    problem, space = begun(LAW, element)
+    expected, descent = equilibria(problem), strained_descent(problem, factor_of(problem), space)
+    for column, total in enumerate(TOTAL):
+        problem, _ = begun(LAW, element, total[None])
+        descent = strained_descent(problem, factor_of(problem), space)
+        found = descent.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 200)
+        assert found.status[0] == DONE and found.residual[0] <= FINE
+        np.testing.assert_allclose(found.u.numpy()[:, 0], expected[:, column], atol=1e-5 * np.abs(expected).max())
+
+
+def test_it_takes_half_the_steps() -> None:
+    problem, space, rest = hard()
+    factor, tolerance = factor_of(problem), np.full(1, 1e-6)
+    plain = Lbfgs(problem, factor).descend(rest, tolerance, 400)
+    found = strained_descent(problem, factor, space).descend(rest, tolerance, 400)
+    assert found.status[0] == plain.status[0] == DONE
+    assert found.steps[0] <= 0.5 * plain.steps[0]
+
+
+def test_the_preconditioner_is_the_inverse_of_what_is_stiffer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all nodes it is the inverse of the whole stiffness where the body is now."""
+    problem, space, rest = hard("p1")
+    factor = factor_of(problem)
+    bent = strained_descent(problem, factor, space).descend(rest, np.full(1, 1e-2), 100).u
+    basis, definite = problem.constraint.basis(), problem.device.array(np.zeros(1), wp.int32)
+    for term in problem.terms:
+        term.linearise(bent, definite)
+    now = sum(
+        (term.curvature() for term in problem.terms if hasattr(term, "curvature")), sp.csc_array((problem.rows,) * 2)
+    )
+    force = basis @ np.random.default_rng(0).normal(size=(basis.shape[1], 1))
+    exact = basis @ sp.linalg.spsolve(sp.csc_array(basis.T @ now @ basis), basis.T @ force)
+    at_rest = basis @ sp.linalg.spsolve(sp.csc_array(basis.T @ problem.rest_curvature() @ basis), basis.T @ force)
+    kept: list[Stiffening] = []
+    inside = StiffenedPreconditioner.apply
+    monkeypatch.setattr(
+        StiffenedPreconditioner, "apply",
+        lambda self, *given: (kept.append(self.stiffening), inside(self, *given))[1],
+    )  # fmt: skip
+    descent = StrainedDescent(problem, factor, np.arange(len(space.nodes)), EVERY)
+    descent.descend(bent, np.full(1, 1e-12), 2)
+    preconditioner, out = StiffenedPreconditioner(factor, problem), problem.device.zeros(problem.rows, 1)
+    preconditioner.stiffening = kept[0]
+    preconditioner.apply(problem.device.array(force), np.ones(1, bool), out)
+    off = np.linalg.norm(out.numpy()[:, 0] - exact) / np.linalg.norm(exact)
+    assert off < 1e-3 < 0.03 < np.linalg.norm(at_rest - exact) / np.linalg.norm(exact)
+
+
+def test_the_next_frame_begins_with_what_served() -> None:
+    problem, space, rest = hard()
+    descent = strained_descent(problem, factor_of(problem), space)
+    there = descent.descend(rest, np.full(1, 1e-6), 400, {})
+    assert there.steps[0] > Renewal().served and there.learnt == {}
+    first = descent.descend(there.u, np.full(1, 1e-8), 400, {})
+    assert first.status[0] == DONE and first.steps[0] <= Renewal().served and set(first.learnt) == set(LEARNT.values())
+    again = descent.descend(there.u, np.full(1, 1e-8), 400, first.learnt)
+    np.testing.assert_array_equal(again.u.numpy(), first.u.numpy())
+    for name, array in first.learnt.items():
+        assert np.shares_memory(again.learnt[name], array)
+    assert descent.descend(there.u, np.full(1, 1e-8), 400).learnt == {}
+
+
+@pytest.mark.parametrize("name", LEARNT.values())
+@pytest.mark.parametrize("fault", ["missing", "short", "negative", "large", "kind"])
+def test_what_does_not_fit_is_forgotten(name: str, fault: str) -> None:
+    problem, space, rest = hard()
+    descent = strained_descent(problem, factor_of(problem), space)
+    there = descent.descend(rest, np.full(1, 1e-6), 400, {}).u
+    first = descent.descend(there, np.full(1, 1e-8), 400, {})
+    learnt, array = dict(first.learnt), first.learnt[name]
+    whole = array.dtype.kind == "i"
+    learnt[name] = {
+        "missing": None,
+        "short": array[..., 1:],
+        "negative": np.where(np.arange(array.shape[-1]) == 1, -1 if whole else np.nan, array).astype(array.dtype),
+        "large": np.where(np.arange(array.shape[-1]) == 1, 10**6 if whole else np.inf, array).astype(array.dtype),
+        "kind": array.astype(str),
+    }[fault]
+    if fault == "missing":
+        del learnt[name]
+    np.testing.assert_array_equal(descent.descend(there, np.full(1, 1e-8), 400, learnt).u.numpy(), first.u.numpy())
+
+
+def test_a_factor_that_cannot_be_divided_by_is_forgotten() -> None:
+    problem, space, rest = hard()
+    descent = strained_descent(problem, factor_of(problem), space)
+    there = descent.descend(rest, np.full(1, 1e-6), 400, {}).u
+    first = descent.descend(there, np.full(1, 1e-8), 400, {})
+    learnt = {name: np.zeros_like(array) for name, array in first.learnt.items()}
+    np.testing.assert_array_equal(descent.descend(there, np.full(1, 1e-8), 400, learnt).u.numpy(), first.u.numpy())
+
+
+def test_where_the_model_is_not_positive_the_rest_stands_in() -> None:
+    """A model that takes tissue for a thousand times softer than nothing would send every step uphill."""
+    problem, space, _ = hard("p1")
+    factor, rows = factor_of(problem), np.arange(3 * len(space.nodes))
+    preconditioner = StiffenedPreconditioner(factor, problem)
+    g = problem.device.array(problem.constraint.basis() @ np.ones((problem.constraint.basis().shape[1], 1)))
+    plain, out = problem.device.zeros(problem.rows, 1), problem.device.zeros(problem.rows, 1)
+    factor.apply(g, np.ones(1, bool), plain)
+    size = len(rows)
+    added = 1e6 * np.eye(size, dtype=np.float32)
+    preconditioner.stiffening = Stiffening(rows, added, np.eye(size, dtype=np.float32), np.arange(size, dtype=np.int32))
+    preconditioner.apply(g, np.ones(1, bool), out)
+    np.testing.assert_array_equal(out.numpy(), plain.numpy())
+
+
+def test_the_budget_leaves_a_finite_state_and_says_so() -> None:
+    problem, space, rest = hard()
+    descent = strained_descent(problem, factor_of(problem), space)
+    found = descent.descend(rest, np.full(1, 1e-12), 3)
+    assert found.status[0] == GOING and found.steps[0] <= 3 and found.left.tolist() == [0]
+    _, free, scale = problem.residual(found.u)
+    np.testing.assert_allclose(found.residual, free / scale, rtol=1e-6)
+    broken = descent.descend(problem.device.array(np.full((problem.rows, 1), np.nan)), np.full(1, 1e-12), 20)
+    assert broken.status[0] == BROKEN
+
+
+def live(*avoid: Step) -> Fem:
+    effects = (Elasticity(tissue(LAW)), *EFFECTS)
+    return Fem(body()[0], effects, replace(LIVE, tolerance=1e-4), "cpu", element="smoothed", live=True, avoid=avoid)
+
+
+def frames(fem: Fem) -> list[Deformation]:
+    """A pull that grows, each frame from the one before."""
+    found: list[Deformation] = []
+    for share in np.linspace(0.78, 0.8, 5):
+        found.append(fem.deform(loads_of(share * HARD), found[-1] if found else None))
+    return found
+
+
+def test_live_frames_go_the_short_way_to_the_same_place() -> None:
+    found, expected = frames(live()), frames(live(Step.STRAINED))
+    assert {answer.outcome[0] for answer in found} == {Outcome.CONVERGED}
+    size = np.abs(expected[-1].displacement).max()
+    for mine, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(mine.displacement, other.displacement, atol=1e-3 * size)
+    assert sum(int(answer.iterations[0]) for answer in found) <= 0.6 * sum(int(each.iterations[0]) for each in expected)
+    served = [set(LEARNT.values()) <= set(answer.warm) for answer in found]
+    assert any(served)
+    np.testing.assert_array_equal(frames(live())[-1].displacement, found[-1].displacement)
+
+
+def test_models_have_the_nodes_nearest_to_the_opening() -> None:
+    problem, space, rest = hard()
+    strains, kept = replace(SINGLE, near=200, nodes=30), Renewal(served=400)
+    descent = strained_descent(problem, factor_of(problem), space, strains, kept)
+    rows = descent.descend(rest, np.full(1, 1e-6), 400, {}).learnt[LEARNT["rows"]][0]
+    assert len(np.unique(rows)) == len(rows) == 90
+    distance = np.linalg.norm(space.nodes[:, None] - space.nodes[OPENING], axis=2).min(axis=1)
+    assert distance[rows // 3].max() <= np.sort(distance)[199]
