@@ -6,11 +6,11 @@ import argparse
 
 
 def add_devices(parser: argparse.ArgumentParser, meant: str = "") -> None:
-    """Declare it; `meant` says what works there, where that is not the whole command."""
+    """Declare it; `meant` is a sentence before, where the whole command does not work there."""
     parser.add_argument(
         "--device",
         default="auto",
         metavar="DEVICES",
-        help=f"{meant}auto, cpu or cuda; several with commas between, as in cuda:0,cuda:1, have a process each; all: "
-        "every graphics card (default %(default)s)",
+        help=f"{meant}auto, cpu or cuda. Several with commas between, as in cuda:0,cuda:1, have a process each. all: "
+        "every graphics card. Default: %(default)s",
     )

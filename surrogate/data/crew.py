@@ -52,8 +52,7 @@ class Asked:
     @property
     def needed(self) -> Needed | None:
         """What they will take of a card; None on the CPU."""
-        loads = -(-self.loads // self.share)
-        return foreseen(self.anatomy, self.element, self.accuracy, self.device, self.batch, loads, self.share)
+        return foreseen(self.anatomy, self.element, self.accuracy, self.device, self.batch, self.loads, self.share)
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """As `Fem.deform`."""
@@ -89,8 +88,8 @@ def solving(asked: Asked, devices: Sequence[str], said: Callable[[str], object])
         _demand([own.needed], said)
         yield Solver(own, *described(own, None))
         return
-    most = max(devices.count(name) for name in devices)
-    with working(devices, placed, replace(asked, share=most)) as children:
+    most, own = max(devices.count(name) for name in devices), -(-asked.loads // len(devices))
+    with working(devices, placed, replace(asked, share=most, loads=own)) as children:
         none = [None] * len(devices)
         _demand(at_once(children, memory_of, none), said)
         elements, words, batches = zip(*at_once(children, described, none), strict=True)
