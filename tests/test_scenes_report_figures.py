@@ -106,12 +106,12 @@ def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
 
 
 def test_a_command_without_data_makes_its_own(tmp_path, monkeypatch, capsys):
-    """Neo-Hookean, smoothed; what it says goes elsewhere than the line for machines."""
+    """Neo-Hookean, smoothed, on two devices; what it says goes elsewhere than the line for machines."""
     box = make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
     monkeypatch.setattr("scenes.report.rows.rows", lambda study, specs: iter([]))
     write_anatomy(tmp_path / "box.vtu", box)
-    words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device", "cpu"]
-    assert main([*words, "--loads", "1", "--json"]) == 0
+    words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device"]
+    assert main([*words, "cpu,cpu", "--loads", "1", "--json"]) == 0
     (section,) = json.loads(capsys.readouterr().out)["sections"]
     assert f"{QUICK[0]} palpation loads" in section["about"][0]
     data = read_dataset(tmp_path / "palpation.h5")

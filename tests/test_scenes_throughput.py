@@ -59,6 +59,30 @@ def test_a_row_for_each_tissue_and_set(words, capsys):
     assert captured.err.count("the tools together (bipolar): 6 loads in") == 2
 
 
+def test_several_devices_solve_all_loads_each_at_the_same_time(words, capsys):
+    """Twice the loads, each checked; the rate is of all of them over one clock."""
+    few = [
+        "--presets",
+        "bipolar",
+        "--count",
+        "5",
+        "--repeats",
+        "2",
+        "--poisson",
+        "0.4",
+        "--device",
+        "cpu,cpu",
+        "--json",
+    ]
+    assert main([*words, *few]) == 0
+    captured = capsys.readouterr()
+    (row,) = json.loads(captured.out)["rows"]
+    assert (row["devices"], row["loads"], row["converged"], row["checked"]) == (2, 10, 10, 8)
+    assert row["rate"] == pytest.approx(20 / sum(row["seconds"])) and 1e-9 < row["double"] < 1.1e-4
+    assert "; at once on cpu, cpu" in captured.err and "2 processes, each with all loads of a set" in captured.err
+    assert "Warp 1" not in captured.out
+
+
 def test_poses_of_a_ball_have_rows_too(words, capsys):
     few = ["--poses", "--presets", "palpation", "bipolar", "--count", "3", "--repeats", "1", "--poisson", "0.4"]
     assert main([*words, *few, "--json"]) == 0
@@ -113,6 +137,7 @@ def test_one_in_a_hundred_is_checked_and_every_solve_is_reported(box):
         (["--repeats", "0"], "--repeats is 0"),
         (["--poisson", "0.5"], "Poisson"),
         (["--device", "abacus"], "abacus"),
+        (["--device", "cpu,abacus"], "abacus"),
         (["--anatomy", "none.vtu"], "no such file"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -24,6 +25,7 @@ from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN
+from sim.strategy.memory_needed import foreseen
 from surrogate.data.tool_loads import draw
 
 from .loglog_chart import Curve, Panel
@@ -38,7 +40,8 @@ SEED = 4
 class Row:
     """One mesh and batch: asked for, then had; seconds; outer steps (median); loads solved, and converged of them.
 
-    memory [GiB]: the process's own at its peak; `card` [GiB] what it took of the graphics card.
+    memory [GiB]: the process's own at its peak; `card` [GiB] what it took of the graphics card, and `foreseen` [GiB]
+    what it was thought to take before it began.
     """
 
     size: int
@@ -54,6 +57,7 @@ class Row:
     converged: int
     memory: float
     card: float
+    foreseen: float
 
 
 @dataclass(frozen=True)
@@ -74,8 +78,18 @@ def template_mesh(folder: Path, size: int) -> Path:
 
 
 def measured(trial: Trial, size: int, batch: int) -> Row:
-    """Solve palpation loads on one mesh, to 1e-4 in single precision, in this process."""
+    """Solve palpation loads on one mesh, to 1e-4 in single precision, in this process.
+
+    Raises
+    ------
+    InputError
+        As `Fem`; a card on which they would not fit.
+    """
     anatomy = read_anatomy(template_mesh(trial.folder, size))
+    needed = foreseen(anatomy, trial.element, TRAIN, trial.device, batch, batch)
+    if needed is not None:
+        print(f"{needed}.", file=sys.stderr)
+        needed.demand()
     with watched_card(trial.device) as card:
         effects = pushed_effects(anatomy, BRAIN)
         fem, made = timed(Fem, anatomy, effects, TRAIN, trial.device, batch, trial.element)
@@ -92,6 +106,7 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
         size, batch, len(anatomy.mesh.nodes), len(anatomy.mesh.tets), fem.plan.preconditioner, batch, made,
         float(np.median(seconds)) / batch, float(np.median(outer)), len(outer), good,
         resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, max(card) / 2**30,
+        0.0 if needed is None else needed.peak / 2**30,
     )  # fmt: skip
 
 

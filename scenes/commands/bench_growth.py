@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     out = claimed(args.out, ".png", "a picture of sulcus", args.force)
     where, record = machine(args.device), out.with_suffix(".csv")
     trial = Trial(args.element, args.device, out.parent)
-    stated = f"{where.split(';')[0]}, {args.device} {args.element}"
+    stated = f"{where.split(';')[0]}, {args.device} {args.element}, with the memory foreseen"
     found = [row for row in read_rows(record, stated, Row) if row.size in args.sizes and row.asked in args.batch]
     table = sys.stderr if args.json else sys.stdout
     print(where, file=table)
@@ -75,12 +75,13 @@ def run(args: argparse.Namespace) -> int:
 def _print(found: Sequence[Row], table) -> None:
     names = (
         "nodes", "tetrahedra", "preconditioner", "set-up [s]", "batch", "a load [s]", "outer", "converged",
-        "host [GiB]", "card [GiB]",
+        "host [GiB]", "card [GiB]", "foreseen",
     )  # fmt: skip
     print(f"\n| {' | '.join(names)} |\n|{'---|' * len(names)}", file=table)
     for row in found:
         cells = (
             row.nodes, row.tets, row.preconditioner, f"{row.set_up:.3g}", row.batch, f"{row.load:.3g}",
             f"{row.outer:g}", f"{row.converged} of {row.loads}", f"{row.memory:.3g}", f"{row.card:.3g}",
+            f"{row.foreseen:.3g}",
         )  # fmt: skip
         print(f"| {' | '.join(map(str, cells))} |", file=table)

@@ -21,6 +21,7 @@ from surrogate.data.tool_loads import PRESETS
 
 from ..bench.figure_tables import three_digits
 from ..script.shipped_files import template_path
+from .devices_option import add_devices
 
 if TYPE_CHECKING:
     from sim.effects import Effect
@@ -58,39 +59,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, help=f"loads a row (default {CUDA_COUNT} on CUDA, {CPU_COUNT} on the CPU)")
     parser.add_argument("--batch", type=int, help=f"loads solved together (default all; {CPU_BATCH} on the CPU)")
     parser.add_argument("--repeats", type=int, default=3, help="of each row; the median counts (default %(default)s)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    add_devices(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line on stdout, the table on stderr")
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
     from sim.effects import ToolContact
-    from sim.runtime.device import find_device
+    from sim.runtime.device import device_names
     from surrogate.data.tool_poses import ROUND, ball_of
 
     from ..bench.robustness import Trial
     from ..bench.stages import machine
     from ..bench.throughput import drawn, rows, together
 
-    on_cuda = find_device(args.device, TRAIN.precision).on_cuda
+    devices = device_names(args.device)
+    on_cuda = devices[0].startswith("cuda")
     count = args.count if args.count is not None else (CUDA_COUNT if on_cuda else CPU_COUNT)
     batch = args.batch if args.batch is not None else (count if on_cuda else CPU_BATCH)
     for name, value in (("--count", count), ("--batch", batch), ("--repeats", args.repeats)):
         at_least(name, value, 1)
     materials = [Material(law, YOUNG, poisson) for law in args.laws for poisson in args.poisson]
     anatomy = read_anatomy(args.anatomy or template_path())
-    trial = Trial(anatomy, (), args.element, args.device, batch)
+    trial = Trial(anatomy, (), args.element, devices[0], batch)
     sets = drawn(anatomy, args.presets or (ROUND if args.poses else PRESETS), count, args.poses)
     groups: list[tuple[dict[str, Drawn], tuple[Effect, ...]]] = [(sets, ())]
     if args.poses:
         groups = [({name: loads}, (ToolContact((ball_of(name),)),)) for name, loads in sets.items()]
     table = sys.stderr if args.json else sys.stdout
-    where = machine(args.device)
+    where = machine(devices[0]) + (f"; at once on {', '.join(devices)}" if len(devices) > 1 else "")
     print(where, file=table)
     found: list[Row] = []
     with tqdm(total=len(materials) * len(sets) * (args.repeats + 2), unit="solve", file=sys.stderr) as bar:
         measured = (
-            rows(trial, material, some, args.repeats, bar.update, tools)
+            rows(trial, material, some, args.repeats, bar.update, tools, devices)
             for material in materials
             for some, tools in groups
         )
@@ -109,8 +111,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _header(row: Row, batch: int, repeats: int) -> str:
+    each = "" if row.devices == 1 else f"; {row.devices} processes, each with all loads of a set"
     done = f"preconditioner: {row.preconditioner}; batches of at most {batch}, E {YOUNG:g} Pa, to {TRAIN.tolerance:g}"
-    return f"{done} in {TRAIN.precision}, median of {repeats}\n\n| {' | '.join(NAMES)} |\n|{'---|' * len(NAMES)}"
+    head = f"\n\n| {' | '.join(NAMES)} |\n|{'---|' * len(NAMES)}"
+    return f"{done} in {TRAIN.precision}, median of {repeats}{each}{head}"
 
 
 def _line(row: Row) -> str:

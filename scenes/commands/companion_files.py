@@ -63,3 +63,12 @@ def remove_data(path: Path, wanted: Mapping[str, str]) -> None:
         found = stated(each)
         if any(found.get(name) != wanted.get(name) for name in KEPT):
             each.unlink(missing_ok=True)
+
+
+def batch_begun(path: Path) -> int | None:
+    """The batch of a data set that is there, or begun, and that goes on with it; None where none can be read."""
+    for each in (path, path.with_name(path.name + ".partial")):
+        found = stated(each).get("batch", "")
+        if found.isdigit():
+            return int(found)
+    return None

@@ -15,8 +15,9 @@ next: sulcus simulate brain.vtu --out brain.h5""",
     "solve": """example:
   sulcus solve mesh.vtu --material neo-hookean --young 3000 --poisson 0.49 --out moved.vtu
 next: open moved.vtu in ParaView; `displacement` is in metres""",
-    "simulate": """example:
+    "simulate": """examples:
   sulcus simulate brain.vtu --out brain.h5 --count 1000
+  sulcus simulate brain.vtu --out brain.h5 --count 100000 --device all
 next: sulcus train brain.h5 --out brain.model.npz""",
     "train": """example:
   sulcus train brain.h5 --out brain.model.npz --learners linear,series,series-gp

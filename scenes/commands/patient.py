@@ -8,15 +8,15 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from sim.accuracy import TRAIN
 from sim.discretisation.space import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS
-from sim.runtime.device import find_device
+from sim.runtime.device import device_names
 from sim.runtime.timing import listened
 from surrogate.data.disc_split import APART, FEWEST
 from surrogate.data.tool_loads import PRESETS
 
+from .devices_option import add_devices
 from .outputs import add_force, claimed
 from .placement_options import add_opening_arguments, opening_words
 from .tissue_options import add_element_argument
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--learners", default="linear,series,series-gp", help="as `sulcus train` has them (default %(default)s)"
     )
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
+    add_devices(parser)
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="a JSON line of each step, then one of the seconds")
 
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     claimed(args.out, ".vtu", "an anatomy of sulcus", args.force, [args.labels, args.t1])
     claimed(data, ".h5", "a data set of `sulcus simulate`", args.force)
     claimed(model, ".npz", "a model of `sulcus train`", args.force)
-    find_device(args.device, TRAIN.precision)
+    device_names(args.device)
     check_learners(asked_learners(args.learners), of_poses=False, where=str(data))
     if args.count - args.count // APART < FEWEST + 1:
         raise InputError(f"--count {args.count} is too few to learn from and to leave {FEWEST} discs out: give more.")

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from sim.errors import InputError
 
+from .devices_option import add_devices
 from .interrupt import INTERRUPTED
 from .outputs import add_force, claimed
 
@@ -40,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("report"), metavar="DIR", help="folder of the page (default %(default)s)"
     )
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    add_devices(parser, "loads are simulated on all of these, and everything else is measured on the first. ")
     parser.add_argument(
         "--data", nargs="+", type=Path, default=[], metavar="DATA.h5",
         help="data sets of `sulcus simulate`, each with rows of its own (default: one is made, smoothed, palpation)",
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _measured(args: argparse.Namespace) -> list[Section]:
     """The rows of each data set; the page is written anew after each."""
-    from sim.runtime.device import find_device
+    from sim.runtime.device import device_names
 
     from ..bench.stages import machine
     from ..report.adaptation import debulked_study, simulate_debulked
@@ -80,7 +81,8 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     from ..report.rows import every, learners, rows, star
     from ..report.study import Study
 
-    find_device(args.device, "float32")
+    several = device_names(args.device)
+    device = args.device if len(several) == 1 else several[0]
     claimed(args.out / "index.html", ".html", "a page of `sulcus report`", args.force)
     count, loads, beyond = QUICK if args.quick else WHOLE
     if args.loads is not None and args.loads < 1:
@@ -93,7 +95,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     if not paths:
         paths = [args.out / "palpation.h5"]
         _simulated(paths[0], args, count)
-    studies = [Study(path, args.out, args.device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
+    studies = [Study(path, args.out, device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
     sections = []
     for study in studies:
         specs = (*(every(study) if args.full else star(study, not args.quick)), *learners())
@@ -111,7 +113,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
                 found.append(row)
                 bar.update()
         sections.append(Section(study.data.stem, _about(study), tuple(found)))
-        write_report(args.out, machine(args.device), sections)
+        write_report(args.out, machine(device), sections)
     return sections
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import ExitStack
+from functools import partial
 from importlib.metadata import version
 
 import h5py
@@ -17,19 +19,21 @@ from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Outcome
 from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effects
 from sim.errors import InputError
-from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import tissue_to_json
+from sim.runtime.device import device_names
 from sim.runtime.memory import Budget
 from sim.runtime.timing import stage
 from sim.tools import Ball
+from surrogate.data.crew import Asked, solving
 from surrogate.data.dataset import read_outcomes
 from surrogate.data.simulate import Solved, simulate
 from surrogate.data.tool_loads import PRESETS, draw, refused_share, refused_words
 from surrogate.data.tool_poses import ball_of, draw_poses
 
 from ..script.shipped_files import template_path
-from .companion_files import remove_data
+from .companion_files import batch_begun, remove_data
+from .devices_option import add_devices
 from .interrupt import INTERRUPTED
 from .outputs import add_force, claimed
 from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
@@ -66,8 +70,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_skull_argument(parser, ("bonded", "slide"))
     parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
     widest = f"up to {Budget.widest}, on CUDA {Budget.widest_on_cuda}"
-    parser.add_argument("--batch", type=int, help=f"loads solved together (default: as fit, {widest})")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument(
+        "--batch", type=int, help=f"loads solved together (default: as fit, {widest}, and those of a file that goes on)"
+    )
+    add_devices(parser)
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
 
@@ -84,33 +90,37 @@ def run(args: argparse.Namespace) -> int:
     if ball is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
         effects = (*passive, ToolContact((ball,)))
-    with stage("set-up"):
-        fem = Fem(anatomy, effects, accuracy, args.device, args.batch, args.element)
-    provenance = {
-        "effects": repr(effects),
-        "tissue": tissue_to_json(tissue),
-        "element": fem.space.element,
-        "accuracy": repr(accuracy),
-        "device": fem.problem.device.name.split(":")[0],
-        "preset": args.preset,
-        "seed": str(args.seed),
-        **({} if ball is None else {"ball": repr(ball.radius)}),
-        **{f"{name} version": version(name) for name in ("sulcus", "warp-lang", "numpy")},
-    }
-    if args.force:
-        remove_data(out, {**provenance, "anatomy": anatomy.digest})
-    with tqdm(unit="load", disable=args.json, file=sys.stderr) as bar:
+    devices = device_names(args.device)
+    batch = batch_begun(out) if args.batch is None else args.batch
+    with ExitStack() as closing:
+        with stage("set-up"):
+            wanted = Asked(anatomy, effects, accuracy, args.element, batch, len(loads))
+            solver = closing.enter_context(solving(wanted, devices, partial(print, file=sys.stderr)))
+        provenance = {
+            "effects": repr(effects),
+            "tissue": tissue_to_json(tissue),
+            "element": solver.element,
+            "accuracy": repr(accuracy),
+            "device": devices[0].split(":")[0],
+            "preset": args.preset,
+            "seed": str(args.seed),
+            **({} if ball is None else {"ball": repr(ball.radius)}),
+            **{f"{name} version": version(name) for name in ("sulcus", "warp-lang", "numpy")},
+        }
+        if args.force:
+            remove_data(out, {**provenance, "anatomy": anatomy.digest})
+        bar = closing.enter_context(tqdm(unit="load", disable=args.json, file=sys.stderr))
 
         def progress(done: int, total: int) -> None:
             bar.total = total
             bar.update(done - bar.n)
 
         try:
-            solved = simulate(out, fem, loads, provenance, fem.batch, progress)
+            solved = simulate(out, solver.deformer, loads, provenance, solver.batch, progress)
         except KeyboardInterrupt:
             print(f"stopped; the same command goes on from {args.out}.partial", file=sys.stderr)
             return INTERRUPTED
-    _report(args, fem.description, len(loads), solved)
+    _report(args, solver.description, len(loads), solved)
     return 0
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.errors import InputError
+from sim.runtime.device import device_names
 from sim.runtime.timing import stage
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.disc_split import APART
@@ -21,6 +22,7 @@ from surrogate.model.store import save
 from surrogate.training.shared_inputs import EXPANDED, Expansion
 from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, learners_for, train
 
+from .devices_option import add_devices
 from .outputs import add_force, claimed
 
 
@@ -34,11 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "all that the data can train)",
     )
     parser.add_argument("--most", type=int, metavar="LOADS", help="train on at most so many loads (default: all)")
-    parser.add_argument(
-        "--device",
-        default="auto",
-        help="where finite elements make the series: auto, cpu or cuda (default %(default)s)",
-    )
+    add_devices(parser, "where finite elements make the series; of a list the first. ")
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of the table")
 
@@ -46,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Returns 0 when the models are written."""
     out = claimed(args.out, ".npz", "a model of `sulcus train`", args.force)
+    device = device_names(args.device)[0]
     asked = None if args.learners is None else asked_learners(args.learners)
     with stage("read the data"):
         data = read_dataset(args.data)
@@ -54,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"sulcus train: {note}", file=sys.stderr)
     with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
         expansion = Expansion(
-            data, args.device, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places")
+            data, device, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places")
         )
         trained = train(data, learners, lambda learner: bar.update(), most=args.most, expansion=expansion)
     with stage("save"):

@@ -56,13 +56,17 @@ def rate(where: str, trial: int = Exchange.trial) -> float:
     return trial**3 / spent
 
 
+def exchange_bytes(count: int, settings: Exchange = Exchange()) -> int:
+    """What an exchange of so many unknowns takes: half the matrix in double precision, and what stands beside it."""
+    return 8 * (count * (count + settings.block) // 2 + BESIDE * min(count, settings.block) * count)
+
+
 def fits(count: int, where: str, besides: int = 0, settings: Exchange = Exchange()) -> bool:
     """Whether a card can exchange so many unknowns, beside so many bytes, in its free memory and in time."""
     if not torch.cuda.is_available():
         return False
     free, _ = torch.cuda.mem_get_info(where)
-    taken = 8 * (count * (count + settings.block) // 2 + BESIDE * min(count, settings.block) * count)
-    if taken + besides >= settings.share * free:
+    if exchange_bytes(count, settings) + besides >= settings.share * free:
         return False
     return count**3 / 2 < settings.longest * rate(where, settings.trial)
 

@@ -32,8 +32,12 @@ LOW = {"float32": wp.float16, "float64": wp.float64}
 
 def fits(rows: int, device: Device) -> bool:
     """Whether the card can invert `rows` unknowns, in time, and keep the inverse."""
-    kept = wp.types.type_size_in_bytes(LOW[device.precision]) * rows**2
-    return block_inverse.fits(rows, wp.device_to_torch(device.name), kept)
+    return block_inverse.fits(rows, wp.device_to_torch(device.name), kept_bytes(rows, device))
+
+
+def kept_bytes(rows: int, device: Device) -> int:
+    """What the inverse of so many unknowns takes."""
+    return wp.types.type_size_in_bytes(LOW[device.precision]) * rows**2
 
 
 @cache

@@ -15,6 +15,9 @@ from ..errors import InputError
 forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
 """`wp.kernel` without adjoint, which nobody asks for, and launched as wide as the work, which saves registers."""
 
+EVERY = "all"
+"""What every graphics card is called in a list of devices."""
+
 SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}
 
 
@@ -67,17 +70,55 @@ def find_device(name: str, precision: Precision) -> Device:
     Raises
     ------
     InputError
-        A device that this machine does not have.
+        A device that this machine does not have, or several of them.
     """
-    if wp.config.log_level == wp.LOG_INFO:  # its start-up notes would stand among a command's own lines
-        wp.config.log_level = wp.LOG_ERROR
-    wp.init()
-    present = [device.alias for device in wp.get_devices()]
+    if "," in name or name == EVERY:
+        raise InputError(
+            f"{name!r} names several devices, and one is wanted here: choose auto, or one of {', '.join(_present())}."
+        )
+    present = _present()
     if name == "auto":
         name = "cuda:0" if "cuda:0" in present else "cpu"
     alias = "cuda:0" if name == "cuda" else name
     if alias not in present:
-        no_card = alias.startswith("cuda") and not wp.is_cuda_available()
-        why = ", as no NVIDIA driver with a card was found" if no_card else ""
+        why = _no_card() if alias.startswith("cuda") else ""
         raise InputError(f"there is no device {name!r} here{why}: choose auto or one of {', '.join(present)}.")
     return Device(alias, precision)
+
+
+def device_names(words: str) -> tuple[str, ...]:
+    """The devices that `words` list, as this machine calls them: "cuda:0,cuda:1", "cpu,cpu", "all", or a single one.
+
+    "all" are the graphics cards. A device may stand there twice: then two processes share it.
+
+    Raises
+    ------
+    InputError
+        A device that this machine does not have, "all" where it has no card, processors beside cards.
+    """
+    if words.strip() == EVERY:
+        cards = tuple(name for name in _present() if name.startswith("cuda"))
+        if not cards:
+            raise InputError(
+                f"'all' means every graphics card, and there is none here{_no_card()}: choose auto, or name devices "
+                "with commas between, as in cpu,cpu."
+            )
+        return cards
+    names = tuple(find_device(name.strip(), "float32").name for name in words.split(","))
+    if len({name.split(":")[0] for name in names}) > 1:
+        raise InputError(
+            f"{words!r} names processors beside graphics cards, whose answers differ in their last digits: choose "
+            "devices of one kind."
+        )
+    return names
+
+
+def _present() -> list[str]:
+    if wp.config.log_level == wp.LOG_INFO:  # its start-up notes would stand among a command's own lines
+        wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    return [device.alias for device in wp.get_devices()]
+
+
+def _no_card() -> str:
+    return "" if wp.is_cuda_available() else ", as no NVIDIA driver with a card was found"

@@ -64,7 +64,7 @@ def host_bytes(budget: Budget = Budget()) -> int:
 
 def fitting_batch(rows: int, device: Device, budget: Budget = Budget()) -> int:
     """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it and fit."""
-    column = _column(rows, device)
+    column = column_bytes(rows, device)
     widest = budget.widest_on_cuda if device.on_cuda else budget.widest
     return int(np.clip(budget.batches * free_bytes(device, budget) / max(column, 1), 1, widest))
 
@@ -79,14 +79,14 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0,
     InputError
         Naming what it takes, what is free, and what would fit.
     """
-    column = _column(rows, device)
+    column = column_bytes(rows, device)
     free = host_bytes(budget)  # read once: Linux counts for a good part of a millisecond
     each, host = ANSWER_COPIES * 8 * rows, budget.share * free
     answers, alone = each * count, 0 if device.on_cuda else column
     if answers + alone > host:
         fitting = int((host - alone) / each)
         raise InputError(
-            f"the answers to {count} loads take about {_gigabytes(answers)}, and {_gigabytes(host)} are free: "
+            f"the answers to {count} loads take about {gigabytes(answers)}, and {gigabytes(host)} are free: "
             + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
         )
     available = free_bytes(device) if device.on_cuda else free
@@ -96,17 +96,18 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0,
         fitting = int(room / column)
         remedy = f"a --batch of {fitting} fits." if fitting else COARSER
         raise InputError(
-            f"a batch of {columns} loads takes about {_gigabytes(column * columns)}, and {_gigabytes(max(room, 0.0))} "
+            f"a batch of {columns} loads takes about {gigabytes(column * columns)}, and {gigabytes(max(room, 0.0))} "
             f"are free: {remedy}"
         )
 
 
-def _column(rows: int, device: Device) -> int:
+def column_bytes(rows: int, device: Device) -> int:
     """Bytes that one load case takes while it is solved."""
     return WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
 
 
-def _gigabytes(amount: float) -> str:
+def gigabytes(amount: float) -> str:
+    """Bytes as a person reads them."""
     return f"{amount / 2**30:.3g} GiB"
 
 

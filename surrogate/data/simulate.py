@@ -17,12 +17,13 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.errors import InputError
-from sim.loads import Loads, Nodal, Touching
+from sim.loads import Loads, Touching
 from sim.runtime.atomic_files import check_output, demand_space, written_stream
 from sim.runtime.outside_files import read_as
+from sim.runtime.processes import LostError
 from sim.runtime.timing import listened, stage
 
-from .answer_rows import CHECKSUM, checksums, row_type, rows_of
+from .answer_rows import CHECKSUM, checksums, row_type
 from .array_meanings import TITLE, explain
 from .cortex_patch import open_patch
 from .dataset import (
@@ -39,13 +40,10 @@ from .dataset import (
     write_provenance,
 )
 from .journal import Batch, DamageWarning, Journal, opened
+from .tasks import Crew, Task, answered
 
-# Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
-# solve with the rest stiffness is the answer.
-UNIT_FORCE = 1e-6
-# Names of the file's groups where their seconds are reported, and the unit of their displacements [m].
+# Names of the file's groups where their seconds are reported.
 STAGES = {"unit": "unit responses", "answers": "loads"}
-UNITS = {"unit": UNIT_FORCE, "answers": 1.0}
 # From this version of HDF5 on, the metadata of arrays have checksums.
 READERS = ("v108", "v108")
 UNTIMED = "not known"  # as wide as a number
@@ -69,11 +67,13 @@ class Solved:
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What is asked of a deformer: unit responses, then loads, in batches.
+    """What is asked: unit responses, then loads, in batches.
 
     Parameters
     ----------
-    deformer, loads
+    anatomy
+        The body.
+    loads
         As in `simulate`.
     nodes
         (m,) vertices that are pushed by a unit force; none where the loads are poses.
@@ -81,15 +81,10 @@ class Work:
         Rows that are solved together.
     """
 
-    deformer: Deformer
+    anatomy: Anatomy
     loads: Loads
     nodes: np.ndarray
     batch: int
-
-    @property
-    def anatomy(self) -> Anatomy:
-        """The body."""
-        return self.deformer.anatomy
 
     @property
     def row(self) -> np.dtype:
@@ -111,17 +106,15 @@ class Work:
         name, first = batch
         return np.arange(first, min(first + self.batch, self.counts[name]))
 
-    def solved(self, batch: Batch) -> np.ndarray:
-        """A batch's rows (`answer_rows.row_type`)."""
+    def task(self, batch: Batch) -> Task:
+        """A batch, as it is solved."""
         rows = self.rows(batch)
-        asked = unit_loads(self.anatomy, rows) if batch[0] == "unit" else self.loads.rows(rows)
-        answer = self.deformer.deform(asked).at(np.arange(len(self.anatomy.mesh.nodes)))
-        return rows_of(answer, UNITS[batch[0]])
+        return Task(batch, rows, None if batch[0] == "unit" else self.loads.rows(rows))
 
 
 def simulate(
     path: str | Path,
-    deformer: Deformer,
+    deformer: Deformer | Crew,
     loads: Loads,
     provenance: Mapping[str, str],
     batch: int = 64,
@@ -137,7 +130,7 @@ def simulate(
     Parameters
     ----------
     deformer
-        Answers `loads` and `Nodal` loads at every vertex.
+        Answers `loads` and `Nodal` loads at every vertex; a `Crew` has one on each of several devices.
     provenance
         Texts that must agree for a run to go on.
     progress
@@ -147,7 +140,7 @@ def simulate(
     ------
     InputError
         A batch below one, a file that holds something else or is being written, a folder that cannot be written to or
-        has too little room.
+        has too little room. A crew of which one is lost.
 
     Warns
     -----
@@ -162,11 +155,11 @@ def simulate(
     stated = {**provenance, "format": FORMAT, "anatomy": deformer.anatomy.digest, "batch": str(batch)}
     partial = path.with_name(path.name + ".partial")
     finished: set[Batch] = set()
-    work = Work(deformer, loads, nodes, batch)
+    work = Work(deformer.anatomy, loads, nodes, batch)
     if path.exists():
         before = _earlier(path, stated, loads)
         if len(before) > len(loads):
-            work = Work(deformer, before, nodes, batch)
+            work = Work(deformer.anatomy, before, nodes, batch)
         finished = _whole_batches(path, work)
         if not partial.exists() and not set(work.batches) - finished and _same_body(path, work):
             return Solved()
@@ -179,37 +172,39 @@ def simulate(
         "hash of the loads": digest_of_loads(work.loads),
     }
     with listened() as seconds, opened(partial, run) as journal:
-        solved = _fill(journal, work, finished, progress)
+        try:
+            solved = _fill(journal, work, deformer, finished, progress)
+        except LostError as error:
+            raise InputError(f"{error} What was solved is kept: the same command goes on.") from error
         with stage(STAGES["answers"]):
             _write(path, work, {**stated, **_rates(path, solved, seconds)}, journal)
     partial.unlink(missing_ok=True)
     return Solved(solved["unit"], solved["answers"], *(seconds[name] for name in STAGES.values()))
 
 
-def unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:
-    """`UNIT_FORCE` at open-cortex node row // 3 along axis row % 3, for each of `rows` (B,)."""
-    force = np.zeros((len(rows), len(anatomy.mesh.nodes), 3))
-    force[np.arange(len(rows)), open_patch(anatomy).nodes[rows // 3], rows % 3] = UNIT_FORCE
-    return Loads((Nodal(force),))
-
-
-def _fill(journal: Journal, work: Work, finished: set[Batch], progress: Callable[[int, int], None]) -> dict[str, int]:
-    """Solve what is in neither file. A second thread writes a batch while the next is solved: one ahead, in order."""
-    total, done = sum(work.counts.values()), 0
+def _fill(
+    journal: Journal,
+    work: Work,
+    deformer: Deformer | Crew,
+    finished: set[Batch],
+    progress: Callable[[int, int], None],
+) -> dict[str, int]:
+    """Solve what is in neither file. A second thread writes a batch while the next is solved, one ahead."""
+    known = [batch for batch in work.batches if batch in finished or batch in journal]
+    total, done = sum(work.counts.values()), sum(len(work.rows(batch)) for batch in known)
     solved = dict.fromkeys(work.counts, 0)
+    progress(done, total)
     with ThreadPoolExecutor(1) as writer:
         for name in work.counts:
             written: Future[None] | None = None
             with stage(STAGES[name]):
-                for batch in (each for each in work.batches if each[0] == name):
-                    count = len(work.rows(batch))
-                    if batch not in finished and batch not in journal:
-                        rows = work.solved(batch)
-                        if written is not None:
-                            written.result()
-                        written = writer.submit(journal.add, batch, rows.tobytes())
-                        solved[name] += count
-                    done += count
+                left = [work.task(batch) for batch in work.batches if batch[0] == name and batch not in known]
+                for task, rows in answered(deformer, left):
+                    if written is not None:
+                        written.result()
+                    written = writer.submit(journal.add, task.batch, rows)
+                    solved[name] += len(task.rows)
+                    done += len(task.rows)
                     progress(done, total)
                 if written is not None:
                     written.result()

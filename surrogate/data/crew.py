@@ -1,0 +1,127 @@
+"""Who solves the loads of a data set: finite elements here, or a process with its own on each of several devices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sim.accuracy import Accuracy
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, Deformer
+from sim.effects import Effect
+from sim.fem import Fem
+from sim.loads import Loads
+from sim.runtime.processes import at_once, working
+from sim.strategy.memory_needed import Needed, foreseen
+
+from .tasks import Crew
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """Finite elements that are asked for, and made where they are first used: a `Deformer`.
+
+    Parameters
+    ----------
+    anatomy, effects, accuracy, element, batch, device
+        As `Fem` has them.
+    loads
+        That will be solved.
+    share
+        Processes that share the device.
+    """
+
+    anatomy: Anatomy
+    effects: tuple[Effect, ...]
+    accuracy: Accuracy
+    element: str | None
+    batch: int | None
+    loads: int
+    device: str = "auto"
+    share: int = 1
+
+    @cached_property
+    def fem(self) -> Fem:
+        """They themselves."""
+        return Fem(self.anatomy, self.effects, self.accuracy, self.device, self.batch, self.element)
+
+    @property
+    def needed(self) -> Needed | None:
+        """What they will take of a card; None on the CPU."""
+        return foreseen(self.anatomy, self.element, self.accuracy, self.device, self.batch, self.loads, self.share)
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """As `Fem.deform`."""
+        return self.fem.deform(loads, start, at)
+
+
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """Who answers; its element, and all of it in words; the loads that are solved together."""
+
+    deformer: Deformer | Crew
+    element: str
+    description: str
+    batch: int
+
+
+@contextmanager
+def solving(asked: Asked, devices: Sequence[str], said: Callable[[str], object]) -> Iterator[Solver]:
+    """Finite elements on each of the devices; on one device they are in this process.
+
+    Without a `batch` it is as large as fits. Of several cards each then gets as many batches. `said` hears first what
+    they will take of each card's memory.
+
+    Raises
+    ------
+    InputError
+        As `Fem`; a card on which they would not fit.
+    LostError
+        A process that was ended.
+    """
+    if len(devices) == 1:
+        own = replace(asked, device=devices[0])
+        _demand([own.needed], said)
+        yield Solver(own, *described(own, None))
+        return
+    most, own = max(devices.count(name) for name in devices), -(-asked.loads // len(devices))
+    with working(devices, placed, replace(asked, share=most, loads=own)) as children:
+        none = [None] * len(devices)
+        _demand(at_once(children, memory_of, none), said)
+        elements, words, batches = zip(*at_once(children, described, none), strict=True)
+        batch = min(batches)
+        if asked.batch is None and devices[0].startswith("cuda"):
+            batch = even_batch(batch // most, asked.loads, len(devices))
+        yield Solver(Crew(asked.anatomy, children), elements[0], words[0], batch)
+
+
+def placed(device: str, asked: Asked) -> Asked:
+    """The same on a device."""
+    return replace(asked, device=device)
+
+
+def memory_of(asked: Asked, task: None) -> Needed | None:
+    """What they will take of a card."""
+    return asked.needed
+
+
+def described(asked: Asked, task: None) -> tuple[str, str, int]:
+    """Their element, all of them in words, and the most loads that they solve together."""
+    return asked.fem.space.element, asked.fem.description, asked.fem.batch
+
+
+def even_batch(most: int, loads: int, devices: int) -> int:
+    """The widest batch of at most `most` loads of which every device has as many, but for the last."""
+    rounds = -(-loads // (max(most, 1) * devices))
+    return max(1, -(-loads // (max(rounds, 1) * devices)))
+
+
+def _demand(needed: Sequence[Needed | None], said: Callable[[str], object]) -> None:
+    for each in dict.fromkeys(map(str, filter(None, needed))):
+        said(f"{each}.")
+    for each in filter(None, needed):
+        each.demand()

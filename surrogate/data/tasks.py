@@ -1,0 +1,63 @@
+"""Batches of a data set, and who solves them: one deformer here, or one on each of several devices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.deformation import Deformer
+from sim.loads import Loads, Nodal
+from sim.runtime.processes import Child, answers
+
+from .answer_rows import rows_of
+from .cortex_patch import open_patch
+from .journal import Batch
+
+# Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
+# solve with the rest stiffness is the answer.
+UNIT_FORCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A batch, the numbers of its rows (B,), and their loads; none of unit responses."""
+
+    batch: Batch
+    rows: np.ndarray
+    loads: Loads | None
+
+
+@dataclass(frozen=True, eq=False)
+class Crew:
+    """Processes that have each made a deformer of the same body."""
+
+    anatomy: Anatomy
+    children: Sequence[Child]
+
+
+def answered(deformer: Deformer | Crew, tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
+    """Each task with its rows as `solved` has them: here one after the other, by a crew as they come."""
+    if isinstance(deformer, Crew):
+        yield from answers(deformer.children, solved, tasks)
+    else:
+        for task in tasks:
+            yield task, solved(deformer, task)
+
+
+def solved(deformer: Deformer, task: Task) -> bytes:
+    """A batch's rows (`answer_rows.row_type`). Every batch starts from rest, whatever its deformer solved before."""
+    anatomy = deformer.anatomy
+    unit = task.loads is None
+    loads = unit_loads(anatomy, task.rows) if task.loads is None else task.loads
+    answer = deformer.deform(loads).at(np.arange(len(anatomy.mesh.nodes)))
+    return rows_of(answer, UNIT_FORCE if unit else 1.0).tobytes()
+
+
+def unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:
+    """`UNIT_FORCE` at open-cortex node row // 3 along axis row % 3, for each of `rows` (B,)."""
+    force = np.zeros((len(rows), len(anatomy.mesh.nodes), 3))
+    force[np.arange(len(rows)), open_patch(anatomy).nodes[rows // 3], rows % 3] = UNIT_FORCE
+    return Loads((Nodal(force),))

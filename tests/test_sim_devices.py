@@ -1,0 +1,134 @@
+"""Lists of devices, and a process on each: who answers what, how one is lost, and that none outlives its parent."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import warp as wp
+from on_devices import doing, gone, named, refusing
+
+from sim.errors import InputError
+from sim.runtime.device import device_names, find_device
+from sim.runtime.processes import LostError, answers, at_once, working
+
+NO_CARD = pytest.mark.skipif(wp.is_cuda_available(), reason="there is a card here")
+
+
+@pytest.mark.parametrize(("words", "names"), [("cpu", 1), ("cpu,cpu", 2), (" cpu , cpu,cpu", 3)])
+def test_a_list_names_devices_one_by_one(words, names):
+    assert device_names(words) == ("cpu",) * names
+    assert device_names("auto") == (find_device("auto", "float32").name,)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ("cpu,abacus", "no device 'abacus' here: choose auto or one of cpu"),
+        ("cpu,", "no device '' here"),
+        ("", "no device '' here"),
+        pytest.param("all", r"'all' means every graphics card, and there is none.*or name devices", marks=NO_CARD),
+        pytest.param("cpu,cuda:0", "no device 'cuda:0' here, as no NVIDIA driver", marks=NO_CARD),
+    ],
+)
+def test_what_is_no_list_of_devices_is_a_sentence(words, reason):
+    with pytest.raises(InputError, match=reason):
+        device_names(words)
+
+
+@pytest.mark.parametrize("words", ["cpu,cpu", "all", "cuda:0,cuda:1"])
+def test_who_wants_one_device_refuses_several(words):
+    with pytest.raises(InputError, match=f"'{words}' names several devices, and one is wanted here: choose auto, or"):
+        find_device(words, "float32")
+
+
+def test_cards_are_listed_and_not_mixed_with_processors(monkeypatch):
+    class Card:
+        def __init__(self, alias):
+            self.alias = alias
+
+    monkeypatch.setattr(wp, "get_devices", lambda: [Card(name) for name in ("cpu", "cuda:0", "cuda:1")])
+    assert device_names("all") == ("cuda:0", "cuda:1") == device_names("cuda,cuda:1")
+    assert device_names("cuda:0,cuda:0") == ("cuda:0", "cuda:0")
+    with pytest.raises(InputError, match="'cuda:0,cpu' names processors beside graphics cards"):
+        device_names("cuda:0,cpu")
+
+
+def test_every_task_is_answered_once_and_processes_end_with_the_block():
+    with working(["cpu", "cpu"], named, "a body") as children:
+        found = dict(answers(children, doing, range(7)))
+        assert sorted(found) == list(range(7))
+        assert all(answer[:2] == (("cpu", ("a body",)), task) for task, answer in found.items())
+        each = at_once(children, doing, ["one", "other"])
+        assert [answer[1] for answer in each] == ["one", "other"]
+        numbers = {answer[2] for answer in each}
+        assert len(numbers) == 2 and {answer[2] for answer in found.values()} <= numbers
+        assert os.getpid() not in numbers
+    assert all(map(gone, numbers))
+
+
+def test_a_process_sees_its_own_card_alone(monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    with working(["cpu", "cuda:0", "cuda:2"], named) as children:
+        said = at_once(children, doing, ["environment"] * 3)
+    assert said == [("cpu", ""), ("cuda:0", ""), ("cuda:0", "2")]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,GPU-7")
+    with working(["cuda:1"], named) as children:
+        assert at_once(children, doing, ["environment"]) == [("cuda:0", "GPU-7")]
+
+
+def test_what_cannot_be_made_is_a_sentence():
+    with pytest.raises(InputError, match="nothing is made on cpu"), working(["cpu", "cpu"], refusing):
+        pass
+
+
+def test_what_goes_wrong_names_its_device():
+    """Errors of bad input stay what they are."""
+    with working(["cpu", "cuda:0"], named) as children:
+        with pytest.raises(InputError, match=r"^this is refused\.\n"):
+            at_once(children, doing, ["refuse", 1])
+        with pytest.raises(RuntimeError, match="out of memory") as failure:
+            at_once(children, doing, ["fail", 1])
+        assert "in doing" in failure.value.__notes__[0]
+    with (
+        working(["cpu", "cuda:0"], named) as children,
+        pytest.raises(LostError, match=r"cuda:0 failed: out of memory\. If that happens again, give --device one"),
+    ):
+        at_once(children, doing, [1, "fail"])
+
+
+def test_what_others_had_ready_is_given_before_a_death_is_reported():
+    """One dies and the other has its answer while nobody looks; what was not begun then is not begun."""
+    given = []
+    with working(["cpu", "cpu"], named) as children, pytest.raises(LostError) as lost:
+        for task, _ in answers(children, doing, ["doze and die", 0, "nap", 9]):
+            given.append(task)
+            time.sleep(1.5)
+    assert "the process on cpu was ended (Killed), for want of memory most likely" in str(lost.value)
+    assert "give --device one cpu less" in str(lost.value) and given == [0, "nap"]
+
+
+def test_none_outlives_a_parent_that_is_killed():
+    """In the middle of a task that takes minutes."""
+    code = (
+        "from on_devices import doing, named\n"
+        "from sim.runtime.processes import at_once, working\n"
+        "if __name__ == '__main__':\n"
+        "    with working(['cpu', 'cpu'], named) as children:\n"
+        "        print(*(child.process.pid for child in children), flush=True)\n"
+        "        at_once(children, doing, ['sleep', 'sleep'])\n"
+    )
+    paths = os.pathsep.join([str(Path(__file__).parents[1]), str(Path(__file__).parent)])
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths}
+    )
+    assert parent.stdout is not None
+    with parent.stdout:
+        numbers = [int(word) for word in parent.stdout.readline().split()]
+        assert len(numbers) == 2 and all(Path(f"/proc/{number}").exists() for number in numbers)
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+    assert all(map(gone, numbers))
