@@ -103,6 +103,7 @@ class Loop:
 
     def __exit__(self, *_):
         self.demo.browser.plays = self.stop
+        self.demo.wish.set(plays=True)  # a page that is paused shows an error until it is asked for more
         self.thread.join()
         self.demo.browser.plays = self.plays
         assert not self.failed
