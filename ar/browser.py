@@ -29,8 +29,8 @@ PANEL = 676.0
 EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")
 
 
-Sight = tuple[int, np.ndarray, str]
-"""A frame's number, its picture (H, W, 3) uint8 and the words, HTML, beside it."""
+Sight = tuple[int, np.ndarray, str, int]
+"""A frame's number, its picture (H, W, 3) uint8, the words, HTML, beside it, and where the playback slider is."""
 
 
 class Browser:
@@ -80,7 +80,7 @@ class Browser:
         self.line = gui.add_html("")
         self.text = gui.add_html(held(SAID, ""))
         # What is shown, newest first asked for: frame, picture and words; the picture as it is sent, and how many were.
-        self.shown: Sight = (0, blank, "")
+        self.shown: Sight = (0, blank, "", 0)
         self.wanted: Sight = self.shown
         self.coded, self.sent = coded(blank), 0
         self.sight = gui.add_html(sight(0, self.coded, ""))
@@ -120,7 +120,7 @@ class Browser:
             self.server.gui.set_panel_label(title)
             self.title = title
             self.words.content, self.line.content = held(PAGE, words), ""
-            self.wanted, self.shown = (0, self.shown[1], ""), (0, self.shown[1], self.shown[2])
+            self.wanted, self.shown = (0, self.shown[1], "", 0), (0, self.shown[1], self.shown[2], 0)
             self.report("")
             self.inputs: dict[str, viser.GuiInputHandle] = {}
             self.notes = {}
@@ -150,29 +150,32 @@ class Browser:
         """Numbers of the visitors who look at the page now, from 1 in the order that they came."""
         return {identifier + 1 for identifier in self.server.get_clients()}
 
-    def show(self, number: int, colour: np.ndarray, words: str) -> None:
-        """Show the picture (H, W, 3) uint8 of frame `number` and its words, HTML; the playback slider goes there."""
+    def show(self, number: int, colour: np.ndarray, words: str, sought: int | None = None) -> None:
+        """Show the picture (H, W, 3) uint8 of frame `number` and its words, HTML.
+
+        The playback slider goes there, or to the frame that is sought, if the one that is shown is on the way to it.
+        """
         with self.lock:
-            self.wanted = number, colour, words
+            self.wanted = number, colour, words, number if sought is None else sought
             self.newest["sight"] = self.send_sight
 
     def report(self, words: str) -> None:
         """Show other words, HTML, beside the picture."""
         with self.lock:
-            self.wanted = self.wanted[0], self.wanted[1], words
+            self.wanted = self.wanted[0], self.wanted[1], words, self.wanted[3]
             self.newest["sight"] = self.send_sight
 
     def send_sight(self) -> None:
         """Send the picture with its words, unless both are there."""
         with self.lock:
-            number, colour, words = wanted = self.wanted
+            _, colour, words, place = wanted = self.wanted
         if colour is not self.shown[1]:
             self.coded = coded(colour)
         if colour is not self.shown[1] or words != self.shown[2]:
             self.put_sight(self.coded, words)
         # Not oftener: a visitor may be moving it.
-        if number != self.shown[0]:
-            self.assign(self.frame, number)
+        if place != self.shown[3]:
+            self.assign(self.frame, place)
         self.shown = wanted
 
     def put_sight(self, code: str, words: str) -> None:
@@ -313,7 +316,7 @@ class Browser:
         @self.saver.on_click
         def save(event: viser.GuiEvent) -> None:
             if event.client is not None:
-                number, colour, _ = self.shown
+                number, colour, *_ = self.shown
                 name = f"{self.title.replace(':', '').replace(' ', '-')}-{number}.png"
                 written = cv2.imencode(".png", np.ascontiguousarray(colour[..., ::-1]))[1]
                 event.client.send_file_download(name, written.tobytes(), save_immediately=True)

@@ -10,9 +10,11 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from . import place, rasteriser, shade, window
 from .camera import Camera
 from .hud import FINE, NARROW, folded, lay, millimetres
 from .layer import Layer, vertex_normals
+from .parallel import load
 from .rasteriser import seen
 from .renderer import Picture
 from .window import SURROUND, with_window
@@ -72,6 +74,11 @@ class Overlaid:
 
     colour: np.ndarray
     taken: np.ndarray
+
+
+def load_kernels(device: str = "cpu") -> None:
+    """Load all kernels that draw a picture with its overlay, so that the first does not wait for them."""
+    load(device, place, rasteriser, shade, window)
 
 
 def composite(

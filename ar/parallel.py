@@ -6,12 +6,27 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
+from threading import Lock
+from types import ModuleType
 
 import numpy as np
 import warp as wp
 
 forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
 """`wp.kernel` without adjoint, launched as wide as the work: pictures are not differentiated here."""
+
+
+_loading = Lock()
+
+
+def load(device: str, *modules: wp.Module | ModuleType | str) -> None:
+    """Load modules of kernels on a device; those that Warp has not cached are compiled, which takes seconds.
+
+    One thread does it at a time, and others wait: Warp alone would compile a module once for each that asks.
+    """
+    with _loading:
+        for module in modules:
+            wp.load_module(module, device=device)
 
 
 def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str, bands: int = 1) -> None:

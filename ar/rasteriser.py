@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from .camera import Camera
-from .parallel import forward_kernel, in_bands, launch_in_bands, run_length
+from .parallel import forward_kernel, in_bands, launch_in_bands, load, run_length
 
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 """Of a z-buffer where nothing is seen."""
@@ -138,7 +138,7 @@ def draw(
 
     points (B, V) vec3d: homogeneous, in each picture; triangles (F,) vec3i, the same in all pictures.
     """
-    wp.load_module(__name__, device=device)
+    load(device, __name__)
     count, run = triangles.shape[0] - since, run_length(device)
     # On a card the rows of a triangle are shared by several threads.
     parts = 1 if device == "cpu" else PARTS

@@ -11,7 +11,7 @@ import warp as wp
 
 from .camera import Camera, look_at
 from .layer import Layer
-from .parallel import launch_in_bands
+from .parallel import launch_in_bands, load
 from .place import place
 from .rasteriser import NEAR, draw, empty_buffer, rows_reached
 from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
@@ -124,8 +124,7 @@ class Renderer:
 
     def __init__(self, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> None:
         """Bring the layers to a Warp device; ValueError when two have one id."""
-        wp.load_module(shade.module, device=device)
-        wp.load_module(place.module, device=device)
+        load(device, shade.module, place.module)
         self.device, self.stack = device, Stack(layers, device)
         self.light, self.lamp_camera = as_light(lamp), lamp.camera()
         self.curve = wp.array(tone_curve(), dtype=wp.uint8, device=device)

@@ -10,7 +10,7 @@ import warp as wp
 
 from .camera import Camera
 from .layer import Layer, vertex_normals
-from .parallel import forward_kernel, launch_in_bands
+from .parallel import forward_kernel, launch_in_bands, load
 from .rasteriser import NOTHING, Seen, depth_of, face_of, weights_of
 from .renderer import Pictures
 
@@ -55,7 +55,7 @@ def with_window(
         wp.array(255.0 * np.asarray(hidden.colour), dtype=wp.vec3f, device=device),
         drawn.depth[0], drawn.segmentation[0], wp.array(over, dtype=wp.bool, device=device),
     ]  # fmt: skip
-    wp.load_module(__name__, device=device)
+    load(device, __name__)
     ground = wp.clone(drawn.colour[0])
     launch_in_bands(shine_through, inputs, [ground], camera.height * camera.width, device)
     return ground.numpy()
@@ -74,7 +74,7 @@ def outside(mask: np.ndarray, device: str) -> wp.array:
 
 def chamfer(mask: wp.array, device: str) -> wp.array:
     """How far each pixel, flat, is from a mask (h, w) uint8 [pixel], as far as the rim reaches."""
-    wp.load_module(__name__, device=device)
+    load(device, __name__)
     aside = wp.empty(mask.shape, dtype=wp.int32, device=device)
     distance = wp.empty(mask.size, dtype=wp.float32, device=device)
     launch_in_bands(find_aside, [mask], [aside], mask.size, device)

@@ -102,23 +102,22 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
 
 
 def test_how_the_finite_elements_solve_a_load_can_be_read(demo, monkeypatch):
-    """Of the referee while a model answers, of those that answer where they do, and nothing where none have a plan."""
+    """While a model answers and where they do; nothing where none have a plan."""
     folder, text = demo.browser.notes[PLAN]
     assert not folder.visible
     demo.wish.set(plays=False)
     assert wait_for(lambda: demo.run(0.3) and folder.visible)
     assert demo.referee.plan and plan_words(demo.referee.plan) in text.content
     assert "Newton-CG" in text.content and text.content.count("<li>") == len(demo.referee.plan)
-    monkeypatch.setattr(demo.referee, "plan", ())
     demo.wish.set(deformer="fem")
-    assert wait_for(lambda: demo.run(0.3) and demo.wish.deformer == "fem" and "Newton-CG" in text.content)
-    monkeypatch.setattr("scenes.play.page.plan_of", lambda deformer: ())
+    assert wait_for(lambda: demo.run(0.3) and "finite elements' own answer" in report(demo) and folder.visible)
+    monkeypatch.setattr(demo.referee, "plan", ())
     assert wait_for(lambda: demo.run(0.3) and not folder.visible)
 
 
 def test_the_words_beside_a_picture_are_of_its_frame(demo, monkeypatch):
     shown = []
-    monkeypatch.setattr(demo.browser, "show", lambda number, colour, words: shown.append((number, colour, words)))
+    monkeypatch.setattr(demo.browser, "show", lambda *said: shown.append(said[:3]))
     demo.run(1.0)
     assert len({number for number, _, _ in shown}) > 3
     pictures = {}
@@ -280,7 +279,7 @@ class TestWish:
 
 
 def test_the_referee_answers_the_newest_question(theatre, scene):
-    referee = Referee(theatre, scene)
+    referee = Referee(theatre, scene, threading.Lock())
     for number in range(60):
         referee.ask(number, None)
     assert wait_for(lambda: referee.truth is not None and referee.truth.number == 59)
@@ -373,3 +372,20 @@ def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):
     demo.wish.hand(force=0.2)
     demo.run(0.2)
     assert said[0].startswith("solving the tool in your hand, 0.20 N (trained model linear)") and said[-1] == ""
+
+
+def test_a_model_answers_while_the_finite_elements_are_in_a_solve(demo, monkeypatch):
+    solved, begun, deform = threading.Event(), [], Fem.deform
+
+    def waiting(fem, loads, start=None, at=None):
+        begun.append(round(60 * loads.times[0]))
+        assert solved.wait(60.0)
+        return deform(fem, loads, start, at)
+
+    monkeypatch.setattr(Fem, "deform", waiting)
+    demo.wish.set(plays=False, number=9, deformer="fem")
+    assert wait_for(lambda: not demo.run(0.3) and begun == [9])
+    demo.wish.set(deformer="svr")
+    assert wait_for(lambda: demo.run(0.3) and "|trained model svr|" in report(demo)) and begun == [9]
+    solved.set()
+    assert wait_for(lambda: demo.run(0.3) and "|error against FEM: mean" in report(demo)) and begun == [9]

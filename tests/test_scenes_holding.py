@@ -30,7 +30,7 @@ class Silent:
 
     truth, failure, plan = None, None, ()
 
-    def __init__(self, theatre, scene):
+    def __init__(self, theatre, scene, turn):
         pass
 
     def ask(self, number, touch):
@@ -42,7 +42,7 @@ class Silent:
 
 @pytest.fixture
 def demo(theatre, scene, monkeypatch):
-    monkeypatch.setattr("scenes.play.page.Referee", Silent)
+    monkeypatch.setattr("scenes.play.page_cast.Referee", Silent)
     demo = Demo(theatre, scene, "linear", "127.0.0.1", free_port())
     demo.wish.set(plays=False)
     yield demo
@@ -112,7 +112,7 @@ def test_loads_that_the_finite_elements_refuse_are_left_out_alone(theatre, scene
     refuse(monkeypatch, lambda number, touch: number == 7, InputError("7 is refused."))
     player = theatre.player("linear", scene)  # as quick to have, and asked the same way
     monkeypatch.setattr(Theatre, "player", lambda *words: player)
-    referee = Referee(theatre, scene)
+    referee = Referee(theatre, scene, threading.Lock())
     referee.ask(7, None)
     assert wait_for(lambda: str(referee.failure) == "7 is refused.")
     referee.ask(8, None)

@@ -191,8 +191,8 @@ def test_a_long_wait_is_reported_and_a_short_one_is_not():
     busy.off()
     time.sleep(NOTICED + 0.3)
     assert said == []
-    busy.on("the first half")
-    busy.on("the second half")
+    busy.on("solving the first half")
+    busy.on("solving the second half")
     time.sleep(NOTICED + 0.3)
     busy.off()
     busy.close()

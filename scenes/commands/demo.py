@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -105,21 +106,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until the time is over, Ctrl-C (exit code 0) or SIGTERM (143)."""
+    from ar.overlay import load_kernels
+    from sim.accuracy import LIVE
+    from sim.runtime.device import find_device
+
+    if not args.seconds > 0.0:
+        raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
+    find_device(args.device, LIVE.precision)
+    # One thread for all kernels of the first picture: each that compiles reads Warp's headers first, for two seconds.
+    kernels = ThreadPoolExecutor(1, "kernels")
+    kernels.submit(load_kernels)
     from ar.browser import check_address
 
     from .interrupt import until_ended
 
-    if not args.seconds > 0.0:
-        raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
     try:
         check_address(args.host, args.port)
     except (OSError, ValueError) as error:
         raise InputError(f"no page on host {args.host}, port {args.port} ({error}): choose others.") from error
-    return until_ended(partial(play, args))
+    return until_ended(partial(play, args, kernels))
 
 
-def play(args: argparse.Namespace, closing: ExitStack) -> int:
-    """Open the page and play; `closing` closes it."""
+def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitStack) -> int:
+    """Open the page, and play when `kernels` has loaded those of the first picture; `closing` closes the page."""
     from ar.guard import UnguardedError
 
     from ..play.deformers import open_theatre
@@ -138,5 +147,9 @@ def play(args: argparse.Namespace, closing: ExitStack) -> int:
     if demo.browser.token is not None:
         print("others than this machine reach the page by its name or address in place of localhost, with this token")
     print(f"{scene.name} by {theatre.described(name, scene)}")
+    demo.busy.on("compiling; the next start finds it done")
+    if name != "fem":
+        kernels.submit(demo.cast.predicted, name, (0, None))
+    kernels.shutdown()
     demo.run(args.seconds)
     return 0

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from sim.accuracy import LIVE, Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity, read_intensity, sidecar
 from sim.bodies.meshfile import read_anatomy
-from sim.deformation import Deformer
+from sim.deformation import Deformation, Deformer, guess
 from sim.discretisation.space import recommended
 from sim.errors import InputError
 from sim.fem import Fem, solver_named
+from sim.loads import Loads
 from sim.resected_fem import Operated, finite_elements
 from sim.runtime.device import find_device
 from surrogate.model.applicability import refusal
@@ -111,6 +114,18 @@ class Theatre:
             As `deformer`; an anatomy without open cortex.
         """
         return Player(self.stage(scene), self.deformer(name, scene))
+
+
+@dataclass(frozen=True, eq=False)
+class AtRest:
+    """A Deformer that solves nothing: the body stays where the scan has it."""
+
+    anatomy: Anatomy
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """A guess that nothing moves, whatever acts."""
+        rest = guess(np.zeros((len(loads), *self.anatomy.mesh.nodes.shape)))
+        return rest if at is None else rest.at(at)
 
 
 def plan_of(deformer: Deformer) -> tuple[str, ...]:

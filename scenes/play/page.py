@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time as clock
 import traceback
 from collections.abc import Callable
@@ -13,34 +14,29 @@ import numpy as np
 
 from ar.browser import Browser
 from ar.hud import marked
-from ar.page_parts import Body, Playback, Sign, Viewpoint
-from sim.deformation import Deformation
+from ar.page_parts import Playback
 from sim.errors import InputError
 from sim.loads import Loads
 from surrogate.data.dataset import digest_of_loads
 
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
-from .deformers import Theatre, plan_of
-from .effect_ablation import without
+from .deformers import AtRest, Theatre
+from .page_cast import Cast
 from .page_controls import PLAN, clocked, controls
 from .page_referee import Referee, Truth
 from .page_requests import HAND, SCRIPT, Wish
 from .page_tally import Tally
-from .page_text import deformer_words, effect_words, plan_words, report, words
+from .page_text import effect_words, pending_words, plan_words, report, words, work_words
 from .page_verdict import Judged, changed, judge, verdict_words
+from .page_view import FEM_COLOUR, STALE_COLOUR, bodies_of, signs_of, viewpoint_of
 from .player import Frame, Player
-from .replay import Session
-from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR
+from .stage import Stage
 from .tool_holder import holding
 from .waiting_notice import Busy
 
-FEM_COLOUR = (0.95, 0.35, 0.75)
-STALE_COLOUR = (0.45, 0.45, 0.45)
-"""Of the finite elements' tumour while it belongs to another load than the one that is shown."""
 WAITS = "The finite elements are working on this load."
-# How far the patient's sides stand from the brain in the 3-D view [m].
-BESIDE = 12e-3
+RESTS = '<p class="stale">The body at rest, as in the scan. The first answer is on its way.</p>'
 # How long a page that plays shows why a frame is left out [s].
 READING = 2.0
 FIRST = Touch(force=0.15, depth=2e-3)
@@ -49,9 +45,15 @@ FIRST = Touch(force=0.15, depth=2e-3)
 
 @dataclass
 class Moment:
-    """What the page shows now: the wish, its answer, the frame, and what the finite elements said of it."""
+    """What the page shows now: the wish, its answer, the frame, and what the finite elements said of it.
 
+    `goal` is the wish that the frame is on the way to, `asked` the one that it answers.
+    """
+
+    goal: tuple | None = None
     asked: tuple | None = None
+    shown: Truth | None = None
+    rests: bool = False
     style: str = ""
     load: str = ""
     frame: Frame | None = None
@@ -79,24 +81,32 @@ class Demo:
     ) -> None:
         """Open the page; `anatomy` is whose brain, in words, and `find` makes the scenes that visitors choose."""
         self.theatre, self.anatomy, self.first, self.find = theatre, anatomy, scene, find
+        self.turn = threading.Lock()
         self._cast(scene, deformer)
-        size = scene.viewpoint.width, scene.viewpoint.height
+        size, site = (scene.viewpoint.width, scene.viewpoint.height), theatre.site
         parts = self._parts(deformer)
         self.browser = Browser(
-            parts[0], self._viewpoint(), *parts[1:], host=host, port=port, size=size, signs=self._signs()
+            parts[0], viewpoint_of(site), *parts[1:], host=host, port=port, size=size, signs=signs_of(site)
         )
         self.busy = Busy(lambda line: self.browser.status(escape(line)))
-        self.referee = Referee(theatre, scene)
         self.dismissed: list[Referee] = []
         self.asked, self.drawn = self.wish.now(), 0
 
     def run(self, seconds: float = float("inf")) -> int:
-        """Play until the time is over; returns the frames drawn. What fails is said on the page, and is left out."""
+        """Play until the time is over; returns the frames drawn. What fails is said on the page, and is left out.
+
+        Raises
+        ------
+        InputError
+            The finite elements of the first scene cannot be had, and nothing else was asked to play it.
+        """
         self.drawn, end = 0, clock.perf_counter() + seconds
         while (left := end - clock.perf_counter()) > 0.0:
             try:
                 self._run(left)
             except Exception as error:
+                if isinstance(error, InputError) and not self.cast.playable:
+                    raise
                 self._leave_out(error, end)
         return self.drawn
 
@@ -125,13 +135,12 @@ class Demo:
             if self.wish.scene != self.stage.scene.name:
                 self._change(self.wish.scene)
                 now = Moment()
-            new = self.answer(now)
+            self.drawn += self.answer(now)
             self.browser.plays(self.wish.plays)
-            if new is None:
-                continue
-            self.drawn += new
-            self._check(now)
             self._tell()
+            if now.frame is None:
+                continue
+            self._check(now)
             rest = 1.0 / self.stage.scene.frames_per_second - (clock.perf_counter() - begun)
             clock.sleep(max(0.0, rest))
 
@@ -142,33 +151,42 @@ class Demo:
             self.browser.tell(lambda visitor: holding(visitor, holder, here))
 
     def close(self) -> None:
-        """Stop the page and the referees."""
+        """Stop the page and the finite elements."""
         self.busy.close()
         self.browser.close()
-        for referee in (self.referee, *self.dismissed):
-            referee.close()
+        for solver in (*self.cast.solvers.values(), *self.dismissed):
+            solver.close()
+
+    @property
+    def stage(self) -> Stage:
+        """What is drawn, with all effects."""
+        return self.cast.stage()
+
+    @property
+    def referee(self) -> Referee:
+        """The finite elements under all effects, which judge the models."""
+        return self.cast.solver()
 
     def _cast(self, scene: Scene, deformer: str) -> None:
-        """Make a stage for a scene, and have a deformer play on it."""
-        # Not on a card: there, what is drawn while the referee's thread records a CUDA graph would be recorded with it.
-        stage = replace(self.theatre.stage(scene), device="cpu")
-        sessions = {(deformer, frozenset[str]()): Session(Player(stage, self.theatre.deformer(deformer, scene)))}
-        self.stage, self.sessions, self.tally = stage, sessions, Tally()
-        self.wish = Wish(deformer, FIRST, scene.name, clocked=clocked(scene, stage.site))
+        """Have a deformer play a scene."""
+        self.cast, self.tally = Cast(self.theatre, scene, deformer, self.turn), Tally()
+        # The frame that is shown.
+        self.reached: int | None = None
+        self.wish = Wish(deformer, FIRST, scene.name, clocked=clocked(scene, self.theatre.site))
 
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""
-        old = self.stage, self.sessions, self.tally, self.wish
-        self.busy.on(f"nothing yet: preparing the scene {name}")
+        old = self.cast, self.tally, self.wish
+        self.busy.on(f"preparing the scene {name}")
         try:
             scene = self.first if name == self.first.name else self.find(name)
             known = self.theatre.names(scene)
             deformer = self.wish.deformer if self.wish.deformer in known else self.theatre.best(scene)
             self._cast(scene, deformer)
-            self.wish.set(style=old[3].style)
+            self.wish.set(style=old[-1].style)
             parts = self._parts(deformer)
         except InputError as error:
-            self.stage, self.sessions, self.tally, self.wish = old
+            self.cast, self.tally, self.wish = old
             self.wish.set(scene=self.stage.scene.name)
             self.browser.put("scene", self.stage.scene.name)
             self.browser.report(f'<p class="warn">{escape(str(error))}</p>')
@@ -176,60 +194,86 @@ class Demo:
         finally:
             self.busy.off()
         self.browser.fill(*parts)
-        self.referee.dismiss()
-        self.dismissed.append(self.referee)
-        self.referee = Referee(self.theatre, scene)
+        self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + old[0].dismiss()
 
-    def answer(self, now: Moment) -> int | None:
-        """Bring the page nearer to what is wished: 1 where a frame was drawn, 0 where all is shown, None on the way."""
-        begun, scene, style = clock.perf_counter(), self.stage.scene, self.wish.style
-        number, name, touch, off = asked = self.asked = self.wish.now()
-        name = "fem" if off else name  # no model was trained without
-        if asked == now.asked and now.frame is not None:
-            if style != now.style:
-                self._restyle(now, name)
-            self.wish.go_on(number, len(scene.times))  # after a pause
-            return 0
-        self.busy.on(self._work(number, name, touch))
-        session = self._session(name, off)
-        reached, answer = session.towards(number, touch)
-        if reached != number:
-            self.busy.on(f"frame {number}, which depends on those before it: {reached + 1} of them are done")
-            return None
+    def answer(self, now: Moment) -> int:
+        """Bring the page nearer to what is wished; returns how many frames were drawn, 0 or 1."""
+        self.asked = self.wish.now()
+        if self.asked == now.asked:
+            self._arrive()
+        elif (found := self._found(now)) is not None:
+            self._draw(now, found)
+            return 1
+        if now.frame is not None and self.wish.style != now.style:
+            self._restyle(now)
+        return 0
+
+    def _arrive(self) -> None:
+        """All is shown: nothing more is wanted, and playing goes on."""
         self.busy.off()
-        player, hand = session.player, touch or session.player.touch(number)
-        loads, took = player.loads(number, touch), clock.perf_counter() - begun
-        now.asked, now.style, now.own = asked, style, None
-        now.load = digest_of_loads(self._whole(number, touch) if off else loads)
-        now.frame = frame = replace(player, style=style).drawn(number, hand, loads, answer, took)
-        self.wish.go_on(number, len(scene.times))
-        if name == "fem" and not off:
-            now.own = Truth(number, loads, answer, frame.seconds["deform"])
+        self.cast.rest()
+        self.wish.go_on(self.asked[0], len(self.stage.scene.times))
+
+    def _found(self, now: Moment) -> Truth | None:
+        """The answer to what is wished, or to a frame on the way there; None until there is one."""
+        number, name, touch, off = self.asked
+        question, scene = (number, touch), self.stage.scene
+        if name != "fem" and not off:  # no model was trained without
+            self.busy.on(work_words(scene, name, *question))
+            return self.cast.predicted(name, question)
+        found = self.cast.solved(off, question, now.shown, 0.0)
+        if found is not None:
+            return found
+        if self.cast.solver(off).player is None:
+            self.busy.on("preparing the finite elements")
+            if now.frame is None and not now.rests:
+                self._rest(now)
+        elif now.goal == self.asked and now.frame is not None:
+            self.busy.on(f"on the way to frame {number}: frame {now.frame.number} is solved")
         else:
+            self.busy.on(work_words(scene, "fem", *question))
+        return self.cast.solved(off, question, now.shown, 1.0 / scene.frames_per_second)
+
+    def _rest(self, now: Moment) -> None:
+        """Show the body at rest while nothing else can be shown."""
+        number, _, touch, _ = self.asked
+        player = Player(self.stage, AtRest(self.stage.site.anatomy), self.wish.style)
+        frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.touch(number))
+        self.show(frame, player)
+        self.browser.show(number, pictured(frame), RESTS)
+        now.rests = True
+
+    def _draw(self, now: Moment, found: Truth) -> None:
+        """Draw an answer, and have it judged by the finite elements unless it is theirs."""
+        number, name, touch, off = self.asked
+        fem = name == "fem" or bool(off)
+        player, style = self.cast.player("fem" if fem else name, off), self.wish.style
+        hand = touch or player.touch(found.number)
+        self.reached, now.goal, now.asked = found.number, self.asked, (found.number, name, touch, off)
+        now.style, now.shown, now.own = style, found, None
+        now.load = digest_of_loads(self._whole(found.number, touch) if off else found.loads)
+        now.frame = frame = replace(player, style=style).drawn(
+            found.number, hand, found.loads, found.deformation, found.seconds
+        )
+        if found.number == number:
+            self._arrive()
+        if fem and not off:
+            now.own = found
+        elif found.number == number:
             self.referee.ask(number, touch)
         if not off:
-            self.tally.took(name, now.load, answer.cost.total)
+            self.tally.took(name, now.load, found.deformation.cost.total)
         now.picture = pictured(frame)
         self.show(frame, player)
-        return 1
 
-    def _work(self, number: int, name: str, touch: Touch | None) -> str:
-        """What is being solved, in words."""
-        if touch is None:
-            return f"frame {number} ({deformer_words(name)})"
-        how = f"{1e3 * touch.depth:.1f} mm deep" if self.stage.scene.posed else f"{touch.force:.2f} N"
-        return f"the tool in your hand, {how} ({deformer_words(name)})"
-
-    def _restyle(self, now: Moment, name: str) -> None:
+    def _restyle(self, now: Moment) -> None:
         """Draw the same answer with another overlay."""
-        assert now.frame is not None
-        frame, style = now.frame, self.wish.style
-        player = self._session(name, self.wish.off).player
+        assert now.frame is not None and now.asked is not None
+        _, name, _, off = now.asked
+        frame, now.style = now.frame, self.wish.style
+        player = replace(self.cast.player("fem" if off else name, off), style=now.style)
         seconds = frame.seconds["deform"]
-        now.style = style
-        now.frame = replace(player, style=style).drawn(
-            frame.number, frame.touch, frame.loads, frame.deformation, seconds
-        )
+        now.frame = player.drawn(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
         now.picture = pictured(now.frame)
 
     def _check(self, now: Moment) -> None:
@@ -239,8 +283,8 @@ class Demo:
         name = "fem" if off else name
         truth = now.own or self.referee.truth
         fresh = truth is not None and digest_of_loads(truth.loads) == now.load
-        whole = self._session(name).player
         if truth is not None and (truth is not now.truth or now.by != (name, off)):
+            whole = self.cast.player(name)
             self._wire(truth, whole)
             if not off:
                 now.judged = judge(truth, whole, name == "fem")
@@ -256,33 +300,25 @@ class Demo:
             why = escape(str(self.referee.failure))
             verdict = f'<p class="warn">error: the finite elements do not answer {what} ({why})</p>'
         elif off and truth is not None:
-            answer: Deformation = now.frame.deformation
-            verdict = changed(truth, whole, answer, gone) if fresh else verdict_words(None, True, WAITS)
+            shown, whole = now.frame.deformation, self.cast.player(name)
+            verdict = changed(truth, whole, shown, gone) if fresh else verdict_words(None, True, WAITS)
         else:
             verdict = verdict_words(now.judged if truth is not None else None, not fresh, WAITS)
-        plan = plan_of(self._session(name, off).player.deformer) or self.referee.plan
+        plan = self.cast.solver(off).plan or self.referee.plan
         if plan != now.plan:
             now.plan = plan
             self.browser.write(PLAN, plan_words(plan))
         scene = self.stage.scene
         said = report(now.frame, self.stage, name, verdict, self.tally.rows, len(scene.times), gone)
+        if now.asked != self.asked and self.busy.noticed:
+            said = pending_words(now.frame.number, self.asked[0], len(scene.times)) + said
         assert now.picture is not None
-        self.browser.show(now.frame.number, now.picture, said)
+        self.browser.show(now.frame.number, now.picture, said, self.asked[0])
 
     def _whole(self, number: int, touch: Touch | None) -> Loads:
         """What acts in a frame under all effects of the scene."""
         scene, time = self.stage.scene, float(self.stage.scene.times[number])
         return scene.loads(self.stage.site, touch or scene.path(time), time)
-
-    def _session(self, name: str, off: frozenset[str] = frozenset()) -> Session:
-        """Of who plays the scene without some effects, of the tissue that it has with them."""
-        if (name, off) not in self.sessions:
-            scene, theatre = self.stage.scene, self.theatre
-            for effect in scene.effects_on(theatre.anatomy) if off else ():
-                scene = without(scene, effect) if type(effect).__name__ in off else scene
-            stage = replace(self.stage, scene=scene) if off else self.stage
-            self.sessions[name, off] = Session(Player(stage, theatre.deformer(name, scene)))
-        return self.sessions[name, off]
 
     def _parts(self, deformer: str) -> tuple:
         """What the page is filled with: bodies, playback, controls, title, words."""
@@ -290,11 +326,13 @@ class Demo:
         wish, names = self.wish, self.theatre.names(scene)
         playback = Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number))
         given = controls(scene, site, names, wish, self._give, self._take)
-        return self._bodies(), playback, given, f"sulcus: {scene.name}", words(self.theatre, scene, self.anatomy)
+        return bodies_of(self.stage), playback, given, f"sulcus: {scene.name}", words(self.theatre, scene, self.anatomy)
 
     def _play(self, plays: bool) -> None:
-        """The button: where nothing moves by itself, playing gives the tool to the script."""
+        """The button: where nothing moves by itself, playing gives the tool to the script. A pause stops on the way."""
         self.wish.play(plays)
+        if not plays and self.reached is not None:
+            self.wish.set(number=self.reached)
         if self.wish.tool == SCRIPT:
             self.wish.set(holder=None)
         if self.stage.scene.tool is not None:
@@ -315,34 +353,6 @@ class Demo:
     def _visitor(self) -> int | None:
         """Who set what is heard now."""
         return None if self.browser.deed is None else self.browser.deed.visitor
-
-    def _bodies(self) -> list[Body]:
-        positions = self.stage.site.anatomy.mesh.nodes
-        tool, site = self.stage.scene.tool, self.stage.site
-        brain, cortex, tumour = self.stage.brain, self.stage.cortex(positions), self.stage.tumour(positions)
-        bodies = [
-            Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
-            Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
-            Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
-            Body("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True),
-        ]
-        if tool is not None:
-            pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
-            at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
-            bodies.append(Body("tool", at, tool.mesh.faces, TOOL_COLOUR))
-        return bodies
-
-    def _signs(self) -> list[Sign]:
-        """The patient's sides round the brain in the 3-D view."""
-        nodes = self.stage.site.anatomy.mesh.nodes
-        middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + BESIDE
-        ways = zip(("RL", "AP", "SI"), np.diag(half), strict=True)
-        return [Sign(word, middle + way) for (plus, minus), arm in ways for word, way in ((plus, arm), (minus, -arm))]
-
-    def _viewpoint(self) -> Viewpoint:
-        site = self.stage.site
-        eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
-        return Viewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
 
     def show(self, frame: Frame, player: Player) -> None:
         """Put the bodies of the 3-D view where a frame has them."""

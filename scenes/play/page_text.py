@@ -14,6 +14,7 @@ from sim.material import Material, Tissue
 
 from ..script.scene import Scene
 from ..script.site import Site
+from ..script.tool_paths import Touch
 from .deformers import Theatre
 from .load_text import acting
 from .page_tally import Row
@@ -110,6 +111,20 @@ def tissue_words(tissue: Tissue | None) -> str:
 def deformer_words(name: str) -> str:
     """What a deformer is."""
     return "finite elements" if name == "fem" else f"trained model {name}"
+
+
+def work_words(scene: Scene, name: str, number: int, touch: Touch | None) -> str:
+    """What a deformer is solving: a frame of the script, or what the hand's touch asks for."""
+    if touch is None:
+        return f"solving frame {number} ({deformer_words(name)})"
+    how = f"{1e3 * touch.depth:.1f} mm deep" if scene.posed else f"{touch.force:.2f} N"
+    return f"solving the tool in your hand, {how} ({deformer_words(name)})"
+
+
+def pending_words(shown: int, asked: int, frames: int) -> str:
+    """A line that says of a picture that it does not yet answer what is asked."""
+    way = f" on the way to frame {asked}, this is frame {shown} of {frames - 1}" if shown != asked else ""
+    return f'<p class="stale">Not yet what is asked:{way or " it is being solved"}.</p>'
 
 
 def plan_words(lines: Sequence[str]) -> str:

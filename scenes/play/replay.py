@@ -1,35 +1,63 @@
-"""Frames asked for in any order, of a run in which each may depend on the one before it."""
+"""Frames asked for in any order, of a run in which each is found from another one near it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 from sim.deformation import Deformation
+from sim.effects import SkullContact
 
 from ..script.tool_paths import Touch
 from .player import Player
 
 T = TypeVar("T")
-# Answers that are kept of a run, evenly over it, so that little is run again: two megabytes each where the default
-# brain relaxes, and quadratic elements ten times as much.
-KEPT = 16
+# How far one solve goes where the brain comes off the skull [s]. One long solve costs half as much as the steps that
+# show its way, but a quarter of a minute passes without a picture.
+LEAP = 0.2
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a frame is reached from others.
+
+    Parameters
+    ----------
+    leap
+        Frames that one step goes at most. Longer ways stop at its multiples.
+    back
+        Whether a frame may be found from a later one.
+    kept
+        Answers that are kept of a run, evenly over it, so that little is run again.
+    """
+
+    leap: int = 1
+    back: bool = False
+    kept: int = 16
+
+
+IN_ORDER = Course()
+"""Each frame depends on the one before. Kept answers take two megabytes each where the default brain relaxes, and ten
+times as much on quadratic elements."""
 
 
 class Reel(Generic[T]):
-    """Frame n of a run is what the straight run 0 ... n gives, whatever was asked for before.
+    """Frames of a run in any order. In order, frame n is what the straight run 0 ... n gives, whatever came before.
 
     Parameters
     ----------
     frames
         How many there are.
     step
-        A frame's number and the frame before it (None: before the first) -> the frame.
+        A frame's number and the frame that it is found from (None: the state before the first) -> the frame.
+    course
+        How a frame is reached.
     """
 
-    def __init__(self, frames: int, step: Callable[[int, T | None], T]) -> None:
-        self._every, self._step = -(-frames // KEPT), step
+    def __init__(self, frames: int, step: Callable[[int, T | None], T], course: Course = IN_ORDER) -> None:
+        self._step, self._course = step, course
+        self._every = course.leap * -(-frames // (course.leap * course.kept))
         self.kept: dict[int, T] = {}
         """Frames that are not run again, by number."""
         self._last: dict[int, T] = {}
@@ -37,34 +65,44 @@ class Reel(Generic[T]):
     def towards(self, number: int) -> tuple[int, T]:
         """The frame, or one nearer to it, and its number: a call takes one step at most."""
         known = self.kept | self._last
-        nearest = max((other for other in known if other <= number), default=-1)
-        if nearest < number:
-            before, nearest = known.get(nearest), nearest + 1
-            known = {nearest: self._step(nearest, before)}
-            if nearest % self._every == 0:
+        starts = known if self._course.back else [other for other in known if other <= number]
+        reached = min(starts, key=lambda other: abs(number - other), default=-1)
+        if reached != number:
+            before, reached = known.get(reached), self._stop(reached, number)
+            known = {reached: self._step(reached, before)}
+            if reached % self._every == 0:
                 self.kept |= known
-        self._last = {nearest: known[nearest]}
-        return nearest, known[nearest]
+        self._last = {reached: known[reached]}
+        return reached, known[reached]
+
+    def _stop(self, start: int, number: int) -> int:
+        """Where a step from `start` towards a frame ends."""
+        leap = self._course.leap
+        if start < number:
+            return min(number, (start // leap + 1) * leap)
+        return max(number, -(-start // leap) * leap - leap)
 
 
 class Session:
-    """What one player answers visitors, who scrub through its script or take its tool over.
+    """What the finite elements answer visitors, who scrub through a script or take its tool over.
 
     Where answers depend on those before them, a frame of the script is that of the straight run. A hand goes on from
-    the last answer: each of its frames is one frame's time later than that, whichever number it has.
+    the last answer: each of its frames is one frame's time later than that, whichever number it has. Where the brain
+    comes off the skull, a jump goes by frames in between.
     """
 
     def __init__(self, player: Player) -> None:
         self.player = player
-        self._reel: Reel[Deformation] = Reel(
-            len(player.scene.times), lambda number, last: player.answer(player.loads(number), last)
-        )
+        course, scene = course_of(player), player.scene
+        self._reel: Reel[Deformation] | None = None
+        if course is not None:
+            self._reel = Reel(len(scene.times), lambda number, last: player.answer(player.loads(number), last), course)
         self._last: Deformation | None = None
 
     def towards(self, number: int, touch: Touch | None = None) -> tuple[int, Deformation]:
         """A frame's answer, or that of one on the way to it, and its number; `touch` where the hand has the tool."""
         player, last = self.player, self._last
-        if player.remembers and touch is None:
+        if self._reel is not None and touch is None:
             number, self._last = self._reel.towards(number)
             return number, self._last
         loads = player.loads(number, touch)
@@ -72,3 +110,14 @@ class Session:
             last = replace(last, time=loads.times - 1.0 / player.scene.frames_per_second)
         self._last = player.answer(loads, last)
         return number, self._last
+
+
+def course_of(player: Player) -> Course | None:
+    """How frames of a script are reached; None where each is as quickly found from any other."""
+    scene = player.scene
+    if player.remembers:
+        return IN_ORDER
+    if not any(isinstance(effect, SkullContact) for effect in scene.effects_on(player.site.anatomy)):
+        return None
+    # Of such a state displacements alone are kept, a third of a megabyte each.
+    return Course(max(1, round(LEAP * scene.frames_per_second)), back=True, kept=64)

@@ -11,13 +11,14 @@ NOTICED, LOOK = 0.3, 0.1
 
 
 class Busy:
-    """A thread that gives `say` what is being solved and for how long, and an empty line when it is done."""
+    """A thread that gives `say` what is being done and for how long, and an empty line when it is done."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
         self._since: float | None = None
         self._what = ""
-        self._shown = False
+        self.noticed = False
+        """Whether the line is up."""
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="busy", daemon=True)
@@ -33,9 +34,9 @@ class Busy:
         """The work is done."""
         with self._lock:
             self._since = None
-            if self._shown:
+            if self.noticed:
                 self._say("")
-            self._shown = False
+            self.noticed = False
 
     def close(self) -> None:
         """Stop watching."""
@@ -47,5 +48,5 @@ class Busy:
             with self._lock:
                 waited = 0.0 if self._since is None else clock.perf_counter() - self._since
                 if waited >= NOTICED:
-                    self._say(f"solving {self._what} ... {waited:.0f} s")
-                    self._shown = True
+                    self._say(f"{self._what} ... {waited:.0f} s")
+                    self.noticed = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,23 @@ class Device:
     def launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel here, unless there is nothing to do."""
         if min(dim) > 0:
+            if not self.on_cuda:
+                load(kernel.module)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.name, record_tape=False)
+
+
+_loading, _loaded = Lock(), set[wp.Module]()
+
+
+def load(module: wp.Module) -> None:
+    """Load a kernel's module on the CPU; if Warp has not cached it, it is compiled.
+
+    One thread does it at a time, and others wait: Warp alone would compile a module once for each that launches it.
+    """
+    if module not in _loaded:
+        with _loading:
+            wp.load_module(module, device="cpu")  # nothing is left to do where another thread had the lock first
+            _loaded.add(module)
 
 
 def find_device(name: str, precision: Precision) -> Device:

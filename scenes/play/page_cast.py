@@ -1,0 +1,124 @@
+"""Who plays a scene on a page: trained models, and finite elements, which solve in threads of their own."""
+
+from __future__ import annotations
+
+import threading
+import time as clock
+from dataclasses import replace
+
+from ..script.scene import Scene
+from .deformers import Theatre
+from .effect_ablation import without
+from .page_referee import Question, Referee, Truth
+from .player import Player
+from .stage import Stage
+
+ALL: frozenset[str] = frozenset()
+"""What is switched off where all effects act."""
+
+
+class Cast:
+    """The stages, models and finite elements of one scene, with all its effects or without some.
+
+    `playable` says whether anything is there that answers.
+    """
+
+    def __init__(self, theatre: Theatre, scene: Scene, deformer: str, turn: threading.Lock) -> None:
+        """Have a deformer by name play; of finite elements one prepares at a time, who holds `turn`.
+
+        Raises
+        ------
+        InputError
+            A deformer that does not know the scene.
+        """
+        self.theatre, self.turn = theatre, turn
+        # Not on a card: there, what is drawn while a solver's thread records a CUDA graph would be recorded with it.
+        self.stages = {ALL: replace(theatre.stage(scene), device="cpu")}
+        self.players: dict[tuple[str, frozenset[str]], Player] = {}
+        self.solvers: dict[frozenset[str], Referee] = {}
+        # Who is asked for what is shown next, and for what.
+        self.seeking: tuple[Referee, Question] | None = None
+        self.playable = deformer != "fem"
+        if self.playable:
+            self.player(deformer)
+
+    def stage(self, off: frozenset[str] = ALL) -> Stage:
+        """The stage of the scene without some effects, of the tissue that it has with them."""
+        if off not in self.stages:
+            scene = self.stages[ALL].scene
+            for effect in scene.effects_on(self.theatre.anatomy):
+                scene = without(scene, effect) if type(effect).__name__ in off else scene
+            self.stages[off] = replace(self.stages[ALL], scene=scene)
+        return self.stages[off]
+
+    def solver(self, off: frozenset[str] = ALL) -> Referee:
+        """The finite elements of the scene without some effects."""
+        if off not in self.solvers:
+            self.solvers[off] = Referee(self.theatre, self.stage(off).scene, self.turn)
+        return self.solvers[off]
+
+    def player(self, name: str, off: frozenset[str] = ALL) -> Player:
+        """Who plays the scene without some effects: a trained model, or finite elements that have answered."""
+        if (name, off) not in self.players:
+            stage = self.stage(off)
+            if name == "fem":
+                solved = self.solver(off).player
+                assert solved is not None
+                deformer = solved.deformer
+            else:
+                deformer = self.theatre.deformer(name, stage.scene)
+            self.players[name, off] = Player(stage, deformer)
+        return self.players[name, off]
+
+    def predicted(self, name: str, question: Question) -> Truth:
+        """A trained model's answer."""
+        begun, player = clock.perf_counter(), self.player(name)
+        loads = player.loads(*question)
+        answer = player.answer(loads)
+        return Truth(question[0], loads, answer, clock.perf_counter() - begun, question)
+
+    def solved(self, off: frozenset[str], question: Question, seen: Truth | None, patience: float) -> Truth | None:
+        """The finite elements' answer, or that to a frame on the way there; they are asked, if they were not.
+
+        Parameters
+        ----------
+        seen
+            An answer that is known already.
+        patience
+            How long to wait for another [s]; None is returned where none came.
+
+        Raises
+        ------
+        Exception
+            What they failed at.
+        """
+        solver = self.solver(off)
+        if self.seeking != (solver, question):
+            self._seek(solver, question)
+        if solver.failure is not None and (solver.refused == question or not solver.thread.is_alive()):
+            self.seeking = None
+            if not solver.thread.is_alive():
+                del self.solvers[off]
+            raise solver.failure
+        truth = solver.newer(question, seen, patience)
+        self.playable = self.playable or solver.player is not None
+        return truth
+
+    def _seek(self, solver: Referee, question: Question) -> None:
+        """Ask for what is shown next; what was asked before is not wanted any more."""
+        if self.seeking is not None and self.seeking[0] is not solver:
+            self.seeking[0].drop()
+        self.seeking = solver, question
+        solver.ask(*question)
+
+    def rest(self) -> None:
+        """Nothing more is wanted: what is under way ends with the step in hand."""
+        if self.seeking is not None:
+            self.seeking[0].drop()
+            self.seeking = None
+
+    def dismiss(self) -> list[Referee]:
+        """Stop the finite elements, without waiting for what they have in hand; returns those that still do."""
+        for solver in self.solvers.values():
+            solver.dismiss()
+        return [solver for solver in self.solvers.values() if solver.thread.is_alive()]

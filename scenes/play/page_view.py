@@ -1,0 +1,48 @@
+"""The 3-D view of a page: which surfaces it shows, the patient's sides round them, and where it is seen from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ar.page_parts import Body, Sign, Viewpoint
+
+from ..script.site import Site
+from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR, Stage
+
+FEM_COLOUR = (0.95, 0.35, 0.75)
+STALE_COLOUR = (0.45, 0.45, 0.45)
+"""Of the finite elements' tumour while it belongs to another load than the one that is shown."""
+# How far the patient's sides stand from the brain [m].
+BESIDE = 12e-3
+
+
+def bodies_of(stage: Stage) -> list[Body]:
+    """Brain, open cortex, tumour, the finite elements' tumour and the tool, at rest."""
+    positions = stage.site.anatomy.mesh.nodes
+    tool, site = stage.scene.tool, stage.site
+    brain, cortex, tumour = stage.brain, stage.cortex(positions), stage.tumour(positions)
+    bodies = [
+        Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
+        Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
+        Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
+        Body("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True),
+    ]
+    if tool is not None:
+        pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
+        at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        bodies.append(Body("tool", at, tool.mesh.faces, TOOL_COLOUR))
+    return bodies
+
+
+def signs_of(site: Site) -> list[Sign]:
+    """The patient's sides round the brain."""
+    nodes = site.anatomy.mesh.nodes
+    middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + BESIDE
+    ways = zip(("RL", "AP", "SI"), np.diag(half), strict=True)
+    return [Sign(word, middle + way) for (plus, minus), arm in ways for word, way in ((plus, arm), (minus, -arm))]
+
+
+def viewpoint_of(site: Site) -> Viewpoint:
+    """Obliquely onto the open cortex."""
+    eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
+    return Viewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))

@@ -1,0 +1,52 @@
+"""Kernels of pictures are loaded ahead: all of them, and by one thread at a time."""
+
+import ast
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+import ar
+from ar.overlay import load_kernels
+from ar.parallel import load
+
+
+@pytest.fixture
+def loading(monkeypatch):
+    """The modules that Warp loads, and how many at the same time at most."""
+    loaded, inside, most = [], [], []
+
+    def slow(module, device):
+        inside.append(module)
+        most.append(len(inside))
+        time.sleep(0.02)
+        inside.remove(module)
+        loaded.append(getattr(module, "__name__", module))
+
+    monkeypatch.setattr(wp, "load_module", slow)
+    return loaded, most
+
+
+def of_kernels(path):
+    """Whether a file has functions that are kernels."""
+    functions = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef))
+    return any(ast.unparse(decorator) == "forward_kernel" for f in functions for decorator in f.decorator_list)
+
+
+def test_every_kernel_of_a_picture_is_loaded_ahead(loading):
+    load_kernels()
+    names = {f"ar.{path.stem}" for path in Path(ar.__file__).parent.glob("*.py") if of_kernels(path)}
+    assert len(names) > 3 and sorted(loading[0]) == sorted(names - {"ar.raycast"})  # the tests' own
+
+
+def test_whoever_needs_them_meanwhile_waits(loading):
+    loaded, most = loading
+    ahead = threading.Thread(target=load_kernels)
+    ahead.start()
+    while not most:
+        time.sleep(0.001)
+    load("cpu", "ar.window")
+    assert loaded[-1] == "ar.window" and len(loaded) == 5 and max(most) == 1
+    ahead.join()

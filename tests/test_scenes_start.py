@@ -1,0 +1,32 @@
+"""`sulcus demo` from its start to the first picture."""
+
+import threading
+
+import pytest
+from theatres import put, theatre_of
+from visitor import free_port
+
+from scenes.cli import main
+from scenes.play.page import Demo
+from scenes.play.page_cast import Cast
+from scenes.play.waiting_notice import Busy
+
+
+@pytest.mark.parametrize("name", ["linear", "fem"])
+def test_the_page_opens_while_kernels_are_compiled_and_plays_when_they_are(name, box, tmp_path, monkeypatch):
+    """A model's first answer belongs to what is made ready."""
+    done, predicted = [], Cast.predicted
+    opened = threading.Event()
+
+    def slow():
+        assert opened.wait(30.0)
+        done.append("compiled")
+
+    monkeypatch.setattr("ar.overlay.load_kernels", slow)
+    monkeypatch.setattr(Busy, "on", lambda busy, what: done.append(what) or opened.set())
+    monkeypatch.setattr(Cast, "predicted", lambda *words: done.append("answered") or predicted(*words))
+    monkeypatch.setattr(Demo, "run", lambda page, seconds: done.append("plays"))
+    path = put(theatre_of(box), tmp_path / "box.vtu")
+    assert main(["demo", "--anatomy", str(path), "--deformer", name, "--port", str(free_port())]) == 0
+    waits = "compiling; the next start finds it done"
+    assert done == [waits, "compiled", *(["answered"] if name == "linear" else []), "plays"]
