@@ -37,9 +37,8 @@ from .runtime.device import find_device
 from .runtime.exclusive import alone
 from .runtime.memory import check_fits, fitting_batch
 from .runtime.threads import one_thread
-from .strategy.captured_frame import Frame
 from .strategy.extrapolation import moved_on, pushes_of, way_of
-from .strategy.frame_sequence import FrameSequence
+from .strategy.frame_sequence import FrameSequence, frame_sequence
 from .strategy.newton_correction import step_from
 from .strategy.plan import Plan, Step, local_solvers, plan_for
 from .strategy.strategy import Answer, Strategy
@@ -198,9 +197,7 @@ class Fem:
         """Who answers frame after frame on CUDA. The CPU waits for nothing that this would spare it."""
         if not self.plan.frames:
             return None
-        strategy = self.strategy
-        frame = Frame(self.problem, strategy.preconditioner, strategy.inversion, self._skin, self.accuracy.tolerance)
-        return FrameSequence(self.problem, strategy.inversion, frame, self.lock, self.description)
+        return frame_sequence(self.strategy, self.space, self._skin, self.lock, self.description)
 
     def _vertices(self, at: np.ndarray) -> np.ndarray:
         return vertex_numbers("at", at, len(self._anatomy.mesh.nodes))

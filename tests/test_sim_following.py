@@ -156,8 +156,8 @@ def test_a_start_that_cannot_be_taken_leaves_no_state_behind(fem, monkeypatch):
     expected, here = fem.deform(pushed(2.1e-3), last), fem.deform(pushed(1.4e-3), middle)
     take = Frame.take
 
-    def interrupted(frame, u, past, learnt):
-        take(frame, u, past, learnt)
+    def interrupted(frame, *given):
+        take(frame, *given)
         raise MemoryError
 
     with monkeypatch.context() as patch, pytest.raises(MemoryError):

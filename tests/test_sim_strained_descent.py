@@ -26,7 +26,7 @@ from sim.local_solvers.strained_descent import (
     StiffenedPreconditioner,
     Stiffening,
     StrainedDescent,
-    strained_descent,
+    strained_part,
 )
 from sim.local_solvers.strained_part import Strains
 from sim.minimisers.lbfgs import Lbfgs
@@ -35,6 +35,7 @@ from sim.minimisers.lbfgs_kernels import LIVE as GOING
 from sim.strategy.plan import Step
 
 LAW, HARD = "neo-hookean", np.array([[1.0, 0.5, -5.0]])
+RENEWAL = Renewal()
 EVERY = Strains(least=0.0, nodes=10**4, cut=np.inf, near=10**4)
 
 
@@ -42,6 +43,13 @@ def factor_of(problem: Problem) -> Factor:
     found = rest_solver(problem)
     assert isinstance(found, Factor)
     return found
+
+
+def descent_on(
+    problem: Problem, space: Discretisation, strains: Strains = SINGLE, renewal: Renewal = RENEWAL
+) -> StrainedDescent:
+    factor = factor_of(problem)
+    return StrainedDescent(problem, factor, strained_part(problem, factor, space, strains), renewal)
 
 
 def hard(element: str = "smoothed") -> tuple[Problem, Discretisation, wp.array]:
@@ -53,10 +61,10 @@ def hard(element: str = "smoothed") -> tuple[Problem, Discretisation, wp.array]:
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
 def test_it_ends_where_the_whole_does(element: str) -> None:
     problem, space = begun(LAW, element)
-    expected, descent = equilibria(problem), strained_descent(problem, factor_of(problem), space)
+    expected, descent = equilibria(problem), descent_on(problem, space)
     for column, total in enumerate(TOTAL):
         problem, _ = begun(LAW, element, total[None])
-        descent = strained_descent(problem, factor_of(problem), space)
+        descent = descent_on(problem, space)
         found = descent.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 200)
         assert found.status[0] == DONE and found.residual[0] <= FINE
         np.testing.assert_allclose(found.u.numpy()[:, 0], expected[:, column], atol=1e-5 * np.abs(expected).max())
@@ -66,7 +74,7 @@ def test_it_takes_half_the_steps() -> None:
     problem, space, rest = hard()
     factor, tolerance = factor_of(problem), np.full(1, 1e-6)
     plain = Lbfgs(problem, factor).descend(rest, tolerance, 400)
-    found = strained_descent(problem, factor, space).descend(rest, tolerance, 400)
+    found = descent_on(problem, space).descend(rest, tolerance, 400)
     assert found.status[0] == plain.status[0] == DONE
     assert found.steps[0] <= 0.5 * plain.steps[0]
 
@@ -75,7 +83,7 @@ def test_the_preconditioner_is_the_inverse_of_what_is_stiffer(monkeypatch: pytes
     """Of all nodes it is the inverse of the whole stiffness where the body is now."""
     problem, space, rest = hard("p1")
     factor = factor_of(problem)
-    bent = strained_descent(problem, factor, space).descend(rest, np.full(1, 1e-2), 100).u
+    bent = descent_on(problem, space).descend(rest, np.full(1, 1e-2), 100).u
     basis, definite = problem.constraint.basis(), problem.device.array(np.zeros(1), wp.int32)
     for term in problem.terms:
         term.linearise(bent, definite)
@@ -91,7 +99,7 @@ def test_the_preconditioner_is_the_inverse_of_what_is_stiffer(monkeypatch: pytes
         StiffenedPreconditioner, "apply",
         lambda self, *given: (kept.append(self.stiffening), inside(self, *given))[1],
     )  # fmt: skip
-    descent = StrainedDescent(problem, factor, np.arange(len(space.nodes)), EVERY)
+    descent = descent_on(problem, space, EVERY)
     descent.descend(bent, np.full(1, 1e-12), 2)
     preconditioner, out = StiffenedPreconditioner(factor, problem), problem.device.zeros(problem.rows, 1)
     preconditioner.stiffening = kept[0]
@@ -102,11 +110,11 @@ def test_the_preconditioner_is_the_inverse_of_what_is_stiffer(monkeypatch: pytes
 
 def test_the_next_frame_begins_with_what_served() -> None:
     problem, space, rest = hard()
-    descent = strained_descent(problem, factor_of(problem), space)
+    descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {})
-    assert there.steps[0] > Renewal().served and there.learnt == {}
+    assert there.steps[0] > RENEWAL.served and there.learnt == {}
     first = descent.descend(there.u, np.full(1, 1e-8), 400, {})
-    assert first.status[0] == DONE and first.steps[0] <= Renewal().served and set(first.learnt) == set(LEARNT.values())
+    assert first.status[0] == DONE and first.steps[0] <= RENEWAL.served and set(first.learnt) == set(LEARNT.values())
     again = descent.descend(there.u, np.full(1, 1e-8), 400, first.learnt)
     np.testing.assert_array_equal(again.u.numpy(), first.u.numpy())
     for name, array in first.learnt.items():
@@ -118,7 +126,7 @@ def test_the_next_frame_begins_with_what_served() -> None:
 @pytest.mark.parametrize("fault", ["missing", "short", "negative", "large", "kind"])
 def test_what_does_not_fit_is_forgotten(name: str, fault: str) -> None:
     problem, space, rest = hard()
-    descent = strained_descent(problem, factor_of(problem), space)
+    descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {}).u
     first = descent.descend(there, np.full(1, 1e-8), 400, {})
     learnt, array = dict(first.learnt), first.learnt[name]
@@ -137,7 +145,7 @@ def test_what_does_not_fit_is_forgotten(name: str, fault: str) -> None:
 
 def test_a_factor_that_cannot_be_divided_by_is_forgotten() -> None:
     problem, space, rest = hard()
-    descent = strained_descent(problem, factor_of(problem), space)
+    descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {}).u
     first = descent.descend(there, np.full(1, 1e-8), 400, {})
     learnt = {name: np.zeros_like(array) for name, array in first.learnt.items()}
@@ -161,7 +169,7 @@ def test_where_the_model_is_not_positive_the_rest_stands_in() -> None:
 
 def test_the_budget_leaves_a_finite_state_and_says_so() -> None:
     problem, space, rest = hard()
-    descent = strained_descent(problem, factor_of(problem), space)
+    descent = descent_on(problem, space)
     found = descent.descend(rest, np.full(1, 1e-12), 3)
     assert found.status[0] == GOING and found.steps[0] <= 3 and found.left.tolist() == [0]
     _, free, scale = problem.residual(found.u)
@@ -198,7 +206,7 @@ def test_live_frames_go_the_short_way_to_the_same_place() -> None:
 def test_models_have_the_nodes_nearest_to_the_opening() -> None:
     problem, space, rest = hard()
     strains, kept = replace(SINGLE, near=200, nodes=30), Renewal(served=400)
-    descent = strained_descent(problem, factor_of(problem), space, strains, kept)
+    descent = descent_on(problem, space, strains, kept)
     rows = descent.descend(rest, np.full(1, 1e-6), 400, {}).learnt[LEARNT["rows"]][0]
     assert len(np.unique(rows)) == len(rows) == 90
     distance = np.linalg.norm(space.nodes[:, None] - space.nodes[OPENING], axis=2).min(axis=1)

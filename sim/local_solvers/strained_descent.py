@@ -22,6 +22,7 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..linalg.compliance import Compliance
 from ..linalg.multifrontal import Factor
+from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs import Descended, Lbfgs
 from ..runtime.threads import one_thread
 from .batch_elimination import open_vertices
@@ -108,23 +109,14 @@ class StrainedDescent:
     ----------
     problem, factor
         The whole body, and its rest stiffness.
-    near
-        (n,) nodes: those that a model may have.
-    strains, renewal
-        Which tissue counts as strained; when its model is made anew.
+    part
+        Finds what is strained.
+    renewal
+        When a model is made anew.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        factor: Factor,
-        near: np.ndarray,
-        strains: Strains = SINGLE,
-        renewal: Renewal = Renewal(),
-    ):
-        self._problem, self._renewal = problem, renewal
-        self._compliance = Compliance(problem, factor, near)
-        self._part = StrainedPart(problem, self._compliance, 0, strains)
+    def __init__(self, problem: Problem, factor: Factor, part: StrainedPart, renewal: Renewal = Renewal()):
+        self._problem, self._part, self._renewal = problem, part, renewal
         self._preconditioner = StiffenedPreconditioner(factor, problem)
         self._lbfgs = Lbfgs(problem, self._preconditioner)
 
@@ -133,7 +125,7 @@ class StrainedDescent:
     ) -> Descended:
         """As `Lbfgs.descend`, of one column; what is learnt is the model."""
         u, left, steps = start, most, 0
-        self._preconditioner.stiffening = self._known(learnt) or self._stiffening(u)
+        self._preconditioner.stiffening = self.known(learnt) or self._stiffening(u)
         while True:
             some = min(left, self._renewal.evaluations)
             found = self._lbfgs.descend(u, tolerance, some)
@@ -151,18 +143,19 @@ class StrainedDescent:
         found = self._part.stiffening(u, np.arange(1))
         if found is None or not found[0].shape[1]:
             return None
-        self._compliance.know(np.ones(len(self._compliance.nodes), bool))
+        compliance = self._part.compliance
+        compliance.know(np.ones(len(compliance.nodes), bool))
         place = (3 * found[0][0][:, None] + np.arange(3)).ravel()
         added = found[1][0].astype(np.float32)
         with one_thread():
-            soft = self._compliance.columns.take(place, axis=0).take(place, axis=1).astype(np.float32)
+            soft = compliance.columns.take(place, axis=0).take(place, axis=1).astype(np.float32)
             system = sp.csr_array(added) @ (0.5 * (soft + soft.T))
             system[np.diag_indices(len(place))] += 1.0
             if not np.isfinite(system).all():
                 return None
-            return Stiffening(self._compliance.rows[place], added, *lu_factor(system, True, check_finite=False))
+            return Stiffening(compliance.rows[place], added, *lu_factor(system, True, check_finite=False))
 
-    def _known(self, learnt: Mapping[str, np.ndarray] | None) -> Stiffening | None:
+    def known(self, learnt: Mapping[str, np.ndarray] | None) -> Stiffening | None:
         """What an earlier descent of this problem left warm; None if that does not fit."""
         if learnt is None or any(name not in learnt for name in LEARNT.values()):
             return None
@@ -180,14 +173,10 @@ class StrainedDescent:
         return Stiffening(rows[0], added[0], factor[0], pivots[0])
 
 
-def strained_descent(
-    problem: Problem,
-    factor: Factor,
-    space: Discretisation,
-    strains: Strains = SINGLE,
-    renewal: Renewal = Renewal(),
-) -> StrainedDescent:
-    """For single loads on the CPU, on a body with a small opening: models have the nodes that are nearest to it."""
+def strained_part(
+    problem: Problem, preconditioner: Preconditioner, space: Discretisation, strains: Strains = SINGLE
+) -> StrainedPart:
+    """On a body with a small opening: models have the nodes that are nearest to it."""
     distance, _ = KDTree(space.nodes[open_vertices(space, problem.constraint)]).query(space.nodes)
     near = np.sort(np.argsort(distance, kind="stable")[: strains.near])
-    return StrainedDescent(problem, factor, near, strains, renewal)
+    return StrainedPart(problem, Compliance(problem, preconditioner, near), 0, strains)

@@ -190,7 +190,9 @@ class StrainedPart:
 
     def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: Strains = STRAINS):
         device, nodes = problem.device, compliance.nodes
-        self._problem, self._compliance, self._touchable, self._strains = problem, compliance, touchable, strains
+        self._problem, self.compliance, self._touchable, self._strains = problem, compliance, touchable, strains
+        self.size = 3 * strains.nodes
+        """Rows of the largest model."""
         self._near = device.array(nodes, wp.int32)
         near = np.zeros(problem.rows // 3, bool)
         near[nodes] = True
@@ -229,7 +231,7 @@ class StrainedPart:
 
     def _bent(self, nodes: Any, stiffer: Any) -> Model:
         """Of D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""
-        self._compliance.know(np.ones(len(self._compliance.nodes), bool))
+        self.compliance.know(np.ones(len(self.compliance.nodes), bool))
         device, count, size = self._problem.device, len(nodes), stiffer.shape[1]
         # One more row and column take what is of nodes that cannot be touched.
         shape = count, 3 * self._touchable + 1, 3 * self._touchable + 1
@@ -239,7 +241,7 @@ class StrainedPart:
         for first in range(0, count if size else 0, each):
             some = slice(first, first + each)
             rows = (3 * nodes[some][:, :, None] + axes).reshape(-1, size)
-            soft = self._compliance.columns[rows[:, :, None], rows[:, None, :]]
+            soft = self.compliance.columns[rows[:, :, None], rows[:, None, :]]
             soft = 0.5 * (soft + soft.mT)
             system = stiffer[some] @ soft
             diagonal = range(size)

@@ -15,6 +15,8 @@ from ..discretisation.footprint import Skin
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
+from ..local_solvers.strained_frame import Bent, BentPreconditioner, bent_at
+from ..local_solvers.strained_part import StrainedPart
 from ..minimisers.lbfgs_kernels import LIVE, PAIRS
 from ..minimisers.lbfgs_state import State, Workspace, ground_of, standing
 from ..runtime.columns import lanes_of, summed
@@ -22,6 +24,8 @@ from ..runtime.device import Device, forward_kernel
 
 # A frame that takes more evaluations is not one of a tool that moves smoothly.
 FRAME_EVALUATIONS = 60
+# A model of strained tissue that served in so many steps stays: to make one takes as long as fifteen.
+SERVED = 8
 # What goes up: point and radius, force, and how far to move on.
 GIVEN = 8
 # What comes down before the displacements; the sums are those of the footprint.
@@ -167,13 +171,24 @@ class Frame:
         Where tools push.
     tolerance
         As `Accuracy` has it.
+    part
+        Finds strained tissue, if frames are to know it.
     """
 
     def __init__(
-        self, problem: Problem, preconditioner: Preconditioner, inversion: Inversion, skin: Skin, tolerance: float
+        self,
+        problem: Problem,
+        preconditioner: Preconditioner,
+        inversion: Inversion,
+        skin: Skin,
+        tolerance: float,
+        part: StrainedPart | None = None,
     ):
-        self._device, self._inversion, self._skin = problem.device, inversion, skin
-        self._workspace = Workspace(problem, preconditioner, 1, ground_of(problem, 1))
+        self._device, self._inversion, self._skin, self.part = problem.device, inversion, skin, part
+        self.bent: Bent | None = None
+        """What the next frame knows of strained tissue."""
+        self._knowing = None if part is None else BentPreconditioner(preconditioner, problem, part.size)
+        self._workspace = Workspace(problem, self._knowing or preconditioner, 1, ground_of(problem, 1))
         self._workspace.columns["tolerance"].fill_(tolerance)
         self._workspace.prepare()
         self._before = standing(problem, 1, ground_of(problem, 1))
@@ -195,9 +210,12 @@ class Frame:
         """What the last answer started from."""
         return self._before
 
-    def take(self, u: np.ndarray, past: np.ndarray | None, learnt: Mapping[str, np.ndarray]) -> None:
-        """Another state: displacements u (3N, 1) [m], those before them, and learnt pairs, as far as there are any."""
+    def take(
+        self, u: np.ndarray, past: np.ndarray | None, learnt: Mapping[str, np.ndarray], bent: Bent | None = None
+    ) -> None:
+        """Another state: displacements u (3N, 1) [m], those before them, and what was learnt, if anything."""
         columns = self._workspace.columns
+        self._know(bent)
         columns["u"].assign(u)
         self._past.assign(u if past is None else past)
         for name in ("s", "w", "known"):
@@ -205,6 +223,17 @@ class Frame:
         columns["head"].fill_(PAIRS - 1)
         for name, rows_first in learnt.items():
             columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
+
+    def learn(self, steps: float) -> None:
+        """After an answer in so many steps: know what is strained there, unless what was known has served."""
+        if self.part is not None and steps > SERVED:
+            self._know(bent_at(self.part, self._device, self._workspace.columns["u"], self.part.size))
+            self._workspace.columns["known"].zero_()  # pairs belong to the model that they were learnt with
+
+    def _know(self, bent: Bent | None) -> None:
+        if self._knowing is not None:
+            self.bent = bent
+            self._knowing.load(bent)
 
     def push(self, point: np.ndarray, radius: float, force: np.ndarray, share: float) -> np.ndarray:
         """The answer (HEAD + 3N,) to a push at point (3,) with a footprint's radius [m] and a force (3,) [N].

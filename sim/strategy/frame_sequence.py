@@ -15,15 +15,20 @@ from weakref import ref
 import numpy as np
 
 from ..deformation import Cost, Deformation, Outcome
+from ..discretisation.footprint import Skin
 from ..discretisation.inverted_elements import Inversion
 from ..discretisation.problem import Problem
+from ..discretisation.space import Discretisation
 from ..discretisation.term import Cases
 from ..loads import Loads
+from ..local_solvers.strained_descent import strained_part
+from ..local_solvers.strained_frame import Bent, bent_from
 from ..minimisers.lbfgs import LEARNT, learnt_from, rows_first
 from ..minimisers.lbfgs_kernels import DONE
 from ..minimisers.lbfgs_state import State
 from .captured_frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, Frame
 from .extrapolation import BEFORE, PUSHES, knows, pushes_of, shares, way_of
+from .strategy import Strategy
 
 # Components of a cross product, a fifth of the time that NumPy's takes.
 TURNED, BACK = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -32,19 +37,22 @@ TURNED, BACK = np.array([1, 2, 0]), np.array([2, 0, 1])
 class Kept(Mapping[str, Any]):
     """What is warm in an answer: curvature pairs stay on the device until they are read, or about to be written over.
 
-    `lock` is that of who answers: another thread may read while the next frame is about to be made.
+    `bent` is what the next frame knows of strained tissue. `lock` is that of who answers: another thread may read while
+    the next frame is about to be made.
     """
 
-    def __init__(self, own: Mapping[str, np.ndarray], state: State, lock: RLock):
+    def __init__(self, own: Mapping[str, np.ndarray], state: State, lock: RLock, bent: Bent | None = None):
         self._own = dict(own)
         self._lock = lock
         self.state: State | None = state
+        self.bent = bent
 
     def settle(self) -> None:
         """Bring to the host what is still on the device."""
         with self._lock:
             if self.state is not None:
                 self._own |= {name: rows_first(self.state.columns[name]) for name in LEARNT}
+                self._own |= {} if self.bent is None else self.bent.learnt
                 self.state = None
 
     def __getitem__(self, key: str) -> Any:
@@ -109,7 +117,8 @@ class FrameSequence:
         found = self._frame.push(point, radius, force, share)
         if found[STATUS] != DONE or (found[INVERTED] and self._inversion.telling):
             return None
-        warm = Kept(way, self._frame.state, self._lock)
+        self._frame.learn(found[STEPS])
+        warm = Kept(way, self._frame.state, self._lock, self._frame.bent)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
         displacement = found[HEAD:].reshape(1, -1, 3).copy()
         displacement.setflags(write=False)  # as a start, the device's own stands in for it
@@ -142,8 +151,14 @@ class FrameSequence:
             here.settle()
         self._last = self._here = _gone
         past = start.warm[BEFORE].T if knows(start.warm, last) else None
-        self._frame.take(last, past, learnt_from(cases, len(last)))
+        self._frame.take(last, past, learnt_from(cases, len(last)), self._bent(start.warm, len(last)))
         return True
+
+    def _bent(self, warm: Mapping[str, Any], rows: int) -> Bent | None:
+        if isinstance(warm, Kept):
+            return warm.bent
+        part = self._frame.part
+        return None if part is None else bent_from(warm, self._problem.device, rows, part.size)
 
     def _make_way(self) -> None:
         """What stands where the last frame ended is about to move to where it began."""
@@ -153,6 +168,14 @@ class FrameSequence:
         if here is not None and here.state is not None:
             here.state = self._frame.before
         self._there = self._here
+
+
+def frame_sequence(strategy: Strategy, space: Discretisation, skin: Skin, lock: RLock, source: str) -> FrameSequence:
+    """By the solvers of a plan that follows frames, on the tissue under a skin."""
+    problem, preconditioner, inversion = strategy.problem, strategy.preconditioner, strategy.inversion
+    part = strained_part(problem, preconditioner, space) if strategy.plan.strained else None
+    frame = Frame(problem, preconditioner, inversion, skin, strategy.accuracy.tolerance, part)
+    return FrameSequence(problem, inversion, frame, lock, source)
 
 
 def _gone() -> None:

@@ -21,7 +21,7 @@ from ..linalg.preconditioner import is_exact, name_of
 from ..local_solvers.batch_elimination import BatchElimination, batch_elimination, has_small_opening
 from ..local_solvers.clamped_elimination import ClampedElimination
 from ..local_solvers.patch_elimination import PatchElimination, patch_elimination
-from ..local_solvers.strained_descent import StrainedDescent, strained_descent
+from ..local_solvers.strained_descent import StrainedDescent, strained_part
 from .captured_frame import FRAME_EVALUATIONS
 
 Alone = PatchElimination | ClampedElimination | StrainedDescent
@@ -61,8 +61,9 @@ class Plan:
         What is tried first of loads whose tools are moved by pose; None where no tool is.
     quick
         Whether L-BFGS is tried before Newton-CG.
-    frames
-        Whether loads that follow another are answered by a captured graph on the card.
+    frames, strained
+        Whether loads that follow another are answered by a captured graph on the card; whether it knows strained
+        tissue.
     evaluations, outer, load_steps
         Most evaluations of the body's forces before Newton-CG, iterations of that, and load steps.
     batch
@@ -75,6 +76,7 @@ class Plan:
     contact: Step | None
     quick: bool
     frames: bool
+    strained: bool
     evaluations: int
     outer: int
     load_steps: int
@@ -95,7 +97,8 @@ class Plan:
         """The same in sentences."""
         lines = [f"The stiffness at rest is prepared once ({self.preconditioner}); every solver starts from it."]
         if self.frames:
-            lines.append(f"A load that follows another is {Step.FRAME.value}.")
+            knows = ". It knows which tissue the last load strained" if self.strained else ""
+            lines.append(f"A load that follows another is {Step.FRAME.value}{knows}.")
         if self.contact:
             lines.append(f"Tools are moved by pose. Every load begins with {self.contact.value}.")
             lines.append(f"{Step.NEWTON.value} takes what that leaves, load by load.")
@@ -136,13 +139,15 @@ def plan_for(
     cuda, exact = problem.device.on_cuda, is_exact(preconditioner)
     elastic = problem.plain  # what is solved by itself is elastic, and nothing else
     small = elastic and has_small_opening(space, problem.constraint)
+    strained = small and exact and space.element == "smoothed" and Step.STRAINED not in avoid
     single = None
     if elastic and not cuda:
         if space.element == "p2" and isinstance(preconditioner, TwoLevel):
             single = Step.CLAMPED
-        elif live and small and isinstance(preconditioner, Factor):
-            # Of smoothed elements a patch takes longer to solve than it spares the whole.
-            single = Step.PATCH if space.element == "p1" else Step.STRAINED
+        elif live and strained:
+            single = Step.STRAINED  # a patch would take longer to solve than it spares the whole
+        elif live and small and space.element == "p1" and isinstance(preconditioner, Factor):
+            single = Step.PATCH
     contact = None
     if problem.barriers:
         # The model of contact knows one barrier, and needs a preconditioner that is alike at every state.
@@ -161,6 +166,7 @@ def plan_for(
         contact=contact,
         quick=quick and most > 0 and Step.LBFGS not in avoid,
         frames=following and most >= FRAME_EVALUATIONS and Step.FRAME not in avoid,
+        strained=strained,
         evaluations=most,
         outer=accuracy.outer,
         load_steps=accuracy.steps,
@@ -185,5 +191,5 @@ def local_solvers(
         return near, patch_elimination(problem, preconditioner, effects, space)
     if plan.single is Step.STRAINED:
         assert isinstance(preconditioner, Factor)
-        return near, strained_descent(problem, preconditioner, space)
+        return near, StrainedDescent(problem, preconditioner, strained_part(problem, preconditioner, space))
     return near, None

@@ -1,0 +1,133 @@
+"""Frames that stay on the device and know strained tissue: as many steps, the same answers wherever a start stands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from conftest import make_box
+from test_sim_following import EFFECTS, same
+
+from sim.accuracy import LIVE
+from sim.deformation import Deformation, Outcome
+from sim.discretisation.term import Cases
+from sim.fem import Fem
+from sim.linalg.multifrontal import Factor
+from sim.loads import Loads, push
+from sim.local_solvers.strained_descent import SINGLE, Renewal, StiffenedPreconditioner, StrainedDescent, strained_part
+from sim.local_solvers.strained_frame import MATRIX, ROWS, BentPreconditioner, bent_at
+from sim.strategy.captured_frame import SERVED
+from sim.strategy.frame_sequence import Kept
+
+BODY = make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3)
+
+
+def follower(strained: bool) -> Fem:
+    """On the CPU, which by itself would not follow."""
+    fem = Fem(BODY, EFFECTS, LIVE, "cpu", element="smoothed")
+    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, frames=True, strained=strained))
+    return fem
+
+
+@pytest.fixture(scope="module")
+def fem() -> Fem:
+    return follower(True)
+
+
+def pressed(number: float) -> Loads:
+    return push(np.array([7e-4 * number, -1e-3, 0.0]), np.array([0.0, 0.2, -1.6]), 8e-3)
+
+
+def ride(fem: Fem, count: int = 7) -> list[Deformation]:
+    answers = [fem.deform(pressed(0))]
+    for number in range(1, count):
+        answers.append(fem.deform(pressed(number), answers[-1]))
+    return answers
+
+
+def test_they_take_fewer_steps_to_the_same_place(fem: Fem) -> None:
+    own, plain = ride(fem), ride(follower(False))
+    for one, other in zip(own[1:], plain[1:], strict=True):
+        assert isinstance(one.warm, Kept) and one.outcome == other.outcome == (Outcome.CONVERGED,)
+        assert one.residual[0] <= LIVE.tolerance
+        size = np.abs(other.displacement).max()
+        np.testing.assert_allclose(one.displacement, other.displacement, atol=5e-3 * size)
+    # The first that follows comes from a solver that left no model.
+    assert own[1].iterations[0] == plain[1].iterations[0] > SERVED
+    assert sum(int(one.iterations[0]) for one in own[2:]) <= 0.6 * sum(int(one.iterations[0]) for one in plain[2:])
+
+
+def test_what_served_stays_and_what_did_not_is_made_anew(fem: Fem) -> None:
+    answers = ride(fem)[1:]
+    models = [answer.warm.bent for answer in answers if isinstance(answer.warm, Kept)]
+    assert models[0] is not None
+    anew = [after is not before for before, after in pairwise(models)]
+    assert anew == [int(answer.iterations[0]) > SERVED for answer in answers[1:]]
+    assert not all(anew)
+
+
+def test_a_start_is_the_same_on_the_device_and_on_the_host(fem: Fem) -> None:
+    last = ride(fem)[-1]
+    here = fem.deform(pressed(7), last)
+    brought = fem.deform(pressed(7), replace(last, warm={**last.warm}))
+    assert {ROWS, MATRIX} <= set(here.warm) and same(here, brought)
+
+
+def test_an_older_frame_leads_where_it_led_before(fem: Fem) -> None:
+    answers = ride(fem)
+    assert same(fem.deform(pressed(3), answers[2]), answers[3])
+    assert same(fem.deform(pressed(6), answers[5]), answers[6])
+
+
+@pytest.mark.parametrize("fault", ["missing", "short", "far", "negative", "nan", "kind"])
+def test_a_model_that_does_not_fit_is_forgotten(fem: Fem, fault: str) -> None:
+    last = ride(fem)[-1]
+    warm = dict(last.warm)
+    none = fem.deform(pressed(7), replace(last, warm={name: warm[name] for name in warm if name not in (ROWS, MATRIX)}))
+    match fault:
+        case "missing":
+            del warm[MATRIX]
+        case "short":
+            warm[ROWS] = warm[ROWS][:, 1:]
+        case "far":
+            warm[ROWS] = warm[ROWS] + fem.problem.rows
+        case "negative":
+            warm[ROWS] = warm[ROWS] - fem.problem.rows
+        case "nan":
+            warm[MATRIX] = np.full_like(warm[MATRIX], np.nan)
+        case _:
+            warm[ROWS] = warm[ROWS].astype(float)
+    assert same(fem.deform(pressed(7), replace(last, warm=warm)), none)
+
+
+def test_the_matrix_does_what_the_factors_do(fem: Fem) -> None:
+    """That of live loads on the CPU, which is held against the inverse itself."""
+    problem, factor = fem.problem, fem.strategy.preconditioner
+    assert isinstance(factor, Factor)
+    last = ride(fem)[-1]
+    u = problem.device.array(fem.guess(pressed(6), last))
+    part = strained_part(problem, factor, fem.space, SINGLE)
+    bent = bent_at(part, problem.device, u, part.size)
+    problem.begin(Cases(pressed(6.5), np.zeros(1)))
+    single = StrainedDescent(problem, factor, part, Renewal(served=8)).descend(u, np.full(1, 1e-2), 8, {})
+    assert bent is not None and set(single.learnt)
+    force = np.zeros((problem.rows, 1))
+    force[-30:] = np.random.default_rng(1).normal(size=(30, 1))
+    g = problem.device.array(force)
+    problem.constraint.project_nodes(g)
+    mine, plain, other = (problem.device.zeros(problem.rows, 1) for _ in range(3))
+    knowing = BentPreconditioner(factor, problem, part.size)
+    knowing.apply(g, np.ones(1, bool), plain)
+    knowing.load(bent)
+    knowing.apply(g, np.ones(1, bool), mine)
+    stiffened = StiffenedPreconditioner(factor, problem)
+    stiffened.stiffening = StrainedDescent(problem, factor, part).known(single.learnt)
+    stiffened.apply(g, np.ones(1, bool), other)
+    size = np.abs(other.numpy()).max()
+    np.testing.assert_allclose(mine.numpy(), other.numpy(), atol=2e-3 * size)
+    assert np.abs(plain.numpy() - other.numpy()).max() > 0.05 * size
+    knowing.load(None)
+    knowing.apply(g, np.ones(1, bool), mine)
+    np.testing.assert_array_equal(mine.numpy(), plain.numpy())
