@@ -17,6 +17,7 @@ from types import SimpleNamespace as Names
 class Demo:
     def __init__(self, *words):
         self.browser = Names(address="here", token=None)
+        self.busy, self.cast = Names(on=len), Names(predicted=lambda *asked: None)
         self.solve = threading.Thread(target=time.sleep, args=(100.0,), daemon=True)
         self.solve.start()
 
@@ -38,6 +39,8 @@ class Demo:
 
 theatre = Names(models={"linear"}, best=lambda scene: "linear", knowing=lambda scene: True,
                 refusals=lambda scene: {}, described=lambda name, scene: name)
+sys.modules["ar.overlay"] = Names(load_kernels=lambda: None)
+sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
 sys.modules["scenes.play.page"] = Names(Demo=Demo)
 scene = Names(name="none", made_of=lambda tissue, element: scene)
 sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",))

@@ -17,7 +17,7 @@ from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
 from ..runtime.columns import combined
 from ..runtime.device import Device, forward_kernel
-from ..runtime.views import in_order, like, placed, view
+from ..runtime.views import in_order, library, like, placed, solved, view
 from .strained_part import StrainedPart
 
 # Names in an answer's `warm`.
@@ -68,19 +68,28 @@ class Bent:
         return {ROWS: self.rows.numpy()[None], MATRIX: self.matrix.numpy()[None]}
 
 
-def bent_at(part: StrainedPart, device: Device, u: wp.array, size: int) -> Bent | None:
-    """The model of size n at u (3N, 1) [m], which the problem has begun; None where nothing is strained."""
+def bent_at(part: StrainedPart, device: Device, u: wp.array) -> Bent | None:
+    """The model at u (3N, 1) [m], which the problem has begun; None where there is none. A card is not waited for."""
     with in_order(device):
-        found = part.model(u, np.arange(1))
-        if found is None or not found.wide:
+        found = part.stiffening(u, np.arange(1), full=True)
+        if found is None:
             return None
-        rows = wp.zeros(size, dtype=wp.int32, device=device.name)
-        matrix = wp.zeros((size, size), dtype=wp.float32, device=device.name)
-        nodes = like(view(rows), placed(device, part.compliance.nodes))[found.nodes[0]]
-        count = 3 * len(nodes)
-        view(rows)[:count] = (3 * nodes[:, None] + like(nodes, placed(device, np.arange(3)))).reshape(-1)
-        view(matrix)[:count, :count] = like(view(matrix), found.matrix[0])
-        return Bent(rows, matrix)
+        compliance, lib = part.compliance, library(device)
+        compliance.know(np.ones(len(compliance.nodes), bool))
+        places, added = found[0][0], found[1][0]
+        axes = like(places, placed(device, np.arange(3)))
+        rows = (3 * places[:, None] + axes).reshape(-1)
+        soft, own = compliance.columns[rows[:, None], rows], wp.zeros(added.shape, dtype=wp.float32, device=device.name)
+        bent, added = view(own), like(view(own), added)
+        system = added @ like(bent, 0.5 * (soft + soft.T))
+        diagonal = range(len(rows))
+        system[diagonal, diagonal] += 1.0
+        matrix = -solved(system, added)
+        bent[:] = lib.where(lib.isfinite(matrix).all(), 0.5 * (matrix + matrix.T), 0.0 * added)
+        of = wp.zeros(len(rows), dtype=wp.int32, device=device.name)
+        nodes = like(places, placed(device, compliance.nodes))[places]
+        view(of)[:] = like(view(of), (3 * nodes[:, None] + axes).reshape(-1))
+        return Bent(of, own)
 
 
 def bent_from(warm: Mapping[str, np.ndarray], device: Device, count: int, size: int) -> Bent | None:

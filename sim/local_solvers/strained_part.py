@@ -19,7 +19,7 @@ from ..discretisation.problem import Problem
 from ..discretisation.term import Strained
 from ..linalg.compliance import Compliance
 from ..runtime.device import Device, forward_kernel
-from ..runtime.views import from_view, library, like, on_host, padded, placed, view
+from ..runtime.views import ascending, from_view, largest_first, library, like, on_host, padded, placed, view
 
 
 @dataclass(frozen=True)
@@ -57,51 +57,9 @@ STRAINS = Strains()
 
 
 @cache
-def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
-    """Kernels that choose each column's nodes, and multiply by its matrix."""
+def press_of(device: Device) -> wp.Kernel:
+    """The kernel that multiplies by each column's matrix."""
     scalar = device.scalar
-
-    @forward_kernel(module="unique")
-    def choose(
-        strain: wp.array2d(dtype=scalar),
-        near: wp.array(dtype=wp.int32),
-        least: scalar,
-        most: int,
-        # outputs
-        limit: wp.array(dtype=scalar),
-        place: wp.array2d(dtype=wp.int32),
-        nodes: wp.array2d(dtype=wp.int32),
-        count: wp.array(dtype=wp.int32),
-    ):
-        """The least limit that leaves at most so many nodes above it; these, and how many."""
-        c = wp.tid()
-        low, high = least + scalar(0.0), least + scalar(0.0)
-        for i in range(near.shape[0]):
-            high = wp.max(high, strain[near[i], c])
-        for halving in range(16):
-            number = wp.int32(0)
-            for i in range(near.shape[0]):
-                if strain[near[i], c] > low:
-                    number += 1
-            if number <= most and halving == 0:
-                high = low
-            middle = scalar(0.5) * (low + high)
-            number = wp.int32(0)
-            for i in range(near.shape[0]):
-                if strain[near[i], c] > middle:
-                    number += 1
-            if number <= most:
-                high = middle
-            else:
-                low = middle
-        number = wp.int32(0)
-        for i in range(near.shape[0]):
-            if strain[near[i], c] > high:
-                place[near[i], c] = number
-                nodes[c, number] = i
-                number += 1
-        limit[c] = high
-        count[c] = number
 
     @forward_kernel(module="unique")
     def press(
@@ -118,7 +76,7 @@ def kernels_of(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
             total += matrix[c, i, j] * wp.float64(motion[3 * nodes[c, j // 3] + j % 3, c])
         wp.atomic_add(out, 3 * nodes[c, i // 3] + i % 3, c, scalar(total))
 
-    return choose, press
+    return press
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +127,22 @@ class Model:
         """E M E' motion (3n, b) [N], of motions (3n, b) [m] of the nodes of the compliance."""
         out, (count, size) = wp.zeros_like(motion), self.matrix.shape[:2]
         inputs = [from_view(device, self.matrix), from_view(device, self.nodes), motion]
-        device.launch(kernels_of(device)[1], (size, count), inputs, [out])
+        device.launch(press_of(device), (size, count), inputs, [out])
         return out
+
+
+def chosen(device: Device, strain: Any, least: float, most: int) -> tuple[Any, Any, Any]:
+    """Of strains (n, b) the `most` rows of each column that are largest, and above the `least`: ascending, (m, b).
+
+    n stands where a column has fewer. With them the limit (b,) that they lie above, and how many they are (b,).
+    """
+    lib, count = library(device), len(strain)
+    columns, order = placed(device, np.arange(strain.shape[1])), largest_first(strain)
+    limit = 0.0 * strain[0] + least
+    if count > most:
+        limit = lib.maximum(limit, strain[order[most], columns])
+    kept = strain[order[:most], columns] > limit
+    return ascending(lib.where(kept, order[:most], count)), limit, kept.sum(0)
 
 
 class StrainedPart:
@@ -191,7 +163,7 @@ class StrainedPart:
     def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: Strains = STRAINS):
         device, nodes = problem.device, compliance.nodes
         self._problem, self.compliance, self._touchable, self._strains = problem, compliance, touchable, strains
-        self.size = 3 * strains.nodes
+        self.size = 3 * min(strains.nodes, len(nodes))
         """Rows of the largest model."""
         self._near = device.array(nodes, wp.int32)
         near = np.zeros(problem.rows // 3, bool)
@@ -204,30 +176,31 @@ class StrainedPart:
         found = self.stiffening(u, columns)
         return None if found is None else self._bent(*found)
 
-    def stiffening(self, u: wp.array, columns: np.ndarray) -> tuple[Any, Any] | None:
+    def stiffening(self, u: wp.array, columns: np.ndarray, full: bool = False) -> tuple[Any, Any] | None:
         """Places in the compliance (k, n) of the nodes that are strained most, and D (k, 3n, 3n) [N/m] between them.
 
-        D has zeros where a column has fewer nodes. None where the room leaves out what is strained by more than `cut`.
+        D has zeros where a column has fewer nodes. If it is to be `full`, n is the most that there may be, and a card
+        is not waited for. None where the room leaves out what is strained by more than `cut`.
         """
-        device, count, most = self._problem.device, len(columns), self._strains.nodes
+        device, count, strains = self._problem.device, len(columns), self._strains
         picked = device.array(columns, wp.int32)
         strain = device.zeros(self._problem.rows // 3, count)
         for term, some in self._elements:
             term.raise_strain(some, u, picked, strain)
-        limit = device.zeros(count)
-        place = wp.full((len(strain), count), -1, dtype=wp.int32, device=device.name)
-        nodes = wp.zeros((count, most), dtype=wp.int32, device=device.name)
-        numbers = wp.zeros(count, dtype=wp.int32, device=device.name)
-        inputs = [strain, self._near, device.scalar(self._strains.least), most]
-        device.launch(kernels_of(device)[0], (count,), inputs, [limit, place, nodes, numbers])
-        if limit.numpy().max(initial=0.0) > max(self._strains.cut, self._strains.least):
+        nodes, limit, numbers = chosen(device, view(strain)[view(self._near)], strains.least, strains.nodes)
+        if strains.cut < np.inf and float(limit.max()) > max(strains.cut, strains.least):
             return None
-        wide = int(numbers.numpy().max(initial=0))
+        wide = len(nodes) if full else int(numbers.max())
+        place = wp.full((len(strain), count), -1, dtype=wp.int32, device=device.name)
+        near, axes = len(self._near), placed(device, np.arange(max(wide, count), dtype=np.int32))
+        ranks = view(wp.full((near + 1, count), -1, dtype=wp.int32, device=device.name))
+        ranks[nodes[:wide], axes[:count]] = axes[:wide, None]
+        view(place)[view(self._near)] = ranks[:near]
         stiffer = wp.zeros((count, 3 * wide, 3 * wide), dtype=wp.float64, device=device.name)
         if wide:
             for term, some in self._elements:
-                term.add_stiffening(some, u, picked, limit, place, stiffer)
-        return view(nodes)[:, :wide], view(stiffer)
+                term.add_stiffening(some, u, picked, from_view(device, limit), place, stiffer)
+        return like(ranks, nodes[:wide].T.clip(max=near - 1)), view(stiffer)
 
     def _bent(self, nodes: Any, stiffer: Any) -> Model:
         """Of D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""

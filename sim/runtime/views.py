@@ -54,6 +54,30 @@ def padded(values: Any, more: tuple[int, ...]) -> Any:
     return out
 
 
+def largest_first(values: Any) -> Any:
+    """The rows in the order in which each column (n, b) falls."""
+    if isinstance(values, np.ndarray):
+        return np.argsort(-values, axis=0, kind="stable")
+    return values.argsort(dim=0, descending=True, stable=True)
+
+
+def ascending(values: Any) -> Any:
+    """Each column (n, b) sorted."""
+    return np.sort(values, axis=0) if isinstance(values, np.ndarray) else values.sort(dim=0).values
+
+
+def solved(matrix: Any, right: Any) -> Any:
+    """matrix^-1 right; not finite where that is singular. A card is not waited for."""
+    if not isinstance(matrix, np.ndarray):
+        import torch
+
+        return torch.linalg.solve_ex(matrix, right).result
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        return np.full_like(right, np.nan)
+
+
 def placed(device: Device, values: np.ndarray) -> Any:
     """The library's array with the same numbers; on the CPU they are these themselves."""
     return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values

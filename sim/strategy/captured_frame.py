@@ -24,8 +24,8 @@ from ..runtime.device import Device, forward_kernel
 
 # A frame that takes more evaluations is not one of a tool that moves smoothly.
 FRAME_EVALUATIONS = 60
-# A model of strained tissue that served in so many steps stays: to make one takes as long as fifteen.
-SERVED = 8
+# A model of strained tissue that served in so many steps stays: to make one takes as long as twenty.
+SERVED = 12
 # What goes up: point and radius, force, and how far to move on.
 GIVEN = 8
 # What comes down before the displacements; the sums are those of the footprint.
@@ -227,7 +227,7 @@ class Frame:
     def learn(self, steps: float) -> None:
         """After an answer in so many steps: know what is strained there, unless what was known has served."""
         if self.part is not None and steps > SERVED:
-            self._know(bent_at(self.part, self._device, self._workspace.columns["u"], self.part.size))
+            self._know(bent_at(self.part, self._device, self._workspace.columns["u"]))
             self._workspace.columns["known"].zero_()  # pairs belong to the model that they were learnt with
 
     def _know(self, bent: Bent | None) -> None:

@@ -17,6 +17,7 @@ from ..deformation import Outcome
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
 from ..linalg.pcg import LinearSolution, conjugate_gradients
+from ..local_solvers.strained_descent import StrainedDescent
 from ..minimisers.line_search import search
 from ..minimisers.newton_cg import Direction
 from ..minimisers.residual import relative
@@ -62,7 +63,9 @@ def step_from(strategy: Strategy, cases: Cases, guess: np.ndarray, linear: Linea
     u = combined(device, start, 1.0, problem.gap(start)[0], start)
     _, free, scale = problem.residual(u)
     before = relative(free, scale)
-    near = strategy.local(count) or strategy.near()
+    near = strategy.local(count)
+    if near is None or isinstance(near, StrainedDescent):  # that settles no part by itself
+        near = strategy.near()
     if near is not None and not problem.constraint.imposes:
         u = near.descend(u, np.full(count, strategy.accuracy.tolerance), 1).u
         problem.begin(cases)  # columns that were done have left
