@@ -109,6 +109,7 @@ def test_the_matrix_does_what_the_factors_do(fem: Fem) -> None:
     last = ride(fem)[-1]
     u = problem.device.array(fem.guess(pressed(6), last))
     part = strained_part(problem, factor, fem.space, SINGLE)
+    part.prepare()
     bent = bent_at(part, problem.device, u)
     problem.begin(Cases(pressed(6.5), np.zeros(1)))
     single = StrainedDescent(problem, factor, part, Renewal(served=8)).descend(u, np.full(1, 1e-2), 8, {})

@@ -123,7 +123,8 @@ class StrainedDescent:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
-        """As `Lbfgs.descend`, of one column; what is learnt is the model."""
+        """As `Lbfgs.descend`, of one column; what is learnt is the model. The first takes half a second to prepare."""
+        self._part.prepare()
         u, left, steps = start, most, 0
         self._preconditioner.stiffening = self.known(learnt) or self._stiffening(u)
         while True:
@@ -144,7 +145,6 @@ class StrainedDescent:
         if found is None or not found[0].shape[1]:
             return None
         compliance = self._part.compliance
-        compliance.know(np.ones(len(compliance.nodes), bool))
         place = (3 * found[0][0][:, None] + np.arange(3)).ravel()
         added = found[1][0].astype(np.float32)
         with one_thread():

@@ -69,13 +69,15 @@ class Bent:
 
 
 def bent_at(part: StrainedPart, device: Device, u: wp.array) -> Bent | None:
-    """The model at u (3N, 1) [m], which the problem has begun; None where there is none. A card is not waited for."""
+    """The model at u (3N, 1) [m], which the problem has begun, of a part that is prepared; None where there is none.
+
+    A card is not waited for.
+    """
     with in_order(device):
         found = part.stiffening(u, np.arange(1), full=True)
         if found is None:
             return None
         compliance, lib = part.compliance, library(device)
-        compliance.know(np.ones(len(compliance.nodes), bool))
         places, added = found[0][0], found[1][0]
         axes = like(places, placed(device, np.arange(3)))
         rows = (3 * places[:, None] + axes).reshape(-1)

@@ -176,6 +176,10 @@ class StrainedPart:
         found = self.stiffening(u, columns)
         return None if found is None else self._bent(*found)
 
+    def prepare(self) -> None:
+        """Find how all nodes give way to forces on each of them, unless that is known."""
+        self.compliance.know(np.ones(len(self.compliance.nodes), bool))
+
     def stiffening(self, u: wp.array, columns: np.ndarray, full: bool = False) -> tuple[Any, Any] | None:
         """Places in the compliance (k, n) of the nodes that are strained most, and D (k, 3n, 3n) [N/m] between them.
 
@@ -204,7 +208,7 @@ class StrainedPart:
 
     def _bent(self, nodes: Any, stiffer: Any) -> Model:
         """Of D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""
-        self.compliance.know(np.ones(len(self.compliance.nodes), bool))
+        self.prepare()
         device, count, size = self._problem.device, len(nodes), stiffer.shape[1]
         # One more row and column take what is of nodes that cannot be touched.
         shape = count, 3 * self._touchable + 1, 3 * self._touchable + 1

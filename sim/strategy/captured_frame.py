@@ -187,7 +187,10 @@ class Frame:
         self._device, self._inversion, self._skin, self.part = problem.device, inversion, skin, part
         self.bent: Bent | None = None
         """What the next frame knows of strained tissue."""
-        self._knowing = None if part is None else BentPreconditioner(preconditioner, problem, part.size)
+        self._knowing: BentPreconditioner | None = None
+        if part is not None:
+            part.prepare()
+            self._knowing = BentPreconditioner(preconditioner, problem, part.size)
         self._workspace = Workspace(problem, self._knowing or preconditioner, 1, ground_of(problem, 1))
         self._workspace.columns["tolerance"].fill_(tolerance)
         self._workspace.prepare()
