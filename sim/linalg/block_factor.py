@@ -37,8 +37,9 @@ def functions_of(device: Device) -> Functions:
             pivot = a[c, k, k]
             if not pivot > wp.float64(0.0):
                 return False
+            inverse = wp.float64(1.0) / pivot
             for i in range(k + 1 + i0, size, down):
-                share = a[c, k, i] / pivot
+                share = a[c, k, i] * inverse
                 for j in range(i + j0, size, across):
                     a[c, i, j] = a[c, i, j] - share * a[c, k, j]
             wait()

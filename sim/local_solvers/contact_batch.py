@@ -37,10 +37,10 @@ class State:
         parts = (self.u[:, stay], self.smooth[:, stay], self.whole[:, stay])
         return State(*parts, self.free[stay], self.scale[stay])
 
-    def put(self, columns: np.ndarray, other: State) -> None:
-        """Write some columns (k,) of another state over these."""
+    def put(self, columns: np.ndarray, some: Any, other: State) -> None:
+        """Write columns (k,) of another state over these; `some` are the same of an array's."""
         for mine, its in ((self.u, other.u), (self.smooth, other.smooth), (self.whole, other.whole)):
-            mine[:, columns] = its[:, columns]
+            mine[:, some] = its[:, some]
         self.free[columns], self.scale[columns] = other.free[columns], other.scale[columns]
 
 
@@ -100,6 +100,8 @@ class Batch:
 
     def forget(self, columns: np.ndarray) -> None:
         """Of some columns (k,) nothing is known but the rest."""
+        if not len(columns):
+            return
         if self.model is None:
             self.pairs.forget(columns)
         else:

@@ -31,7 +31,7 @@ from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
 from ..minimisers.line_search import goes_too_far, kept_of
 from ..minimisers.residual import Judge, judge_of
 from ..runtime.device import Device
-from ..runtime.views import doubled, from_view, in_order, like, on_host, placed, view
+from ..runtime.views import columns_of, doubled, from_view, in_order, like, on_host, placed, view
 from .contact_batch import Batch, State
 from .contact_forces import BENT, FORCES, ForceLimits, Softness, scratch_of, settled
 from .contact_structs import Scratch
@@ -102,8 +102,12 @@ class ContactDescent:
     def compliance(self) -> Compliance:
         """At the nodes that can be touched; after them those that may be strained, if they have a model."""
         exact = is_exact(self.preconditioner)
-        nodes = self.barrier.around(self.strains.near) if exact else self.barrier.touchable
-        return Compliance(self.problem, self.preconditioner, nodes)
+        own = self.barrier.touchable
+        nodes = self.barrier.around(self.strains.near) if exact else own
+        compliance = Compliance(self.problem, self.preconditioner, nodes)
+        if exact and self.problem.device.on_cuda:  # as much at once as at one node
+            compliance.know(np.arange(len(nodes)) < len(own))
+        return compliance
 
     @cached_property
     def _strained(self) -> StrainedPart | None:
@@ -113,9 +117,9 @@ class ContactDescent:
         return StrainedPart(self.problem, self.compliance, len(self.barrier.touchable), self.strains)
 
     @cached_property
-    def _rows(self) -> np.ndarray:
-        """Those (3n,) of the nodes that can be touched."""
-        return self.compliance.rows[: 3 * len(self.barrier.touchable)]
+    def _rows(self) -> Any:
+        """Those (3n,) of the nodes that can be touched, on the device."""
+        return self.compliance.places[: 3 * len(self.barrier.touchable)]
 
     @cached_property
     def _room(self) -> Callable[[int, int, int], Scratch]:
@@ -185,7 +189,8 @@ class ContactDescent:
         bent = batch.failed >= 2 * times
         for some, limits in ((np.flatnonzero(wanted & ~bent), FORCES), (np.flatnonzero(wanted & bent), BENT)):
             if len(some):
-                force[:, some], found[some] = self._forces(batch, some, tolerance, limits)
+                on = columns_of(self.problem.device, some, len(wanted))
+                force[:, on], found[some] = self._forces(batch, some, tolerance, limits)
         batch.waiting = wanted & ~found
         batch.failed = np.where(batch.waiting, batch.failed + 1, 0)
         fresh = batch.waiting & (batch.failed % times == 0)
@@ -198,41 +203,42 @@ class ContactDescent:
 
     def _direct(self, batch: Batch, some: np.ndarray, force: Any) -> None:
         """The directions of some columns (k,) under the tools' forces (3n, b)."""
-        now = batch.now
+        now, device = batch.now, self.problem.device
+        on = columns_of(device, some, len(batch.drag))
         if batch.model is None:
-            batch.rest[:, some] += self.compliance.spread((force - batch.force)[:, some])
-            batch.force[:, some] = force[:, some]
-            batch.x[:, some] = -batch.rest[:, some]
+            batch.rest[:, on] += self.compliance.spread((force - batch.force)[:, on])
+            batch.force[:, on] = force[:, on]
+            batch.x[:, on] = -batch.rest[:, on]
         else:
-            batch.aimed[:, some] = force[:, some]
-            batch.x[:, some] = -batch.rest[:, some] - self.compliance.answered(self._bent(batch, force)[0])[:, some]
+            batch.aimed[:, on] = force[:, on]
+            batch.x[:, on] = -batch.rest[:, on] - self.compliance.answered(self._bent(batch, force)[0])[:, on]
         if batch.pairs.most:
             learnt = batch.pairs.of(some)
-            batch.x[:, some] -= learnt.motion(learnt.weights(self._pull(now.smooth, force)[:, some]))
-        device = self.problem.device
+            batch.x[:, on] -= learnt.motion(learnt.weights(self._pull(now.smooth, force)[:, on]))
         longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.x))
         batch.length[some] = longest[some]
-        batch.promised[some] = -_dots(now.whole[:, some], batch.x[:, some])
+        batch.promised[some] = -_dots(now.whole[:, on], batch.x[:, on])
 
     def _forces(
         self, batch: Batch, some: np.ndarray, tolerance: np.ndarray, most: ForceLimits
     ) -> tuple[Any, np.ndarray]:
         """The tools' forces (3n, k) where the model of some columns (k,) is in equilibrium, and which (k,) have one."""
         limits, rows, now = self.limits, self._rows, batch.now
-        barrier, known = self.barrier.reduced(some), batch.force[:, some]
+        on = columns_of(self.problem.device, some, len(batch.drag))
+        barrier, known = self.barrier.reduced(some), batch.force[:, on]
         if barrier is None:
             return known, np.ones(len(some), bool)
         exact = np.maximum(limits.forcing * np.minimum(now.relative, 1.0), limits.enough * tolerance)[some]
         soft, free = Softness(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows]
         if batch.model is not None:
             free = free - self._bent(batch, batch.force)[1]
-            soft = replace(soft, own=batch.model.own[some])
-        free, here = free[:, some], doubled(now.u[rows][:, some])
+            soft = replace(soft, own=batch.model.own[on])
+        free, here = free[:, on], doubled(now.u[rows][:, on])
         if batch.pairs.most:
             learnt = batch.pairs.of(some)
             own = doubled(learnt.sw[:, :, rows])
             soft = replace(soft, learnt=own, middle=doubled(learnt.middle))
-            weights = learnt.weights(self._pull(now.smooth, batch.force)[:, some])
+            weights = learnt.weights(self._pull(now.smooth, batch.force)[:, on])
             free = free - (doubled(weights).mT @ own)[:, 0].T
         return settled(barrier, soft, here, doubled(free), known, exact, batch.drag[some], most)
 
@@ -244,10 +250,10 @@ class ContactDescent:
         assert batch.model is not None
         device, compliance = self.problem.device, self.compliance
         out, change = view(device.zeros(*batch.rest.shape)), force - batch.force
-        near = batch.rest[compliance.rows] + like(batch.rest, compliance.moved(change))
+        near = batch.rest[compliance.places] + like(batch.rest, compliance.moved(change))
         own = view(batch.model.pressed(device, from_view(device, near)))
         out[self._rows] = like(out, change)
-        out[compliance.rows] += own
+        out[compliance.places] += own
         return out, like(batch.rest, compliance.moved(own)[: len(self._rows)])
 
     def _harder(self, drag: np.ndarray) -> np.ndarray:
@@ -278,24 +284,26 @@ class ContactDescent:
         batch.slow = np.where(there & well, 0, batch.slow + (misled | there))
         batch.forget(np.flatnonzero(misled))
         if len(taken):
-            self._learn(batch, new, taken)
-            now.put(taken, new)
+            some = columns_of(self.problem.device, taken, len(t))
+            self._learn(batch, new, taken, some)
+            now.put(taken, some, new)
         return misled | there | batch.waiting
 
-    def _learn(self, batch: Batch, new: State, taken: np.ndarray) -> None:
-        """From steps that some columns (k,) have taken to a new state."""
+    def _learn(self, batch: Batch, new: State, taken: np.ndarray, some: Any) -> None:
+        """From steps that columns (k,) have taken to a new state; `some` are the same of an array's."""
         now = batch.now
-        moved, change = new.u[:, taken] - now.u[:, taken], new.smooth[:, taken] - now.smooth[:, taken]
         if batch.model is not None:
-            batch.force[:, taken] = batch.aimed[:, taken]
-        rest = self._answered(new.smooth[:, taken], batch.force[:, taken])
-        way = rest - batch.rest[:, taken]
-        batch.rest[:, taken] = rest
-        if batch.model is not None:
+            batch.force[:, some] = batch.aimed[:, some]
+            batch.rest[:, some] = self._answered(new.smooth[:, some], batch.force[:, some])
             return
-        some = np.flatnonzero((_dots(moved, change) > self.limits.felt) & new.finite[taken])
-        if len(some):
-            batch.pairs.learn(taken[some], moved[:, some], change[:, some], way[:, some])
+        moved, change = new.u[:, some] - now.u[:, some], new.smooth[:, some] - now.smooth[:, some]
+        rest = self._answered(new.smooth[:, some], batch.force[:, some])
+        way = rest - batch.rest[:, some]
+        batch.rest[:, some] = rest
+        felt = np.flatnonzero((_dots(moved, change) > self.limits.felt) & new.finite[taken])
+        if len(felt):
+            on = columns_of(self.problem.device, felt, len(taken))
+            batch.pairs.learn(taken[felt], moved[:, on], change[:, on], way[:, on])
 
     def _felt(self, now: State) -> Any:
         """Forces (3n, b) that balance all that is smooth, where tools touch."""

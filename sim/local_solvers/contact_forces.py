@@ -22,10 +22,10 @@ import warp as wp
 from ..discretisation.term import Reduction
 from ..linalg.compliance import Compliance
 from ..minimisers.lbfgs_kernels import PAIRS
-from ..runtime.blocks import launch, threads_of
+from ..runtime.blocks import launch
 from ..runtime.device import Device
 from ..runtime.threads import together
-from ..runtime.views import from_view, on_host, view
+from ..runtime.views import columns_of, from_view, on_host, view
 from .contact_kernel import kernel_of
 from .contact_structs import CROWDED, FOUND, OPEN, UNKNOWN, Ends, Model, Scratch
 
@@ -77,22 +77,23 @@ class Softness:
     middle: Any = None
     own: Any = None
 
-    def know(self, acting: np.ndarray) -> None:
-        """See to it that the compliance at `acting` (n,) of its first nodes is known."""
-        every = np.zeros(len(self.rest.nodes), bool)
-        every[: len(acting)] = acting
-        self.rest.know(every)
+    def know(self, force: Any) -> None:
+        """See to it that the compliance is known where forces (3n, b) act on its first nodes."""
+        every = self.rest.known.copy()
+        if not every[: len(force) // 3].all():
+            every[: len(force) // 3] = on_host((force != 0.0).any(1)).reshape(-1, 3).any(axis=1)
+            self.rest.know(every)
 
     def model(self, columns: np.ndarray, rounded: float) -> Model:
         """Of some columns (k,)."""
         out, n, count = Model(), len(self.rest.rows), len(columns)
         out.rest, out.known = from_view(self.device, self.rest.columns), self.device.array(self.rest.known, wp.int32)
-        if self.learnt is None:
-            out.learnt, out.middle = (self.device.zeros(count, 0, size) for size in (n, 0))
-        else:
-            out.learnt, out.middle = (from_view(self.device, x[columns]) for x in (self.learnt, self.middle))
         none = wp.zeros((count, 0, 0), dtype=wp.float32, device=self.device.name)
-        out.own = none if self.own is None else from_view(self.device, self.own[columns])
+        kinds = ("learnt", self.device.zeros(count, 0, n)), ("middle", self.device.zeros(count, 0, 0)), ("own", none)
+        for name, nothing in kinds:
+            known = getattr(self, name)
+            some = None if known is None else known[columns_of(self.device, columns, len(known))]
+            setattr(out, name, nothing if some is None else from_view(self.device, some))
         out.rounded = rounded
         return out
 
@@ -114,19 +115,22 @@ def settled(
     `tolerance` (b,), relative. `drag` (b,) is d in units of how stiff a touched node is.
     """
     out, status = known + 0.0, np.full(here.shape[1], OPEN)
-    soft.know(on_host((known != 0.0).any(1)).reshape(-1, 3).max(axis=1))
+    soft.know(known)
     for room in (limits.few, limits.most):
         status[status == CROWDED] = OPEN
         each = max(1, limits.bytes // (4 * 8 * (3 * room) ** 2))
         while (status == OPEN).any():
             some = np.flatnonzero(status == OPEN)[:each]
-            own = here[:, some], there[:, some], known[:, some]
+            on = columns_of(soft.device, some, len(status))
+            own = here[:, on], there[:, on], known[:, on]
             force, status[some], touched = _solved(barrier, soft, some, *own, tolerance[some], drag[some], limits, room)
-            ready = some[status[some] == FOUND]
-            out[:, ready] = force[:, np.isin(some, ready)]
+            ready = np.flatnonzero(status[some] == FOUND)
+            if len(ready):
+                here_too = columns_of(soft.device, ready, len(some))
+                out[:, columns_of(soft.device, some[ready], len(status))] = force[:, here_too]
             lacking = status[some] == UNKNOWN
             if lacking.any():
-                soft.know(touched[:, lacking].max(axis=1) >= 0)
+                soft.know((on_host(touched)[:, lacking] >= 0).repeat(3, axis=0))
                 status[some[lacking]] = OPEN
     return out, status == FOUND
 
@@ -142,7 +146,7 @@ def _solved(
     drag: np.ndarray,
     limits: ForceLimits,
     room: int,
-) -> tuple[Any, np.ndarray, np.ndarray]:
+) -> tuple[Any, np.ndarray, Any]:
     """Forces (3n, k) of some columns (k,) with room for so many touched nodes, status (k,), and places (n, k)."""
     device, count = soft.device, len(columns)
     nodes, functions = len(here) // 3, barrier.functions
@@ -159,7 +163,7 @@ def _solved(
 
     middle = count if device.on_cuda else (count + 1) // 2
     together([partial(part, 0, middle), partial(part, middle, count)])
-    return view(out), status.numpy(), scratch.place.numpy()[:, :count]
+    return view(out), status.numpy(), view(scratch.place)[:, :count]
 
 
 def scratch_of(device: Device, nodes: int, columns: int, room: int) -> Scratch:
@@ -176,7 +180,6 @@ def scratch_of(device: Device, nodes: int, columns: int, room: int) -> Scratch:
         setattr(out, name, numbers(columns, 3 * nodes).transpose())
     out.place, out.acts = counts(columns, nodes).transpose(), counts(columns, nodes).transpose()
     out.touched, out.acting, out.counts = counts(columns, nodes), counts(columns, nodes), counts(columns, 2)
-    out.shares = numbers(columns, int(np.prod(threads_of(device))))
     out.learnt = numbers(columns, 2 * PAIRS, size)
     for name in ("soft", "stiff", "both", "system"):
         setattr(out, name, numbers(columns, size, size))

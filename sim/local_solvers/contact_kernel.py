@@ -7,13 +7,12 @@ import warp as wp
 from ..discretisation.term import BlockFunctions
 from ..linalg.block_factor import functions_of
 from ..minimisers.lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
-from ..runtime.blocks import threads_of, total, wait
+from ..runtime.blocks import before, threads_of, total, wait
 from ..runtime.device import Device, forward_kernel
 from .contact_structs import CROWDED, FOUND, NONE, OPEN, UNKNOWN, Ends, Model, Scratch
 
-# So many sums at once keep a thread from waiting for memory.
-WIDE = wp.constant(8)
-Strip = wp.types.vector(length=WIDE, dtype=wp.float64)
+# So many sums at once keep a thread from waiting for memory; where there are many threads, few.
+WIDE, NARROW = 8, 2
 TOUCHED, ACTING = wp.constant(0), wp.constant(1)
 
 
@@ -22,17 +21,34 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     """It, for what touches: launches over (column, thread)."""
     down, across = threads_of(device)
     threads, dense, Stage, Near = down * across, functions_of(device), barrier.stage, barrier.near
+    wide = wp.constant(NARROW if device.on_cuda else WIDE)
+    Strip = wp.types.vector(length=wide, dtype=wp.float64)
     overshoot, least, middle, most = (wp.constant(wp.float64(x)) for x in (OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT))
     factor, solve = dense.factor, dense.solve
     add_force, add_matrix, longest = barrier.add_force, barrier.add_matrix, barrier.longest
 
     @wp.func
-    def dot(x: wp.array2d(dtype=wp.float64), y: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
+    def dot(x: wp.array2d(dtype=wp.float64), y: wp.array2d(dtype=wp.float64), c: int, me: int) -> wp.float64:
         """x . y."""
         own = wp.float64(0.0)
         for r in range(me, x.shape[0], threads):
             own += x[r, c] * y[r, c]
-        return total(own, c, me, s.shares)
+        return total(own)
+
+    @wp.func
+    def acts(x: wp.array2d(dtype=wp.float64), i: int, c: int) -> bool:
+        """Whether x is not zero at a node."""
+        zero = wp.float64(0.0)
+        return x[3 * i, c] != zero or x[3 * i + 1, c] != zero or x[3 * i + 2, c] != zero
+
+    @wp.func
+    def alike(x: wp.array2d(dtype=wp.float64), place: wp.array2d(dtype=wp.int32), c: int, me: int) -> bool:
+        """Whether the nodes where x is not zero are those that have a place."""
+        other = wp.float64(0.0)
+        for i in range(me, place.shape[0], threads):
+            if acts(x, i, c) != (place[i, c] >= 0):
+                other += wp.float64(1.0)
+        return total(other) == wp.float64(0.0)
 
     @wp.func
     def listed(
@@ -47,25 +63,19 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         """The nodes where x is not zero, ascending: how many, which, and each node's place among them or -1."""
         n = place.shape[0]
         own = (n + threads - 1) // threads
-        begin, end = me * own, wp.min((me + 1) * own, n)
+        begin, end = wp.min(me * own, n), wp.min((me + 1) * own, n)
+        mine = wp.int32(0)
         for i in range(begin, end):
-            place[i, c] = 0
-            for k in range(3):
-                if x[3 * i + k, c] != wp.float64(0.0):
-                    place[i, c] = 1
-        wait()
-        number = wp.int32(0)
-        for i in range(wp.min(begin, n)):
-            number += place[i, c]
-        wait()
+            if acts(x, i, c):
+                mine += 1
+        number = before(mine)
         for i in range(begin, end):
-            if place[i, c] != 0:
+            place[i, c] = -1
+            if acts(x, i, c):
                 nodes[c, number] = i
                 place[i, c] = number
                 number += 1
-            else:
-                place[i, c] = -1
-        if begin < n and end == n:
+        if me == threads - 1:
             counts[c, which] = number
         wait()
         return counts[c, which]
@@ -111,23 +121,15 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + changed(model, c, i, j)
 
     @wp.func
-    def give(
-        model: Model,
-        f: wp.array2d(dtype=wp.float64),
-        out: wp.array2d(dtype=wp.float64),
-        sign: wp.float64,
-        s: Scratch,
-        c: int,
-        me: int,
-    ):
-        """How far nodes go under forces, with a sign."""
-        m = listed(f, s.acts, s.acting, s.counts, ACTING, c, me)
+    def pull(model: Model, s: Scratch, c: int, me: int) -> int:
+        """On how many nodes the change acts, which, and what weights it gives to what was learnt."""
+        m = listed(s.change, s.acts, s.acting, s.counts, ACTING, c, me)
         pairs = model.learnt.shape[1]
         for p in range(me, pairs, threads):
             own = wp.float64(0.0)
             for a in range(3 * m):
                 j = 3 * s.acting[c, a // 3] + a % 3
-                own += model.learnt[c, p, j] * f[j, c]
+                own += model.learnt[c, p, j] * s.change[j, c]
             s.x[c, p] = own
         wait()
         for p in range(me, pairs, threads):
@@ -136,26 +138,46 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 own += model.middle[c, p, q] * s.x[c, q]
             s.y[c, p] = own
         wait()
-        size = out.shape[0]
-        for first in range(me, size, WIDE * threads):
+        return m
+
+    @wp.func
+    def give(model: Model, out: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
+        """How far all nodes go against the change."""
+        m, size = pull(model, s, c, me), out.shape[0]
+        for first in range(me, size, wide * threads):
             sums = Strip()
             for a in range(m):
                 for k in range(3):
                     j = 3 * s.acting[c, a] + k
-                    share = f[j, c]
-                    for q in range(WIDE):
+                    share = s.change[j, c]
+                    for q in range(wide):
                         i = wp.min(first + q * threads, size - 1)
                         soft = model.rest[j, i] + changed(model, c, j, i)
                         if s.place[i // 3, c] >= 0:
                             soft = between(model, c, i, j)
                         sums[q] += soft * share
-            for p in range(pairs):
+            for p in range(model.learnt.shape[1]):
                 share = s.y[c, p]
-                for q in range(WIDE):
+                for q in range(wide):
                     sums[q] += model.learnt[c, p, wp.min(first + q * threads, size - 1)] * share
-            for q in range(WIDE):
+            for q in range(wide):
                 if first + q * threads < size:
-                    out[first + q * threads, c] = sign * sums[q]
+                    out[first + q * threads, c] = -sums[q]
+        wait()
+
+    @wp.func
+    def give_touched(model: Model, size: int, s: Scratch, c: int, me: int):
+        """How far the touched nodes, `size` numbers, go under the change: to `at`."""
+        m = pull(model, s, c, me)
+        for i in range(me, size, threads):
+            row = 3 * s.touched[c, i // 3] + i % 3
+            own = wp.float64(0.0)
+            for a in range(3 * m):
+                j = 3 * s.acting[c, a // 3] + a % 3
+                own += between(model, c, row, j) * s.change[j, c]
+            for p in range(model.learnt.shape[1]):
+                own += model.learnt[c, p, row] * s.y[c, p]
+            s.at[row, c] = own
         wait()
 
     @wp.func
@@ -181,7 +203,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         own = wp.float64(0.0)
         for i in range(me, 3 * m, threads):
             own += s.soft[c, i, i]
-        mean = total(own, c, me, s.shares) / wp.float64(3 * m)
+        mean = total(own) / wp.float64(3 * m)
         for i in range(me, 3 * m, threads):
             s.soft[c, i, i] = s.soft[c, i, i] + model.rounded * mean
         wait()
@@ -195,26 +217,27 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         """
         size = 3 * m
         for i in range(me // across, size, down):
-            for first in range(me % across, size, WIDE * across):
+            for first in range(me % across, size, wide * across):
                 sums = Strip()
                 for p in range(first, size):
                     share = s.stiff[c, i, p]
-                    for q in range(WIDE):
-                        j = first + q * across
-                        if j <= p:
-                            sums[q] += share * s.soft[c, p, j]
-                for q in range(WIDE):
+                    if share != wp.float64(0.0):  # most nodes share no triangle
+                        for q in range(wide):
+                            j = first + q * across
+                            if j <= p:
+                                sums[q] += share * s.soft[c, p, j]
+                for q in range(wide):
                     if first + q * across < size:
                         s.both[c, i, first + q * across] = sums[q]
         wait()
         for i in range(me // across, size, down):
-            for first in range(i + me % across, size, WIDE * across):
+            for first in range(i + me % across, size, wide * across):
                 sums = Strip()
                 for p in range(i, size):
                     share = s.soft[c, p, i]
-                    for q in range(WIDE):
+                    for q in range(wide):
                         sums[q] += share * s.both[c, p, wp.min(first + q * across, size - 1)]
-                for q in range(WIDE):
+                for q in range(wide):
                     j = first + q * across
                     if j < size:
                         s.system[c, i, j] = sums[q] + wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
@@ -250,7 +273,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             missing += 1 - model.known[s.touched[c, i]]
         return missing == 0
 
-    @forward_kernel(module="unique")
+    @forward_kernel(module="unique", launch_bounds=threads)
     def settle(
         here: wp.array2d(dtype=wp.float64),
         there: wp.array2d(dtype=wp.float64),
@@ -285,6 +308,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             if me == 0:
                 status[c] = wp.where(m > ends.room, CROWDED, UNKNOWN)
             return
+        sound = wp.bool(False)  # whether L L' is the compliance between the touched nodes
         if m > 0:
             stiff = drag[c] / soften(model, m, s, c, me)
             for i in range(me, 3 * m, threads):
@@ -292,7 +316,8 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 s.held[row, c] = stiff
                 s.x[c, i] = there[row, c] - here[row, c]
             wait()
-            if factor(s.soft, 3 * m, c, me):
+            sound = factor(s.soft, 3 * m, c, me)
+            if sound:
                 solve(s.soft, 3 * m, c, me, s.x)
                 for i in range(me, 3 * m, threads):
                     row = 3 * s.touched[c, i // 3] + i % 3
@@ -301,46 +326,49 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         for r in range(me, size, threads):
             s.change[r, c] = s.force[r, c] - known[r, c]
         wait()
-        give(model, s.change, s.at, wp.float64(-1.0), s, c, me)
+        give(model, s.at, s, c, me)
         for r in range(me, size, threads):
             s.w[r, c] = there[r, c] + s.at[r, c]
         wait()
         feel(s.w, here, stage, near, s, c, me)
         convex, verdict = wp.bool(True), wp.int32(OPEN)
         for step in range(ends.iterations + 1):
-            m = listed(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
+            fresh = not alike(s.slope, s.place, c, me)
+            if fresh:
+                m = listed(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
             for r in range(me, size, threads):
                 s.change[r, c] = s.slope[r, c] - s.force[r, c]
             wait()
-            left = dot(s.change, s.change, s, c, me)
-            if left <= tolerance[c] * tolerance[c] * dot(s.slope, s.slope, s, c, me):
+            left = dot(s.change, s.change, c, me)
+            if left <= tolerance[c] * tolerance[c] * dot(s.slope, s.slope, c, me):
                 verdict = wp.int32(FOUND)
             elif m > ends.room:
                 verdict = wp.int32(CROWDED)
             elif step == ends.iterations or not (convex or step <= ends.late):
                 verdict = wp.int32(NONE)
-            elif not are_known(model, m, s, c):
+            elif fresh and not are_known(model, m, s, c):
                 verdict = wp.int32(UNKNOWN)
             if verdict != OPEN:
                 break
             # What is out of balance, and the change of the forces that makes good for it.
-            give(model, s.change, s.at, wp.float64(1.0), s, c, me)
             convex = True
             if m > 0:
-                soften(model, m, s, c, me)
-                convex = factor(s.soft, 3 * m, c, me)
-                sound = convex
+                give_touched(model, 3 * m, s, c, me)
+                if fresh:
+                    soften(model, m, s, c, me)
+                    sound = factor(s.soft, 3 * m, c, me)
+                convex = sound
                 if sound:
                     curve(stage, near, 0, m, s, c, me)
                     convex = relieve(m, s, c, me)
                 if sound and not convex:  # there tools count as flat
                     curve(stage, near, 1, m, s, c, me)
                     relieve(m, s, c, me)
-            give(model, s.change, s.way, wp.float64(-1.0), s, c, me)
+            give(model, s.way, s, c, me)
             own = wp.float64(0.0)
             for r in range(me, size, threads):
                 own += (s.slope[r, c] - s.force[r, c]) * s.way[r, c]
-            promised = -total(own, c, me, s.shares)
+            promised = -total(own)
             t = longest(s.w, s.way, stage, near, c, me)
             for cut in range(ends.cuts + 1):
                 for r in range(me, size, threads):
@@ -350,7 +378,7 @@ def kernel_of(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 own = wp.float64(0.0)
                 for r in range(me, size, threads):
                     own += (s.slope[r, c] - s.force[r, c] - t * s.change[r, c]) * s.way[r, c]
-                ahead = total(own, c, me, s.shares)
+                ahead = total(own)
                 if ahead <= overshoot * wp.abs(promised) or cut == ends.cuts:
                     break
                 share = middle

@@ -53,7 +53,6 @@ class Scratch:
     touched: wp.array2d(dtype=wp.int32)
     acting: wp.array2d(dtype=wp.int32)
     counts: wp.array2d(dtype=wp.int32)
-    shares: wp.array2d(dtype=wp.float64)
     learnt: wp.array3d(dtype=wp.float64)
     soft: wp.array3d(dtype=wp.float64)
     stiff: wp.array3d(dtype=wp.float64)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..runtime.device import Device
-from ..runtime.views import like, on_host, placed, view
+from ..runtime.views import columns_of, like, on_host, placed, view
 from .lbfgs_kernels import PAIRS
 
 
@@ -87,14 +87,17 @@ class PairsOfColumns:
         self._sw = view(device.zeros(columns * 2 * PAIRS, rows)).reshape(columns, 2 * PAIRS, rows)
         self._sy, self._yw = np.zeros((2, columns, PAIRS, PAIRS))
         self.count = np.zeros(columns, int)
+        self._asked: tuple[np.ndarray, Learnt] | None = None
 
     def keep(self, columns: np.ndarray) -> None:
         """Keep these columns (k,): the others have left the batch."""
+        self._asked = None
         self._sw = self._sw[columns]
         self._sy, self._yw, self.count = self._sy[columns], self._yw[columns], self.count[columns]
 
     def forget(self, columns: np.ndarray) -> None:
         """Of some columns (k,) nothing is known any more."""
+        self._asked = None
         self._sw[columns], self._sy[columns], self._yw[columns], self.count[columns] = 0.0, 0.0, 0.0, 0
 
     @property
@@ -103,22 +106,29 @@ class PairsOfColumns:
         return min(int(self.count.max(initial=0)), PAIRS)
 
     def of(self, columns: np.ndarray) -> Learnt:
-        """What some columns (k,) have learnt."""
+        """What some columns (k,) have learnt; asked again, nothing is worked out again."""
+        if self._asked is not None and np.array_equal(self._asked[0], columns):
+            return self._asked[1]
         order = (self.count[columns, None] + np.arange(PAIRS)) % PAIRS  # oldest first
         both = np.concatenate([order, PAIRS + order], axis=1)
         place = columns[:, None, None], order[:, :, None], order[:, None, :]
         middle = np.empty((len(columns), 2 * PAIRS, 2 * PAIRS))
         found = middle_of(self._sy[place], self._yw[place])
         middle[np.arange(len(columns))[:, None, None], both[:, :, None], both[:, None, :]] = found
-        return Learnt(self._sw[columns], placed(self._device, middle.astype(self._device.precision)))
+        own = self._sw[columns_of(self._device, columns, len(self.count))]
+        learnt = Learnt(own, placed(self._device, middle.astype(self._device.precision)))
+        self._asked = columns, learnt
+        return learnt
 
     def learn(self, columns: np.ndarray, s: Any, y: Any, w: Any) -> None:
         """A newer pair of some columns (k,): s, y and w (3N, k); the oldest is forgotten where there are too many."""
-        place = self.count[columns] % PAIRS
-        self._sw[columns, place], self._sw[columns, PAIRS + place] = s.T, w.T
+        self._asked = None
+        place, some = self.count[columns] % PAIRS, columns_of(self._device, columns, len(self.count))
+        own, at = placed(self._device, columns), placed(self._device, place)
+        self._sw[own, at], self._sw[own, PAIRS + at] = s.T, w.T
         # y . H0 y' = y' . H0 y: what the new change is worth along old ones, and old changes along the new step.
         change = like(self._sw, y.T[:, :, None])
-        worth = on_host(self._sw[columns] @ change)[:, :, 0].astype(np.float64)
+        worth = on_host(self._sw[some] @ change)[:, :, 0].astype(np.float64)
         self._sy[columns, place] = 0.0
         self._sy[columns, :, place] = worth[:, :PAIRS]
         self._yw[columns, :, place] = self._yw[columns, place] = worth[:, PAIRS:]

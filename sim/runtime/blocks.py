@@ -19,21 +19,68 @@ def wait():
     ...
 
 
-@wp.func
-def total(value: wp.float64, c: int, me: int, room: wp.array2d(dtype=wp.float64)) -> wp.float64:
-    """The sum over the threads, with room (b, threads) for their shares: of the same bits in each of them."""
-    room[c, me] = value
-    wait()
-    out = wp.float64(0.0)
-    for i in range(room.shape[1]):
-        out += room[c, i]
-    wait()
-    return out
+def folded(fold: str) -> str:
+    """C++ for a fold over the threads, of the same bits in each of them: `fold` joins `value` and `other`."""
+    return f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ double shares[32];
+    for (int away = 16; away > 0; away /= 2) {{
+        const double other = __shfl_xor_sync(0xffffffffu, value, away);
+        value = {fold};
+    }}
+    __syncthreads();
+    if (threadIdx.x % 32 == 0) shares[threadIdx.x / 32] = value;
+    __syncthreads();
+    value = shares[0];
+    for (int warp = 1; warp < blockDim.x / 32; ++warp) {{
+        const double other = shares[warp];
+        value = {fold};
+    }}
+#endif
+    return value;
+"""
+
+
+@wp.func_native(snippet=folded("value + other"))
+def total(value: wp.float64) -> wp.float64:
+    """The sum over the threads."""
+    ...
+
+
+@wp.func_native(snippet=folded("fmax(value, other)"))
+def largest(value: wp.float64) -> wp.float64:
+    """The largest of the threads' values."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __shared__ int shares[32];
+    const int place = threadIdx.x % 32, warp = threadIdx.x / 32;
+    int upto = value;
+    for (int away = 1; away < 32; away *= 2) {
+        const int other = __shfl_up_sync(0xffffffffu, upto, away);
+        if (place >= away) upto += other;
+    }
+    __syncthreads();
+    if (place == 31) shares[warp] = upto;
+    __syncthreads();
+    for (int other = 0; other < warp; ++other) upto += shares[other];
+    return upto - value;
+#else
+    return 0;
+#endif
+"""
+)
+def before(value: wp.int32) -> wp.int32:
+    """The sum over the threads before this one."""
+    ...
 
 
 def threads_of(device: Device) -> tuple[int, int]:
-    """How many threads a block has, as rows and columns."""
-    return (8, 16) if device.on_cuda else (1, 1)
+    """How many threads a block has, as rows and columns: on a card whole warps."""
+    return (16, 32) if device.on_cuda else (1, 1)
 
 
 def launch(device: Device, kernel: wp.Kernel, columns: int, inputs: list[Any], outputs: list[Any]) -> None:

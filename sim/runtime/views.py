@@ -83,6 +83,14 @@ def placed(device: Device, values: np.ndarray) -> Any:
     return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values
 
 
+def columns_of(device: Device, some: np.ndarray, count: int) -> Any:
+    """What picks some columns (k,), ascending, of `count`: all of them by a slice, so that nothing is copied.
+
+    A card is not waited for where it stands for many arrays: each index of NumPy's would go up by itself.
+    """
+    return slice(None) if len(some) == count else placed(device, some)
+
+
 def on_host(values: Any) -> np.ndarray:
     """Either library's numbers as NumPy's."""
     return values if isinstance(values, np.ndarray) else values.cpu().numpy()

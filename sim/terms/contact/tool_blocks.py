@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from ...discretisation.term import BlockFunctions
-from ...runtime.blocks import threads_of, wait
+from ...runtime.blocks import largest, threads_of, wait
 from ...runtime.device import Device
 from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools
 from .tool_functions import functions_of as at_triangles
@@ -112,9 +112,10 @@ def functions_of(device: Device, size: int) -> BlockFunctions:
         me: int,
     ) -> wp.float64:
         """The share of a way from x, at most 1, that may be gone; what is near is no longer known."""
-        farthest = wp.float64(0.0)
-        for i in range(x.shape[0] // 3):
-            farthest = wp.max(farthest, wp.length(wp.vec3d(way[3 * i, c], way[3 * i + 1, c], way[3 * i + 2, c])))
+        far = wp.float64(0.0)
+        for i in range(me, x.shape[0] // 3, threads):
+            far = wp.max(far, wp.length(wp.vec3d(way[3 * i, c], way[3 * i + 1, c], way[3 * i + 2, c])))
+        farthest = largest(far)
         if me == 0:
             near.least[c] = wp.float64(1.0)
         tools = stage.tools.radius.shape[0]
