@@ -93,6 +93,8 @@ class Contact:
         self._asked, self._gap, self._shear = gap, (1.0 - touch.sag) * gap, shear
         self.widen(1.0)
         self._pose: np.ndarray | None = None
+        # A step asks for the same poses several times.
+        self._stood = lru_cache(4)(self._brought)
 
     def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
         """As `Way.stride`: through the air a tool goes as far as it can touch nothing."""
@@ -224,7 +226,12 @@ class Contact:
             self._tools = self._standing(pose)
 
     def _standing(self, pose: np.ndarray) -> Tools:
-        out, of_cores = Tools(), pose[:, self._owner].swapaxes(0, 1)
+        return self._stood(np.ascontiguousarray(pose, np.float64).tobytes())
+
+    def _brought(self, pose: bytes) -> Tools:
+        """Tools at poses (b, tools, 4, 4) in double precision."""
+        of_cores = np.frombuffer(pose).reshape(-1, len(self._shapes), 4, 4)[:, self._owner].swapaxes(0, 1)
+        out = Tools()
         out.centre, out.half, out.radius = self._cores
         out.rotation = self._device.array(of_cores[:, :, :3, :3], wp.mat33d)
         out.origin = self._device.array(of_cores[:, :, :3, 3], wp.vec3d)
