@@ -60,8 +60,9 @@ class Batch:
         (3N, b) [m] the direction, and (b,) the step along it that is tried; what it promises.
     drag, slow, steps
         (b,).
-    failed, waiting
-        (b,) how often in a row no forces of the tools were found; which (b,) bool are to be tried again.
+    failed, waiting, gone
+        (b,) how often in a row no forces of the tools were found; which (b,) bool are to be tried again, and which have
+        ended and stand by until the others close ranks.
     """
 
     judge: Judge
@@ -80,6 +81,7 @@ class Batch:
     steps: np.ndarray
     failed: np.ndarray
     waiting: np.ndarray
+    gone: np.ndarray
 
     def keep(self, stay: np.ndarray) -> None:
         """Keep these columns (k,)."""
@@ -90,7 +92,7 @@ class Batch:
             self.model = self.model.rows(stay)
         self.force, self.aimed = self.force[:, stay], self.aimed[:, stay]
         self.rest, self.x = self.rest[:, stay], self.x[:, stay]
-        for name in ("stale", "length", "promised", "drag", "slow", "steps", "failed", "waiting"):
+        for name in ("stale", "length", "promised", "drag", "slow", "steps", "failed", "waiting", "gone"):
             setattr(self, name, getattr(self, name)[stay])
 
     @property

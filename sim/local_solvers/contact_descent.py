@@ -60,6 +60,8 @@ class ContactLimits:
         [J] A step that is worth less is round-off, and nothing is learnt from it.
     drag, growth, times
         The first drag that is tried where one is wanted, by how much it grows and shrinks, and how often it grows.
+    crowd
+        Columns that have ended leave the batch when they are this share of it: each time everything is copied.
     """
 
     forcing: float = 0.03
@@ -74,6 +76,7 @@ class ContactLimits:
     drag: float = 0.3
     growth: float = 3.0
     times: int = 5
+    crowd: float = 0.125
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,16 +148,19 @@ class ContactDescent:
                 if (ready & ~over).any():
                     over |= self._aimed(batch, ready & ~over, tolerance[live])
                 if over.any():
-                    leave, stay = np.flatnonzero(over), np.flatnonzero(~over)
+                    leave = np.flatnonzero(over)
                     there = live[leave]
                     view(result)[:, there] = batch.now.u[:, leave]
                     status[there] = np.where(done, DONE, np.where(batch.now.finite, LIVE, BROKEN))[leave]
                     steps[there], residual[there] = batch.steps[leave], batch.now.relative[leave]
-                    if not len(stay):
+                    batch.gone |= over
+                    if batch.gone.all():
                         return Descended(result, status, steps, residual, {})
-                    batch.keep(stay)
-                    live = live[stay]
-                ready = self._tried(batch, tolerance[live])
+                    if batch.gone.mean() >= limits.crowd:
+                        stay = np.flatnonzero(~batch.gone)
+                        batch.keep(stay)
+                        live = live[stay]
+                ready = self._tried(batch)
 
     def _begun(self, start: wp.array) -> Batch:
         judge, count = judge_of(self.problem, start), start.shape[1]
@@ -166,10 +172,10 @@ class ContactDescent:
             model = self._strained.model(start, np.arange(count))
         pairs = PairsOfColumns(self.problem.device, self.problem.rows, count if model is None else 0)
         slow, steps, failed = np.zeros((3, count), int)
-        stale, waiting = np.zeros((2, count), bool)
+        stale, waiting, gone = np.zeros((3, count), bool)
         return Batch(
             judge, now, pairs, model, stale, force, rest, force + 0.0, 0.0 * rest, none, none.copy(), none.copy(),
-            slow, steps, failed, waiting,
+            slow, steps, failed, waiting, gone,
         )  # fmt: skip
 
     def _aimed(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
@@ -259,15 +265,16 @@ class ContactDescent:
     def _harder(self, drag: np.ndarray) -> np.ndarray:
         return np.maximum(self.limits.drag, self.limits.growth * drag)
 
-    def _tried(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
+    def _tried(self, batch: Batch) -> np.ndarray:
         """Try the step of every column that does not wait; which columns (b,) want another direction.
 
         They have taken it, as the energy still falls there, or about so. Or hardly anything is left of it after cuts:
         then they have not moved, and forget what has misled them.
         """
-        limits, now, t, going = self.limits, batch.now, np.where(batch.waiting, 0.0, batch.length), ~batch.waiting
+        limits, now, going = self.limits, batch.now, ~(batch.waiting | batch.gone)
+        t = np.where(going, batch.length, 0.0)
         if not going.any():
-            return batch.waiting
+            return batch.waiting & ~batch.gone
         new = self._judged(
             batch.judge, now.u + placed(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
         )
@@ -287,7 +294,7 @@ class ContactDescent:
             some = columns_of(self.problem.device, taken, len(t))
             self._learn(batch, new, taken, some)
             now.put(taken, some, new)
-        return misled | there | batch.waiting
+        return misled | there | (batch.waiting & ~batch.gone)
 
     def _learn(self, batch: Batch, new: State, taken: np.ndarray, some: Any) -> None:
         """From steps that columns (k,) have taken to a new state; `some` are the same of an array's."""
