@@ -151,14 +151,14 @@ class FrameSequence:
             here.settle()
         self._last = self._here = _gone
         past = start.warm[BEFORE].T if knows(start.warm, last) else None
-        self._frame.take(last, past, learnt_from(cases, len(last)), self._bent(start.warm, len(last)))
+        self._frame.take(last, past, learnt_from(cases, len(last)), self._bent(start.warm))
         return True
 
-    def _bent(self, warm: Mapping[str, Any], rows: int) -> Bent | None:
+    def _bent(self, warm: Mapping[str, Any]) -> Bent | None:
         if isinstance(warm, Kept):
             return warm.bent
         part = self._frame.part
-        return None if part is None else bent_from(warm, self._problem.device, rows, part.size)
+        return None if part is None else bent_from(warm, self._problem.device, len(self._nodes), part.size)
 
     def _make_way(self) -> None:
         """What stands where the last frame ended is about to move to where it began."""
