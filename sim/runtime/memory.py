@@ -62,11 +62,10 @@ def host_bytes(budget: Budget = Budget()) -> int:
     return min(found)
 
 
-def fitting_batch(rows: int, device: Device, budget: Budget = Budget()) -> int:
-    """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it and fit."""
-    column = column_bytes(rows, device)
+def fitting_batch(rows: int, device: Device, free: int, budget: Budget = Budget()) -> int:
+    """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it and `free` bytes hold."""
     widest = budget.widest_on_cuda if device.on_cuda else budget.widest
-    return int(np.clip(budget.batches * free_bytes(device, budget) / max(column, 1), 1, widest))
+    return int(np.clip(budget.batches * free / max(column_bytes(rows, device), 1), 1, widest))
 
 
 def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0, budget: Budget = Budget()) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
 from ..accuracy import Accuracy
@@ -13,7 +12,7 @@ from ..discretisation.space import Discretisation, discretise
 from ..errors import InputError
 from ..linalg.preconditioner import Preconditioning
 from ..runtime.device import Device, find_device
-from ..runtime.memory import COARSER, Budget, column_bytes, free_bytes, gigabytes
+from ..runtime.memory import COARSER, Budget, column_bytes, fitting_batch, free_bytes, gigabytes
 
 PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900}
 """Bytes of single precision that each node of an element takes: tables of the elements, and levels of multigrid. The
@@ -119,7 +118,7 @@ def needed(
     taken, left = _inverse_bytes(inverted, device)
     column = column_bytes(rows, device)
     if batch is None:
-        batch = int(np.clip(budget.batches * (free - tables - left) / column, 1, budget.widest_on_cuda))
+        batch = fitting_batch(rows, device, free - tables - left, budget)
     return Needed(
         len(space.mesh.nodes), space.element, device, tables + taken, tables + left, column, min(batch, loads), free
     )
