@@ -115,7 +115,7 @@ class FrameSequence:
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
         self._last = self._here = _gone
         found = self._frame.push(point, radius, force, share)
-        if found[STATUS] != DONE or (found[INVERTED] and self._inversion.telling):
+        if found[STATUS] != DONE or self._inversion.doubtful(found[INVERTED]):
             return None
         self._frame.learn(found[STEPS])
         warm = Kept(way, self._frame.state, self._lock, self._frame.bent)
@@ -144,7 +144,7 @@ class FrameSequence:
         cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
         u = self._problem.device.array(last)
-        if self._problem.gap(u)[1].any() or (self._inversion.telling and self._inversion.count(u).any()):
+        if self._problem.gap(u)[1].any() or self._inversion.doubtful(self._inversion.count(u)).any():
             return False
         here = self._here()
         if here is not None:
