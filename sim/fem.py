@@ -68,7 +68,7 @@ class Fem:
         Most load cases that are solved together; None: as many as are worth it on this device. Quadratic elements with
         levels go one by one on the CPU.
     element
-        One of `space.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
+        One of `elements.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
     live
         Loads come one at a time. On the CPU the first takes a second more, the others a third to two thirds as long.
     avoid

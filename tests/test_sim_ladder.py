@@ -13,8 +13,9 @@ from oracle import internal_forces, tissue
 from sim.accuracy import DRAFT, Accuracy
 from sim.deformation import Deformation, Outcome, guess
 from sim.discretisation.inverted_elements import Inversion
-from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, NodalForce
+from sim.elements import ELEMENTS
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
 from sim.runtime.device import find_device
