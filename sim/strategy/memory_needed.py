@@ -11,6 +11,7 @@ from ..anatomy import Anatomy
 from ..discretisation.space import Discretisation, discretise
 from ..errors import InputError
 from ..linalg.preconditioner import Preconditioning
+from ..runtime.columns import widest_within, width_of
 from ..runtime.device import Device, find_device
 from ..runtime.memory import COARSER, Budget, column_bytes, fitting_batch, free_bytes, gigabytes
 
@@ -52,8 +53,8 @@ class Needed:
 
     @property
     def peak(self) -> int:
-        """The most at any time."""
-        return max(self.set_up, self.kept + self.batch * self.column)
+        """The most at any time: a batch stands in a room that may be wider."""
+        return max(self.set_up, self.kept + width_of(self.device, self.batch) * self.column)
 
     def __str__(self) -> str:
         loads = f"{self.batch} loads together" if self.batch > 1 else "one load at a time"
@@ -71,7 +72,7 @@ class Needed:
         room = budget.share * self.free
         if self.peak <= room:
             return self
-        fitting = int((room - self.kept) / self.column)
+        fitting = widest_within(self.device, int((room - self.kept) / self.column))
         fits = self.set_up <= room and fitting > 0
         raise InputError(f"{self}: {f'a --batch of {fitting} fits.' if fits else COARSER}")
 
