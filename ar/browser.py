@@ -151,9 +151,9 @@ class Browser:
         return {identifier + 1 for identifier in self.server.get_clients()}
 
     def show(self, number: int, colour: np.ndarray, words: str, sought: int | None = None) -> None:
-        """Show the picture (H, W, 3) uint8 of frame `number` and its words, HTML.
+        """Show the picture (H, W, 3) uint8 of frame `number`, and its words in HTML.
 
-        The playback slider goes there, or to the frame that is sought, if the one that is shown is on the way to it.
+        The playback slider goes to that number. Of a frame on the way to another, `sought`, it goes to the other's.
         """
         with self.lock:
             self.wanted = number, colour, words, number if sought is None else sought

@@ -35,7 +35,7 @@ from .minimisers.residual import shortfall
 from .runtime.columns import unstacked
 from .runtime.device import find_device
 from .runtime.exclusive import alone
-from .runtime.memory import check_fits, fitting_batch
+from .runtime.memory import check_fits, fitting_batch, free_bytes
 from .runtime.threads import one_thread
 from .strategy.extrapolation import moved_on, pushes_of, way_of
 from .strategy.frame_sequence import FrameSequence, frame_sequence
@@ -68,7 +68,7 @@ class Fem:
         Most load cases that are solved together; None: as many as are worth it on this device. Quadratic elements with
         levels go one by one on the CPU.
     element
-        One of `space.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
+        One of `elements.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
     live
         Loads come one at a time. On the CPU the first takes a second more, the others a third to two thirds as long.
     avoid
@@ -105,8 +105,9 @@ class Fem:
         self._skin = Skin(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
         problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
         preconditioner = choose_preconditioner(problem, self.space, self._unsmoothed)
-        fitting = fitting_batch(problem.rows, problem.device) if batch is None else at_least("batch", batch, 1)
-        plan = plan_for(problem, preconditioner, self.space, accuracy, fitting, live, avoid)
+        if batch is None:
+            batch = fitting_batch(problem.rows, problem.device, free_bytes(problem.device))
+        plan = plan_for(problem, preconditioner, self.space, accuracy, at_least("batch", batch, 1), live, avoid)
         parts = local_solvers(plan, problem, preconditioner, self.effects, self.space)
         if problem.device.on_cuda:
             parts[0]()  # a card is there for batches; a frame on the CPU need not wait for what it does not use

@@ -318,7 +318,7 @@ def coefficients_of(tissues: Sequence[Tissue], carries: str = "whole") -> np.nda
 
 
 BRAIN = Material("neo-hookean", 3000.0, 0.49)
-"""The recommended tissue, of every scene and command; the recommended element is `space.RECOMMENDED`."""
+"""The recommended tissue, of every scene and command; the recommended element is `elements.RECOMMENDED`."""
 
 
 @dataclass(frozen=True)

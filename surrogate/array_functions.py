@@ -5,12 +5,13 @@ from __future__ import annotations
 from functools import singledispatch
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 
 @singledispatch
 def squared_distances(points: np.ndarray, sites: np.ndarray) -> np.ndarray:
     """Squared distances (B, n) of points (B, f) from sites (n, f)."""
+    from scipy.spatial.distance import cdist  # takes a tenth of a second, and help texts need none of it
+
     return cdist(points, sites, "sqeuclidean")
 
 

@@ -16,7 +16,7 @@ HOUSE = Path(__file__).parents[1]
 ROOMS = {"ar": set(), "sim": set(), "surrogate": {"sim"}, "scenes": {"ar", "sim", "surrogate"}}
 """Each room and the rooms that it may import."""
 ORDER = (
-    {"sim.errors"},
+    {"sim.errors", "sim.elements"},
     {"sim.arguments", "sim.skulls", "sim.tools", "sim.material", "sim.geometry"},
     {"sim.accuracy", "sim.loads", "sim.anatomy"},
     {"sim.runtime", "sim.effects", "sim.deformation"},

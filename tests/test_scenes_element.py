@@ -13,7 +13,8 @@ from boxes import box, quadratic, top_forces
 from oracle import internal_forces
 
 from scenes.cli import main
-from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.space import discretise
+from sim.elements import ELEMENTS
 from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, Material
 

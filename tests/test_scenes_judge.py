@@ -20,8 +20,8 @@ from scenes.script.site import site_of
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
-from sim.discretisation.space import RECOMMENDED
 from sim.effects import Elasticity, Held, Slide, ToolForce
+from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN, Material, Tissue

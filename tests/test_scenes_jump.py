@@ -113,6 +113,13 @@ def shows(page, number, of=FRAMES):
     return f"frame {number} of {of - 1}" in page.shown[2]
 
 
+def ask_for_frame_12(demo, gated, page, steps):
+    """So many frames on the way are answered, and the next is in hand."""
+    demo.wish.set(number=12)
+    gated.let(steps)
+    assert wait_for(lambda: shows(page, steps - 1) and gated.solved[steps])
+
+
 def test_frames_on_the_way_are_shown_as_they_come_and_the_slider_stays(demo, gated, monkeypatch):
     said, begun = [], demo.busy.on
     monkeypatch.setattr(demo.busy, "on", lambda what: said.append(what) or begun(what))
@@ -136,9 +143,7 @@ def test_frames_on_the_way_are_shown_as_they_come_and_the_slider_stays(demo, gat
 
 def test_who_jumps_elsewhere_is_not_kept_waiting(demo, gated):
     with Loop(demo) as page:
-        demo.wish.set(number=12)
-        gated.let(4)
-        assert wait_for(lambda: shows(page, 3) and gated.solved[4])
+        ask_for_frame_12(demo, gated, page, 4)
         demo.wish.set(number=1)
         assert wait_for(lambda: demo.referee.newest == (1, None))
         gated.let(1)  # the step in hand
@@ -171,9 +176,7 @@ def test_a_pause_stops_on_the_way(demo, gated):
 
 def test_without_an_effect_others_answer_and_those_before_stop(demo, gated):
     with Loop(demo) as page:
-        demo.wish.set(number=12)
-        gated.let(3)
-        assert wait_for(lambda: shows(page, 2) and gated.solved[3])
+        ask_for_frame_12(demo, gated, page, 3)
         full = demo.referee
         demo.wish.switch("Retraction", False)
         assert wait_for(lambda: len(demo.cast.solvers) == 2 and full.newest is None)

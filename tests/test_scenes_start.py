@@ -1,5 +1,7 @@
 """`sulcus demo` from its start to the first picture."""
 
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -10,6 +12,15 @@ from scenes.cli import main
 from scenes.play.page import Demo
 from scenes.play.page_cast import Cast
 from scenes.play.waiting_notice import Busy
+
+
+@pytest.mark.parametrize("command", ["demo", "render", "check", "effects", "collect", "judge", "export", "sensitivity"])
+def test_help_texts_come_without_warp_and_scipy(command):
+    """They take a second to import."""
+    asks = "import sys; from scenes.cli import make_parsers; make_parsers(sys.argv[1])[1][sys.argv[1]].format_help(); "
+    code = asks + "print({'warp', 'scipy', 'torch'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code, command], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
 
 
 @pytest.mark.parametrize("name", ["linear", "fem"])

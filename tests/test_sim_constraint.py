@@ -11,8 +11,8 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformation
 from sim.discretisation.constraint import Constraint
 from sim.discretisation.footprint import footprint_weights
-from sim.discretisation.space import ELEMENTS
 from sim.effects import Effect, Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
+from sim.elements import ELEMENTS
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Cause, Displaced, Loads, Nodal, Prescribed, Pushed

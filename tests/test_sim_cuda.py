@@ -10,7 +10,6 @@ from oracle import EVERY_LAW, tissue
 from scenes.script.shipped_files import template_path
 from sim.accuracy import LIVE, TRAIN, Accuracy
 from sim.bodies.meshfile import read_anatomy
-from sim.discretisation.space import ELEMENTS
 from sim.effects import (
     Elasticity,
     Gravity,
@@ -23,6 +22,7 @@ from sim.effects import (
     ToolDisplacement,
     ToolForce,
 )
+from sim.elements import ELEMENTS
 from sim.fem import Fem
 from sim.linalg.half_symv import add_product, tiles_of
 from sim.linalg.pcg import BlockJacobi

@@ -10,8 +10,8 @@ from boxes import base_held, box, hold, quadratic
 from cuts import BODY, EFFECTS, MESH, STEPS, TIGHT, lying
 
 from sim.deformation import Deformation, guess
-from sim.discretisation.space import ELEMENTS
 from sim.effects import Elasticity, Gravity, Held, Inertia, Resection
+from sim.elements import ELEMENTS
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Prescribed, Resected

@@ -12,8 +12,9 @@ from oracle import EVERY_LAW, elastic_energy, internal_forces, tissue
 from sim.accuracy import REFERENCE, TRAIN, Precision
 from sim.compile import compile_problem
 from sim.discretisation.problem import Problem
-from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, NodalForce
+from sim.elements import ELEMENTS
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal

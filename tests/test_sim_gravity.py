@@ -12,9 +12,10 @@ from boxes import base_held, box, hold, quadratic
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
-from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.space import discretise
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Gravity, Held, ToolForce
+from sim.elements import ELEMENTS
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh

@@ -14,9 +14,10 @@ from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.deformation import Deformation, guess
 from sim.discretisation.problem import Problem
-from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.space import discretise
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Inertia, NodalForce, ToolContact
+from sim.elements import ELEMENTS
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh

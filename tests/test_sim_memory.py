@@ -11,8 +11,9 @@ from boxes import base_held, box
 from sim.accuracy import TRAIN
 from sim.discretisation.space import discretise
 from sim.errors import InputError
+from sim.runtime.columns import widest_within, width_of
 from sim.runtime.device import Device, find_device
-from sim.runtime.memory import Budget, check_fits, column_bytes, host_bytes
+from sim.runtime.memory import Budget, check_fits, column_bytes, fitting_batch, host_bytes
 from sim.strategy.memory_needed import FIXED, PER_NODE, foreseen, needed
 
 ROWS = 3_000
@@ -58,6 +59,25 @@ def test_a_mesh_of_which_not_one_load_fits_is_reported(tmp_path: Path) -> None:
 
 
 CARD = Device("cuda:0", "float32")
+
+
+def test_columns_on_a_card_stand_in_rooms_of_few_widths() -> None:
+    counts = (1, 4, 5, 64, 65, 96, 97, 16384, 16385)
+    assert [width_of(CARD, count) for count in counts] == [1, 4, 64, 64, 96, 96, 128, 16384, 32768]
+    assert [widest_within(CARD, count) for count in (-3, 0, *counts)] == [
+        -3, 0, 1, 4, 4, 64, 64, 96, 96, 16384, 16384,
+    ]  # fmt: skip
+    processor = Device("cpu", "float32")
+    assert width_of(processor, 65) == widest_within(processor, 65) == 65
+
+
+def test_a_batch_that_fits_a_card_fills_its_room() -> None:
+    """As many loads as are worth it, and at least one."""
+    column = column_bytes(ROWS, CARD)
+    batches = [fitting_batch(ROWS, CARD, free * column) for free in (0, 2, 9, 100, 200, 10**9)]
+    assert batches == [1, 1, 4, 4, 96, Budget.widest_on_cuda]
+
+
 SPACE = discretise(box((6, 6, 6)), "smoothed")
 TABLES = FIXED + PER_NODE["smoothed"] * SPACE.count
 
@@ -69,7 +89,9 @@ def test_what_a_card_must_have_is_the_tables_the_inverse_and_the_loads() -> None
     assert one.peak == one.kept + one.column and one.kept == one.set_up == TABLES
     assert one.column == column_bytes(rows, CARD)
     many = needed(SPACE, CARD, 0, 64, 5, free)
-    assert many.batch == 5 and many.peak - one.peak == 4 * one.column  # no more than there are loads
+    assert many.batch == 5  # no more than there are loads
+    assert many.peak - one.peak == 63 * one.column  # where 5 columns stand there is room for 64
+    assert needed(SPACE, CARD, 0, 4, 5, free).peak - one.peak == 3 * one.column
     inverted = needed(SPACE, CARD, 50_000, 1, 1, free)
     assert inverted.kept - TABLES == 2 * 50_000**2
     assert 4 * 50_000**2 < inverted.set_up - inverted.kept < 7 * 50_000**2 and inverted.peak == inverted.set_up

@@ -16,9 +16,10 @@ from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
 from sim.compile import compile_problem
 from sim.discretisation.problem import Problem
-from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.space import discretise
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Pulsation, Resection, Slide, Wave
+from sim.elements import ELEMENTS
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.surface import unit

@@ -14,8 +14,8 @@ from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.deformation import guess
 from sim.discretisation.resected_body import bodies, remains
-from sim.discretisation.space import ELEMENTS
 from sim.effects import Elasticity, Gravity, Held, Inertia, NodalForce, Resection, SkullContact, Slide, ToolContact
+from sim.elements import ELEMENTS
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh

@@ -12,9 +12,10 @@ from oracle import tissue
 from sim.accuracy import Accuracy
 from sim.compile import compile_problem
 from sim.discretisation.problem import Problem
-from sim.discretisation.space import ELEMENTS, discretise
+from sim.discretisation.space import discretise
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
+from sim.elements import ELEMENTS
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal, push

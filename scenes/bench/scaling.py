@@ -38,10 +38,24 @@ SEED = 4
 
 @dataclass(frozen=True)
 class Row:
-    """One mesh and batch: asked for, then had; seconds; outer steps (median); loads solved, and converged of them.
+    """What loads on one mesh cost, in batches of one size.
 
-    memory [GiB]: the process's own at its peak; `card` [GiB] what it took of the graphics card, and `foreseen` [GiB]
-    what it was thought to take before it began.
+    Parameters
+    ----------
+    size, asked
+        Nodes and batch that were asked for.
+    nodes, tets, preconditioner, batch
+        What was had.
+    set_up, load
+        Seconds: of the set-up, and of each load.
+    outer
+        Median of the loads' outer steps.
+    loads, converged
+        How many were solved, and how many of these converged.
+    memory, card
+        Peak of the process's own memory, and of what it took of the graphics card [GiB].
+    foreseen
+        What it was thought to take of the card before it began [GiB].
     """
 
     size: int

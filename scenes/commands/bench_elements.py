@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.refine import refined
-from sim.discretisation.space import ELEMENTS
+from sim.elements import ELEMENTS
 
 from ..script.shipped_files import template_path
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from sim.arguments import at_least
-from sim.discretisation.space import ELEMENTS, RECOMMENDED
+from sim.elements import ELEMENTS, RECOMMENDED
 
 from .outputs import add_force, claimed
 

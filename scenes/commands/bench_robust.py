@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from sim.bodies.meshfile import read_anatomy
-from sim.discretisation.space import ELEMENTS, RECOMMENDED
 from sim.effects import pushed_effects
+from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 from sim.runtime.atomic_files import check_output
 

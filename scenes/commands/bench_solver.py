@@ -15,7 +15,6 @@ from tqdm import tqdm
 from sim.arguments import at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
-from sim.runtime.device import find_device
 
 from ..script.shipped_files import template_path
 from .json_line import json_line
@@ -65,6 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare; 1 if one of our answers is off."""
+    from sim.runtime.device import find_device
+
     from ..bench.peers import LEAST, LIVE, OWN, PEERS, case_of, compare, judge_of
     from ..bench.stages import machine
 

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from sim.accuracy import TRAIN
 from sim.arguments import at_least
 from sim.bodies.meshfile import read_anatomy
-from sim.discretisation.space import ELEMENTS, RECOMMENDED
+from sim.elements import ELEMENTS, RECOMMENDED
 from sim.material import LAWS, Material
 from surrogate.data.tool_loads import PRESETS
 

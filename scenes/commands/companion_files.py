@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sim.errors import InputError
+from sim.runtime.atomic_files import unfinished_path
 
 from .outputs import HEAD, model_header
 
@@ -36,7 +37,7 @@ def strangers(mesh: Path, digest: str) -> list[Path]:
     from ..play.deformers import model_path  # takes seconds, and whoever only simulates needs none of it
 
     data = mesh.with_suffix(".h5")
-    beside = (data, data.with_name(data.name + ".partial"), model_path(mesh))
+    beside = (data, unfinished_path(data), model_path(mesh))
     return [path for path in beside if path.is_file() and stated(path).get("anatomy", digest) != digest]
 
 
@@ -59,7 +60,7 @@ def demand_no_strangers(mesh: Path, digest: str, force: bool) -> list[Path]:
 
 def remove_data(path: Path, wanted: Mapping[str, str]) -> None:
     """Remove a data set, and an unfinished one of its name, that cannot go on as what is `wanted`; keep others."""
-    for each in (path, path.with_name(path.name + ".partial")):
+    for each in (path, unfinished_path(path)):
         found = stated(each)
         if any(found.get(name) != wanted.get(name) for name in KEPT):
             each.unlink(missing_ok=True)
@@ -67,7 +68,7 @@ def remove_data(path: Path, wanted: Mapping[str, str]) -> None:
 
 def batch_begun(path: Path) -> int | None:
     """The batch of a data set that is there, or begun, and that goes on with it; None where none can be read."""
-    for each in (path, path.with_name(path.name + ".partial")):
+    for each in (path, unfinished_path(path)):
         found = stated(each).get("batch", "")
         if found.isdigit():
             return int(found)

@@ -5,10 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
-from surrogate.model.store import load
-from surrogate.onnx_export.export import write_onnx
 
 from .outputs import add_force, claimed
 
@@ -39,6 +36,10 @@ def run(args: argparse.Namespace) -> int:
     InputError
         A model or a mesh that is not there, or a learner that is not in the file.
     """
+    from sim.bodies.meshfile import read_anatomy
+    from surrogate.model.store import load
+    from surrogate.onnx_export.export import write_onnx
+
     out = claimed(args.out, ".onnx", "a graph of `sulcus export`", args.force)
     if not args.model.is_file():
         raise InputError(f"{args.model}: no such file. Give a model of `sulcus train`.")

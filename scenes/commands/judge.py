@@ -8,13 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from sim.bodies.tip_distance import tip_gauge
 from sim.errors import InputError
-from surrogate.data.dataset import read_dataset
-from surrogate.data.tool_loads import refused_share, refused_words
-from surrogate.evaluation.coverage import coverage, distance_coverage
-from surrogate.evaluation.score import score, table
-from surrogate.model.store import load
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +26,13 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Loads at places that the models were trained on, or of another tissue or element.
     """
+    from sim.bodies.tip_distance import tip_gauge
+    from surrogate.data.dataset import read_dataset
+    from surrogate.data.tool_loads import refused_share, refused_words
+    from surrogate.evaluation.coverage import coverage, distance_coverage
+    from surrogate.evaluation.score import score, table
+    from surrogate.model.store import load
+
     data = read_dataset(args.data)
     models = load(args.model, data.anatomy)
     loads = data.loads.rows(np.flatnonzero(data.good))

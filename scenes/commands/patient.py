@@ -8,10 +8,9 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from sim.discretisation.space import RECOMMENDED
+from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS
-from sim.runtime.device import device_names
 from sim.runtime.timing import listened
 from surrogate.data.disc_split import APART, FEWEST
 from surrogate.data.tool_loads import PRESETS
@@ -55,6 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; an interrupted run goes on when the same command is given again."""
+    from sim.runtime.device import device_names
     from surrogate.training.train import check_learners
 
     from ..cli import main

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from sim.discretisation.space import ELEMENTS
+from sim.elements import ELEMENTS
 from sim.errors import InputError
 from surrogate.data.tool_loads import PRESETS, draw
 

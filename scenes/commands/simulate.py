@@ -21,6 +21,7 @@ from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effec
 from sim.errors import InputError
 from sim.loads import Loads
 from sim.material import tissue_to_json
+from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.device import device_names
 from sim.runtime.memory import Budget
 from sim.runtime.timing import stage
@@ -118,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
         try:
             solved = simulate(out, solver.deformer, loads, provenance, solver.batch, progress)
         except KeyboardInterrupt:
-            print(f"stopped; the same command goes on from {args.out}.partial", file=sys.stderr)
+            print(f"stopped; the same command goes on from {unfinished_path(out)}", file=sys.stderr)
             return INTERRUPTED
     _report(args, solver.description, len(loads), solved)
     return 0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 
-from sim.discretisation.space import ELEMENTS, RECOMMENDED
 from sim.effects import SKULLS
+from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
 

@@ -20,11 +20,11 @@ ALL: frozenset[str] = frozenset()
 class Cast:
     """The stages, models and finite elements of one scene, with all its effects or without some.
 
-    `playable` says whether anything is there that answers.
+    `playable` says whether any of them is ready to answer.
     """
 
     def __init__(self, theatre: Theatre, scene: Scene, deformer: str, turn: threading.Lock) -> None:
-        """Have a deformer by name play; of finite elements one prepares at a time, who holds `turn`.
+        """Have the `deformer` of that name play. Finite elements are prepared one at a time, by who holds `turn`.
 
         Raises
         ------
@@ -36,7 +36,7 @@ class Cast:
         self.stages = {ALL: replace(theatre.stage(scene), device="cpu")}
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
         self.solvers: dict[frozenset[str], Referee] = {}
-        # Who is asked for what is shown next, and for what.
+        # The finite elements that are asked for what is shown next, and their question.
         self.seeking: tuple[Referee, Question] | None = None
         self.playable = deformer != "fem"
         if self.playable:
@@ -78,7 +78,7 @@ class Cast:
         return Truth(question[0], loads, answer, clock.perf_counter() - begun, question)
 
     def solved(self, off: frozenset[str], question: Question, seen: Truth | None, patience: float) -> Truth | None:
-        """The finite elements' answer, or that to a frame on the way there; they are asked, if they were not.
+        """The finite elements' answer, or that to a frame on the way there. They are asked, if they were not yet.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class Cast:
         Raises
         ------
         Exception
-            What they failed at.
+            Whatever the solver's thread raised.
         """
         solver = self.solver(off)
         if self.seeking != (solver, question):
@@ -118,7 +118,7 @@ class Cast:
             self.seeking = None
 
     def dismiss(self) -> list[Referee]:
-        """Stop the finite elements, without waiting for what they have in hand; returns those that still do."""
+        """Stop the finite elements, without waiting for the steps in hand; returns those that have one."""
         for solver in self.solvers.values():
             solver.dismiss()
         return [solver for solver in self.solvers.values() if solver.thread.is_alive()]

@@ -14,6 +14,7 @@ from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.effects import NodalForce, pushed_effects
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
+from sim.runtime.atomic_files import unfinished_path
 from surrogate.data.simulate import simulate
 
 from .artefact_time import note_seconds, noted_seconds
@@ -49,7 +50,7 @@ def simulate_debulked(study: Study, progress: Callable[[int], object]) -> None:
     if path.exists():
         progress(len(study.dataset.loads) + len(study.dataset.unit_good))
         return
-    whole = not path.with_name(path.name + ".partial").exists()
+    whole = not unfinished_path(path).exists()
     body, data = debulked(study.anatomy), study.dataset
     effects = (*pushed_effects(body, study.tissue), NodalForce())
     begun = clock.perf_counter()

@@ -107,7 +107,7 @@ class Scene:
     surgery
         What is cut, if anything.
     element
-        One of `sim.discretisation.space.ELEMENTS`; None: the one that is recommended for the mesh.
+        One of `sim.elements.ELEMENTS`; None: the one that is recommended for the mesh.
 
     Raises
     ------

@@ -53,15 +53,18 @@ class Inversion:
         elements = (
             quadratic_elements(space.nodes, space.table, every) if quadratic else linear_elements(space.mesh, every)
         )
-        self.telling = not (bounded and space.element == "smoothed")
-        """Whether one that lies inside out makes an equilibrium doubtful, as the body may be turned over.
-
-        Not where the law sees averages alone, and no descent can take these through its infinity. There a strong load
-        may turn single tetrahedra, from rest as from any other start.
-        """
+        self._telling = not (bounded and space.element == "smoothed")
         self._device, self._collapsed = device, collapsed
         self._table = device.array(elements.table, wp.int32)
         self._gradient = device.array(elements.gradient, device.vector)
+
+    def doubtful(self, inverted: np.ndarray) -> np.ndarray:
+        """Which states (B,) with so many (B,) inside out may be those of a body that is turned over.
+
+        None where the law sees averages alone, and no descent can take these through its infinity. There a strong load
+        may turn single tetrahedra, from rest as from any other start.
+        """
+        return self._telling & (inverted > 0)
 
     def count(self, u: wp.array) -> np.ndarray:
         """How many (B,) in u (3N, B) [m], on the device."""

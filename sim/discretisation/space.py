@@ -8,19 +8,12 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
+from ..elements import ELEMENTS, RECOMMENDED
 from ..errors import InputError
 from ..geometry.surface import unit
 from ..geometry.tetmesh import QUADRATIC_EDGES, TRIANGLE_EDGES, TetMesh, row_keys
 from .element import Elements, linear_elements, quadratic_elements
 from .smoothed import edge_elements, node_elements
-
-ELEMENTS = {
-    "p1": "linear tetrahedra: the fastest, and too stiff, the more so the less tissue can be compressed",
-    "p2": "quadratic tetrahedra: the most accurate, seven times as many nodes",
-    "smoothed": "linear tetrahedra with strains averaged over edges and nodes: nearly as accurate as p2 on p1's nodes",
-}
-RECOMMENDED = "smoothed"
-"""The element of every scene and command that names none, on meshes of linear tetrahedra."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,8 @@ def blurred_normals(
     blur nothing is left, and the finer the mesh, the less the normals depend on it. Triangles that are so wide that
     none of their middles need be in sight of a corner are seen through a wider blur, a share of their longest edge.
     """
+    from scipy.spatial import KDTree  # takes a tenth of a second, and help texts need none of it
+
     a, b, c = np.moveaxis(nodes[triangles], 1, 0)
     longest = np.linalg.norm([b - a, c - b, a - c], axis=2).max()
     blur = max(blur, sight.narrowest * longest)

@@ -89,7 +89,7 @@ class StiffenedPreconditioner:
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
         """A sweep of the factor, and another one for what that misses, unless the whole would not be positive there."""
         self._rest.apply(r, live, out)
-        if self.stiffening is None or not live.all():
+        if self.stiffening is None:
             return
         z = out.numpy()[:, 0].astype(np.float32)
         pull, more = wp.zeros_like(r), wp.zeros_like(r)
@@ -136,8 +136,8 @@ class StrainedDescent:
             u = found.u
             self._preconditioner.stiffening = self._stiffening(u)
         stiffening, self._preconditioner.stiffening = self._preconditioner.stiffening, None
-        serves = learnt is not None and stiffening is not None and steps <= self._renewal.served
-        return replace(found, steps=np.array([steps]), learnt=stiffening.learnt if serves and stiffening else {})
+        serves = learnt is not None and steps <= self._renewal.served
+        return replace(found, steps=np.array([steps]), learnt=stiffening.learnt if stiffening and serves else {})
 
     def _stiffening(self, u: wp.array) -> Stiffening | None:
         """At u (3N, 1) [m]; None where nothing is strained."""

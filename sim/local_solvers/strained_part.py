@@ -9,7 +9,6 @@ a deep press for a third as stiff as it is, and a step that follows K0 goes thre
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,9 @@ import warp as wp
 from ..discretisation.problem import Problem
 from ..discretisation.term import Strained
 from ..linalg.compliance import Compliance
-from ..runtime.device import Device, forward_kernel
+from ..runtime.device import Device
 from ..runtime.views import ascending, from_view, largest_first, library, like, on_host, padded, placed, view
+from .press_kernel import press_of
 
 
 @dataclass(frozen=True)
@@ -54,29 +54,6 @@ class Strains:
 
 
 STRAINS = Strains()
-
-
-@cache
-def press_of(device: Device) -> wp.Kernel:
-    """The kernel that multiplies by each column's matrix."""
-    scalar = device.scalar
-
-    @forward_kernel(module="unique")
-    def press(
-        matrix: wp.array3d(dtype=wp.float64),
-        nodes: wp.array2d(dtype=wp.int32),
-        motion: wp.array2d(dtype=scalar),
-        # outputs
-        out: wp.array2d(dtype=scalar),
-    ):
-        """out = E M E' motion."""
-        i, c = wp.tid()
-        total = wp.float64(0.0)
-        for j in range(matrix.shape[2]):
-            total += matrix[c, i, j] * wp.float64(motion[3 * nodes[c, j // 3] + j % 3, c])
-        wp.atomic_add(out, 3 * nodes[c, i // 3] + i % 3, c, scalar(total))
-
-    return press
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +104,7 @@ class Model:
         """E M E' motion (3n, b) [N], of motions (3n, b) [m] of the nodes of the compliance."""
         out, (count, size) = wp.zeros_like(motion), self.matrix.shape[:2]
         inputs = [from_view(device, self.matrix), from_view(device, self.nodes), motion]
-        device.launch(press_of(device), (size, count), inputs, [out])
+        device.launch(press_of(device, wp.float64, wp.float64), (1, count, size), inputs, [out])
         return out
 
 
@@ -206,6 +183,11 @@ class StrainedPart:
                 term.add_stiffening(some, u, picked, from_view(device, limit), place, stiffer)
         return like(ranks, nodes[:wide].T.clip(max=near - 1)), view(stiffer)
 
+    def soft(self, rows: Any) -> Any:
+        """C (b, n, n) [m/N] between some rows (b, n) of the compliance, which are known: symmetric."""
+        between = self.compliance.columns[rows[:, :, None], rows[:, None, :]]
+        return 0.5 * (between + between.mT)
+
     def _bent(self, nodes: Any, stiffer: Any) -> Model:
         """Of D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""
         self.prepare()
@@ -218,8 +200,7 @@ class StrainedPart:
         for first in range(0, count if size else 0, each):
             some = slice(first, first + each)
             rows = (3 * nodes[some][:, :, None] + axes).reshape(-1, size)
-            soft = self.compliance.columns[rows[:, :, None], rows[:, None, :]]
-            soft = 0.5 * (soft + soft.mT)
+            soft = self.soft(rows)
             system = stiffer[some] @ soft
             diagonal = range(size)
             system[:, diagonal, diagonal] += 1.0

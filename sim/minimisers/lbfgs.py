@@ -17,7 +17,7 @@ from ..arguments import all_finite
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
 from ..linalg.pcg import Preconditioner
-from ..runtime.columns import EXACT, WIDTHS, scattered
+from ..runtime.columns import EXACT, scattered, width_of
 from .lbfgs_kernels import LEFT, LIVE, PAIRS
 from .lbfgs_state import Workspace, ground_of
 
@@ -151,9 +151,7 @@ class Lbfgs:
         return self._workspaces[width]
 
     def _width(self, count: int) -> int:
-        if self._problem.device.on_cuda:
-            return next((width for width in WIDTHS if width >= count), -(-count // WIDTHS[-1]) * WIDTHS[-1])
-        return count
+        return width_of(self._problem.device, count)
 
 
 def rows_first(array: wp.array) -> np.ndarray:

@@ -182,6 +182,11 @@ def _host() -> str:
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
+def unfinished_path(path: Path) -> Path:
+    """Where a run that goes on keeps what it has done so far of `path`."""
+    return path.with_name(path.name + ".partial")
+
+
 def _partial(path: Path) -> Path:
     """The hidden name under which this process writes `path`."""
     return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")

@@ -170,6 +170,20 @@ def moving_kernels_of(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
     return gather, scatter
 
 
+def width_of(device: Device, count: int) -> int:
+    """How wide a room of L-BFGS for so many columns is."""
+    if not device.on_cuda:
+        return count
+    return next((width for width in WIDTHS if width >= count), -(-count // WIDTHS[-1]) * WIDTHS[-1])
+
+
+def widest_within(device: Device, count: int) -> int:
+    """How wide a room of at most so many columns is; 0 where there is none."""
+    if not device.on_cuda or count < 1:
+        return count
+    return max(count // WIDTHS[-1] * WIDTHS[-1], *(width for width in WIDTHS if width <= count))
+
+
 def is_kept(width: int) -> bool:
     """Whether a room may be so wide."""
     return width in WIDTHS or width % WIDTHS[-1] == 0

@@ -9,9 +9,11 @@ import numpy as np
 import warp as wp
 
 from ..errors import InputError
+from .columns import widest_within, width_of
 from .device import Device
 
 # Columns of the solver at its widest: pairs of L-BFGS, those that move elsewhere, vectors of the elimination around it.
+# Arrays counted on the CPU, 2026-11-24: at most 46 where levels precondition (19,508 and 26,452 nodes, smoothed).
 WORK_COLUMNS = 60
 # Copies of the answer on the host while batches are joined, in double precision.
 ANSWER_COPIES = 3
@@ -62,11 +64,11 @@ def host_bytes(budget: Budget = Budget()) -> int:
     return min(found)
 
 
-def fitting_batch(rows: int, device: Device, budget: Budget = Budget()) -> int:
-    """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it and fit."""
-    column = column_bytes(rows, device)
+def fitting_batch(rows: int, device: Device, free: int, budget: Budget = Budget()) -> int:
+    """How many load cases of `rows` = 3N unknowns to solve together: as many as are worth it and `free` bytes hold."""
     widest = budget.widest_on_cuda if device.on_cuda else budget.widest
-    return int(np.clip(budget.batches * free_bytes(device, budget) / max(column, 1), 1, widest))
+    fitting = int(budget.batches * free / max(column_bytes(rows, device), 1))
+    return int(np.clip(widest_within(device, fitting), 1, widest))
 
 
 def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0, budget: Budget = Budget()) -> None:
@@ -92,11 +94,12 @@ def check_fits(rows: int, batch: int, count: int, device: Device, held: int = 0,
     available = free_bytes(device) if device.on_cuda else free
     room = budget.share * available + held - (0 if device.on_cuda else answers)
     columns = min(batch, count)
-    if column * columns > room:
-        fitting = int(room / column)
-        remedy = f"a --batch of {fitting} fits." if fitting else COARSER
+    taken = column * width_of(device, columns)
+    if taken > room:
+        fitting = widest_within(device, int(room / column))
+        remedy = f"a --batch of {fitting} fits." if fitting > 0 else COARSER
         raise InputError(
-            f"a batch of {columns} loads takes about {gigabytes(column * columns)}, and {gigabytes(max(room, 0.0))} "
+            f"a batch of {columns} loads takes about {gigabytes(taken)}, and {gigabytes(max(room, 0.0))} "
             f"are free: {remedy}"
         )
 

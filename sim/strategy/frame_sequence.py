@@ -115,7 +115,7 @@ class FrameSequence:
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
         self._last = self._here = _gone
         found = self._frame.push(point, radius, force, share)
-        if found[STATUS] != DONE or (found[INVERTED] and self._inversion.telling):
+        if found[STATUS] != DONE or self._inversion.doubtful(found[INVERTED]):
             return None
         self._frame.learn(found[STEPS])
         warm = Kept(way, self._frame.state, self._lock, self._frame.bent)
@@ -144,21 +144,21 @@ class FrameSequence:
         cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
         u = self._problem.device.array(last)
-        if self._problem.gap(u)[1].any() or (self._inversion.telling and self._inversion.count(u).any()):
+        if self._problem.gap(u)[1].any() or self._inversion.doubtful(self._inversion.count(u)).any():
             return False
         here = self._here()
         if here is not None:
             here.settle()
         self._last = self._here = _gone
         past = start.warm[BEFORE].T if knows(start.warm, last) else None
-        self._frame.take(last, past, learnt_from(cases, len(last)), self._bent(start.warm, len(last)))
+        self._frame.take(last, past, learnt_from(cases, len(last)), self._bent(start.warm))
         return True
 
-    def _bent(self, warm: Mapping[str, Any], rows: int) -> Bent | None:
+    def _bent(self, warm: Mapping[str, Any]) -> Bent | None:
         if isinstance(warm, Kept):
             return warm.bent
         part = self._frame.part
-        return None if part is None else bent_from(warm, self._problem.device, rows, part.size)
+        return None if part is None else bent_from(warm, self._problem.device, len(self._nodes), part.size)
 
     def _make_way(self) -> None:
         """What stands where the last frame ended is about to move to where it began."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
 from ..accuracy import Accuracy
@@ -12,8 +11,9 @@ from ..anatomy import Anatomy
 from ..discretisation.space import Discretisation, discretise
 from ..errors import InputError
 from ..linalg.preconditioner import Preconditioning
+from ..runtime.columns import widest_within, width_of
 from ..runtime.device import Device, find_device
-from ..runtime.memory import COARSER, Budget, column_bytes, free_bytes, gigabytes
+from ..runtime.memory import COARSER, Budget, column_bytes, fitting_batch, free_bytes, gigabytes
 
 PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900}
 """Bytes of single precision that each node of an element takes: tables of the elements, and levels of multigrid. The
@@ -53,8 +53,8 @@ class Needed:
 
     @property
     def peak(self) -> int:
-        """The most at any time."""
-        return max(self.set_up, self.kept + self.batch * self.column)
+        """The most at any time: a batch stands in a room that may be wider."""
+        return max(self.set_up, self.kept + width_of(self.device, self.batch) * self.column)
 
     def __str__(self) -> str:
         loads = f"{self.batch} loads together" if self.batch > 1 else "one load at a time"
@@ -72,7 +72,7 @@ class Needed:
         room = budget.share * self.free
         if self.peak <= room:
             return self
-        fitting = int((room - self.kept) / self.column)
+        fitting = widest_within(self.device, int((room - self.kept) / self.column))
         fits = self.set_up <= room and fitting > 0
         raise InputError(f"{self}: {f'a --batch of {fitting} fits.' if fits else COARSER}")
 
@@ -119,7 +119,7 @@ def needed(
     taken, left = _inverse_bytes(inverted, device)
     column = column_bytes(rows, device)
     if batch is None:
-        batch = int(np.clip(budget.batches * (free - tables - left) / column, 1, budget.widest_on_cuda))
+        batch = fitting_batch(rows, device, free - tables - left, budget)
     return Needed(
         len(space.mesh.nodes), space.element, device, tables + taken, tables + left, column, min(batch, loads), free
     )

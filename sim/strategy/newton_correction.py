@@ -17,7 +17,6 @@ from ..deformation import Outcome
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
 from ..linalg.pcg import LinearSolution, conjugate_gradients
-from ..local_solvers.strained_descent import StrainedDescent
 from ..minimisers.line_search import search
 from ..minimisers.newton_cg import Direction
 from ..minimisers.residual import relative
@@ -54,18 +53,27 @@ class Step:
 
 
 def step_from(strategy: Strategy, cases: Cases, guess: np.ndarray, linear: Linear = Linear()) -> Step:
-    """One step from guess (3N, B) [m], which is first put on the constraints; from rest where it lies inside out."""
+    """One step from guess (3N, B) [m], which is first put on the constraints.
+
+    From rest where the guess may be turned over, or the law is infinite there.
+    """
     problem, device, count = strategy.problem, strategy.problem.device, len(cases.loads)
     clocks = [time.perf_counter()]
     problem.begin(cases)
+
+    def put(start: wp.array) -> wp.array:
+        return combined(device, start, 1.0, problem.gap(start)[0], start)
+
     start = device.array(guess)
-    start = device.array(np.where(strategy.inversion.count(start) > 0, 0.0, guess))
-    u = combined(device, start, 1.0, problem.gap(start)[0], start)
+    turned, u = strategy.inversion.doubtful(strategy.inversion.count(start)), put(start)
     _, free, scale = problem.residual(u)
+    turned |= ~np.isfinite(free)
+    if turned.any():
+        u = put(device.array(np.where(turned, 0.0, guess)))
+        _, free, scale = problem.residual(u)
     before = relative(free, scale)
-    near = strategy.local(count)
-    if near is None or isinstance(near, StrainedDescent):  # that settles no part by itself
-        near = strategy.near()
+    step = strategy.plan.local(count)
+    near = strategy.local(count) if step is not None and step.eliminates else strategy.near()
     if near is not None and not problem.constraint.imposes:
         u = near.descend(u, np.full(count, strategy.accuracy.tolerance), 1).u
         problem.begin(cases)  # columns that were done have left

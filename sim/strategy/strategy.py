@@ -149,7 +149,7 @@ class Strategy:
                 cases = replace(cases, anew=astray.copy())
                 problem.begin(cases)
             answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
-            lost = np.where(answer.good, self.inversion.telling & (answer.inverted > 0), self._lost(answer))
+            lost = np.where(answer.good, self.inversion.doubtful(answer.inverted), self._lost(answer))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
@@ -193,7 +193,7 @@ class Strategy:
             if inverted.any():
                 fewer = self.inversion.count(device.array(other))
                 guess, inverted = np.where(fewer < inverted, other, guess), np.minimum(fewer, inverted)
-        return guess, self.inversion.telling & (inverted > 0)
+        return guess, self.inversion.doubtful(inverted)
 
     def _lost(self, answer: Answer) -> np.ndarray:
         """Which cases (B,) another solver may save: at round-off none is nearer to equilibrium."""

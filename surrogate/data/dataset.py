@@ -20,6 +20,7 @@ from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh, digest_of
 from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Touching
+from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
 from sim.runtime.outside_files import path_of, read_as
 
@@ -179,7 +180,7 @@ def read_dataset(path: str | Path) -> Dataset:
     """
     path = path_of(path)
     if not path.is_file():
-        unfinished = path.with_name(path.name + ".partial")
+        unfinished = unfinished_path(path)
         remedy = (
             f"{unfinished.name} is an unfinished run: give the same `sulcus simulate` again and it goes on"
             if unfinished.exists()

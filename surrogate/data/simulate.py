@@ -18,7 +18,7 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.errors import InputError
 from sim.loads import Loads, Touching
-from sim.runtime.atomic_files import check_output, demand_space, written_stream
+from sim.runtime.atomic_files import check_output, demand_space, unfinished_path, written_stream
 from sim.runtime.outside_files import read_as
 from sim.runtime.processes import LostError
 from sim.runtime.timing import listened, stage
@@ -153,7 +153,7 @@ def simulate(
     check_output(path, path.suffix)
     nodes = open_patch(deformer.anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
     stated = {**provenance, "format": FORMAT, "anatomy": deformer.anatomy.digest, "batch": str(batch)}
-    partial = path.with_name(path.name + ".partial")
+    partial = unfinished_path(path)
     finished: set[Batch] = set()
     work = Work(deformer.anatomy, loads, nodes, batch)
     if path.exists():
