@@ -34,7 +34,8 @@ from ..runtime.device import Device
 from ..runtime.views import columns_of, doubled, from_view, in_order, like, on_host, placed, view
 from .contact_batch import Batch, State
 from .contact_forces import BENT, FORCES, ForceLimits, Softness, scratch_of, settled
-from .contact_structs import Scratch
+from .contact_steps import PROMISED, STATUS, ContactSteps, judged
+from .contact_structs import FOUND, Scratch
 from .strained_part import STRAINS, StrainedPart, Strains
 
 
@@ -93,6 +94,8 @@ class ContactDescent:
         When it goes on, and when it gives up.
     strains
         Which tissue counts as strained.
+    replays
+        Single columns take steps that a card captures as graphs, where the problem is one for that.
     """
 
     problem: Problem
@@ -100,6 +103,7 @@ class ContactDescent:
     barrier: Local
     limits: ContactLimits = ContactLimits()
     strains: Strains = STRAINS
+    replays: bool = False
 
     @cached_property
     def compliance(self) -> Compliance:
@@ -118,6 +122,16 @@ class ContactDescent:
         if not is_exact(self.preconditioner):
             return None
         return StrainedPart(self.problem, self.compliance, len(self.barrier.touchable), self.strains)
+
+    @cached_property
+    def _steps(self) -> ContactSteps | None:
+        """Those of single columns; None where arrays change from batch to batch, or nothing is to be replayed."""
+        still = all(term is self.barrier or term.constant or term.passive for term in self.problem.terms)
+        if self._strained is None or not self.replays or not still:
+            return None
+        self._strained.prepare()
+        size = self._strained.size
+        return ContactSteps(self.problem, self.preconditioner, self.barrier, self.compliance, size)
 
     @cached_property
     def _rows(self) -> Any:
@@ -141,10 +155,12 @@ class ContactDescent:
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
         with in_order(device):
             batch = self._begun(start)
+            if count == 1 and self._steps is not None:
+                self._replay(self._steps, batch, tolerance, most)
             ready = np.ones(count, bool)
             while True:
-                done = ready & (batch.now.relative <= tolerance[live])
-                over = done | (ready & ((batch.slow >= limits.patience) | (batch.steps >= most) | ~batch.now.finite))
+                over = ready & self._ended(batch, tolerance[live], most)
+                done = over & (batch.now.relative <= tolerance[live])
                 if (ready & ~over).any():
                     over |= self._aimed(batch, ready & ~over, tolerance[live])
                 if over.any():
@@ -178,19 +194,60 @@ class ContactDescent:
             slow, steps, failed, waiting, gone,
         )  # fmt: skip
 
+    def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:
+        """Take steps of a single column, until it has come to its end or tools' forces are not found at once."""
+        known, judge = None, batch.judge
+        if batch.model is None or not steps.stand(judge.constant):
+            return
+        batch.now, batch.force, batch.rest, batch.x = steps.hold(batch.now, batch.force, batch.rest)
+        while not self._ended(batch, tolerance, most).any():
+            self._renew(batch, np.ones(1, bool))
+            if batch.model is not known:
+                known = batch.model
+                steps.load(known)
+            said = steps.aim(self._exactly(batch, tolerance)[0], batch.drag[0])
+            if said[STATUS] != FOUND:
+                return
+            batch.waiting[:], batch.failed[:], batch.promised[:] = False, 0, said[PROMISED]
+            while True:
+                t, ahead, free, scale = judged(said, judge.square)
+                there, misled = self._decided(batch, t, ahead, free)
+                if there.any() or misled.any():
+                    break
+                said = steps.again(batch.length[0])
+            if there.any():
+                steps.accept()
+                batch.now.free[:], batch.now.scale[:] = free, scale
+            else:  # its model has been forgotten
+                known = None
+
+    def _ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
+        """Which columns (b,) have come to their end, in equilibrium or not."""
+        lost = (batch.slow >= self.limits.patience) | (batch.steps >= most) | ~batch.now.finite
+        return lost | (batch.now.relative <= tolerance)
+
+    def _renew(self, batch: Batch, wanted: np.ndarray) -> None:
+        """Make stale models anew of the columns that are `wanted` (b,) bool."""
+        renewed = np.flatnonzero(wanted & batch.stale)
+        if batch.model is not None and self._strained is not None and len(renewed):
+            fresh = self._strained.model(from_view(self.problem.device, batch.now.u), renewed)
+            batch.stale &= ~wanted
+            if fresh is not None:
+                batch.model = batch.model.with_columns(renewed, fresh)
+
+    def _exactly(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
+        """To what share (b,) of themselves the tools' forces are to be found."""
+        limits = self.limits
+        return np.maximum(limits.forcing * np.minimum(batch.now.relative, 1.0), limits.enough * tolerance)
+
     def _aimed(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
         """Give the columns that are `wanted` (b,) bool a direction; which (b,) have none, whatever was tried.
 
         One whose model has no equilibrium waits for the next time, dragged more; then it forgets what it has learnt. At
         last a model will do that is not convex. Others need not wait for it.
         """
-        now, times = batch.now, self.limits.times
-        renewed = np.flatnonzero(wanted & batch.stale)
-        if batch.model is not None and self._strained is not None and len(renewed):
-            fresh = self._strained.model(from_view(self.problem.device, now.u), renewed)
-            batch.stale &= ~wanted
-            if fresh is not None:
-                batch.model = batch.model.with_columns(renewed, fresh)
+        times = self.limits.times
+        self._renew(batch, wanted)
         force, found = batch.force + 0.0, np.zeros(len(wanted), bool)
         bent = batch.failed >= 2 * times
         for some, limits in ((np.flatnonzero(wanted & ~bent), FORCES), (np.flatnonzero(wanted & bent), BENT)):
@@ -229,12 +286,12 @@ class ContactDescent:
         self, batch: Batch, some: np.ndarray, tolerance: np.ndarray, most: ForceLimits
     ) -> tuple[Any, np.ndarray]:
         """The tools' forces (3n, k) where the model of some columns (k,) is in equilibrium, and which (k,) have one."""
-        limits, rows, now = self.limits, self._rows, batch.now
+        rows, now = self._rows, batch.now
         on = columns_of(self.problem.device, some, len(batch.drag))
         barrier, known = self.barrier.reduced(some), batch.force[:, on]
         if barrier is None:
             return known, np.ones(len(some), bool)
-        exact = np.maximum(limits.forcing * np.minimum(now.relative, 1.0), limits.enough * tolerance)[some]
+        exact = self._exactly(batch, tolerance)[some]
         soft, free = Softness(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows]
         if batch.model is not None:
             free = free - self._bent(batch, batch.force)[1]
@@ -271,7 +328,7 @@ class ContactDescent:
         They have taken it, as the energy still falls there, or about so. Or hardly anything is left of it after cuts:
         then they have not moved, and forget what has misled them.
         """
-        limits, now, going = self.limits, batch.now, ~(batch.waiting | batch.gone)
+        now, going = batch.now, ~(batch.waiting | batch.gone)
         t = np.where(going, batch.length, 0.0)
         if not going.any():
             return batch.waiting & ~batch.gone
@@ -279,22 +336,32 @@ class ContactDescent:
             batch.judge, now.u + placed(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
         )
         ahead = np.where(new.finite, _dots(new.whole, batch.x), np.inf)
-        far = going & goes_too_far(ahead, batch.promised) & (t > limits.least)
-        batch.length, there = np.where(far, t * kept_of(ahead, batch.promised), t), going & ~far
-        misled = far & (batch.length < limits.shortest) & batch.learnt
-        taken, well = np.flatnonzero(there), (t > limits.long) & (new.free <= limits.left * now.free)
-        eased = np.where(batch.drag >= limits.drag, batch.drag / limits.growth, 0.0)
-        worse = (t < limits.long) | (new.free > now.free)
-        drag = np.where(there & well, eased, np.where(misled | (there & worse), self._harder(batch.drag), batch.drag))
-        batch.drag, batch.steps = drag, batch.steps + (misled | there)
-        batch.stale |= there & (new.free > limits.stale * now.free)
-        batch.slow = np.where(there & well, 0, batch.slow + (misled | there))
-        batch.forget(np.flatnonzero(misled))
+        there, misled = self._decided(batch, t, ahead, new.free)
+        taken = np.flatnonzero(there)
         if len(taken):
             some = columns_of(self.problem.device, taken, len(t))
             self._learn(batch, new, taken, some)
             now.put(taken, some, new)
         return misled | there | (batch.waiting & ~batch.gone)
+
+    def _decided(self, batch: Batch, t: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Which columns (b,) take steps of a length t (b,), and which were misled; others' are cut.
+
+        By the slopes `ahead` (b,) and the free forces (b,) there.
+        """
+        limits, now, going = self.limits, batch.now, ~(batch.waiting | batch.gone)
+        far = going & goes_too_far(ahead, batch.promised) & (t > limits.least)
+        batch.length, there = np.where(far, t * kept_of(ahead, batch.promised), t), going & ~far
+        misled = far & (batch.length < limits.shortest) & batch.learnt
+        well = (t > limits.long) & (free <= limits.left * now.free)
+        eased = np.where(batch.drag >= limits.drag, batch.drag / limits.growth, 0.0)
+        worse = (t < limits.long) | (free > now.free)
+        drag = np.where(there & well, eased, np.where(misled | (there & worse), self._harder(batch.drag), batch.drag))
+        batch.drag, batch.steps = drag, batch.steps + (misled | there)
+        batch.stale |= there & (free > limits.stale * now.free)
+        batch.slow = np.where(there & well, 0, batch.slow + (misled | there))
+        batch.forget(np.flatnonzero(misled))
+        return there, misled
 
     def _learn(self, batch: Batch, new: State, taken: np.ndarray, some: Any) -> None:
         """From steps that columns (k,) have taken to a new state; `some` are the same of an array's."""

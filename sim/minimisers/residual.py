@@ -27,7 +27,8 @@ class Balance:
     own: wp.array
 
 
-def _balance_workspace(problem: Problem, count: int) -> Balance:
+def balance_workspace(problem: Problem, count: int) -> Balance:
+    """Arrays for the balance of so many columns."""
     device = problem.device
     sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
     return Balance(device.zeros(problem.rows, count), device.zeros(problem.rows, count), sums, own)
@@ -41,7 +42,7 @@ def balance(
     In the arrays of `workspace`, if it is given.
     """
     device, (rows, count) = problem.device, v.shape
-    workspace = workspace or _balance_workspace(problem, count)
+    workspace = workspace or balance_workspace(problem, count)
     varying = [term for term in problem.terms if not term.constant]
     workspace.sums.zero_()
     wp.copy(workspace.g, constant)

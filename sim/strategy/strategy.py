@@ -109,7 +109,7 @@ class Strategy:
             return None
         (barrier,) = self.problem.barriers
         assert isinstance(barrier, Local)
-        return ContactDescent(self.problem, self.preconditioner, barrier)
+        return ContactDescent(self.problem, self.preconditioner, barrier, replays=self.problem.device.on_cuda)
 
     def local(self, count: int) -> BatchElimination | Alone | None:
         """What solves a part by itself for so many loads, if anything does."""

@@ -95,6 +95,8 @@ class Contact:
         self._pose: np.ndarray | None = None
         # A step asks for the same poses several times.
         self._stood = lru_cache(4)(self._brought)
+        # A captured graph reads the tools of a single column where they stood when it was captured.
+        self._single: Tools | None = None
 
     def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
         """As `Way.stride`: through the air a tool goes as far as it can touch nothing."""
@@ -224,6 +226,12 @@ class Contact:
         self._pose = pose
         if pose is not None:
             self._tools = self._standing(pose)
+        if pose is not None and len(pose) == 1:
+            if self._single is None:
+                self._single = self._brought(np.ascontiguousarray(pose, np.float64).tobytes())
+            wp.copy(self._single.rotation, self._tools.rotation)
+            wp.copy(self._single.origin, self._tools.origin)
+            self._tools = self._single
 
     def _standing(self, pose: np.ndarray) -> Tools:
         return self._stood(np.ascontiguousarray(pose, np.float64).tobytes())
@@ -242,7 +250,9 @@ class Contact:
         if self._pose is None:
             raise ValueError("no tool is there")
         out, near, name = Stage(), Near(), self._device.name
-        out.surface, out.tools, out.scale = self._surface, self._standing(self._pose[columns]), self._scale
+        every = len(columns) == len(self._pose)
+        out.tools = self._tools if every else self._standing(self._pose[columns])
+        out.surface, out.scale = self._surface, self._scale
         out.rows = self._rows
         near.pairs = wp.empty((len(columns), len(self._triangles) * len(self._owner)), dtype=wp.int32, device=name)
         near.count = wp.empty(len(columns), dtype=wp.int32, device=name)

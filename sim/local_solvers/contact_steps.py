@@ -1,0 +1,342 @@
+"""Steps of single columns under tools in fixed arrays, which CUDA replays as captured graphs.
+
+They are those of `contact_descent.py`, where all that is decided between them is decided.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..discretisation.problem import Problem
+from ..discretisation.term import Local
+from ..linalg.compliance import Compliance
+from ..linalg.pcg import Preconditioner
+from ..minimisers.lbfgs_kernels import FREE, WHOLE
+from ..minimisers.residual import balance, balance_workspace
+from ..runtime import blocks
+from ..runtime.columns import add_dots, combined, put_rows, rows_taken
+from ..runtime.columns import kernels_of as columns_kernels_of
+from ..runtime.device import Device, forward_kernel
+from ..runtime.views import from_view, view
+from .contact_batch import State
+from .contact_forces import FORCES, scratch_of
+from .contact_kernel import kernel_of
+from .contact_structs import Ends
+from .contact_structs import Model as Softness
+from .press_kernel import press_of
+from .strained_part import Model
+
+# A product is divided among so many threads a row.
+PARTS = 16
+# What goes up: how exact forces are to be, the drag, and the length of a step that was cut.
+TOLERANCE, DRAG, LENGTH, GIVEN = 0, 1, 2, 3
+# What comes down.
+STATUS, TRIED, PROMISED, AHEAD, LOUD, WHOLE_SUM, FREE_SUM, SAID = range(8)
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """What stands between products, in one scalar type."""
+
+    look: wp.Kernel
+    change: wp.Kernel
+    shorten: wp.Kernel
+    push: wp.Kernel
+    report: wp.Kernel
+
+
+@cache
+def kernels_of(device: Device) -> Kernels:
+    """Kernels of a device's scalar type, for one column."""
+    scalar = device.scalar
+
+    @forward_kernel(module="unique")
+    def look(
+        rows: wp.array(dtype=wp.int32),
+        u: wp.array2d(dtype=scalar),
+        rest: wp.array2d(dtype=scalar),
+        more: wp.array2d(dtype=scalar),
+        # outputs
+        here: wp.array2d(dtype=wp.float64),
+        there: wp.array2d(dtype=wp.float64),
+    ):
+        """Where nodes are, and where they would go under the forces that are known."""
+        i = wp.tid()
+        here[i, 0] = wp.float64(u[rows[i], 0])
+        there[i, 0] = here[i, 0] - wp.float64(rest[rows[i], 0]) - wp.float64(more[i, 0])
+
+    @forward_kernel(module="unique")
+    def change(
+        found: wp.array2d(dtype=wp.float64),
+        force: wp.array2d(dtype=wp.float64),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """By how much forces have changed."""
+        i = wp.tid()
+        out[i, 0] = scalar(found[i, 0] - force[i, 0])
+
+    @forward_kernel(module="unique")
+    def shorten(
+        given: wp.array(dtype=wp.float64),
+        # outputs
+        length: wp.array(dtype=scalar),
+    ):
+        """The length that is given."""
+        length[0] = scalar(given[LENGTH])
+
+    @forward_kernel(module="unique")
+    def push(
+        rows: wp.array(dtype=wp.int32),
+        force: wp.array2d(dtype=wp.float64),
+        # outputs
+        out: wp.array2d(dtype=scalar),
+    ):
+        """out_rows(i) += f_i."""
+        i = wp.tid()
+        out[rows[i], 0] += scalar(force[i, 0])
+
+    @forward_kernel(module="unique")
+    def report(
+        status: wp.array(dtype=wp.int32),
+        length: wp.array(dtype=scalar),
+        promised: wp.array(dtype=wp.float64),
+        ahead: wp.array(dtype=wp.float64),
+        sums: wp.array2d(dtype=wp.float64),
+        own: wp.array2d(dtype=wp.float64),
+        # outputs
+        out: wp.array(dtype=wp.float64),
+    ):
+        """All that the host wants to know."""
+        out[STATUS] = wp.float64(status[0])
+        out[TRIED] = wp.float64(length[0])
+        out[PROMISED] = -promised[0]
+        out[AHEAD] = ahead[0]
+        loudest = wp.float64(0.0)
+        for i in range(own.shape[0]):
+            loudest = wp.where(own[i, 0] <= loudest, loudest, own[i, 0])
+        out[LOUD] = loudest
+        out[WHOLE_SUM] = sums[WHOLE, 0]
+        out[FREE_SUM] = sums[FREE, 0]
+
+    return Kernels(look, change, shorten, push, report)
+
+
+def judged(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Length, slope ahead [J], free force [N] and its scale [N] of a step, (1,) each, of what `ContactSteps` said.
+
+    square (1,) is as `Judge` has it.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        free = np.sqrt(said[[FREE_SUM]])
+        scale = np.sqrt(np.maximum(np.maximum(square, said[LOUD]), said[[WHOLE_SUM]] - said[FREE_SUM]))
+    ahead = np.where(np.isfinite(free) & np.isfinite(scale), said[[AHEAD]], np.inf)
+    return said[[TRIED]], ahead, free, scale
+
+
+class ContactSteps:
+    """One column's steps, in arrays that stay. Where it is may be written to between steps, by the views of `hold`.
+
+    Parameters
+    ----------
+    problem, preconditioner
+        As a `ContactDescent` has them. Every term but the barrier is constant, or has the same arrays in each batch.
+    barrier
+        The problem's.
+    compliance
+        At the nodes that can be touched, all known, and at others after them.
+    size
+        Rows 3k of the largest model of strained tissue.
+    """
+
+    def __init__(
+        self, problem: Problem, preconditioner: Preconditioner, barrier: Local, compliance: Compliance, size: int
+    ):
+        device = problem.device
+        name, exact, count = device.name, replace(device, precision="float64"), 3 * len(barrier.touchable)
+        self._problem, self._preconditioner, self._barrier, self._device = problem, preconditioner, barrier, device
+
+        def numbers(rows: int) -> wp.array:
+            return device.zeros(rows, 1)
+
+        self._u, self._smooth, self._whole, self._rest, self._x = (numbers(problem.rows) for _ in range(5))
+        self._new_u, self._new_smooth, self._new_rest = (numbers(problem.rows) for _ in range(3))
+        self._constant, self._pull, self._answer, self._pressed = (numbers(problem.rows) for _ in range(4))
+        self._force, self._found, self._here, self._there = (exact.zeros(count, 1) for _ in range(4))
+        self._balance = balance_workspace(problem, 1)
+        self._near, self._own, self._more, self._change = (numbers(len(compliance.rows)) for _ in range(4))
+        self._rows = device.array(compliance.rows, wp.int32)
+        self._touched = self._rows[:count]
+        self._nodes = wp.zeros((1, size // 3), dtype=wp.int32, device=name)
+        self._matrix = wp.zeros((1, size, size), dtype=wp.float64, device=name)
+        self._compliance = from_view(exact, compliance.columns).reshape((1, *compliance.columns.shape))
+        self._every = device.array(np.arange(len(compliance.nodes))[None], wp.int32)
+        self._model, self._ends = Softness(), Ends()
+        self._model.rest, self._model.known = self._compliance[0], device.array(compliance.known, wp.int32)
+        self._model.learnt, self._model.middle = exact.zeros(1, 0, len(compliance.rows)), exact.zeros(1, 0, 0)
+        self._model.own = wp.zeros((1, count + 1, count + 1), dtype=wp.float32, device=name)
+        self._model.rounded = FORCES.rounded
+        self._ends.iterations, self._ends.cuts = FORCES.iterations, FORCES.cuts
+        self._ends.late, self._ends.room = FORCES.late, FORCES.few
+        self._scratch = scratch_of(exact, count // 3, 1, FORCES.few)
+        self._exact, self._touch = exact, None
+        self._status = wp.zeros(1, dtype=wp.int32, device=name)
+        self._length = wp.zeros(1, dtype=device.scalar, device=name)
+        self._promised, self._ahead = (wp.zeros(1, dtype=wp.float64, device=name) for _ in range(2))
+        self._given, self._up = self._both_sides(GIVEN)
+        self._out, self._down = self._both_sides(SAID)
+        self._live = np.ones(1, bool)
+        self._graphs: dict[str, wp.Graph] = {}
+
+    def load(self, model: Model | None) -> None:
+        """Know strained tissue as a model of one column does, or none."""
+        for array in (self._nodes, self._matrix, self._model.own):
+            array.zero_()
+        if model is not None and model.wide:
+            count = model.nodes.shape[1]
+            view(self._nodes)[:, :count] = model.nodes
+            view(self._matrix)[:, : 3 * count, : 3 * count] = model.matrix
+            view(self._model.own)[:] = model.own
+
+    def aim(self, tolerance: float, drag: float) -> np.ndarray:
+        """Forces of the tools, exact to a tolerance, under a drag; the direction, and its longest step: `SAID` numbers.
+
+        Where no forces were `FOUND` all else means nothing. What is returned is written over by what comes next.
+        """
+        self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, drag
+        return self._run("aim", self._aim)
+
+    def again(self, length: float) -> np.ndarray:
+        """The same of a shorter step."""
+        self._up.numpy()[LENGTH] = length
+        return self._run("again", self._again)
+
+    def accept(self) -> None:
+        """Go where the last step led."""
+        self._run("accept", self._accept)
+
+    def stand(self, constant: wp.array) -> bool:
+        """Tools are where the problem has them, beside constant gradients (3N, 1) [N]; False where there is none."""
+        reduction = self._barrier.reduced(np.zeros(1, int))
+        if reduction is None:
+            return False
+        if self._touch is None:
+            self._touch = kernel_of(self._exact, reduction.functions), reduction.stage(np.zeros(1, int))
+        wp.copy(self._constant, constant)
+        return True
+
+    def hold(self, now: State, force: Any, rest: Any) -> tuple[State, Any, Any, Any]:
+        """Begin at a state under forces, where the body at rest moves so: views on what stands still, and on `x`."""
+        here = [view(array) for array in (self._u, self._smooth, self._whole, self._force, self._rest, self._x)]
+        for mine, its in zip(here, (now.u, now.smooth, now.whole, force, rest), strict=False):
+            mine[:] = its
+        u, smooth, whole, *others = here
+        return State(u, smooth, whole, now.free.copy(), now.scale.copy()), *others
+
+    def _run(self, name: str, work: Callable[[], None]) -> np.ndarray:
+        device = self._device
+        if name in self._graphs:
+            wp.capture_launch(self._graphs[name])
+        else:
+            work()
+        if device.on_cuda:
+            wp.synchronize_stream(wp.get_stream(device.name))
+            if name not in self._graphs:
+                with wp.ScopedCapture(device.name, force_module_load=False) as capture:
+                    work()
+                self._graphs[name] = capture.graph
+        return self._down.numpy()
+
+    def _aim(self) -> None:
+        device, k = self._device, kernels_of(self._device)
+        assert self._touch is not None
+        kernel, stage = self._touch
+        wp.copy(self._given, self._up)
+        rows_taken(device, self._rest, self._rows, self._near)
+        self._press()
+        self._more.zero_()
+        self._give(self._own, self._more, len(self._touched))
+        inputs = [self._touched, self._u, self._rest, self._more]
+        device.launch(k.look, (len(self._touched),), inputs, [self._here, self._there])
+        self._status.zero_()
+        self._found.zero_()
+        given = [self._given[TOLERANCE : TOLERANCE + 1], self._given[DRAG : DRAG + 1], 0]
+        inputs = [self._here, self._there, self._force, *given, *stage, self._model, self._ends, self._scratch]
+        blocks.launch(self._exact, kernel, 1, inputs, [self._found, self._status])
+        self._change.zero_()
+        device.launch(k.change, (len(self._touched),), [self._found, self._force], [self._change])
+        self._give(self._change, self._near, len(self._rows))
+        self._press()
+        combined(device, self._own, 1.0, self._change, self._own)
+        self._pull.zero_()
+        put_rows(device, self._own, self._rows, self._pull)
+        self._answered(self._answer)
+        combined(device, self._answer, 1.0, self._rest, self._x)
+        combined(device, self._x, -2.0, self._x, self._x)
+        self._length.fill_(1.0)
+        for term in self._problem.terms:
+            term.longest_step(self._u, self._x, self._length)
+        self._promised.zero_()
+        add_dots(device, self._whole, self._x, self._promised)
+        self._try()
+
+    def _again(self) -> None:
+        wp.copy(self._given, self._up)
+        self._device.launch(kernels_of(self._device).shorten, (1,), [self._given], [self._length])
+        self._try()
+
+    def _try(self) -> None:
+        """Take the step, see what is out of balance there, and how the body at rest would move under it."""
+        device, problem, k = self._device, self._problem, kernels_of(self._device)
+        inputs = [self._u, self._length, self._x]
+        device.launch(columns_kernels_of(device).combine, self._u.shape, inputs, [self._new_u])
+        found = balance(problem, self._new_u, self._constant, self._x, self._balance)
+        self._pressed.zero_()
+        self._barrier.add_gradient(self._new_u, self._pressed)
+        problem.constraint.project_nodes(self._pressed)
+        combined(device, found.g, -1.0, self._pressed, self._new_smooth)
+        self._ahead.zero_()
+        add_dots(device, found.g, self._x, self._ahead)
+        wp.copy(self._pull, self._new_smooth)
+        device.launch(k.push, (len(self._touched),), [self._touched, self._found], [self._pull])
+        self._answered(self._new_rest)
+        inputs = [self._status, self._length, self._promised, self._ahead, found.sums, found.own]
+        device.launch(k.report, (1,), inputs, [self._out])
+        wp.copy(self._down, self._out)
+
+    def _accept(self) -> None:
+        for to, new in (
+            (self._u, self._new_u),
+            (self._smooth, self._new_smooth),
+            (self._whole, self._balance.g),
+            (self._rest, self._new_rest),
+            (self._force, self._found),
+        ):
+            wp.copy(to, new)
+
+    def _press(self) -> None:
+        """What the model adds under the motions near the tools."""
+        self._own.zero_()
+        inputs = [self._matrix, self._nodes, self._near]
+        dim = (PARTS, 1, self._matrix.shape[2])
+        self._device.launch(press_of(self._device, wp.float64, wp.float64, PARTS), dim, inputs, [self._own])
+
+    def _give(self, force: wp.array, out: wp.array, rows: int) -> None:
+        """Add to the first `rows` how they move under forces."""
+        inputs = [self._compliance, self._every, force]
+        self._device.launch(press_of(self._device, wp.float64, wp.float64, PARTS), (PARTS, 1, rows), inputs, [out])
+
+    def _answered(self, out: wp.array) -> None:
+        """How the body at rest moves under the pull."""
+        self._problem.constraint.project_nodes(self._pull)
+        self._preconditioner.apply(self._pull, self._live, out)
+        self._problem.constraint.project_nodes(out)
+
+    def _both_sides(self, count: int) -> tuple[wp.array, wp.array]:
+        """So many numbers on the device, and as many on the host, from where a card reads without asking."""
+        there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
+        return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)
