@@ -34,50 +34,10 @@ from ..runtime.device import Device
 from ..runtime.views import columns_of, doubled, from_view, in_order, like, on_host, placed, view
 from .contact_batch import Batch, State
 from .contact_forces import BENT, FORCES, ForceLimits, Softness, scratch_of, settled
+from .contact_limits import CONTACT, ContactLimits
 from .contact_steps import PROMISED, STATUS, ContactSteps, judged
-from .contact_structs import FOUND, Scratch
+from .contact_structs import CROWDED, FOUND, Scratch
 from .strained_part import STRAINS, StrainedPart, Strains
-
-
-@dataclass(frozen=True)
-class ContactLimits:
-    """When steps are cut, damped by a drag, and left to Newton.
-
-    Parameters
-    ----------
-    forcing, enough
-        Tools' forces are exact to this share of the whole residual, or of the tolerance.
-    left, long
-        A step does well that leaves so much of the free force, and is not cut shorter than this.
-    patience
-        After so many in a row that do not, Newton goes on.
-    shortest
-        A step that is cut to less than this is not taken if what was learnt may have misled it.
-    least
-        A step so short is taken as it is.
-    stale
-        A model of strained tissue that left more than this share of the free force is made anew.
-    felt
-        [J] A step that is worth less is round-off, and nothing is learnt from it.
-    drag, growth, times
-        The first drag that is tried where one is wanted, by how much it grows and shrinks, and how often it grows.
-    crowd
-        Columns that have ended leave the batch when they are this share of it: each time everything is copied.
-    """
-
-    forcing: float = 0.03
-    enough: float = 0.1
-    left: float = 0.6
-    long: float = 0.5
-    patience: int = 10
-    shortest: float = 0.1
-    least: float = 1e-3
-    stale: float = 0.5
-    felt: float = 1e-60
-    drag: float = 0.3
-    growth: float = 3.0
-    times: int = 5
-    crowd: float = 0.125
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +61,7 @@ class ContactDescent:
     problem: Problem
     preconditioner: Preconditioner
     barrier: Local
-    limits: ContactLimits = ContactLimits()
+    limits: ContactLimits = CONTACT
     strains: Strains = STRAINS
     replays: bool = False
 
@@ -124,7 +84,7 @@ class ContactDescent:
         return StrainedPart(self.problem, self.compliance, len(self.barrier.touchable), self.strains)
 
     @cached_property
-    def _steps(self) -> ContactSteps | None:
+    def steps(self) -> ContactSteps | None:
         """Those of single columns; None where arrays change from batch to batch, or nothing is to be replayed."""
         still = all(term is self.barrier or term.constant or term.passive for term in self.problem.terms)
         if self._strained is None or not self.replays or not still:
@@ -155,8 +115,8 @@ class ContactDescent:
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
         with in_order(device):
             batch = self._begun(start)
-            if count == 1 and self._steps is not None:
-                self._replay(self._steps, batch, tolerance, most)
+            if count == 1 and self.steps is not None:
+                self._replay(self.steps, batch, tolerance, most)
             ready = np.ones(count, bool)
             while True:
                 over = ready & self._ended(batch, tolerance[live], most)
@@ -196,7 +156,7 @@ class ContactDescent:
 
     def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:
         """Take steps of a single column, until it has come to its end or tools' forces are not found at once."""
-        known, judge = None, batch.judge
+        known, judge, limits = None, batch.judge, self.limits
         if batch.model is None or not steps.stand(judge.constant):
             return
         batch.now, batch.force, batch.rest, batch.x = steps.hold(batch.now, batch.force, batch.rest)
@@ -205,10 +165,16 @@ class ContactDescent:
             if batch.model is not known:
                 known = batch.model
                 steps.load(known)
-            said = steps.aim(self._exactly(batch, tolerance)[0], batch.drag[0])
-            if said[STATUS] != FOUND:
+            said = steps.aim(self._exactly(batch, tolerance)[0], batch.drag[0], bool(self._bends(batch)[0]))
+            if said[STATUS] == CROWDED:
                 return
-            batch.waiting[:], batch.failed[:], batch.promised[:] = False, 0, said[PROMISED]
+            if self._waits(batch, said[[STATUS]] != FOUND).any():
+                return
+            if batch.waiting.any():
+                # Its model may have been forgotten.
+                known = None if batch.failed[0] % limits.times == 0 else known
+                continue
+            batch.promised[:] = said[PROMISED]
             while True:
                 t, ahead, free, scale = judged(said, judge.square)
                 there, misled = self._decided(batch, t, ahead, free)
@@ -218,7 +184,7 @@ class ContactDescent:
             if there.any():
                 steps.accept()
                 batch.now.free[:], batch.now.scale[:] = free, scale
-            else:  # its model has been forgotten
+            else:
                 known = None
 
     def _ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
@@ -246,22 +212,31 @@ class ContactDescent:
         One whose model has no equilibrium waits for the next time, dragged more; then it forgets what it has learnt. At
         last a model will do that is not convex. Others need not wait for it.
         """
-        times = self.limits.times
         self._renew(batch, wanted)
         force, found = batch.force + 0.0, np.zeros(len(wanted), bool)
-        bent = batch.failed >= 2 * times
+        bent = self._bends(batch)
         for some, limits in ((np.flatnonzero(wanted & ~bent), FORCES), (np.flatnonzero(wanted & bent), BENT)):
             if len(some):
                 on = columns_of(self.problem.device, some, len(wanted))
                 force[:, on], found[some] = self._forces(batch, some, tolerance, limits)
-        batch.waiting = wanted & ~found
-        batch.failed = np.where(batch.waiting, batch.failed + 1, 0)
-        fresh = batch.waiting & (batch.failed % times == 0)
-        batch.forget(np.flatnonzero(fresh))
-        batch.drag = np.where(fresh, 0.0, np.where(batch.waiting, self._harder(batch.drag), batch.drag))
+        over = self._waits(batch, wanted & ~found)
         some = np.flatnonzero(found)
         if len(some):
             self._direct(batch, some, force)
+        return over
+
+    def _bends(self, batch: Batch) -> np.ndarray:
+        """Which columns (b,) take a model that is not convex."""
+        return batch.failed >= 2 * self.limits.times
+
+    def _waits(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
+        """Some columns (b,) bool have found no forces, and will be dragged more; which (b,) have tried all there is."""
+        times = self.limits.times
+        batch.waiting = waiting
+        batch.failed = np.where(waiting, batch.failed + 1, 0)
+        fresh = waiting & (batch.failed % times == 0)
+        batch.forget(np.flatnonzero(fresh))
+        batch.drag = np.where(fresh, 0.0, np.where(waiting, self._harder(batch.drag), batch.drag))
         return batch.failed >= 3 * times
 
     def _direct(self, batch: Batch, some: np.ndarray, force: Any) -> None:
@@ -352,7 +327,9 @@ class ContactDescent:
         limits, now, going = self.limits, batch.now, ~(batch.waiting | batch.gone)
         far = going & goes_too_far(ahead, batch.promised) & (t > limits.least)
         batch.length, there = np.where(far, t * kept_of(ahead, batch.promised), t), going & ~far
-        misled = far & (batch.length < limits.shortest) & batch.learnt
+        misled = far & (batch.length < limits.shortest)
+        if misled.any():  # a card is asked only then
+            misled &= batch.learnt
         well = (t > limits.long) & (free <= limits.left * now.free)
         eased = np.where(batch.drag >= limits.drag, batch.drag / limits.growth, 0.0)
         worse = (t < limits.long) | (free > now.free)

@@ -151,19 +151,25 @@ def _solved(
     device, count = soft.device, len(columns)
     nodes, functions = len(here) // 3, barrier.functions
     scratch = soft.room(nodes, 1 << (count - 1).bit_length(), room)
-    ends = Ends()
-    ends.iterations, ends.cuts, ends.late, ends.room = limits.iterations, limits.cuts, limits.late, room
     out, status = device.zeros(3 * nodes, count), wp.zeros(count, dtype=wp.int32, device=device.name)
     arrays = [from_view(device, x) for x in (here, there, known)] + [device.array(x) for x in (tolerance, drag)]
     touching = barrier.stage(columns)
-    kernel, model = kernel_of(device, functions), soft.model(columns, limits.rounded)
+    kernel, model, ends = kernel_of(device, functions), soft.model(columns, limits.rounded), ends_of(limits, room)
 
     def part(first: int, stop: int) -> None:
-        launch(device, kernel, stop - first, [*arrays, first, *touching, model, ends, scratch], [out, status])
+        inputs = [*arrays, first, *touching, model, ends, scratch]
+        launch(device, kernel, stop - first, inputs, [out, status])
 
     middle = count if device.on_cuda else (count + 1) // 2
     together([partial(part, 0, middle), partial(part, middle, count)])
     return view(out), status.numpy(), view(scratch.place)[:, :count]
+
+
+def ends_of(limits: ForceLimits, room: int) -> Ends:
+    """As the kernel takes them, with room for so many touched nodes."""
+    ends = Ends()
+    ends.iterations, ends.cuts, ends.late, ends.room = limits.iterations, limits.cuts, limits.late, room
+    return ends
 
 
 def scratch_of(device: Device, nodes: int, columns: int, room: int) -> Scratch:

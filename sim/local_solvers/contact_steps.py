@@ -23,7 +23,7 @@ from ..runtime.columns import kernels_of as columns_kernels_of
 from ..runtime.device import Device, forward_kernel
 from ..runtime.views import from_view, view
 from .contact_batch import State
-from .contact_forces import FORCES, scratch_of
+from .contact_forces import BENT, FORCES, ends_of, scratch_of
 from .contact_kernel import kernel_of
 from .contact_structs import Ends
 from .contact_structs import Model as Softness
@@ -175,13 +175,11 @@ class ContactSteps:
         self._matrix = wp.zeros((1, size, size), dtype=wp.float64, device=name)
         self._compliance = from_view(exact, compliance.columns).reshape((1, *compliance.columns.shape))
         self._every = device.array(np.arange(len(compliance.nodes))[None], wp.int32)
-        self._model, self._ends = Softness(), Ends()
+        self._model = Softness()
         self._model.rest, self._model.known = self._compliance[0], device.array(compliance.known, wp.int32)
         self._model.learnt, self._model.middle = exact.zeros(1, 0, len(compliance.rows)), exact.zeros(1, 0, 0)
         self._model.own = wp.zeros((1, count + 1, count + 1), dtype=wp.float32, device=name)
         self._model.rounded = FORCES.rounded
-        self._ends.iterations, self._ends.cuts = FORCES.iterations, FORCES.cuts
-        self._ends.late, self._ends.room = FORCES.late, FORCES.few
         self._scratch = scratch_of(exact, count // 3, 1, FORCES.few)
         self._exact, self._touch = exact, None
         self._status = wp.zeros(1, dtype=wp.int32, device=name)
@@ -202,13 +200,15 @@ class ContactSteps:
             view(self._matrix)[:, : 3 * count, : 3 * count] = model.matrix
             view(self._model.own)[:] = model.own
 
-    def aim(self, tolerance: float, drag: float) -> np.ndarray:
+    def aim(self, tolerance: float, drag: float, bent: bool = False) -> np.ndarray:
         """Forces of the tools, exact to a tolerance, under a drag; the direction, and its longest step: `SAID` numbers.
 
-        Where no forces were `FOUND` all else means nothing. What is returned is written over by what comes next.
+        The model need not be convex where it is `bent`. Where no forces were `FOUND` all else means nothing. What is
+        returned is written over by what comes next.
         """
         self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, drag
-        return self._run("aim", self._aim)
+        ends = ends_of(BENT if bent else FORCES, FORCES.few)
+        return self._run("bent" if bent else "aim", lambda: self._aim(ends))
 
     def again(self, length: float) -> np.ndarray:
         """The same of a shorter step."""
@@ -251,7 +251,7 @@ class ContactSteps:
                 self._graphs[name] = capture.graph
         return self._down.numpy()
 
-    def _aim(self) -> None:
+    def _aim(self, ends: Ends) -> None:
         device, k = self._device, kernels_of(self._device)
         assert self._touch is not None
         kernel, stage = self._touch
@@ -265,7 +265,7 @@ class ContactSteps:
         self._status.zero_()
         self._found.zero_()
         given = [self._given[TOLERANCE : TOLERANCE + 1], self._given[DRAG : DRAG + 1], 0]
-        inputs = [self._here, self._there, self._force, *given, *stage, self._model, self._ends, self._scratch]
+        inputs = [self._here, self._there, self._force, *given, *stage, self._model, ends, self._scratch]
         blocks.launch(self._exact, kernel, 1, inputs, [self._found, self._status])
         self._change.zero_()
         device.launch(k.change, (len(self._touched),), [self._found, self._force], [self._change])

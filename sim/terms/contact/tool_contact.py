@@ -95,8 +95,7 @@ class Contact:
         self._pose: np.ndarray | None = None
         # A step asks for the same poses several times.
         self._stood = lru_cache(4)(self._brought)
-        # A captured graph reads the tools of a single column where they stood when it was captured.
-        self._single: Tools | None = None
+        self._single: list[Tools] = []
 
     def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
         """As `Way.stride`: through the air a tool goes as far as it can touch nothing."""
@@ -227,11 +226,15 @@ class Contact:
         if pose is not None:
             self._tools = self._standing(pose)
         if pose is not None and len(pose) == 1:
-            if self._single is None:
-                self._single = self._brought(np.ascontiguousarray(pose, np.float64).tobytes())
-            wp.copy(self._single.rotation, self._tools.rotation)
-            wp.copy(self._single.origin, self._tools.origin)
-            self._tools = self._single
+            self._tools = self._placed(self._tools)
+
+    def _placed(self, tools: Tools) -> Tools:
+        """The same, where those of a single column always are: a captured graph reads them there."""
+        if not self._single:
+            self._single.append(self._brought(np.ascontiguousarray(self._pose, np.float64).tobytes()))
+        for mine, its in ((self._single[0].rotation, tools.rotation), (self._single[0].origin, tools.origin)):
+            wp.copy(mine, its)
+        return self._single[0]
 
     def _standing(self, pose: np.ndarray) -> Tools:
         return self._stood(np.ascontiguousarray(pose, np.float64).tobytes())
