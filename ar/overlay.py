@@ -17,7 +17,7 @@ from .layer import Layer, vertex_normals
 from .parallel import load
 from .rasteriser import seen
 from .renderer import Picture
-from .window import SURROUND, with_window
+from .window import DARK, SURROUND, Lines, covering, overlaid
 
 Style = Literal["window", "contour", "fill", "none"]
 # What may not be relied on is drawn in amber, and broken, with words in a paler one, so that pixels of the outline are
@@ -35,8 +35,8 @@ GAUGE = 0.6
 BESIDE = 10
 # A motion of fewer pixels has no arrow.
 LEAST_ARROW = 4.0
-# Rows and columns of a picture from its corner on.
-WHOLE = slice(0, None), slice(0, None)
+# Of a sheet's fourth channel, where a line covers what is under it.
+OPAQUE = 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,35 +135,32 @@ def composite(
     if doubt:
         hidden, margin = replace(hidden, colour=DOUBTFUL), 0.0
         gauge = None if gauge is None else replace(gauge, error=None)
-    uncertain = bool(np.any(np.asarray(margin) > 0.0))
-    grown = hidden.vertices
-    if uncertain:
-        grown = grown + np.reshape(margin, (-1, 1)) * vertex_normals(hidden.vertices, hidden.triangles)
-    past = hidden.vertices if before is None else before.vertices
-    ends = np.zeros((0, 3)) if gauge is None else np.stack([gauge.tip, gauge.nearest])
-    surfaces = np.concatenate([hidden.vertices, grown, past])
-    box, region = box_around(camera, surfaces), box_around(camera, np.concatenate([surfaces, ends]))
-    covered = cv2.LUT(picture.segmentation, np.isin(np.arange(256), occluders).astype(np.uint8))
-    out, lines = _ground(picture, camera, box, hidden, style, occluders, covered)
-    if region is not None:
-        unlined = out[region].copy()
-        if before is not None and box is not None:
-            draw_before(out, camera, before, hidden)
-        if uncertain:
-            for outline in outlined(camera, grown, hidden.triangles):
-                dash(out, outline, [FAINT * part for part in ink_of(hidden.colour)], DASHED)
-        for ink, width in (((10.0, 12.0, 12.0), 4), (ink_of(hidden.colour), 2)):
-            for outline in lines:
-                if doubt:
-                    dash(out, outline, ink, BROKEN, width)
-                else:
-                    cv2.polylines(out, [outline], True, ink, width, cv2.LINE_AA)
+    grown = None
+    if np.any(np.asarray(margin) > 0.0):
+        normals = vertex_normals(hidden.vertices, hidden.triangles)
+        grown = replace(hidden, vertices=hidden.vertices + np.reshape(margin, (-1, 1)) * normals)
+    surfaces = [layer.vertices for layer in (hidden, grown, before) if layer is not None]
+    box = box_around(camera, np.concatenate(surfaces))
+    around = box if gauge is None else joined(box, box_around(camera, np.stack([gauge.tip, gauge.nearest])))
+    if around is None:
+        out = picture.colour.copy()
+    else:
+        part, device = camera.cropped(*around), str(picture.drawn.colour.device)
+        found = seen(part, hidden.vertices, hidden.triangles, device=device)
+        under, above = blank(part), None
+        if before is not None:
+            draw_before(under, camera, around, before, hidden)
+        ink = ink_of(hidden.colour)
+        if grown is not None:
+            margin_mask = seen(part, grown.vertices, grown.triangles, device=device).mask
+            dash(under, outlines(margin_mask), [FAINT * share for share in ink], DASHED, 1)
+        if doubt:
+            dash(under, outlines(found.mask), ink, BROKEN)
         if gauge is not None:
-            draw_line(out, camera, gauge)
-        same = cv2.inRange(cv2.absdiff(out[region], unlined), (0, 0, 0), (0, 0, 0))
-        taken[region] = (same == 0) & (covered[region] == 0)
-        # A view of columns is none of OpenCV's own arrays: it would write to a copy.
-        out[region] = cv2.copyTo(unlined, covered[region], out[region])
+            above = blank(part)
+            draw_line(above, part, gauge)
+        lines = Lines(ink, not doubt, under, above)
+        out, taken[around] = overlaid(picture.drawn, around, part, hidden, found, occluders, style, lines)
     drawn = Overlaid(out, taken)
     # The corner first, so that its words never move; then by importance, for where there is no room some are left out.
     if before is not None and box is not None:
@@ -171,33 +168,16 @@ def composite(
         lay(out, taken, [f"moved {millimetres(motion, float(np.max(margin)) or None)}"], (0, camera.height))
     write_doubt(drawn, doubt)
     if gauge is not None:
-        write_gauge(drawn, camera, gauge, covered)
+        write_gauge(drawn, camera, gauge, cv2.LUT(picture.segmentation, covering(tuple(occluders))))
     return drawn
 
 
-def _ground(
-    picture: Picture,
-    camera: Camera,
-    box: tuple[slice, slice] | None,
-    hidden: Layer,
-    style: Style,
-    occluders: Sequence[int],
-    covered: np.ndarray,
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The picture (H, W, 3) uint8 with window or tint, a copy, and the hidden surface's outlines; all lies in `box`."""
-    if box is None:
-        return picture.colour.copy(), []
-    here, device = camera.cropped(*box), str(picture.drawn.colour.device)
-    found = seen(here, hidden.vertices, hidden.triangles, device=device)
-    mask = found.mask
-    lines = outlines(mask, box)
-    if style == "window":
-        return with_window(picture.drawn, box, here, hidden, found, mask, occluders), lines
-    out = picture.colour.copy()
-    if style == "fill":
-        tinted = mask & (covered[box] == 0)
-        out[box][tinted] = 0.55 * out[box][tinted] + 0.45 * np.array(ink_of(hidden.colour))
-    return out, lines
+def joined(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> tuple[slice, slice] | None:
+    """The rows and columns that hold two boxes."""
+    if a is None or b is None:
+        return a or b
+    rows, columns = (slice(min(i.start, j.start), max(i.stop, j.stop)) for i, j in zip(a, b, strict=True))
+    return rows, columns
 
 
 def ink_of(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
@@ -206,18 +186,37 @@ def ink_of(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, floa
     return red, green, blue
 
 
-def draw_before(ground: np.ndarray, camera: Camera, before: Layer, hidden: Layer) -> None:
-    """Draw where the hidden surface was, dotted, and an arrow from its middle there to its middle now, in place."""
-    for outline in outlined_before(camera, before):
-        for ink, width in (((10.0, 12.0, 12.0), 4), (ink_of(BEFORE), 2)):
-            dash(ground, outline, ink, DOTTED, width)
-    ends, depth = camera.project(np.stack([before.vertices.mean(axis=0), hidden.vertices.mean(axis=0)]))
+def blank(camera: Camera) -> np.ndarray:
+    """A sheet (h, w, 4) uint8 for lines: colour times coverage, and coverage."""
+    return np.zeros((camera.height, camera.width, 4), np.uint8)
+
+
+def draw_before(sheet: np.ndarray, camera: Camera, box: tuple[slice, slice], before: Layer, hidden: Layer) -> None:
+    """Draw where the hidden surface was, dotted, and an arrow from its middle there to its middle now, in place.
+
+    The sheet is that of the picture's rows and columns `box`, which hold both surfaces.
+    """
+    there = box_around(camera, before.vertices)
+    if there is not None:
+        rows, columns = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(there, box, strict=True))
+        sheet[rows, columns] = dotted(camera, before)
+    middles = np.stack([before.vertices.mean(axis=0), hidden.vertices.mean(axis=0)])
+    ends, depth = camera.cropped(*box).project(middles)
     length = float(np.linalg.norm(ends[1] - ends[0]))
     if (depth <= 0.0).any() or not length >= LEAST_ARROW:
         return
     start, end = (tuple(each) for each in np.clip(ends, -1e4, 1e4).round().astype(int).tolist())
-    for ink, width in (((10.0, 12.0, 12.0), 4), (ink_of(BEFORE), 2)):
-        cv2.arrowedLine(ground, start, end, ink, width, cv2.LINE_AA, tipLength=min(0.5, 6.0 / length))
+    for ink, width in ((DARK, 4), (ink_of(BEFORE), 2)):
+        cv2.arrowedLine(sheet, start, end, (*ink, OPAQUE), width, cv2.LINE_AA, tipLength=min(0.5, 6.0 / length))
+
+
+@lru_cache(maxsize=4)
+def dotted(camera: Camera, layer: Layer) -> np.ndarray:
+    """The dotted outline of a layer that stays, on the sheet of the box around it: drawn once for a camera."""
+    part = camera.cropped(*box_around(camera, layer.vertices))
+    sheet = blank(part)
+    dash(sheet, outlines(silhouette(part, layer.vertices, layer.triangles)), ink_of(BEFORE), DOTTED)
+    return sheet
 
 
 def box_around(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None:
@@ -236,46 +235,40 @@ def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray) -> n
     return seen(camera, vertices, triangles).mask
 
 
-def outlined(camera: Camera, vertices: np.ndarray, triangles: np.ndarray) -> list[np.ndarray]:
-    """Closed outlines of a surface seen alone, each (n, 1, 2) int32 pixels."""
-    box = box_around(camera, vertices)
-    return [] if box is None else outlines(silhouette(camera.cropped(*box), vertices, triangles), box)
-
-
-@lru_cache(maxsize=4)
-def outlined_before(camera: Camera, layer: Layer) -> list[np.ndarray]:
-    """The same of a layer that stays: found once."""
-    return outlined(camera, layer.vertices, layer.triangles)
-
-
 def iou(a: np.ndarray, b: np.ndarray) -> float:
     """Intersection over union of two masks (H, W); 0 when both are empty, for nothing seen is no agreement."""
     union = np.count_nonzero(a | b)
     return float(np.count_nonzero(a & b) / union) if union else 0.0
 
 
-def outlines(mask: np.ndarray, box: tuple[slice, slice] = WHOLE) -> list[np.ndarray]:
-    """Closed outlines of a mask (H, W), each (n, 1, 2) int32 pixels of the picture that the mask is a box of."""
-    corner = box[1].start, box[0].start
-    return list(cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=corner)[0])
+def outlines(mask: np.ndarray) -> list[np.ndarray]:
+    """Closed outlines of a mask (H, W), each (n, 1, 2) int32 pixels."""
+    return list(cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
 
 
-def dash(out: np.ndarray, outline: np.ndarray, ink: Sequence[float], pattern: tuple[int, int], width: int = 1) -> None:
-    """Draw strokes of an outline (n, 1, 2) with gaps, both of so many pixels as `pattern` says, in place."""
+def dash(
+    out: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], pattern: tuple[int, int], width: int = 2
+) -> None:
+    """Draw strokes of outlines, each (n, 1, 2), with gaps, both of so many pixels as `pattern` says, in place.
+
+    A line of more than one pixel has a dark rim.
+    """
     stroke, gap = pattern
-    strokes = [outline[start : start + stroke] for start in range(0, len(outline), stroke + gap)]
-    cv2.polylines(out, strokes, False, ink, width, cv2.LINE_AA)
+    strokes = [line[start : start + stroke] for line in lines for start in range(0, len(line), stroke + gap)]
+    if width > 1:
+        cv2.polylines(out, strokes, False, (*DARK, OPAQUE), width + 2, cv2.LINE_AA)
+    cv2.polylines(out, strokes, False, (*ink, OPAQUE), width, cv2.LINE_AA)
 
 
-def draw_line(out: np.ndarray, camera: Camera, gauge: Gauge) -> None:
+def draw_line(sheet: np.ndarray, camera: Camera, gauge: Gauge) -> None:
     """Draw the gauge's line, in place; nothing when an end lies behind the camera."""
     ends, depth = camera.project(np.stack([gauge.tip, gauge.nearest]))
     if (depth <= 0.0).any():
         return
     tip, nearest = (tuple(end) for end in np.clip(ends, -1e4, 1e4).round().astype(int).tolist())
-    cv2.line(out, tip, nearest, (12, 14, 16), 3, cv2.LINE_AA)
-    cv2.line(out, tip, nearest, (250, 250, 250), 1, cv2.LINE_AA)
-    cv2.circle(out, nearest, 3, (250, 250, 250), -1, cv2.LINE_AA)
+    cv2.line(sheet, tip, nearest, (12, 14, 16, OPAQUE), 3, cv2.LINE_AA)
+    cv2.line(sheet, tip, nearest, (250, 250, 250, OPAQUE), 1, cv2.LINE_AA)
+    cv2.circle(sheet, nearest, 3, (250, 250, 250, OPAQUE), -1, cv2.LINE_AA)
 
 
 def write_gauge(drawn: Overlaid, camera: Camera, gauge: Gauge, covered: np.ndarray) -> None:

@@ -9,6 +9,8 @@ import numpy as np
 PAD, CLEAR = 8, 6
 # Places are tried at every so many pixels.
 STEP = 4
+# Places so far from the wish are tried before all others [pixel].
+REACHES = 64, 256
 # So many times as far as a place to its side a place is that lies above: lines of text go below each other.
 ASIDE = 2
 
@@ -32,12 +34,26 @@ def free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) 
     near = taken[row - CLEAR : row + tall + CLEAR, column - CLEAR : column + wide + CLEAR]
     if not near.any():
         return column, row
-    columns, rows = np.arange(PAD, right + 1, STEP), np.arange(PAD, low + 1, STEP)
-    # What is taken above and left of each pixel: the box's share of it is a sum of four.
-    sums = cv2.integral((taken > 0).astype(np.uint8))
-    top, low, left, right = rows[:, None] - CLEAR, rows[:, None] + tall + CLEAR, columns - CLEAR, columns + wide + CLEAR
-    inside = sums[low, right] - sums[top, right] - sums[low, left] + sums[top, left]
-    far = (ASIDE * (columns - column)) ** 2 + ((rows - row) ** 2)[:, None]
-    best = np.where(inside == 0, far, np.inf)
-    at = np.unravel_index(best.argmin(), best.shape)
-    return (int(columns[at[1]]), int(rows[at[0]])) if np.isfinite(best[at]) else None
+    whole = ASIDE * width + height
+    for reach in (*REACHES, whole):
+        # All places that may be as near as that, and what is taken round them.
+        columns, rows = within(column, reach // ASIDE, right), within(row, reach, low)
+        top, left = rows[0] - CLEAR, columns[0] - CLEAR
+        there = taken[top : rows[-1] + tall + CLEAR, left : columns[-1] + wide + CLEAR]
+        # What is taken above and left of each pixel: the box's share of it is a sum of four.
+        sums = cv2.integral((there > 0).astype(np.uint8))
+        up, aside = rows[:, None] - CLEAR - top, columns - CLEAR - left
+        down, across = up + tall + 2 * CLEAR, aside + wide + 2 * CLEAR
+        inside = sums[down, across] - sums[up, across] - sums[down, aside] + sums[up, aside]
+        far = (ASIDE * (columns - column)) ** 2 + ((rows - row) ** 2)[:, None]
+        best = np.where(inside == 0, far, np.inf)
+        at = np.unravel_index(best.argmin(), best.shape)
+        if best[at] <= reach**2:
+            return int(columns[at[1]]), int(rows[at[0]])
+    return None
+
+
+def within(middle: int, reach: int, last: int) -> np.ndarray:
+    """The tried places PAD, PAD + STEP, ... up to `last` that are at most `reach` from a middle."""
+    places = np.arange(PAD, last + 1, STEP)
+    return places[np.abs(places - middle) <= reach]
