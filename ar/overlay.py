@@ -213,7 +213,9 @@ def draw_before(sheet: np.ndarray, camera: Camera, box: tuple[slice, slice], bef
 @lru_cache(maxsize=4)
 def dotted(camera: Camera, layer: Layer) -> np.ndarray:
     """The dotted outline of a layer that stays, on the sheet of the box around it: drawn once for a camera."""
-    part = camera.cropped(*box_around(camera, layer.vertices))
+    box = box_around(camera, layer.vertices)
+    assert box is not None
+    part = camera.cropped(*box)
     sheet = blank(part)
     dash(sheet, outlines(silhouette(part, layer.vertices, layer.triangles)), ink_of(BEFORE), DOTTED)
     return sheet

@@ -111,7 +111,7 @@ def sheet(lines: np.ndarray | None, device: str) -> wp.array:
 
 
 def from_edge(seen: Seen) -> wp.array:
-    """How far each pixel is from the edge of a silhouette (h, w) [pixel], as far as the rim reaches: a chamfer distance.
+    """How far each pixel (h, w) is from a silhouette's edge [pixel], as far as the rim reaches: a chamfer distance.
 
     OpenCV's on the processor, and the same by kernels on a card.
     """
@@ -206,7 +206,7 @@ def find_distance(
 def smooth_distance(
     row: wp.int32, column: wp.int32, away: wp.array2d(dtype=wp.float32), nearest: wp.array2d(dtype=wp.uint64)
 ) -> wp.float32:
-    """How far a pixel is outside the silhouette's edge, below 0 inside: the mean of nine, in which steps do not show."""
+    """How far a pixel is outside the silhouette, below 0 inside: the mean of nine, in which steps do not show."""
     total = wp.float32(0.0)
     for i in range(-1, 2):
         for j in range(-1, 2):

@@ -51,8 +51,7 @@ def worst_picture(study: Study, answer: np.ndarray) -> np.ndarray:
     picture = stage.picture(camera, there, tool.pose(tip, site.axis, site.right))
     shown = composite(picture, camera, stage.tumour(predicted), (TOOL,), "window").colour
     reference = stage.tumour(there)
-    for outline in outlines(silhouette(camera, reference.vertices, reference.triangles)):
-        dash(shown, outline, YELLOW, DASHED)
+    dash(shown, outlines(silhouette(camera, reference.vertices, reference.triangles)), YELLOW, DASHED, 1)
     force = float(np.linalg.norm(pushed.force[worst]))
     lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"off by up to {1e3 * distance[worst]:.3f} mm"]
     return panel(shown, lines)
