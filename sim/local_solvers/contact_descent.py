@@ -155,7 +155,10 @@ class ContactDescent:
         )  # fmt: skip
 
     def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:
-        """Take steps of a single column, until it has come to its end or tools' forces are not found at once."""
+        """Take steps of a single column in arrays that stay, until it has come to its end.
+
+        Or until it wants what the others do: more touched nodes than there is room for, or Newton.
+        """
         known, judge, limits = None, batch.judge, self.limits
         if batch.model is None or not steps.stand(judge.constant):
             return
@@ -184,7 +187,7 @@ class ContactDescent:
             if there.any():
                 steps.accept()
                 batch.now.free[:], batch.now.scale[:] = free, scale
-            else:
+            else:  # it has forgotten its model
                 known = None
 
     def _ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:

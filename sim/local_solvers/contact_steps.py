@@ -190,11 +190,11 @@ class ContactSteps:
         self._live = np.ones(1, bool)
         self._graphs: dict[str, wp.Graph] = {}
 
-    def load(self, model: Model | None) -> None:
-        """Know strained tissue as a model of one column does, or none."""
+    def load(self, model: Model) -> None:
+        """Know strained tissue as a model of one column does."""
         for array in (self._nodes, self._matrix, self._model.own):
             array.zero_()
-        if model is not None and model.wide:
+        if model.wide:
             count = model.nodes.shape[1]
             view(self._nodes)[:, :count] = model.nodes
             view(self._matrix)[:, : 3 * count, : 3 * count] = model.matrix
