@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import re
 import sys
 import warnings
@@ -44,12 +45,17 @@ READING = ("judge", "export", "scenes", "effects", "demo", "render", "collect", 
 INNER = {"bench": tuple(BENCHES)}
 
 
+# More threads of a library's wait for one another: products here are small.
+MOST_THREADS = 4
+
 POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+")
 """A point whose first coordinate is negative, which argparse would take for an option."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0 (done), 1 (ran, but did not reach what was asked) or 2 (bad input)."""
+    if argv is None:
+        limit_threads()
     arguments = with_points(sys.argv[1:] if argv is None else argv)
     asked = arguments[0] if arguments else None
     inner = INNER.get(asked or "", ())
@@ -65,6 +71,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"sulcus {args.command}: {error}", file=sys.stderr)
         return 2
+
+
+def limit_threads() -> None:
+    """Hold libraries that are not loaded yet to `MOST_THREADS`, here and in processes to come, if nobody said more."""
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, str(min(MOST_THREADS, os.cpu_count() or 1)))
 
 
 def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:

@@ -176,7 +176,7 @@ def test_a_frame_finds_the_resting_tool_and_the_nearest_point_once(play, monkeyp
     found = []
     for place, name in (
         ("scenes.play.player", "resting_tip"),
-        ("sim.bodies.tip_distance", "resting_tip"),
+        ("sim.bodies.tip_distance", "resting_tips"),
         ("scenes.play.player", "closest"),
         ("sim.bodies.tip_distance", "closest"),
     ):

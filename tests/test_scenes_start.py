@@ -1,5 +1,6 @@
 """`sulcus demo` from its start to the first picture."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -8,7 +9,7 @@ import pytest
 from theatres import put, theatre_of
 from visitor import free_port
 
-from scenes.cli import main
+from scenes.cli import limit_threads, main
 from scenes.play.page import Demo
 from scenes.play.page_cast import Cast
 from scenes.play.waiting_notice import Busy
@@ -41,3 +42,17 @@ def test_the_page_opens_while_kernels_are_compiled_and_plays_when_they_are(name,
     assert main(["demo", "--anatomy", str(path), "--deformer", name, "--port", str(free_port())]) == 0
     waits = "compiling; the next start finds it done"
     assert done == [waits, "compiled", *(["answered"] if name == "linear" else []), "plays"]
+
+
+@pytest.mark.parametrize(
+    ("cores", "said", "most"), [(64, None, "4"), (2, None, "2"), (64, "7", "7"), (None, None, "1")]
+)
+def test_libraries_use_few_threads_unless_somebody_asks_for_more(monkeypatch, cores, said, most):
+    monkeypatch.setattr("os.cpu_count", lambda: cores)
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+    for name in names:
+        monkeypatch.setenv(name, said or "")
+        if said is None:
+            monkeypatch.delenv(name)
+    limit_threads()
+    assert [os.environ[name] for name in names] == [most, most]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from sim.geometry.ball_at_rest import resting_tip
+from sim.geometry.ball_at_rest import resting_tip, resting_tips
 
 DOWN = np.array([0.0, 0.0, -1.0])
 RADIUS = 7e-3
@@ -120,3 +120,18 @@ def test_triangles_without_area_are_edges_or_points():
 def test_a_ball_that_passes_by_is_reported():
     with pytest.raises(InputError, match="passes the surface by"):
         resting_tip(CORNERS, ONE, np.array([0.02, -0.008, 0.1]), DOWN, RADIUS)
+
+
+def test_many_balls_rest_where_each_would_alone():
+    """Surfaces, lines and radii of their own, of which one ball passes its surface by."""
+    nodes, triangles = landscape(4)
+    random = np.random.default_rng(4)
+    surfaces = nodes + random.normal(scale=1e-3, size=(9, *nodes.shape))
+    through = np.append(random.uniform(-0.01, 0.01, (9, 2)), random.uniform(-0.1, 0.1, (9, 1)), axis=1)
+    radius = random.uniform(1e-3, 8e-3, 9)
+    tips = resting_tips(surfaces, triangles, through, DOWN, radius)
+    alone = [resting_tip(*each, DOWN, r) for *each, r in zip(surfaces, [triangles] * 9, through, radius, strict=True)]
+    assert tips == pytest.approx(np.array(alone), abs=1e-15)
+    through[7, 0] = 1.0
+    with pytest.raises(InputError, match=rf"a ball of {1e3 * radius[7]:.3g} mm passes the surface by"):
+        resting_tips(surfaces, triangles, through, DOWN, radius)

@@ -21,14 +21,22 @@ Spec = Elements | Learner
 FAMILY = {Elements: "finite elements", Learner: "learnt"}
 
 
+def ready() -> None:
+    """Does nothing, in a process that has then imported all that rows need."""
+
+
 def measured(study: Study, spec: Spec, picture: Path) -> Row:
     """The row of a deformer, and the picture of its worst case; what cannot be had says why in `Row.state`."""
     try:
-        with watched_card(study.device) as card:
-            row, field = measure_elements(study, spec) if isinstance(spec, Elements) else _on_one_core(study, spec)
+        if isinstance(spec, Elements):
+            with watched_card(study.device) as taken:
+                row, field = measure_elements(study, spec)
+            row = replace(row, card=max(taken) / 2**30 or None)
+        else:
+            row, field = _on_one_core(study, spec)
     except InputError as error:
         return Row(spec.name, FAMILY[type(spec)], state=str(error))
-    row = replace(row, memory=peak_memory(), card=max(card) / 2**30 or None)
+    row = replace(row, memory=peak_memory())
     if field.shape[1] < len(study.anatomy.tumour_nodes):
         return row  # what knows some vertices alone has no surface to draw
     # What pictures take is not the row's.

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
-from itertools import product
+from functools import partial
+from itertools import groupby, product
 from multiprocessing import get_context
 from pathlib import Path
+from threading import BoundedSemaphore
 
 import msgspec
 import numpy as np
@@ -23,7 +28,7 @@ from surrogate.training.train import LEARNERS
 
 from .finite_elements import HALVED, OWN, STANDARD, Elements
 from .learner import Learner
-from .measure import FAMILY, Spec, measured
+from .measure import FAMILY, Spec, measured, ready
 from .row import Row
 from .study import Study
 
@@ -31,6 +36,8 @@ ELEMENTS = ("p1", "smoothed", "p2")
 MESHES = {"2.5k": "2500", "17k": "17000"}
 TOLERANCES = (1e-2, 1e-3, STANDARD, 1e-5, 1e-6)
 Run = Callable[[Study, Spec, Path], Row]
+# Cores for each learner that is measured, of which it uses one; with so many the next process is made ready besides.
+CORES = 4
 
 
 def star(study: Study, remesh: bool = True) -> tuple[Elements, ...]:
@@ -64,32 +71,59 @@ def learners() -> tuple[Learner, ...]:
     return tuple(Learner(name) for name in (*LEARNERS, *MACHINES))
 
 
-def apart(study: Study, spec: Spec, picture: Path) -> Row:
-    """Measured in a process of its own."""
+def apart(turn: AbstractContextManager[object], study: Study, spec: Spec, picture: Path) -> Row:
+    """Measured in a process of its own, which starts at once and measures in its `turn`."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         try:
-            # What the study has read already stays here.
-            return pool.submit(measured, replace(study), spec, picture).result()
+            pool.submit(ready).result()
+            with turn:
+                # What the study has read already stays here.
+                return pool.submit(measured, replace(study), spec, picture).result()
         except BrokenProcessPool:
             return Row(spec.name, FAMILY[type(spec)], state="its process was ended, for want of memory most likely")
 
 
-def rows(study: Study, specs: Sequence[Spec], run: Run = apart) -> Iterator[Row]:
+def rows(study: Study, specs: Sequence[Spec], run: Run | None = None, cores: int | None = None) -> Iterator[Row]:
     """A row for each of the `specs`; those whose inputs are the same as before are read.
 
-    A row is kept as soon as it is measured, unless it could not be.
+    A row is kept as soon as it is measured, unless it could not be. By default each has a process of its own. Finite
+    elements are measured one by one; of learners one for every `CORES` of the machine's cores.
     """
-    for spec in specs:
-        stem = f"{study.data.stem} {spec.name}".replace(" ", "-")
-        path = study.folder / "rows" / f"{stem}.json"
-        digest = _digest(study, spec)
-        kept = _kept(path, digest)
-        if kept is None:
-            kept = run(study, spec, study.folder / "pictures" / f"{stem}.png")
-            if kept.state == "measured":
-                with written_whole(path, ".json") as partial:
-                    partial.write_text(json.dumps({"digest": digest, "row": asdict(kept)}))
-        yield kept
+    cores = cores or os.cpu_count() or 1
+    for kind, alike in groupby(specs, type):
+        together = 1 if kind is Elements else max(1, cores // CORES)
+        measuring = run or partial(apart, BoundedSemaphore(together))
+        ahead = together if cores >= CORES else 0
+        yield from _ahead(partial(_row, study, measuring), list(alike), ahead)
+
+
+def _ahead(work: Callable[[Spec], Row], specs: Sequence[Spec], ahead: int) -> Iterator[Row]:
+    """The rows in order; so many more are under way while one is waited for. Of the others none begins after a stop."""
+    waiting: deque[Future[Row]] = deque()
+    with ThreadPoolExecutor(ahead + 1) as threads:
+        try:
+            for spec in specs:
+                waiting.append(threads.submit(work, spec))
+                if len(waiting) > ahead:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def _row(study: Study, run: Run, spec: Spec) -> Row:
+    stem = f"{study.data.stem} {spec.name}".replace(" ", "-")
+    path = study.folder / "rows" / f"{stem}.json"
+    digest = _digest(study, spec)
+    kept = _kept(path, digest)
+    if kept is None:
+        kept = run(study, spec, study.folder / "pictures" / f"{stem}.png")
+        if kept.state == "measured":
+            with written_whole(path, ".json") as unfinished:
+                unfinished.write_text(json.dumps({"digest": digest, "row": asdict(kept)}))
+    return kept
 
 
 def _power(tolerance: float) -> str:

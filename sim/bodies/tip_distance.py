@@ -9,7 +9,7 @@ import numpy as np
 
 from ..anatomy import Anatomy
 from ..errors import InputError
-from ..geometry.ball_at_rest import resting_tip
+from ..geometry.ball_at_rest import resting_tips
 from ..geometry.closest_point import closest
 from ..loads import Loads, Pushed, Touching
 from .open_cortex import OpenCortex, open_cortex
@@ -119,10 +119,10 @@ class TipGauge:
         for first in range(0, len(loads), self.together):
             some = slice(first, first + self.together)
             _, triangle, weights = closest(pushed.point[some], rest[triangles])
-            for case, at, share in zip(range(first, len(loads)), triangle, weights, strict=False):
-                surface = rest + displacement[case, row]
-                through = share @ surface[triangles[at]]
-                tips[case] = resting_tip(surface, triangles, through, axis, float(pushed.footprint[case]))
+            surface = rest + displacement[some][:, row]
+            corners = surface[np.arange(len(surface))[:, None], triangles[triangle]]
+            through = np.einsum("bc,bci->bi", weights, corners)
+            tips[some] = resting_tips(surface, triangles, through, axis, pushed.footprint[some])
         return tips - lift * axis
 
 

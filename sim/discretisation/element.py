@@ -92,37 +92,41 @@ def quadratic_slopes(corner: np.ndarray) -> np.ndarray:
     return slope[:, :, 1:] - slope[:, :, :1]
 
 
-def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray, together: int = 20_000_000) -> sp.csc_array:
+def hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray, together: int = 8_000_000) -> sp.csc_array:
     """Stiffness at rest (3N, 3N) [N/m] of isotropic elements with Lamé's mu, lam (T,) [Pa].
 
-    K_ab = integral of mu (g_a . g_b I + g_b (x) g_a) + lambda g_a (x) g_b. Element matrices are summed in parts of so
-    many entries `together`, which bounds the memory that it takes.
+    K = integral of 2 mu E^T E + lambda D^T D, with the strains E and the change of volume D of a motion. See Hughes
+    2000, "The Finite Element Method", section 2.8. It is summed by products of sparse matrices, as elements have any
+    number of nodes. Parts of so many numbers `together` bound the memory that it takes.
     """
-    rows = 3 * elements.nodes
-    total = sp.csc_array((rows, rows))
-    count, most = elements.table.shape
-    size = np.full(count, most) if elements.size is None else elements.size
-    for places in np.unique(size):
-        alike = np.flatnonzero(size == places)
-        for part in np.array_split(alike, -(-len(alike) * 9 * places**2 // together)):
-            total += _assembled(elements, part, int(places), mu[part], lam[part])
-    return total
+    total = sp.csr_array((3 * elements.nodes,) * 2)
+    count, points, most = elements.gradient.shape[:3]
+    for part in np.array_split(np.arange(count), max(1, -(-count * points * most * 18 // together))):
+        table = np.repeat(elements.table[part], points, axis=0)
+        size = np.full(len(table), most) if elements.size is None else np.repeat(elements.size[part], points)
+        used = np.arange(most) < size[:, None]
+        column, start = table[used], np.append(0, np.cumsum(size))
+        slope = elements.gradient[part].reshape(-1, most, 3)[used]
+        for modulus, of in ((2.0 * mu[part], _strain), (lam[part], _volume_change)):
+            if modulus.any():
+                blocks, weight = of(slope), (modulus[:, None] * elements.weight[part]).ravel()
+                shape = blocks.shape[1] * len(table), 3 * elements.nodes
+                scaled = np.repeat(weight, size)[:, None, None] * blocks
+                left, right = (sp.bsr_array((each, column, start), shape) for each in (blocks, scaled))
+                total += (left.T @ right).tocsr()
+    return sp.csc_array(total.T)  # symmetric
 
 
-def _assembled(elements: Elements, part: np.ndarray, size: int, mu: np.ndarray, lam: np.ndarray) -> sp.csc_array:
-    g, w = elements.gradient[part, :, :size], elements.weight[part]
-    slopes = g.reshape(len(part), -1, 3 * size)
-    outer = (np.swapaxes(slopes * w[:, :, None], 1, 2) @ slopes).reshape(len(part), size, 3, size, 3)
-    outer = outer.transpose(0, 1, 3, 2, 4)  # g_a (x) g_b as blocks (T, a, b, 3, 3)
-    blocks = lam[:, None, None, None, None] * outer + mu[:, None, None, None, None] * np.swapaxes(outer, 3, 4)
-    dots = mu[:, None, None] * np.trace(outer, axis1=3, axis2=4)
+def _volume_change(slope: np.ndarray) -> np.ndarray:
+    """Blocks (M, 1, 3) of the divergence, of shape functions with gradients (M, 3)."""
+    return slope[:, None]
+
+
+def _strain(slope: np.ndarray) -> np.ndarray:
+    """Blocks (M, 6, 3) of the small strain in Mandel's order (xx, yy, zz, and root 2 times yz, xz, xy)."""
+    blocks = np.zeros((len(slope), 6, 3))
     for i in range(3):
-        blocks[..., i, i] += dots
-    table = elements.table[part, :size].astype(np.int64)
-    pair = (table[:, :, None] * elements.nodes + table[:, None, :]).ravel()
-    order = np.argsort(pair, kind="stable")
-    first = np.flatnonzero(np.diff(pair[order], prepend=-1))
-    row, column = np.divmod(pair[order[first]], elements.nodes)
-    summed = np.add.reduceat(blocks.reshape(-1, 9)[order], first, axis=0).reshape(-1, 3, 3)
-    start = np.searchsorted(row, np.arange(elements.nodes + 1))
-    return sp.csc_array(sp.bsr_array((summed, column, start), shape=(3 * elements.nodes,) * 2).tocsr().T)  # symmetric
+        blocks[:, i, i] = slope[:, i]
+    for row, (i, j) in enumerate(((1, 2), (0, 2), (0, 1)), start=3):
+        blocks[:, row, i], blocks[:, row, j] = np.sqrt(0.5) * slope[:, j], np.sqrt(0.5) * slope[:, i]
+    return blocks

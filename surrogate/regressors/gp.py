@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, get_lapack_funcs, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
@@ -119,7 +119,9 @@ def negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[
     misfit = np.einsum("nr,nr->r", y, dual)
     value = 0.5 * count * np.log(misfit / count).sum() + outputs * np.log(np.diagonal(factor[0])).sum()
     # The derivative by K, of which every other is a trace with dK (equation 5.9).
-    slope = outputs * cho_solve(factor, np.eye(count), check_finite=False)
+    (inverted,) = get_lapack_funcs(("potri",), factor[:1])
+    lower, _ = inverted(factor[0], lower=True)
+    slope = outputs * (np.tril(lower) + np.tril(lower, -1).T)
     slope -= dual * (count / misfit) @ dual.T
     s = np.sqrt(5.0) * distance
     pull = slope * (5.0 / 3.0 * (1.0 + s) * np.exp(-s))  # dK / d log(length_j) = this x (u_ij - u_kj)^2

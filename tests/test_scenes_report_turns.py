@@ -1,0 +1,71 @@
+"""`sulcus report`: which rows are measured at the same time, and what happens when one of them stops."""
+
+import threading
+from contextlib import contextmanager
+
+import pytest
+from conftest import make_box
+from studies import study_of
+
+from scenes.report.finite_elements import Elements
+from scenes.report.learner import Learner
+from scenes.report.row import Row
+from scenes.report.rows import apart, rows
+
+SPECS = (*(Elements(f"fem {k}") for k in range(4)), *(Learner(f"learner {k}") for k in range(9)))
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    return study_of(tmp_path_factory.mktemp("report"), make_box(tumour=9e-3, depth=12e-3, opening=20e-3), 60)
+
+
+class Rows:
+    """Rows that take as long as others that may be under way with them; "fail" is the name of one that is stopped."""
+
+    def __init__(self, fail=""):
+        self.fail, self.begun, self.now, self.most, self.lock = fail, [], {}, {}, threading.Lock()
+
+    def __call__(self, study, spec, picture):
+        kind = type(spec)
+        with self.lock:
+            self.begun.append(spec.name)
+            self.now[kind] = self.now.get(kind, 0) + 1
+            self.most[kind] = max(self.most.get(kind, 0), self.now[kind])
+        threading.Event().wait(0.05)
+        with self.lock:
+            self.now[kind] -= 1
+        if spec.name == self.fail:
+            raise KeyboardInterrupt
+        return Row(spec.name, "some", state="not kept")
+
+
+@pytest.mark.parametrize(("cores", "elements", "learners"), [(2, 1, 1), (4, 2, 2), (16, 2, 5)])
+def test_learners_are_measured_side_by_side_where_there_are_cores(study, cores, elements, learners):
+    run = Rows()
+    assert [row.name for row in rows(study, SPECS, run, cores)] == [spec.name for spec in SPECS]
+    assert run.most[Elements] == elements and run.most[Learner] == learners
+
+
+@pytest.mark.parametrize("cores", [2, 16])
+def test_after_a_stop_no_row_begins(study, cores):
+    run = Rows("learner 1")
+    with pytest.raises(KeyboardInterrupt):
+        list(rows(study, SPECS, run, cores))
+    under_way = 0 if cores == 2 else 5
+    assert set(run.begun) <= {spec.name for spec in SPECS[: 6 + under_way]}
+    assert {spec.name for spec in SPECS[:6]} <= set(run.begun)
+
+
+def test_a_row_has_its_turn_when_its_process_is_ready(study, tmp_path):
+    """What cannot be had is said, and the turn is given back."""
+    turns = []
+
+    @contextmanager
+    def turn():
+        turns.append("begins")
+        yield
+        turns.append("ends")
+
+    row = apart(turn(), study, Elements("FEM odd law", law="odd"), tmp_path / "odd.png")
+    assert turns == ["begins", "ends"] and "odd" in row.state and row.state != "measured"
