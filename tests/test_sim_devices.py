@@ -27,9 +27,10 @@ def test_a_list_names_devices_one_by_one(words, names):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        ("cpu,abacus", "no device 'abacus' here: choose auto or one of cpu"),
-        ("cpu,", "no device '' here"),
-        ("", "no device '' here"),
+        ("all,cpu", "names devices beside 'all'"),
+        ("cpu,", "names a device that has no name"),
+        ("", "names a device that has no name"),
+        ("cpu,abacus", "no device 'abacus' here: choose auto or cpu"),
         pytest.param("all", r"'all' means every graphics card, and there is none.*or name devices", marks=NO_CARD),
         pytest.param("cpu,cuda:0", "no device 'cuda:0' here, as no NVIDIA driver", marks=NO_CARD),
     ],
@@ -41,7 +42,7 @@ def test_what_is_no_list_of_devices_is_a_sentence(words, reason):
 
 @pytest.mark.parametrize("words", ["cpu,cpu", "all", "cuda:0,cuda:1"])
 def test_who_wants_one_device_refuses_several(words):
-    with pytest.raises(InputError, match=f"'{words}' names several devices, and one is wanted here: choose auto, or"):
+    with pytest.raises(InputError, match=f"'{words}' names several devices, and one is wanted here: choose auto or"):
         find_device(words, "float32")
 
 

@@ -16,6 +16,7 @@ from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
 
 from .figure_readings import Better
+from .figures import NAMED, command_of
 
 FORMAT = "sulcus bench figures 1"
 KIND = "a record of `sulcus bench all`"
@@ -69,6 +70,12 @@ class Entry:
     reason: Text
     seconds: Number
     origin: Origin
+
+    @property
+    def quick(self) -> bool:
+        """Whether it was measured with small counts, so that its times mean nothing."""
+        figure = NAMED.get(self.name)
+        return figure is not None and self.command == command_of(figure, quick=True) != command_of(figure)
 
 
 @dataclass(frozen=True)

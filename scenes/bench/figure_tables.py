@@ -74,9 +74,15 @@ def write_page(path: Path, record: Record) -> bool:
     Raises
     ------
     InputError
-        As `read_page`; a page that cannot be written.
+        As `read_page`; a page that cannot be written; figures that were measured with small counts.
     """
     before = read_page(path)
+    asked = {name for block in MARKED.findall(before) for name in block[1].split()}
+    for entry in record.rows:
+        if entry.quick and entry.values and entry.name in asked:
+            raise InputError(
+                f"{path}: {entry.name} was measured with --quick, whose times mean nothing: measure it in full."
+            )
     after = MARKED.sub(lambda block: f"{block[1]}\n{_marked(block[2].split(), record)}\n\n{block[4]}", before)
     if after != before:
         with written_whole(path, ".md") as partial:

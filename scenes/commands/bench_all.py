@@ -90,6 +90,11 @@ def _measured(args: argparse.Namespace) -> Record:
     body = read_anatomy(args.anatomy or template_path()).digest
     run = Run(version_here(), body, args.anatomy, args.quick, args.again)
     found = {entry.name: entry for entry in read_record(out).rows} if recognised(out, KIND) else {}
+    whole = [name for name in args.only if name in found and found[name].values and not found[name].quick]
+    if args.quick and whole:
+        raise InputError(
+            f"{out}: holds {whole[0]} as measured in full, which --quick would replace: choose another --json."
+        )
     with tqdm(total=len(args.only), unit="figure", file=sys.stderr) as bar:
 
         def heard(line: str) -> None:

@@ -27,7 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--brain", required=True, help="labels that are brain, separated by commas")
     parser.add_argument("--tumour", required=True, help="labels that are tumour, separated by commas")
     parser.add_argument("--t1", type=Path, help="intensities in the same space, for the camera view")
-    parser.add_argument("--out", required=True, type=Path, help="the anatomy, PATIENT.vtu; all else is put beside it")
+    parser.add_argument(
+        "--out",
+        required=True,
+        type=Path,
+        help="the anatomy, PATIENT.vtu; data (.h5) and models (.model.npz) are put beside it",
+    )
     parser.add_argument("--nodes", type=int, default=5300, help="number of mesh nodes (default %(default)s)")
     parser.add_argument(
         "--craniotomy",
@@ -45,9 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law (default %(default)s)")
     add_element_argument(parser)
     parser.add_argument(
-        "--learners", default="linear,series,series-gp", help="as `sulcus train` has them (default %(default)s)"
+        "--learners",
+        default="linear,series,series-gp",
+        help="of `sulcus train --help`, with commas (default %(default)s)",
     )
-    add_devices(parser)
+    add_devices(parser, "loads are simulated on all of these; models are trained on the first. ")
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="a JSON line of each step, then one of the seconds")
 

@@ -72,7 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
     widest = f"up to {Budget.widest}, on CUDA {Budget.widest_on_cuda}"
     parser.add_argument(
-        "--batch", type=int, help=f"loads solved together (default: as fit, {widest}, and those of a file that goes on)"
+        "--batch",
+        type=int,
+        help=f"loads solved together (default: as many as fit, {widest}; a file that goes on keeps its own)",
     )
     add_devices(parser)
     add_force(parser)

@@ -91,7 +91,7 @@ def find_device(name: str, precision: Precision) -> Device:
     """
     if "," in name or name == EVERY:
         raise InputError(
-            f"{name!r} names several devices, and one is wanted here: choose auto, or one of {', '.join(_present())}."
+            f"{name!r} names several devices, and one is wanted here: choose {' or '.join(['auto', *_present()])}."
         )
     present = _present()
     if name == "auto":
@@ -99,7 +99,7 @@ def find_device(name: str, precision: Precision) -> Device:
     alias = "cuda:0" if name == "cuda" else name
     if alias not in present:
         why = _no_card() if alias.startswith("cuda") else ""
-        raise InputError(f"there is no device {name!r} here{why}: choose auto or one of {', '.join(present)}.")
+        raise InputError(f"there is no device {name!r} here{why}: choose {' or '.join(['auto', *present])}.")
     return Device(alias, precision)
 
 
@@ -111,7 +111,8 @@ def device_names(words: str) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        A device that this machine does not have, "all" where it has no card, processors beside cards.
+        A device that this machine does not have, "all" where it has no card or beside others, an empty name, processors
+        beside cards.
     """
     if words.strip() == EVERY:
         cards = tuple(name for name in _present() if name.startswith("cuda"))
@@ -121,7 +122,12 @@ def device_names(words: str) -> tuple[str, ...]:
                 "with commas between, as in cpu,cpu."
             )
         return cards
-    names = tuple(find_device(name.strip(), "float32").name for name in words.split(","))
+    asked = [name.strip() for name in words.split(",")]
+    if EVERY in asked:
+        raise InputError(f"{words!r} names devices beside 'all', which means every graphics card: give it alone.")
+    if not all(asked):
+        raise InputError(f"{words!r} names a device that has no name: leave the comma out, or name one.")
+    names = tuple(find_device(name, "float32").name for name in asked)
     if len({name.split(":")[0] for name in names}) > 1:
         raise InputError(
             f"{words!r} names processors beside graphics cards, whose answers differ in their last digits: choose "
