@@ -47,6 +47,13 @@ def test_learners_are_measured_side_by_side_where_there_are_cores(study, cores, 
     assert run.most[Elements] == elements and run.most[Learner] == learners
 
 
+def test_what_is_measured_in_this_process_is_measured_one_by_one(study, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 16)
+    run = Rows()
+    assert len(list(rows(study, SPECS, run))) == len(SPECS)
+    assert run.most == {Elements: 1, Learner: 1}
+
+
 @pytest.mark.parametrize("cores", [2, 16])
 def test_after_a_stop_no_row_begins(study, cores):
     run = Rows("learner 1")

@@ -87,9 +87,10 @@ def rows(study: Study, specs: Sequence[Spec], run: Run | None = None, cores: int
     """A row for each of the `specs`; those whose inputs are the same as before are read.
 
     A row is kept as soon as it is measured, unless it could not be. By default each has a process of its own. Finite
-    elements are measured one by one; of learners one for every `CORES` of the machine's cores.
+    elements are measured one by one; of learners one for every `CORES` of the machine's cores. What `run` measures in
+    this process is measured one by one, unless `cores` say otherwise.
     """
-    cores = cores or os.cpu_count() or 1
+    cores = cores or (1 if run else os.cpu_count() or 1)
     for kind, alike in groupby(specs, type):
         together = 1 if kind is Elements else max(1, cores // CORES)
         measuring = run or partial(apart, BoundedSemaphore(together))
