@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,20 +36,22 @@ def solver(material: Material, radius: float = 6e-3) -> Fem:
     return Fem(BODY, effects, Accuracy(TOLERANCE), "cpu", element="p1")
 
 
-def cases_at(x: float, y: float, z: float) -> Cases:
-    """The ball at a place [m]."""
+def cases_at(number: int, memory: Mapping[str, Any]) -> Cases:
+    """The ball at a place on its way, a second after the one before."""
     pose = np.eye(4)
-    pose[:3, 3] = x, y, z
-    return Cases(Loads((Touching(pose[None, None]),)), np.zeros(1))
+    pose[:3, 3] = WAY[number]
+    loads = Loads((Touching(pose[None, None]),), np.full(1, number + 1.0))
+    return Cases(loads, np.full(1, float(number)), memory)
 
 
 def followed(fem: Fem, descent: ContactDescent, many: int) -> list[Descended]:
-    """Along so much of the way, each from where the last one ended."""
-    u, out = fem.problem.device.zeros(fem.problem.rows, 1), []
-    for place in WAY[:many]:
-        fem.problem.begin(cases_at(*place))
+    """Along so much of the way, each from where the last one ended, with what is remembered of it."""
+    u, out, memory = fem.problem.device.zeros(fem.problem.rows, 1), [], {}
+    for number in range(many):
+        fem.problem.begin(cases_at(number, memory))
         out.append(descent.descend(u, np.full(1, TOLERANCE), 30))
         u = out[-1].u
+        memory = fem.problem.end(u)
     return out
 
 
@@ -64,22 +68,23 @@ def counted(monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> list[obj
 
 
 @pytest.mark.parametrize(
-    ("limits", "least", "radius", "many"),
+    ("limits", "least", "radius", "many", "material"),
     [
-        (ContactLimits(), 0.02, 6e-3, 3),
-        (ContactLimits(stale=0.0), 0.02, 6e-3, 3),
-        (ContactLimits(drag=30.0), 0.02, 6e-3, 2),
-        (ContactLimits(), 9.0, 6e-3, 2),
-        (ContactLimits(shortest=2.0), 0.5, 6e-3, 3),
-        (ContactLimits(), 0.02, 1.5e-3, 1),
+        (ContactLimits(), 0.02, 6e-3, 3, NEO),
+        (ContactLimits(stale=0.0), 0.02, 6e-3, 3, NEO),
+        (ContactLimits(drag=30.0), 0.02, 6e-3, 2, NEO),
+        (ContactLimits(), 9.0, 6e-3, 2, NEO),
+        (ContactLimits(shortest=2.0), 0.5, 6e-3, 3, NEO),
+        (ContactLimits(), 0.02, 1.5e-3, 1, NEO),
+        (ContactLimits(), 0.02, 6e-3, 3, RELAXING),
     ],
-    ids=["usual", "models made anew", "dragged", "as at rest", "misled", "sharp"],
+    ids=["usual", "models made anew", "dragged", "as at rest", "misled", "sharp", "relaxing"],
 )
 def test_replayed_steps_are_those_of_the_descent(
-    limits: ContactLimits, least: float, radius: float, many: int, monkeypatch: pytest.MonkeyPatch
+    limits: ContactLimits, least: float, radius: float, many: int, material: Material, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As many of them, to the same places, whatever becomes of models, and of steps that go too far."""
-    fem = solver(NEO, radius)
+    fem = solver(material, radius)
     found = fem.strategy.contact
     assert found is not None
     strains = Strains(least=least, cut=np.inf)
@@ -92,12 +97,3 @@ def test_replayed_steps_are_those_of_the_descent(
         motion = np.abs(other.u.numpy()).max()
         np.testing.assert_allclose(answer.u.numpy(), other.u.numpy(), rtol=0.0, atol=1e-9 * motion)
     assert taken
-
-
-def test_steps_are_replayed_only_where_arrays_stay() -> None:
-    """Tissue that relaxes has a memory, which each batch brings anew."""
-    for material, replays in ((NEO, True), (RELAXING, False)):
-        found = solver(material).strategy.contact
-        assert found is not None
-        assert (replace(found, replays=True).steps is not None) is replays
-        assert found.steps is None

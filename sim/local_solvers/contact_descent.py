@@ -55,7 +55,7 @@ class ContactDescent:
     strains
         Which tissue counts as strained.
     replays
-        Single columns take steps that a card captures as graphs, where the problem is one for that.
+        Single columns take steps that a card captures as graphs.
     """
 
     problem: Problem
@@ -85,9 +85,8 @@ class ContactDescent:
 
     @cached_property
     def steps(self) -> ContactSteps | None:
-        """Those of single columns; None where arrays change from batch to batch, or nothing is to be replayed."""
-        still = all(term is self.barrier or term.constant or term.passive for term in self.problem.terms)
-        if self._strained is None or not self.replays or not still:
+        """Those of single columns; None where nothing is to be replayed."""
+        if self._strained is None or not self.replays:
             return None
         self._strained.prepare()
         size = self._strained.size

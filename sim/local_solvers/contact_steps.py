@@ -144,7 +144,7 @@ class ContactSteps:
     Parameters
     ----------
     problem, preconditioner
-        As a `ContactDescent` has them. Every term but the barrier is constant, or has the same arrays in each batch.
+        As a `ContactDescent` has them.
     barrier
         The problem's.
     compliance

@@ -19,6 +19,7 @@ from ..linalg.pcg import Preconditioner
 from ..local_solvers.batch_elimination import BatchElimination
 from ..local_solvers.contact_descent import ContactDescent
 from ..local_solvers.contact_preconditioner import ContactPreconditioner
+from ..local_solvers.strained_part import ON_CARD
 from ..minimisers.lbfgs import Lbfgs, learnt_from
 from ..minimisers.lbfgs_kernels import BROKEN, DONE
 from ..minimisers.newton import find_equilibrium
@@ -109,7 +110,8 @@ class Strategy:
             return None
         (barrier,) = self.problem.barriers
         assert isinstance(barrier, Local)
-        return ContactDescent(self.problem, self.preconditioner, barrier, replays=self.problem.device.on_cuda)
+        found = ContactDescent(self.problem, self.preconditioner, barrier)
+        return replace(found, strains=ON_CARD, replays=True) if self.problem.device.on_cuda else found
 
     def local(self, count: int) -> BatchElimination | Alone | None:
         """What solves a part by itself for so many loads, if anything does."""
