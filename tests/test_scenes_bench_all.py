@@ -375,8 +375,9 @@ def test_bad_input_is_a_sentence(words, reason, tmp_path, monkeypatch, capsys):
 
 def test_only_figures_that_there_are(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["bench", "all", "--only", "lively"])
-    assert end.value.code == 2 and "'lively'" in capsys.readouterr().err
+        main(["bench", "all", "--only", "lively-cpu"])
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and "'lively-cpu': try live-cpu" in said and "growth" not in said
 
 
 def test_the_tables_of_the_page_are_marked_as_they_are_written(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"the record, written after every figure; an unfinished run goes on (default {OUT})",
     )  # fmt: skip
     parser.add_argument(
-        "--only", nargs="+", choices=NAMED, default=list(NAMED), metavar="NAME",
+        "--only", nargs="+", type=_named, default=list(NAMED), metavar="NAME",
         help="these figures (default: all; their names stand below)",
     )  # fmt: skip
     parser.add_argument("--again", action="store_true", help="measure also what the record has already")
@@ -49,6 +50,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="then compare with this record, and exit with 1 if a number is worse by more than 10 percent",
     )  # fmt: skip
     add_force(parser)
+
+
+def _named(word: str) -> str:
+    """The name of a figure, or an error with the names that are most like it."""
+    if word in NAMED:
+        return word
+    near = get_close_matches(word, NAMED) or list(NAMED)[:3]
+    raise argparse.ArgumentTypeError(
+        f"no figure is called {word!r:.80}: try {', '.join(near)}; `sulcus bench all --help` has all names."
+    )
 
 
 def run(args: argparse.Namespace) -> int:
