@@ -31,7 +31,7 @@ ORDER = (
     {"surrogate.array_functions"},
     {"surrogate.data", "surrogate.regressors"},
     {"surrogate.model"},
-    {"surrogate.evaluation", "surrogate.onnx_export"},
+    {"surrogate.evaluation", "surrogate.locating", "surrogate.onnx_export"},
     {"surrogate.training"},
     {"scenes.script"},
     {"scenes.builtin", "scenes.play"},

@@ -32,6 +32,10 @@ next: run it by ONNX Runtime; the file itself says what goes in and what comes o
     "patient": """example:
   sulcus patient labels.nii.gz --brain 1,2 --tumour 3 --t1 t1.nii.gz --out patient.vtu
 next: sulcus demo --anatomy patient.vtu""",
+    "locate": """examples:
+  sulcus locate patient.vtu vessels.csv --out located.vtu
+  sulcus locate patient.vtu cloud.csv --tool tips.csv --out located.vtu --json
+next: open located.vtu in ParaView; `displacement` and `deviation` are in metres""",
     "scenes": """examples:
   sulcus scenes
   sulcus scenes --out pictures

@@ -120,7 +120,12 @@ def _names(path: Path) -> set[bytes]:
 
 def _is_solution(path: Path) -> bool:
     names = _names(path)
-    return {b"region", b"displacement"} <= names and not names & {b"fixed", b"force", b"prescribed", b"held"}
+    others = {b"fixed", b"force", b"prescribed", b"held", b"deviation"}
+    return {b"region", b"displacement"} <= names and not names & others
+
+
+def _is_located(path: Path) -> bool:
+    return {b"region", b"displacement", b"deviation"} <= _names(path)
 
 
 def _hdf5(words: str) -> Callable[[Path], bool]:
@@ -179,6 +184,8 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "an anatomy of sulcus": lambda path: {b"region", b"held", b"slide_normal", b"craniotomy"} <= _names(path),
     "a scan that sulcus put beside an anatomy": _is_scan,
     "a result of `sulcus solve`": _is_solution,
+    "a result of `sulcus locate`": _is_located,
+    "a locator of `sulcus locate`": lambda path: str(model_header(path)["format"]).startswith("sulcus locator"),
     "a data set of `sulcus simulate`": _hdf5("sulcus data"),
     "an episode of `sulcus collect`": _hdf5("sulcus episode"),
     "a model of `sulcus train`": lambda path: str(model_header(path)["format"]).startswith("sulcus model"),

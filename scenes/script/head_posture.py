@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.bodies.fluid_level import fluid_level
 from sim.loads import Posture
 
 from .tool_paths import smooth
 
 SUPINE = (0.0, -1.0, 0.0)
-# Fluid of a full skull stands so far over the highest vertex, and of a drained one under the lowest [m].
-SPARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -34,9 +33,7 @@ class Lying:
     def posture(self, nodes: np.ndarray) -> Posture:
         """One load case for a body of these nodes (V, 3) [m]."""
         down = np.array(self.direction) / np.linalg.norm(self.direction)
-        height = -nodes @ down
-        low, high = height.min() - SPARE, height.max() + SPARE
-        return Posture(down[None], np.array([low + self.fluid * (high - low)]), np.ones(1))
+        return Posture(down[None], np.array([fluid_level(nodes, down, self.fluid)]), np.ones(1))
 
 
 Lie = Callable[[float], Lying]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -27,10 +28,9 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> Located:
 
     In graded meshes the tetrahedron that holds a point is among the 64 `candidates` whose middles are nearest to it.
     """
-    corners = mesh.nodes[mesh.tets]
-    _, near = KDTree(corners.mean(axis=1)).query(points, k=min(candidates, len(corners)))
+    _, near = _middles(mesh).query(points, k=min(candidates, len(mesh.tets)))
     near = near.reshape(len(points), -1)
-    a, *others = np.moveaxis(corners[near], 2, 0)
+    a, *others = np.moveaxis(mesh.nodes[mesh.tets[near]], 2, 0)
     edges = np.stack([other - a for other in others], axis=-1)
     inner = np.linalg.solve(edges, (points[:, None] - a)[..., None])[..., 0]
     weights = np.concatenate([1.0 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)
@@ -38,3 +38,9 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> Located:
     row = np.arange(len(points))
     inside = np.maximum(weights[row, best], 0.0)
     return Located(mesh.tets[near[row, best]], inside / inside.sum(axis=1, keepdims=True))
+
+
+@lru_cache(maxsize=4)
+def _middles(mesh: TetMesh) -> KDTree:
+    """The middles of a mesh's tetrahedra."""
+    return KDTree(mesh.nodes[mesh.tets].mean(axis=1))

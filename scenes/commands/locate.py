@@ -1,0 +1,132 @@
+"""`sulcus locate`: where the tumour is, from what is seen of the open cortex, with what is not known of it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.arguments import at_least
+
+from .json_line import json_line
+from .outputs import add_force, claimed
+
+if TYPE_CHECKING:
+    from sim.anatomy import Anatomy
+    from surrogate.locating.locator import Location, Locator
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("anatomy", metavar="ANATOMY.vtu", help="made by `sulcus anatomy` or `sulcus patient`")
+    parser.add_argument(
+        "observed",
+        metavar="OBSERVED.csv",
+        help="what was seen, in millimetres, RAS, with a header. `x,y,z,dx,dy,dz`: points in the scan, as of vessels, "
+        "and how they were seen to move; `x,y,z`: a cloud of where the open cortex is now. A last column `sigma` is "
+        "each point's error, of what is not rigid (default 0.58)",
+    )
+    parser.add_argument(
+        "--tool", metavar="TIPS.csv", help="`x,y,z`: where tips of tools touch the cortex, as further evidence"
+    )
+    parser.add_argument(
+        "--out", required=True, metavar="RESULT.vtu", help="mean motion, deviation and covariance of every vertex"
+    )
+    parser.add_argument(
+        "--locator",
+        metavar="FILE.npz",
+        type=Path,
+        help="what is made once for an anatomy; made where there is none, which takes minutes (default: beside it)",
+    )
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, to make that on (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of what is made (default %(default)s)")
+    add_force(parser)
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Locate the tumour. 0: done; what fits no cause is bad input."""
+    from sim.bodies.meshfile import read_anatomy, write_mesh
+    from surrogate.locating.observation import placed
+    from surrogate.locating.observed_files import read_observation
+
+    out = claimed(args.out, ".vtu", "a result of `sulcus locate`", args.force, [args.anatomy])
+    at_least("--seed", args.seed, 0)
+    anatomy = read_anatomy(args.anatomy)
+    observation = read_observation(args.observed, args.tool)
+    placed(anatomy, observation)  # what cannot be placed need not wait for a locator
+    found = _locator(args, anatomy).locate(observation)
+    every = np.arange(len(anatomy.mesh.nodes))
+    covariance = found.covariance(every)
+    fields = {
+        "displacement": found.at(every),
+        "deviation": np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0)),
+        "covariance": covariance[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
+    }
+    write_mesh(out, anatomy.mesh, fields)
+    print(json_line(_numbers(found, len(observation.now), out)) if args.json else _sentences(found, out))
+    return 0
+
+
+def _locator(args: argparse.Namespace, anatomy: Anatomy) -> Locator:
+    """The locator that lies beside the anatomy, or a new one."""
+    import shutil
+
+    from tqdm import tqdm
+
+    from surrogate.locating.locator_files import load, save
+    from surrogate.locating.setup import made
+
+    path = args.locator or Path(args.anatomy).with_suffix(".locator.npz")
+    if path.is_file():
+        return load(path, anatomy)
+    path = claimed(path, ".npz", "a locator of `sulcus locate`", args.force)
+    folder = path.with_suffix(".parts")
+    print(f"sulcus locate: {path} is made first; if it is stopped, the same command goes on", file=sys.stderr)
+    with tqdm(file=sys.stderr) as bar:
+
+        def progress(stage: str, done: int, total: int) -> None:
+            bar.total, bar.n = total, done
+            bar.set_description(stage)
+
+        locator = made(anatomy, args.seed, args.device, folder=folder, progress=progress)
+    save(path, locator)
+    shutil.rmtree(folder, ignore_errors=True)
+    return locator
+
+
+def _numbers(found: Location, points: int, out: Path) -> dict[str, object]:
+    return {
+        "centroid_mm": (1e3 * found.centroid).tolist(),
+        "covariance_mm2": (1e6 * found.centroid_covariance).tolist(),
+        "p95_mm": 1e3 * found.p95,
+        "explained": found.explained,
+        "causes": found.causes,
+        "bias_mm": (1e3 * found.bias).tolist(),
+        "bias_degrees": np.degrees(found.rotation).tolist(),
+        "points": points,
+        "outliers": found.outliers.tolist(),
+        "calibrated": found.calibrated,
+        "milliseconds": 1e3 * found.seconds,
+        "of": "the tumour, as far as the causes that were tried go; not of a model",
+        "out": str(out),
+    }
+
+
+def _sentences(found: Location, out: Path) -> str:
+    x, y, z = 1e3 * found.centroid
+    causes = ", ".join(f"{name} {share:.0%}" for name, share in found.causes.items() if share > 0.005)
+    lines = [
+        f"The middle of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",
+        f"With a probability of 95 % it is within {1e3 * found.p95:.1f} mm of there.",
+        f"The motion explains {found.explained:.0%} of what was seen. Causes: {causes}.",
+        f"The observation as a whole seems off by {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
+    ]
+    if not found.calibrated:
+        lines.append("The 95 % were not tried on so few or so many points, or on such motions: take them as a guess.")
+    if len(found.outliers):
+        lines.append(f"Left out, as no other point supports them: points {', '.join(map(str, found.outliers[:20]))}.")
+    return "\n".join([*lines, f"written: {out}"])

@@ -1,0 +1,116 @@
+"""Covariances that hold: the estimator is tried on members of tissues and skulls that its prior does not know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from sim.anatomy import Anatomy
+from sim.geometry.locate import Located
+
+from .causes import DRAINAGE, SWELLING, TOOL
+from .ensemble import Ensemble, surface_size
+from .evidence import SIGMA, Evidence, of_motions
+from .posterior import conditioned, rigid_scale
+from .presses import Presses
+from .prior import Prior, middle_of, prior_of
+
+LEVEL = 0.95
+# Trials in all, and parts that they leave out in turn. So many of those most like an observation say how far its
+# covariance must grow.
+TRIALS, FOLDS, NEAREST = 240, 3, 80
+# What moves the brain in a trial.
+ALONE = (TOOL, DRAINAGE, SWELLING)
+# Points of a trial, the share of the open cortex that they lie on, how much softer its tissue is than the ensemble's,
+# and errors as shares of the usual.
+POINTS, COVER, SOFTER, ERRORS = (20, 300), (0.2, 0.6), (0.7, 2.0), (0.1, 1.0)
+# A member that moves the open cortex by less [m] is in no trial.
+LEAST_SEEN = 0.5e-3
+
+
+def trials(
+    ensemble: Ensemble, presses: Presses, progress: Callable[[int, int], object] = lambda done, total: None
+) -> np.ndarray:
+    """What came of trials (TRIALS, 3): `likeness` of each, and its error's square by its own covariance.
+
+    One member in three is estimated by the others, in turn: other directions and amounts in the same tissues. A motion
+    in three is two causes' together. Every second trial has a rigid error as large as its prior expects.
+    """
+    fold, found = np.arange(len(ensemble.kind)) % FOLDS, []
+    large = surface_size(ensemble.anatomy, ensemble.motion) > LEAST_SEEN
+    for turn, numbers in enumerate(np.array_split(np.arange(TRIALS), FOLDS)):
+        prior, members = prior_of(ensemble, presses, fold != turn), np.flatnonzero((fold == turn) & large)
+        for number in numbers:
+            evidence, middle = _trial(ensemble, members, number, np.random.default_rng(number))
+            found.append([*likeness(evidence), _square(prior, evidence, middle)])
+            progress(len(found), TRIALS)
+    return np.array(found)
+
+
+def covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
+    """By how much covariances must grow for ellipsoids of the tumour's middle to hold in 95 of 100 trials like this."""
+    away = ((tried[:, :2] - likeness(evidence)) ** 2).sum(axis=1)
+    square = np.sort(tried[np.argsort(away, kind="stable")[:NEAREST], 2])
+    rank = min(int(np.ceil(LEVEL * (len(square) + 1))), len(square))
+    return float(square[rank - 1] / chi2.ppf(LEVEL, 3))
+
+
+def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:
+    """Whether such an observation lies within the range of the trials."""
+    own = likeness(evidence)
+    return bool((own >= tried[:, :2].min(axis=0)).all() and (own <= tried[:, :2].max(axis=0)).all())
+
+
+def likeness(evidence: Evidence) -> np.ndarray:
+    """Logarithms (2,) of the seen motion over its error, and of the number of points."""
+    count = len(np.unique(evidence.point))
+    return np.log([np.sqrt((evidence.value**2).sum() / count) / np.median(evidence.sigma), count])
+
+
+def _trial(
+    ensemble: Ensemble, members: np.ndarray, number: int, random: np.random.Generator
+) -> tuple[Evidence, np.ndarray]:
+    """What is seen of some member's motion, or of two; and how that moves the tumour's middle (3,) [m]."""
+    anatomy = ensemble.anatomy
+    here = members[ensemble.skull[members] == random.choice(np.unique(ensemble.skull[members]))]
+    several = np.intersect1d(ALONE, ensemble.kind[here])
+    causes = random.permutation(several)[: 1 + (number % 3 == 0)]
+    chosen = [random.choice(here[ensemble.kind[here] == cause]) for cause in causes]
+    softer = np.exp(random.uniform(*np.log(SOFTER)))
+    motion = softer * ensemble.motion[chosen].sum(axis=0, dtype=float)
+    evidence = seen_patch(anatomy, motion, random, int(np.exp(random.uniform(*np.log(POINTS)))), random.uniform(*COVER))
+    sigma = np.full(len(evidence), SIGMA * np.exp(random.uniform(*np.log(ERRORS))))
+    evidence = replace(evidence, sigma=sigma)
+    off = np.linalg.cholesky(evidence.noise()) @ random.standard_normal(len(evidence))
+    if number % 2:
+        way = random.standard_normal((2, 3))
+        way *= np.sqrt(3.0) / np.linalg.norm(way, axis=1, keepdims=True)
+        off += evidence.rigid @ (rigid_scale() * way.ravel())
+    return replace(evidence, value=evidence.value + off), middle_of(anatomy, motion[None])[0]
+
+
+def seen_patch(anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator, count: int, cover: float) -> Evidence:
+    """So many points on a round share `cover` of the open cortex, without error, of a motion (V, 3) [m]."""
+    nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
+    corners = nodes[triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    middles = corners.mean(axis=1)
+    order = np.argsort(((middles - middles[random.choice(len(area), p=area / area.sum())]) ** 2).sum(axis=1))
+    within = np.cumsum(area[order]) <= cover * area.sum()
+    some = order[: max(4, np.count_nonzero(within))]
+    triangle = random.choice(some, count, p=area[some] / area[some].sum())
+    weights = random.dirichlet(np.ones(3), count)
+    vertices = triangles[triangle]
+    at, moved = (np.einsum("nc,nci->ni", weights, field[vertices]) for field in (nodes, motion))
+    place = Located(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(count)]))
+    return of_motions(place, at, moved, np.full(count, SIGMA))
+
+
+def _square(prior: Prior, evidence: Evidence, middle: np.ndarray) -> float:
+    """The square of an estimate's error (3,) [m], by its own covariance."""
+    found = conditioned(prior, evidence)
+    off = found.weight @ prior.middle - middle
+    return float(off @ np.linalg.solve(prior.middle.T @ found.spread @ prior.middle, off))

@@ -1,0 +1,152 @@
+"""What may have moved a brain that is only seen: tools, drained fluid and swelling, in tissue that nobody measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.bodies.fluid_level import fluid_level
+from sim.bodies.open_cortex import open_cortex
+from sim.effects import SKULLS, Effect, Elasticity, Gravity, Held, Pulsation, ToolForce, Wave
+from sim.loads import Loads, Posture, Pushed
+from sim.material import Material
+
+from ..data.tool_loads import draw
+
+KINDS = ("tool", "drainage", "swelling", "tumour swelling")
+"""The causes of an ensemble, by name."""
+TOOL, DRAINAGE, SWELLING, TUMOUR_SWELLING = range(len(KINDS))
+# Swelling is one rising wave, and another that does nothing.
+RISE = Wave(0.25, 0.0)
+
+
+@dataclass(frozen=True)
+class Causes:
+    """From what the members of an ensemble are drawn. Ranges are those of the brain-shift literature.
+
+    Parameters
+    ----------
+    poisson
+        Poisson's ratios; drained tissue gives 0.45, brain within seconds 0.49 (`sim.MATERIALS`).
+    poisson_let_go
+        The greatest one in a skull that lets go: beyond, swelling is solved for minutes, and explains no more.
+    stiffness
+        Least and greatest tumour stiffness over the brain's, log-uniform.
+    tools
+        Members of this kind in one group; of a skull that lets go, whose loads are solved one by one.
+    drainages
+        Directions of gravity in one group.
+    levels
+        Shares of the fluid that are left, one after the other, in each drainage.
+    cone
+        Greatest angle [rad] between gravity and the open cortex's inward axis: surgeons turn the opening up.
+    swellings, tumour_swellings
+        Changes of the brain's volume in each group, and of the tumour's alone.
+    """
+
+    poisson: tuple[float, ...] = (0.45, 0.47, 0.49)
+    poisson_let_go: float = 0.48
+    stiffness: tuple[float, float] = (0.5, 3.0)
+    tools: tuple[int, int] = (12, 4)
+    drainages: int = 6
+    levels: tuple[float, ...] = (0.75, 0.55, 0.35, 0.15)
+    cone: float = np.radians(60.0)
+    swellings: tuple[float, ...] = (0.06, 0.04, 0.02, -0.02, -0.04)
+    tumour_swellings: tuple[float, ...] = (0.2, -0.15)
+
+
+USUAL = Causes()
+# Radius [m] over which a force is spread on the cortex.
+SPREAD = 7e-3
+# The one of the skulls that lets go.
+LETS_GO = "contact"
+# Which way gravity pulls in the scan, as `Gravity` has it.
+SUPINE = np.array(Gravity().direction)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Members that share tissue and skull.
+
+    Parameters
+    ----------
+    number
+        From 0: what is drawn depends on it and the seed alone.
+    skull
+        One of `sim.effects.SKULLS`.
+    poisson, ratio
+        Of the brain; tumour stiffness over the brain's.
+    """
+
+    number: int
+    skull: str
+    poisson: float
+    ratio: float
+
+    def effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
+        """What its finite elements are made of, if these regions (None: all) swell by at most such shares."""
+        brain = Material("neo-hookean", 3000.0, self.poisson)
+        tumour = Material("neo-hookean", 3000.0 * self.ratio, self.poisson)
+        swells = Pulsation(Wave(RISE.frequency, max(map(abs, swelling))), RISE, regions)
+        return (
+            Elasticity(brain, {TUMOUR_LABEL: tumour}), Held(), SKULLS[self.skull], ToolForce(), Gravity(), swells,
+        )  # fmt: skip
+
+
+def groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Group, ...]:
+    """Groups with each skull and each Poisson's ratio; skulls only where the anatomy has one."""
+    made = []
+    for skull in SKULLS if anatomy.slide_normal.any() else ():
+        for poisson in causes.poisson:
+            if skull == LETS_GO and poisson > causes.poisson_let_go:
+                continue
+            low, high = np.log(causes.stiffness)
+            ratio = float(np.exp(np.random.default_rng([seed, len(made)]).uniform(low, high)))
+            made.append(Group(len(made), skull, poisson, ratio))
+    return tuple(made)
+
+
+def pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> Loads:
+    """What tools do in a group."""
+    count = causes.tools[group.skull == LETS_GO]
+    pushed = draw("mixed", anatomy, count, seed * 1000 + group.number).of(Pushed)
+    assert pushed is not None
+    return Loads((pushed, _posture(anatomy, np.tile(SUPINE, (count, 1)), 1.0)), np.zeros(count))
+
+
+def swellings(anatomy: Anatomy, shares: tuple[float, ...]) -> Loads:
+    """Changes of volume by such shares of what `Group.effects` was given the same of."""
+    # The wave says by which time the volume has changed so much.
+    time = np.arcsin(np.array(shares) / max(map(abs, shares))) / (2.0 * np.pi * RISE.frequency)
+    return Loads((_idle(anatomy, len(time)), _posture(anatomy, np.tile(SUPINE, (len(time), 1)), 1.0)), time)
+
+
+def drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Loads, ...]:
+    """Fluid that leaves, level by level, under heads that lie in some ways."""
+    random = np.random.default_rng([seed, group.number, 1])
+    down = _directions(random, open_cortex(anatomy).axis, causes)
+    idle = _idle(anatomy, len(down))
+    return tuple(Loads((idle, _posture(anatomy, down, left)), np.zeros(len(down))) for left in causes.levels)
+
+
+def _idle(anatomy: Anatomy, count: int) -> Pushed:
+    """So many pushes of no force, for loads in which no tool takes part."""
+    return Pushed(np.tile(open_cortex(anatomy).origin, (count, 1)), np.zeros((count, 3)), np.full(count, SPREAD))
+
+
+def _posture(anatomy: Anatomy, down: np.ndarray, left: float) -> Posture:
+    """Gravity along `down` (n, 3), with a share of the fluid left."""
+    level = np.array([fluid_level(anatomy.mesh.nodes, one, left) for one in down])
+    return Posture(down, level, np.ones(len(down)))
+
+
+def _directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
+    """Ways that gravity pulls (n, 3): evenly by solid angle within a cone round the inward axis."""
+    cosine = random.uniform(np.cos(causes.cone), 1.0, causes.drainages)
+    angle = random.uniform(0.0, 2.0 * np.pi, causes.drainages)
+    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    side /= np.linalg.norm(side)
+    other, sine = np.cross(axis, side), np.sqrt(1.0 - cosine**2)
+    return cosine[:, None] * axis + (sine * np.cos(angle))[:, None] * side + (sine * np.sin(angle))[:, None] * other

@@ -1,0 +1,143 @@
+"""Motions of a brain by every cause, in many tissues and skulls: what an observation is held against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import Accuracy
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.deformation import Deformation
+from sim.effects import SKULLS
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.geometry.tetmesh import digest_of
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import read_as
+
+from ..model.npz_archive import Archive
+from .causes import (
+    DRAINAGE,
+    SWELLING,
+    TOOL,
+    TUMOUR_SWELLING,
+    USUAL,
+    Causes,
+    Group,
+    drainages,
+    groups,
+    pushes,
+    swellings,
+)  # fmt: skip
+
+# Thousandths of the motion: far below what is seen.
+ACCURACY = Accuracy(tolerance=3e-3)
+# A member that moves the open cortex by less than this [m] tells shapes of rounding.
+LEAST_MOTION = 2e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """Motions of all vertices of one anatomy.
+
+    Parameters
+    ----------
+    anatomy
+        The body.
+    motion
+        (N, V, 3) float32 [m].
+    kind, skull, group
+        (N,) indices into `KINDS` and into the names of `sim.effects.SKULLS`, and number of the group.
+    """
+
+    anatomy: Anatomy
+    motion: np.ndarray
+    kind: np.ndarray
+    skull: np.ndarray
+    group: np.ndarray
+
+
+def solved(
+    anatomy: Anatomy,
+    seed: int = 0,
+    device: str = "auto",
+    causes: Causes = USUAL,
+    folder: Path | None = None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Ensemble:
+    """Solve an ensemble, group by group. Groups that a `folder` keeps from a run that was stopped are read.
+
+    `progress` hears how many groups are done, and of how many.
+
+    Raises
+    ------
+    InputError
+        An anatomy without open cortex, tumour or skull; a group of which nothing converged.
+    """
+    if not len(anatomy.tumour_nodes):
+        raise InputError("the anatomy has no tumour to locate: make one that has.")
+    made = groups(anatomy, seed, causes)
+    if not made:
+        raise InputError("the anatomy has no skull (`slide_normal`) that brackets what it does: make it anew.")
+    parts = []
+    progress(0, len(made))
+    for done, group in enumerate(made, start=1):
+        parts.append(_kept(anatomy, group, seed, device, causes, folder))
+        progress(done, len(made))
+    motion, kind = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    counts = [len(kinds) for _, kinds in parts]
+    number = np.repeat([group.number for group in made], counts)
+    skull = np.repeat([list(SKULLS).index(group.skull) for group in made], counts)
+    return Ensemble(anatomy, motion, kind, skull, number)
+
+
+def _kept(
+    anatomy: Anatomy, group: Group, seed: int, device: str, causes: Causes, folder: Path | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The motions and kinds of a group, from the folder if they are there, of the same draw."""
+    stated = digest_of(np.frombuffer(repr((anatomy.digest, group, seed, causes)).encode(), np.uint8))
+    path = None if folder is None else folder / f"{group.number:03d}-{stated}.npz"
+    if path is not None and path.exists():
+        with read_as(path, "a group of an ensemble", "Delete it: it is made anew."), path.open("rb") as raw:
+            arrays = Archive(raw).arrays(["motion", "kind"])
+            return arrays["motion"], arrays["kind"]
+    motion, kind = members(anatomy, group, seed, device, causes)
+    if path is not None:
+        with written_whole(path, ".npz") as unfinished:
+            np.savez(unfinished, motion=motion, kind=kind)
+    return motion, kind
+
+
+def members(
+    anatomy: Anatomy, group: Group, seed: int = 0, device: str = "auto", causes: Causes = USUAL
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motions (n, V, 3) float32 [m] and kinds (n,) of one group: those that converged and move the open cortex."""
+    fem = Fem(anatomy, group.effects(causes.swellings), ACCURACY, device)
+    local = Fem(anatomy, group.effects(causes.tumour_swellings, (TUMOUR_LABEL,)), ACCURACY, device)
+    answers = [
+        fem.deform(pushes(group, anatomy, seed, causes)),
+        fem.deform(swellings(anatomy, causes.swellings)),
+        local.deform(swellings(anatomy, causes.tumour_swellings)),
+    ]
+    kind = [TOOL, SWELLING, TUMOUR_SWELLING]
+    last: Deformation | None = None
+    for loads in drainages(group, anatomy, seed, causes):
+        last = fem.deform(loads, start=last)
+        answers.append(last)
+        kind.append(DRAINAGE)
+    motion = np.concatenate([answer.displacement for answer in answers])
+    kind = np.repeat(kind, [len(answer) for answer in answers])
+    good = np.array([outcome.good for answer in answers for outcome in answer.outcome])
+    good &= surface_size(anatomy, motion) > LEAST_MOTION
+    if not good.any():
+        raise InputError(f"no motion of group {group.number} ({group.skull}, nu {group.poisson:g}) converged.")
+    return motion[good].astype(np.float32), kind[good]
+
+
+def surface_size(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
+    """Root mean square motion (n,) [m] of the open cortex's vertices in motions (n, V, 3) [m]."""
+    nodes = np.unique(anatomy.open_surface)
+    return np.sqrt((motion[:, nodes] ** 2).sum(axis=2).mean(axis=1))

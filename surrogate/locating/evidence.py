@@ -1,0 +1,132 @@
+"""What is seen of a brain, as numbers that a motion predicts: along which axis, at which material point, how surely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+
+from sim.geometry.locate import Located
+
+# How the share of an error that is not rigid is made: white, and smooth over the surface.
+WHITE, SMOOTH = 0.3e-3, 0.5e-3
+SIGMA = float(np.hypot(WHITE, SMOOTH))
+"""What a point that is seen is off by, of what is not rigid [m]: white and smooth errors together."""
+# Length of the smooth one [m].
+LENGTH = 15e-3
+# What no sum of shapes is nearer than to a true motion: white and smooth errors as shares of what is seen, and the
+# length of the smooth one [m].
+LACK_WHITE, LACK_SMOOTH, LACK_LENGTH = 0.08, 0.1, 5e-3
+# Of the rigid error: a translation [m] along each axis, and a rotation [rad] about each.
+TRANSLATION, ROTATION = 0.8e-3, float(np.radians(0.3))
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """m numbers, each what a material point's motion is seen to be along an axis.
+
+    Parameters
+    ----------
+    place
+        The material points of the rows, in the mesh.
+    at
+        (m, 3) [m] where they are at rest.
+    axis
+        (m, 3) unit vectors.
+    value
+        (m,) [m].
+    sigma
+        (m,) [m]: standard deviation of what is not rigid in the error.
+    point
+        (m,) number of the observed point that each row belongs to.
+    """
+
+    place: Located
+    at: np.ndarray
+    axis: np.ndarray
+    value: np.ndarray
+    sigma: np.ndarray
+    point: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    def rows(self, chosen: np.ndarray) -> Evidence:
+        """Some rows (m,) bool or numbers."""
+        place = Located(self.place.vertices[chosen], self.place.weights[chosen])
+        arrays = {name: getattr(self, name)[chosen] for name in ("at", "axis", "value", "sigma", "point")}
+        return replace(self, place=place, **arrays)
+
+    @property
+    def middle(self) -> np.ndarray:
+        """(3,) [m] about which rotations are meant."""
+        return self.at.mean(axis=0)
+
+    @property
+    def rigid(self) -> np.ndarray:
+        """What a rigid error does (m, 6), by translation [m] and rotation [rad] about the middle."""
+        return np.concatenate([self.axis, np.cross(self.at - self.middle, self.axis)], axis=1)
+
+    def noise(self, scale: float = 0.0) -> np.ndarray:
+        """Covariance (m, m) [m^2] of errors that are not rigid, and of what shapes lack where `scale` [m] is seen."""
+        share, sigma = (WHITE / SIGMA) ** 2, self.sigma
+        square = ((self.at[:, None] - self.at) ** 2).sum(axis=2)
+        out = (1.0 - share) * np.outer(sigma, sigma) * np.exp(-0.5 * square / LENGTH**2)
+        out += (LACK_SMOOTH * scale) ** 2 * np.exp(-0.5 * square / LACK_LENGTH**2)
+        out *= self.axis @ self.axis.T
+        out[np.diag_indices(len(self))] += share * sigma**2 + (LACK_WHITE * scale) ** 2
+        return out
+
+    def whitening(self, scale: float) -> Whitening:
+        """What makes errors independent and of variance 1, where `scale` [m] is seen."""
+        threefold = len(self) % 3 == 0 and np.array_equal(self.axis, np.tile(np.eye(3), (len(self) // 3, 1)))
+        some = self.rows(np.arange(0, len(self), 3)) if threefold else self
+        return Whitening(cholesky(some.noise(scale), lower=True), 3 if threefold else 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """The Cholesky factor L of a covariance of errors.
+
+    Parameters
+    ----------
+    lower
+        (m / copies, m / copies).
+    copies
+        3 where the errors along three axes are alike and independent, row after row; else 1.
+    """
+
+    lower: np.ndarray
+    copies: int
+
+    def white(self, rows: np.ndarray) -> np.ndarray:
+        """L^-1 rows, (m, k) or (m,)."""
+        wide = rows.reshape(len(self.lower), -1)
+        return solve_triangular(self.lower, wide, lower=True, check_finite=False).reshape(rows.shape)
+
+    def back(self, rows: np.ndarray) -> np.ndarray:
+        """L^-T rows, (m, k) or (m,)."""
+        wide = rows.reshape(len(self.lower), -1)
+        return solve_triangular(self.lower, wide, lower=True, trans=1, check_finite=False).reshape(rows.shape)
+
+    def precision(self, table: np.ndarray) -> np.ndarray:
+        """Blocks (n, c, c) of the inverse covariance, for rows (n, c)."""
+        inverse = cho_solve((self.lower, True), np.eye(len(self.lower)))
+        point, axis = np.divmod(table, self.copies)
+        alike = axis[:, :, None] == axis[:, None]
+        return np.where(alike, inverse[point[:, :, None], point[:, None]], 0.0)
+
+
+def of_motions(place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray) -> Evidence:
+    """Points (n, 3) [m] at rest and how each was seen to move (n, 3) [m]; three rows a point."""
+    count = len(at)
+    point = np.repeat(np.arange(count), 3)
+    return Evidence(
+        Located(place.vertices[point], place.weights[point]),
+        at[point],
+        np.tile(np.eye(3), (count, 1)),
+        motion.ravel(),
+        sigma[point],
+        point,
+    )

@@ -1,0 +1,172 @@
+"""Where the tumour is, from what is seen of the brain's surface, with what is not known of it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.runtime.threads import one_thread
+
+from .calibration import covering_factor, was_tried
+from .causes import KINDS
+from .observation import Observation, placed, placed_anew
+from .posterior import Posterior, conditioned, scaled
+from .prior import Prior
+
+# Rounds in which points without a place at rest look for it on the surface as it is believed to be.
+ROUNDS = 6
+# More points than this share are no outliers, and no cause of the ensemble moves what this is more surprised by.
+MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
+# Normal numbers by which a radius is found that holds 95 in 100.
+DRAWS = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class Location:
+    """Where a tumour is, of the tumour and not of a model: Gaussian, in RAS.
+
+    Parameters
+    ----------
+    prior
+        What motions are made of.
+    posterior
+        The weights of its shapes and the rigid error, with covariances that were made to hold.
+    p95
+        [m]: with probability 0.95 the middle of the tumour is no farther from `centroid`.
+    calibrated
+        Whether covariances were tried on observations like this: on so many points, and motions so far above errors.
+    seconds
+        What this took, set-up apart.
+    """
+
+    prior: Prior
+    posterior: Posterior
+    p95: float
+    calibrated: bool
+    seconds: float
+
+    def at(self, nodes: np.ndarray) -> np.ndarray:
+        """Mean motion (n, 3) [m] of vertices (n,)."""
+        return np.tensordot(self.posterior.weight, self.prior.shape[:, nodes], 1)
+
+    def covariance(self, nodes: np.ndarray) -> np.ndarray:
+        """Covariances (n, 3, 3) [m^2] of the motion of vertices (n,)."""
+        rows = self.posterior.rows
+        shape = self.prior.shape[np.ix_(rows, nodes)]
+        spread = np.tensordot(self.posterior.spread[np.ix_(rows, rows)], shape, 1)
+        return np.einsum("rvi,rvj->vij", shape, spread, optimize=True)
+
+    @property
+    def centroid(self) -> np.ndarray:
+        """(3,) [m]: how far the middle of the tumour's volume has moved, as a mean."""
+        return self.posterior.weight @ self.prior.middle
+
+    @property
+    def centroid_covariance(self) -> np.ndarray:
+        """(3, 3) [m^2] of that."""
+        return self.prior.middle.T @ self.posterior.spread @ self.prior.middle
+
+    @property
+    def bias(self) -> np.ndarray:
+        """(3,) [m]: how far the observation as a whole seems shifted, at the middle of its points."""
+        return self.posterior.rigid[:3]
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3,) [rad]: how far it seems turned about that."""
+        return self.posterior.rigid[3:]
+
+    @property
+    def outliers(self) -> np.ndarray:
+        """Numbers of the points, from 0, that no other supports; they were left out."""
+        return self.posterior.outliers
+
+    @property
+    def explained(self) -> float:
+        """Share of the seen motion, in mean square, that the mean motion and the rigid error explain."""
+        evidence, found = self.posterior.evidence, self.posterior
+        left = evidence.value - self.prior.seen(evidence.place, evidence.axis) @ found.weight
+        left -= evidence.rigid @ found.rigid
+        return float(max(0.0, 1.0 - (left @ left) / (evidence.value @ evidence.value)))
+
+    @property
+    def causes(self) -> dict[str, float]:
+        """Share of each of `KINDS` in the mean motion of the open cortex; they sum to 1."""
+        weight = self.posterior.weight
+        shape = self.prior.shape[:, np.unique(self.prior.anatomy.open_surface)].reshape(len(weight), -1)
+        whole = weight @ shape
+        own = [float((weight[rows] @ shape[rows]) @ whole) for rows in map(self.prior.kind.__eq__, range(len(KINDS)))]
+        total = float(whole @ whole) or 1.0
+        return {name: part / total for name, part in zip(KINDS, own, strict=True)}
+
+
+@dataclass(frozen=True, eq=False)
+class Locator:
+    """Answers observations of one anatomy; made once (`setup.made`), it answers any number of them.
+
+    Parameters
+    ----------
+    prior
+        What is believed of motions before they are seen.
+    tried
+        (k, 3): what came of trials (`calibration.trials`).
+    """
+
+    prior: Prior
+    tried: np.ndarray
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The body."""
+        return self.prior.anatomy
+
+    def locate(self, observation: Observation) -> Location:
+        """Where the tumour is by one observation.
+
+        Raises
+        ------
+        InputError
+            An observation that is too small, lies elsewhere, or that no cause of the ensemble explains.
+        """
+        with one_thread():  # products are small
+            return self._located(observation)
+
+    def _located(self, observation: Observation) -> Location:
+        begun, prior = time.perf_counter(), self.prior
+        evidence = placed(self.anatomy, observation)
+        found = conditioned(prior, evidence)
+        if observation.rest is None or len(observation.tips):
+            for _ in range(ROUNDS):
+                motion = np.tensordot(found.weight, prior.shape, 1)
+                evidence = placed_anew(self.anatomy, observation, motion, found.bias_at)
+                found = conditioned(prior, evidence)
+        _demand_explained(found, len(np.unique(evidence.point)))
+        found = scaled(found, covering_factor(self.tried, found.evidence))
+        root = np.linalg.cholesky(prior.middle.T @ found.spread @ prior.middle)
+        radius = np.linalg.norm(np.random.default_rng(0).standard_normal((DRAWS, 3)) @ root.T, axis=1)
+        seconds = time.perf_counter() - begun
+        return Location(prior, found, float(np.quantile(radius, 0.95)), was_tried(self.tried, found.evidence), seconds)
+
+
+def _demand_explained(found: Posterior, points: int) -> None:
+    """Refuse an observation that the ensemble does not know.
+
+    Raises
+    ------
+    InputError
+        Too many outliers, or residuals that are no noise.
+    """
+    if len(found.outliers) > MOST_OUTLIERS * points:
+        raise InputError(
+            f"{len(found.outliers)} of {points} points fit no motion that the others support: check that the points "
+            "belong to this brain, and raise sigma if they are less sure."
+        )
+    if found.surprise > MOST_SURPRISE:
+        raise InputError(
+            f"the observation fits no cause: its points are off by {np.sqrt(found.surprise):.1f} times their sigma. "
+            "Check units, frame (RAS) and sigma, or that nothing was cut out."
+        )

@@ -1,0 +1,71 @@
+"""Locators in files: what was made once for a patient, read in a second."""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.effects import SKULLS
+from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import read_as
+
+from ..model.npz_archive import Archive
+from .causes import KINDS
+from .locator import Locator
+from .prior import NOWHERE, PLACES, Prior
+
+FORMAT = "sulcus locator 1"
+LABELS = ("kind", "skull", "place")
+
+
+def save(path: str | Path, locator: Locator) -> None:
+    """Write a locator; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        A name that does not end in .npz, or a folder that cannot be written to.
+    """
+    prior = locator.prior
+    header = {"format": FORMAT, "anatomy": prior.anatomy.digest, "version": version("sulcus"), "kinds": KINDS}
+    arrays = {name: getattr(prior, name) for name in ("shape", *LABELS)}
+    with written_whole(path, ".npz") as unfinished:
+        np.savez(unfinished, header=np.array(json.dumps(header)), tried=locator.tried, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def load(path: str | Path, anatomy: Anatomy) -> Locator:
+    """Read the locator of an anatomy.
+
+    Raises
+    ------
+    InputError
+        A file that is missing, no locator of this version, damaged, or of another anatomy.
+    """
+    with read_as(path, "a locator", "Delete it: `sulcus locate` makes it anew."), Path(path).open("rb") as raw:
+        archive = Archive(raw)
+        header = json.loads(archive.text("header"))
+        if header["format"] != FORMAT or tuple(header["kinds"]) != KINDS:
+            raise InputError(f"{path}: is no locator of this version: delete it, and it is made anew.")
+        if header["anatomy"] != anatomy.digest:
+            raise InputError(f"{path}: was made for another anatomy: delete it, and it is made anew.")
+        arrays = archive.arrays(["shape", *LABELS, "tried"])
+        _check(path, anatomy, arrays)
+        tried = arrays.pop("tried")
+        return Locator(Prior(anatomy, **arrays), tried)
+
+
+def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) -> None:
+    """Raise InputError where arrays do not fit the anatomy or each other."""
+    shape, tried = arrays["shape"], arrays["tried"]
+    fits = shape.ndim == 3 and shape.shape[1:] == anatomy.mesh.nodes.shape and tried.ndim == 2 and tried.shape[1] == 3
+    fits = fits and all(arrays[name].shape == (len(shape),) for name in LABELS) and len(shape) and len(tried)
+    limits = ((0, len(KINDS)), (0, len(SKULLS)), (NOWHERE, PLACES))
+    for name, (low, high) in zip(LABELS, limits, strict=True):
+        fits = fits and arrays[name].dtype.kind == "i" and arrays[name].min() >= low and arrays[name].max() < high
+    if not fits or not (np.isfinite(shape).all() and np.isfinite(tried).all()):
+        raise InputError(f"{path}: has arrays that do not fit the anatomy: delete it, and it is made anew.")

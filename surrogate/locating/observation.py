@@ -1,0 +1,166 @@
+"""What was seen of a brain, checked against it: points that moved, a cloud of where its surface is, tips of tools."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.bodies.open_cortex import open_cortex
+from sim.errors import InputError
+from sim.geometry.closest_point import closest
+from sim.geometry.locate import Located, locate
+from sim.geometry.surface import unit
+
+from .evidence import SIGMA, Evidence, of_motions
+
+FEWEST = 6
+# Spread of points across a line, as a share of that along it: less is a line.
+THIN = 0.05
+# How far [m] half of the points may lie off the surface they are said to be of, and how far any may.
+NEAR, FAR = 6e-3, 12e-3
+# Motions [m] beyond which no brain goes.
+LONGEST_MOTION = 0.05
+# Points of a cloud that are looked at together, and at most.
+TOGETHER, MOST = 64, 400
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What was seen, in RAS and metres.
+
+    Parameters
+    ----------
+    now
+        (n, 3): where points are seen, rigid error included.
+    rest
+        (n, 3): where the same points are in the scan; None: a cloud of the surface, whose points have no names.
+    sigma
+        (n,): standard deviation of each point's error, of what is not rigid.
+    tips
+        (k, 3): where tips of tools touch the surface.
+    """
+
+    now: np.ndarray
+    rest: np.ndarray | None = None
+    sigma: np.ndarray | None = None
+    tips: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def sigmas(self) -> np.ndarray:
+        """(n,) [m]."""
+        return np.full(len(self.now), SIGMA) if self.sigma is None else self.sigma
+
+
+def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
+    """The observation as evidence about a body, before anything is known of its motion.
+
+    Raises
+    ------
+    InputError
+        Numbers that are not finite, too few points, points on a line, a sigma that is not positive, motions beyond any
+        brain's. Points that lie off the brain's surface, with the likely reason: units, LPS for RAS, another anatomy.
+    """
+    _check(observation)
+    where = observation.now if observation.rest is None else observation.rest
+    off = _off_surface(anatomy, where)
+    if np.median(off) > NEAR:
+        raise InputError(_elsewhere(anatomy, where, float(np.median(off))))
+    if observation.rest is not None:
+        motion = np.median(np.linalg.norm(observation.now - observation.rest, axis=1))
+        if motion > LONGEST_MOTION:
+            raise InputError(
+                f"half of the points move by more than {1e3 * motion:.0f} mm, which no brain does: give motions in "
+                "millimetres, rather than new positions."
+            )
+    if observation.rest is not None:
+        near = np.flatnonzero(off <= FAR)
+        here = observation.rest[near]
+        evidence = of_motions(locate(anatomy.mesh, here), here, observation.now[near] - here, observation.sigmas[near])
+        return evidence
+    return placed_anew(anatomy, observation, np.zeros_like(anatomy.mesh.nodes), lambda at: np.zeros_like(at))
+
+
+def placed_anew(anatomy: Anatomy, observation: Observation, motion: np.ndarray, bias) -> Evidence:
+    """The observation as evidence where the body is believed to have moved by `motion` (V, 3) [m].
+
+    Points without a name are those of the surface that are nearest to them; they tell of its motion along its normal.
+    `bias` gives the rigid error (n, 3) [m] that is believed in at places (n, 3).
+    """
+    parts = []
+    if observation.rest is not None:
+        here = observation.rest
+        parts.append(of_motions(locate(anatomy.mesh, here), here, observation.now - here, observation.sigmas))
+        cloud, sigma = observation.tips, np.full(len(observation.tips), SIGMA)
+    else:
+        cloud = np.concatenate([observation.now, observation.tips])
+        sigma = np.concatenate([observation.sigmas, np.full(len(observation.tips), SIGMA)])
+    some = np.unique(np.linspace(0, len(cloud) - 1, min(len(cloud), MOST)).round().astype(int)) if len(cloud) else []
+    if len(some):
+        first = 0 if not parts else int(parts[0].point.max()) + 1
+        parts.append(_along_normals(anatomy, cloud[some], sigma[some], motion, bias, first))
+    return parts[0] if len(parts) == 1 else _joined(parts)
+
+
+def _along_normals(
+    anatomy: Anatomy, cloud: np.ndarray, sigma: np.ndarray, motion: np.ndarray, bias, first: int
+) -> Evidence:
+    """One row a point: how far along the moved surface's normal the surface moved to be there."""
+    triangles, nodes = anatomy.open_surface, anatomy.mesh.nodes
+    corners = (nodes + motion)[triangles]
+    asked = cloud - bias(cloud)
+    found = [closest(asked[some : some + TOGETHER], corners) for some in range(0, len(asked), TOGETHER)]
+    triangle, weights = (np.concatenate([getattr(each, name) for each in found]) for name in ("triangle", "weights"))
+    a, b, c = np.moveaxis(corners[triangle], 1, 0)
+    normal = unit(np.cross(b - a, c - a))
+    vertices = triangles[triangle]
+    at = np.einsum("nc,nci->ni", weights, nodes[vertices])
+    # A fourth vertex of no weight makes it a place of the mesh.
+    place = Located(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(len(at))]))
+    value = np.einsum("ni,ni->n", cloud - at, normal)
+    return Evidence(place, at, normal, value, sigma, first + np.arange(len(at)))
+
+
+def _joined(parts: list[Evidence]) -> Evidence:
+    def joined(of, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        return {name: np.concatenate([getattr(of(part), name) for part in parts]) for name in names}
+
+    place = Located(**joined(lambda part: part.place, ("vertices", "weights")))
+    return Evidence(place=place, **joined(lambda part: part, ("at", "axis", "value", "sigma", "point")))
+
+
+def _check(observation: Observation) -> None:
+    arrays = {"positions": observation.now, "sigma": observation.sigmas, "tips": observation.tips}
+    if observation.rest is not None:
+        arrays["points at rest"] = observation.rest
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise InputError(f"the {name} have a value that is not finite: leave such points out.")
+    count = len(observation.now)
+    if count < FEWEST:
+        raise InputError(f"{count} points say too little: give at least {FEWEST}, spread over the open cortex.")
+    if not (observation.sigmas > 0.0).all():
+        raise InputError("a sigma is not positive: give each point the standard deviation of its error [mm].")
+    where = observation.now if observation.rest is None else observation.rest
+    along, across, _ = np.linalg.svd(where - where.mean(axis=0), compute_uv=False)
+    if not across > THIN * along:
+        raise InputError("the points lie on a line: spread them over the open cortex.")
+
+
+def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
+    """Distances (n,) [m] from the open cortex."""
+    corners = open_cortex(anatomy).corners
+    parts = [points[some : some + TOGETHER] for some in range(0, len(points), TOGETHER)]
+    return np.concatenate([np.linalg.norm(closest(part, corners).point - part, axis=1) for part in parts])
+
+
+def _elsewhere(anatomy: Anatomy, points: np.ndarray, off: float) -> str:
+    """Why points may be so far off the open cortex [m]."""
+    start = f"half of the points lie more than {1e3 * off:.3g} mm off the open cortex"
+    for scale, unit_meant in ((1e-3, "the file is in micrometres, or a thousandth"), (1e3, "the file is in metres")):
+        if np.median(_off_surface(anatomy, scale * points)) <= NEAR:
+            return f"{start}: {unit_meant}. Give millimetres."
+    if np.median(_off_surface(anatomy, points * [-1.0, -1.0, 1.0])) <= NEAR:
+        return f"{start}, and would lie on it if x and y were turned: the file is LPS. Give RAS."
+    return f"{start}: they are of another brain or frame. Give the scan's own RAS, in millimetres."

@@ -1,0 +1,69 @@
+"""Observations in CSV files: millimetres, RAS, a header that says what each column is."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from sim.errors import InputError
+from sim.runtime.outside_files import path_of, read_as
+
+from .observation import Observation
+
+PLACE, MOTION, SIGMA, RADIUS = ("x", "y", "z"), ("dx", "dy", "dz"), "sigma", "radius"
+# Rows and characters of a line, beyond which a file is no list of points.
+MOST_ROWS, LONGEST_LINE = 1_000_000, 1000
+
+
+def read_observation(path: str | Path, tips: str | Path | None = None) -> Observation:
+    """Read `x,y,z,dx,dy,dz[,sigma]`, points in the scan and how they moved, or `x,y,z[,sigma]`, a cloud of the surface.
+
+    `tips` is a file of `x,y,z`: where tips of tools touch the surface. All in millimetres, RAS.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or no such table, columns that are missing, unknown or named twice, cells that are no
+        finite numbers.
+    """
+    columns = _columns(path, {(*PLACE, *MOTION), (*PLACE, *MOTION, SIGMA), PLACE, (*PLACE, SIGMA)})
+    touched = np.zeros((0, 3)) if tips is None else _points(_columns(tips, {PLACE}), PLACE)
+    at = _points(columns, PLACE)
+    sigma = 1e-3 * columns[SIGMA] if SIGMA in columns else None
+    if "dx" in columns:
+        return Observation(at + _points(columns, MOTION), at, sigma, touched)
+    return Observation(at, None, sigma, touched)
+
+
+def _points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
+    """Columns [mm] as points (n, 3) [m]."""
+    return 1e-3 * np.column_stack([columns[name] for name in names])
+
+
+def _columns(path: str | Path, allowed: set[tuple[str, ...]]) -> dict[str, np.ndarray]:
+    path = path_of(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    known = " or ".join(",".join(names) for names in sorted(allowed))
+    with read_as(path, "a table of points", f"Give a CSV file with the header {known}."):
+        text = path.read_text(encoding="utf-8-sig")
+    lines = text.splitlines()
+    if len(lines) > MOST_ROWS or any(len(line) > LONGEST_LINE for line in lines):
+        raise InputError(f"{path}: has more than {MOST_ROWS:,} rows, or longer ones than a list of points has.")
+    rows = [row for row in csv.reader(lines) if row]
+    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
+    if set(header) not in map(set, allowed) or len(set(header)) < len(header):
+        raise InputError(f"{path}: its first line is {','.join(header)[:80]!r}: give the header {known}.")
+    values = np.empty((len(rows) - 1, len(header)))
+    for number, row in enumerate(rows[1:], start=2):
+        try:
+            values[number - 2] = [float(cell) for cell in row]
+        except ValueError as error:
+            raise InputError(
+                f"{path}: row {number} is {','.join(row)[:80]!r}, not {len(header)} numbers: mend or remove it."
+            ) from error
+        if not np.isfinite(values[number - 2]).all():
+            raise InputError(f"{path}: row {number} has a number that is not finite: remove it.")
+    return dict(zip(header, values.T, strict=True))

@@ -1,0 +1,189 @@
+"""What is believed of a motion before it is seen: shapes of every cause in every skull, and which may take part.
+
+A motion is a sum of shapes with independent weights. Shapes of drainage and swelling are the principal ones of an
+ensemble. Those of tools are what smooth forces on the open cortex do to linear tissue, all over it or round one place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.effects import SKULLS
+from sim.geometry.locate import Located
+
+from .causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
+from .ensemble import Ensemble, surface_size
+from .presses import Presses, spaced
+
+# Shapes of each kind in each skull, at most; the least share of the variance that one of them has.
+MOST = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, TOOL: 40}
+SMALLEST_SHARE = 1e-6
+# Places that one tool may press on, shapes of each, and how far [m] its forces reach round it.
+PLACES, PLACE_SHAPES, REACH = 30, 6, 6e-3
+# Sizes as shares of the seen motion: of what takes part; of a tumour's swelling where a brain swells; of forces all
+# over the cortex, which make good what the other shapes lack.
+FULL, LESS, LEAST = 1.0, 0.3, 0.15
+# The rigid error, as shares of its prior: a brain that sinks looks much like one.
+RIGIDS = (0.1, 1.0)
+# A skull that lets go holds what tools press against it, as one does in which the brain slides.
+PRESSED = {"bonded": "bonded", "slide": "slide", "contact": "slide"}
+# What may take part beside tools.
+SETS = ((), (DRAINAGE,), (SWELLING,), (DRAINAGE, SWELLING), (DRAINAGE, SWELLING, TUMOUR_SWELLING))
+# With one of these a tool may press on one place.
+WITH_PLACE = SETS[:4]
+NOWHERE = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """What takes part in a motion.
+
+    Parameters
+    ----------
+    rows
+        (k,) of the prior's shapes.
+    size
+        (k,) standard deviations of their weights, as shares of the seen motion.
+    rigid
+        That of the rigid error, as a share of its prior.
+    places
+        (p, q) rows of shapes, of which those of one line may take part too: of a tool that presses on one place.
+    """
+
+    rows: np.ndarray
+    size: np.ndarray
+    rigid: float
+    places: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Shapes of one anatomy.
+
+    Parameters
+    ----------
+    anatomy
+        The body.
+    shape
+        (r, V, 3) float32 [m]. Those of one kind, skull and place together, with weights of variance 1, move the open
+        cortex or the tumour by 1 mm in root mean square.
+    kind, skull
+        (r,) indices into `KINDS` and into the names of `sim.effects.SKULLS`.
+    place
+        (r,) number of the place that a tool presses on, or `NOWHERE`.
+    """
+
+    anatomy: Anatomy
+    shape: np.ndarray
+    kind: np.ndarray
+    skull: np.ndarray
+    place: np.ndarray
+
+    @cached_property
+    def middle(self) -> np.ndarray:
+        """(r, 3) [m]: how each shape moves the middle of the tumour's volume."""
+        return middle_of(self.anatomy, self.shape)
+
+    @cached_property
+    def _by_vertex(self) -> np.ndarray:
+        """(V, r * 3) float32 [m]: the shapes, so that those at a few places are near each other."""
+        return np.ascontiguousarray(self.shape.transpose(1, 0, 2)).reshape(self.shape.shape[1], -1)
+
+    def seen(self, place: Located, axis: np.ndarray) -> np.ndarray:
+        """What would be seen (m, r) [m] of each shape at m places, along axes (m, 3)."""
+        vertices, number = np.unique(place.vertices, return_inverse=True)
+        weights = np.zeros((len(axis), len(vertices)), np.float32)
+        np.add.at(weights, (np.arange(len(axis))[:, None], number.reshape(place.vertices.shape)), place.weights)
+        moved = (weights @ self._by_vertex[vertices]).reshape(len(axis), -1, 3)
+        return np.einsum("mri,mi->mr", moved, axis)
+
+    @cached_property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """Every set of causes in every skull, with and without much of a rigid error."""
+        made = []
+        for number, name in enumerate(SKULLS):
+            pressed = (self.kind == TOOL) & (self.skull == list(SKULLS).index(PRESSED[name]))
+            spread = np.flatnonzero(pressed & (self.place == NOWHERE))
+            places = np.array(
+                [np.flatnonzero(pressed & (self.place == place)) for place in range(self.place.max() + 1)]
+            )
+            for some, rigid in product(SETS, RIGIDS):
+                rows = [np.flatnonzero((self.kind == kind) & (self.skull == number)) for kind in some]
+                size = [
+                    np.full(len(own), LESS if kind == TUMOUR_SWELLING else FULL)
+                    for own, kind in zip(rows, some, strict=True)
+                ]
+                size = np.concatenate([*size, np.full(len(spread), LEAST)])
+                made.append(
+                    Hypothesis(
+                        np.concatenate([*rows, spread]), size, rigid, places if some in WITH_PLACE else places[:0]
+                    )
+                )
+        return tuple(made)
+
+
+def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = None) -> Prior:
+    """The prior of an ensemble, or of some of its members (N,) bool, and of forces on the open cortex."""
+    anatomy, parts = ensemble.anatomy, []
+    chosen = np.ones(len(ensemble.kind), bool) if members is None else members
+    for kind, skull in product((DRAINAGE, SWELLING, TUMOUR_SWELLING), range(len(SKULLS))):
+        some = np.flatnonzero(chosen & (ensemble.kind == kind) & (ensemble.skull == skull))
+        if len(some):
+            shape = principal(unit(anatomy, ensemble.motion[some]) / np.float32(np.sqrt(len(some))), MOST[kind])
+            parts.append((shape, kind, skull, NOWHERE))
+    centres = spaced(presses.points, PLACES)
+    for name in dict.fromkeys(PRESSED.values()):
+        skull, motion = list(SKULLS).index(name), presses.motion[name]
+        parts.append(
+            (alike(anatomy, principal(motion.reshape(-1, *motion.shape[-2:]), MOST[TOOL])), TOOL, skull, NOWHERE)
+        )
+        for place, centre in enumerate(centres):
+            away = ((presses.points - presses.points[centre]) ** 2).sum(axis=1)
+            near = np.flatnonzero(away < (3.0 * REACH) ** 2)
+            weight = np.exp(-away[near] / (2.0 * REACH**2)).astype(np.float32)
+            some = motion[:, near] * weight[:, None, None, None]
+            parts.append(
+                (alike(anatomy, principal(some.reshape(-1, *motion.shape[-2:]), PLACE_SHAPES)), TOOL, skull, place)
+            )
+    shapes, *labels = zip(*parts, strict=True)
+    return Prior(
+        anatomy, np.concatenate(shapes), *(np.repeat(label, [len(shape) for shape in shapes]) for label in labels)
+    )
+
+
+def unit(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
+    """Motions (n, V, 3) [m], made so large that they move the open cortex or the tumour by 1 mm, what moves farther.
+
+    A motion that leaves the cortex nearly still says little of what is seen.
+    """
+    tumour = np.sqrt((motion[:, anatomy.tumour_nodes] ** 2).sum(axis=2).mean(axis=1))
+    size = np.maximum(surface_size(anatomy, motion), tumour)
+    return motion * (1e-3 / size)[:, None, None].astype(np.float32)
+
+
+def alike(anatomy: Anatomy, shape: np.ndarray) -> np.ndarray:
+    """Shapes (k, V, 3) [m] that together move the open cortex by 1 mm."""
+    return shape * np.float32(1e-3 / np.sqrt((surface_size(anatomy, shape) ** 2).sum()))
+
+
+def principal(motion: np.ndarray, most: int) -> np.ndarray:
+    """At most so many principal parts (k, V, 3) of motions (n, V, 3): their products sum to those of the motions."""
+    flat = motion.reshape(len(motion), -1)
+    value, vector = np.linalg.eigh((flat @ flat.T).astype(float))
+    chosen = np.argsort(-value)[:most]
+    chosen = chosen[value[chosen] > SMALLEST_SHARE * value.sum()]
+    return (vector[:, chosen].T.astype(np.float32) @ flat).reshape(-1, *motion.shape[1:])
+
+
+def middle_of(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
+    """How motions (n, V, 3) [m] move the middle of the tumour's volume (n, 3) [m]."""
+    mesh = anatomy.mesh
+    inside = mesh.region == TUMOUR_LABEL
+    share = np.zeros(len(mesh.nodes))
+    np.add.at(share, mesh.tets[inside], np.repeat(mesh.volumes[inside][:, None] / 4.0, 4, axis=1))
+    return np.einsum("v,nvi->ni", share / share.sum(), motion)

@@ -1,0 +1,41 @@
+"""All that is made once for a patient, before anything is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sim.anatomy import Anatomy
+from sim.runtime.threads import one_thread
+
+from .calibration import trials
+from .causes import USUAL, Causes
+from .ensemble import solved
+from .locator import Locator
+from .presses import pressed
+from .prior import PRESSED, prior_of
+
+
+def made(
+    anatomy: Anatomy,
+    seed: int = 0,
+    device: str = "auto",
+    causes: Causes = USUAL,
+    folder: Path | None = None,
+    progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
+) -> Locator:
+    """A locator of one anatomy. Groups that a `folder` keeps from a run that was stopped are read.
+
+    `progress` hears a stage, how many of its parts are done, and of how many.
+
+    Raises
+    ------
+    InputError
+        An anatomy without open cortex, tumour or skull; causes of which nothing converged.
+    """
+    ensemble = solved(anatomy, seed, device, causes, folder, lambda done, total: progress("causes", done, total))
+    progress("forces on the cortex", 0, 1)
+    presses = pressed(anatomy, tuple(dict.fromkeys(PRESSED.values())), device)
+    with one_thread():  # products are small
+        tried = trials(ensemble, presses, lambda done, total: progress("trials", done, total))
+    return Locator(prior_of(ensemble, presses), tried)

@@ -1,0 +1,126 @@
+"""`sulcus locate`: files in, a mesh and numbers out, and what is wrong with a file in one sentence."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+
+from scenes.cli import main
+from sim.bodies.meshfile import read_mesh, write_anatomy
+from sim.runtime.threads import one_thread
+from surrogate.locating.calibration import trials
+from surrogate.locating.causes import KINDS
+from surrogate.locating.ensemble import Ensemble
+from surrogate.locating.locator import Locator
+from surrogate.locating.locator_files import save
+from surrogate.locating.presses import Presses
+from surrogate.locating.prior import prior_of
+
+
+@pytest.fixture(scope="module")
+def body():
+    box = make_box(cells=(8, 8, 5), spacing=9e-3, tumour=12e-3, opening=30e-3)
+    return replace(box, mesh=replace(box.mesh, nodes=box.mesh.nodes + [0.04, 0.03, 0.02]))
+
+
+@pytest.fixture(scope="module")
+def files(body, tmp_path_factory):
+    """An anatomy with a locator by formula: dents that reach into the depth, shears and stretches; and a truth."""
+    folder, random = tmp_path_factory.mktemp("locate"), np.random.default_rng(0)
+    write_anatomy(folder / "box.vtu", body)
+    at = body.mesh.nodes - [0.04, 0.03, 0.02]
+
+    def motion():
+        middle = np.append(random.uniform(-0.02, 0.02, 2), 0.0)
+        fall = np.exp(-0.5 * (((at - middle) / [0.025, 0.025, 0.03]) ** 2).sum(axis=1))
+        return 3e-3 * fall[:, None] * (random.normal(size=3) * [0.3, 0.3, 1.0])
+
+    members = np.array([motion() for _ in range(48)], np.float32)
+    count = np.arange(48)
+    ensemble = Ensemble(body, members, count % 4, count // 4 % 3, count // 12)
+    points = body.mesh.nodes[np.unique(body.open_surface)]
+    dents = np.array([[motion() for _ in range(3)] for _ in points], np.float32)[None]
+    presses = Presses(points, {"bonded": dents, "slide": dents})
+    with one_thread():
+        save(folder / "box.locator.npz", Locator(prior_of(ensemble, presses), trials(ensemble, presses)))
+    truth = motion()
+    triangles = body.open_surface[random.integers(len(body.open_surface), size=50)]
+    share = random.dirichlet(np.ones(3), 50)
+    rest, moved = (np.einsum("nc,nci->ni", share, field[triangles]) for field in (body.mesh.nodes, truth))
+    moved = moved + 1e-4 * random.standard_normal((50, 3))
+    sigma = np.full((50, 1), 0.15)
+    for name, header, table in (
+        ("vessels", "x,y,z,dx,dy,dz,sigma", np.hstack([1e3 * rest, 1e3 * moved, sigma])),
+        ("plain", "x,y,z,dx,dy,dz", np.hstack([1e3 * rest, 1e3 * moved])),
+        ("cloud", "x,y,z,sigma", np.hstack([1e3 * (rest + moved), sigma])),
+        ("tips", "x,y,z", 1e3 * (rest + moved)[:3]),
+    ):
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header=header, comments="")
+    return folder, truth
+
+
+def test_the_result_is_a_mesh_and_numbers_in_millimetres(files, body, capsys):
+    folder, truth = files
+    out = folder / "located.vtu"
+    words = ["locate", str(folder / "box.vtu"), str(folder / "vessels.csv"), "--out", str(out), "--json"]
+    assert main(words) == 0
+    said = json.loads(capsys.readouterr().out)
+    expected = {"centroid_mm", "covariance_mm2", "p95_mm", "explained", "causes", "bias_mm", "milliseconds", "outliers"}
+    assert expected <= set(said) and set(said["causes"]) == set(KINDS) and said["points"] == 50
+    assert np.shape(said["covariance_mm2"]) == (3, 3) and np.linalg.eigvalsh(said["covariance_mm2"]).min() > 0.0
+    tumour = 1e3 * truth[body.tumour_nodes].mean(axis=0)
+    assert np.linalg.norm(np.array(said["centroid_mm"]) - tumour) < 0.5 * np.linalg.norm(tumour) + 0.3
+    assert said["explained"] > 0.9
+    found = read_mesh(out)
+    field = found.point_data["displacement"]
+    assert field.shape == truth.shape and np.isfinite(field).all()
+    assert found.point_data["covariance"].shape == (len(field), 6)
+    trace = found.point_data["covariance"][:, :3].sum(axis=1)
+    assert found.point_data["deviation"] == pytest.approx(np.sqrt(np.maximum(trace, 0.0)), abs=1e-9)
+    assert main(words) == 0  # the same again, over its own file
+    assert json.loads(capsys.readouterr().out)["centroid_mm"] == said["centroid_mm"]
+
+
+@pytest.mark.parametrize("words", [["plain.csv"], ["cloud.csv"], ["cloud.csv", "--tool", "tips.csv"]])
+def test_people_read_sentences(files, capsys, words):
+    folder, _ = files
+    words = [str(folder / word) if word.endswith(".csv") else word for word in words]
+    assert main(["locate", str(folder / "box.vtu"), *words, "--out", str(folder / "other.vtu")]) == 0
+    said = capsys.readouterr().out
+    assert "The middle of the tumour has moved by" in said and "With a probability of 95 %" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "its first line is ''"),
+        ("a,b,c\n1,2,3\n", "give the header x,y,z"),
+        ("x,y,z,x\n1,2,3,4\n", "give the header"),
+        ("x,y,z\n1,2\n", "row 2 is '1,2', not 3 numbers"),
+        ("x,y,z\n1,2,three\n", "row 2 is '1,2,three'"),
+        ("x,y,z\n1,2,nan\n", "row 2 has a number that is not finite"),
+        ("x,y,z\n1,2,3\n", "1 points say too little"),
+        ("x,y,z\n" + "1,2,3\n" * 20, "lie on a line"),
+        ("x,y,z," + "d" * 2000 + "\n", "longer ones than a list of points has"),
+        ("\x00\x01", "its first line"),
+    ],
+)
+def test_bad_files_are_one_sentence_and_write_nothing(files, tmp_path, capsys, text, reason):
+    folder, _ = files
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    assert main(["locate", str(folder / "box.vtu"), str(path), "--out", str(tmp_path / "out.vtu")]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert reason in said[-1] and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_cannot_be_placed_does_not_wait_for_a_locator(tmp_path, capsys, body):
+    """The anatomy has none, and none is begun."""
+    write_anatomy(tmp_path / "box.vtu", body)
+    far = tmp_path / "far.csv"
+    far.write_text("x,y,z\n" + "".join(f"{300 + 9 * (k % 3)},{9 * (k // 3)},{k % 2}\n" for k in range(9)))
+    assert main(["locate", str(tmp_path / "box.vtu"), str(far), "--out", str(tmp_path / "out.vtu")]) == 2
+    assert "they are of another brain or frame" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["box.vtu", "far.csv"]

@@ -1,0 +1,65 @@
+"""Covariances that hold: the factor by which they grow, and the patches on which they are tried."""
+
+import numpy as np
+import pytest
+from conftest import make_box
+from scipy.stats import chi2
+
+from surrogate.locating.calibration import covering_factor, likeness, seen_patch, was_tried
+from surrogate.locating.prior import middle_of
+
+MOTION = np.array([1e-3, -2e-3, 2e-3])
+
+
+@pytest.fixture(scope="module")
+def body():
+    return make_box(cells=(8, 8, 5), spacing=9e-3, tumour=12e-3, opening=30e-3)
+
+
+@pytest.fixture(scope="module")
+def evidence(body):
+    motion = np.tile(MOTION, (len(body.mesh.nodes), 1))
+    return seen_patch(body, motion, np.random.default_rng(0), 60, 0.5)
+
+
+def test_points_lie_on_a_patch_of_the_open_cortex_and_move_with_it(body, evidence):
+    assert len(evidence) == 180 and evidence.value.reshape(60, 3) == pytest.approx(np.tile(MOTION, (60, 1)))
+    places = evidence.at[::3]
+    on = body.mesh.nodes[np.unique(body.open_surface)]
+    assert np.ptp(places[:, 2]) == pytest.approx(0.0, abs=1e-12) and places[0, 2] == pytest.approx(on[:, 2].max())
+    whole = seen_patch(body, np.zeros_like(body.mesh.nodes), np.random.default_rng(0), 400, 1.0).at
+    assert np.ptp(places[:, :2], axis=0).max() < 0.95 * np.ptp(whole[:, :2], axis=0).max()
+    moved = np.einsum("mc,mci->mi", evidence.place.weights, body.mesh.nodes[evidence.place.vertices])
+    assert moved == pytest.approx(evidence.at)
+
+
+def test_likeness_is_of_motion_over_error_and_of_the_number_of_points(evidence):
+    assert likeness(evidence) == pytest.approx(np.log([3e-3 / evidence.sigma[0], 60.0]))
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 4.0])
+def test_the_factor_makes_ellipsoids_hold_in_95_of_100_trials(evidence, times):
+    """Squares that are chi-square of three degrees, times a number, need just that number."""
+    random = np.random.default_rng(1)
+    squares = times * chi2.ppf((np.arange(80) + 0.5) / 80, 3)
+    tried = np.column_stack([likeness(evidence) + 0.01 * random.standard_normal((80, 2)), squares])
+    assert covering_factor(tried, evidence) == pytest.approx(times, rel=0.12)
+    # Trials that are unlike it do not count.
+    other = np.column_stack([likeness(evidence) + np.full((500, 2), 3.0), np.full(500, 1e3)])
+    assert covering_factor(np.concatenate([other, tried]), evidence) == covering_factor(tried, evidence)
+
+
+def test_what_was_never_tried_is_said(evidence):
+    around = likeness(evidence) + np.array([[-0.1, -0.1], [0.1, 0.1]])
+    assert was_tried(np.column_stack([around, [1.0, 1.0]]), evidence)
+    assert not was_tried(np.column_stack([around + [0.2, 0.0], [1.0, 1.0]]), evidence)
+    assert not was_tried(np.column_stack([around - [0.0, 0.2], [1.0, 1.0]]), evidence)
+
+
+def test_the_tumours_middle_is_that_of_its_volume(body):
+    """A motion that grows with x moves it as far as its middle's x says."""
+    inside = body.mesh.region == 2
+    middle = np.average(body.mesh.nodes[body.mesh.tets[inside]].mean(axis=1), axis=0, weights=body.mesh.volumes[inside])
+    motion = np.zeros((1, *body.mesh.nodes.shape))
+    motion[0, :, 1] = 1.0 + 3.0 * body.mesh.nodes[:, 0]
+    assert middle_of(body, motion) == pytest.approx(np.array([[0.0, 1.0 + 3.0 * middle[0], 0.0]]))

@@ -1,0 +1,244 @@
+"""Locating a tumour from what is seen: a small body's ensemble, motions that it does not hold, bad observations."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+
+from sim.errors import InputError
+from surrogate.locating import ensemble as ensembles
+from surrogate.locating.causes import KINDS, LETS_GO, Causes, drainages, groups, pushes
+from surrogate.locating.ensemble import members, solved, surface_size
+from surrogate.locating.locator import Locator
+from surrogate.locating.locator_files import load, save
+from surrogate.locating.observation import Observation
+from surrogate.locating.prior import NOWHERE, PLACES, middle_of
+from surrogate.locating.setup import made
+
+FEW = Causes(
+    poisson=(0.45, 0.485),
+    tools=(8, 3),
+    drainages=3,
+    levels=(0.6, 0.3),
+    swellings=(0.04, 0.02, -0.02),
+    tumour_swellings=(0.2, -0.1),
+)
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A small box on a floor that is held, with a skull round its sides, off the origin as openings are."""
+    box = make_box(cells=(8, 8, 5), spacing=9e-3, tumour=12e-3, opening=30e-3)
+    nodes = box.mesh.nodes
+    normal, held = np.zeros_like(nodes), box.held.copy()
+    for axis in (0, 1):
+        side = (np.abs(nodes[:, axis]) > 36e-3 - 1e-9) & (nodes[:, 2] > -45e-3 + 1e-9) & ~normal.any(axis=1)
+        normal[side] = np.sign(nodes[side]) * np.eye(3)[axis]
+        held[side] = False
+    mesh = replace(box.mesh, nodes=nodes + [0.04, 0.03, 0.02])
+    return replace(box, mesh=mesh, held=held, slide_normal=normal)
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    return tmp_path_factory.mktemp("parts")
+
+
+@pytest.fixture(scope="module")
+def locator(body, parts):
+    return made(body, causes=FEW, device="cpu", folder=parts)
+
+
+@pytest.fixture(scope="module")
+def ensemble(body, parts, locator):
+    """That which the locator was made of, read from where it was kept."""
+    return solved(body, causes=FEW, device="cpu", folder=parts)
+
+
+@pytest.fixture(scope="module")
+def truth(body):
+    """Motions of another tissue and of other loads than the ensemble's, of each skull, 3 mm at the surface."""
+    found = []
+    for group in groups(body, seed=7, causes=FEW)[::2]:
+        motion, kind = members(body, replace(group, poisson=0.47), seed=7, device="cpu", causes=FEW)
+        size = surface_size(body, motion)
+        found += [(3e-3 * motion[n] / size[n], KINDS[kind[n]]) for n in range(0, len(motion), 3)]
+    return found
+
+
+def observed(body, motion, seed=0, count=60, bias=0.0, noise=1.0):
+    """Points all over the open cortex, with white, smooth and rigid errors; and the rigid translation."""
+    random = np.random.default_rng(seed)
+    triangles = body.open_surface[random.integers(len(body.open_surface), size=count)]
+    share = random.dirichlet(np.ones(3), count)
+    rest = np.einsum("nc,nci->ni", share, body.mesh.nodes[triangles])
+    moved = np.einsum("nc,nci->ni", share, motion[triangles])
+    near = np.exp(-0.5 * ((rest[:, None] - rest) ** 2).sum(axis=2) / 15e-3**2) + 1e-9 * np.eye(count)
+    smooth = np.linalg.cholesky(near) @ random.standard_normal((count, 3))
+    off = bias * np.array([0.6, -0.8, 0.0])
+    return Observation(
+        rest + moved + noise * (0.3e-3 * random.standard_normal((count, 3)) + 0.5e-3 * smooth) + off, rest
+    )
+
+
+def test_draws_depend_on_the_seed_and_the_group_alone(body):
+    first, second = groups(body, 0, FEW)[:2]
+    draws = [(first, 0), (first, 0), (second, 0), (first, 1)]
+    force, again, other, later = (pushes(group, body, seed, FEW).causes[0].force for group, seed in draws)
+    assert np.array_equal(force, again) and not np.array_equal(force, other) and not np.array_equal(force, later)
+    falling = drainages(first, body, 0, FEW)
+    assert [len(level) for level in falling] == [3, 3]
+    down = [level.causes[1].direction for level in falling]
+    assert np.array_equal(*down) and (falling[1].causes[1].csf_level < falling[0].causes[1].csf_level).all()
+
+
+def test_a_skull_that_lets_go_is_not_asked_for_swollen_fluid_tissue(body):
+    made = {(group.skull, group.poisson) for group in groups(body, 0, FEW)}
+    assert (LETS_GO, 0.45) in made and (LETS_GO, 0.485) not in made and ("slide", 0.485) in made
+
+
+def test_an_ensemble_has_every_cause_in_every_skull(ensemble, body):
+    assert {(kind, skull) for kind, skull in zip(ensemble.kind, ensemble.skull, strict=True)} == {
+        (kind, skull) for kind in range(len(KINDS)) for skull in range(3)
+    }
+    assert np.isfinite(ensemble.motion).all() and ensemble.motion.shape[1:] == body.mesh.nodes.shape
+
+
+def test_shapes_of_each_place_and_skull_move_the_open_cortex_by_a_millimetre(locator, body):
+    prior = locator.prior
+    for skull in (0, 1):
+        for place in (NOWHERE, 0, int(prior.place.max())):
+            rows = (prior.kind == 0) & (prior.skull == skull) & (prior.place == place)
+            size = surface_size(body, prior.shape[rows])
+            assert np.sqrt((size**2).sum()) == pytest.approx(1e-3, rel=1e-4)
+    assert prior.place.max() == PLACES - 1 and not ((prior.kind == 0) & (prior.skull == 2)).any()
+
+
+def test_a_stopped_ensemble_goes_on(body, tmp_path, monkeypatch, ensemble):
+    made = []
+
+    def stopped(anatomy, group, *rest):
+        made.append(group.number)
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        chosen = ensemble.group == group.number
+        return ensemble.motion[chosen], ensemble.kind[chosen]
+
+    monkeypatch.setattr(ensembles, "members", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        solved(body, causes=FEW, device="cpu", folder=tmp_path)
+    found = solved(body, causes=FEW, device="cpu", folder=tmp_path)
+    assert made == [0, 1, 2, 2, 3, 4]
+    for name in ("motion", "kind", "skull", "group"):
+        assert np.array_equal(getattr(found, name), getattr(ensemble, name)), name
+
+
+def test_files_of_locators_are_read_as_they_were_and_refused_where_they_do_not_belong(locator, body, tmp_path):
+    path = tmp_path / "box.locator.npz"
+    save(path, locator)
+    again = load(path, body)
+    assert np.array_equal(again.tried, locator.tried)
+    for name in ("shape", "kind", "skull", "place"):
+        assert np.array_equal(getattr(again.prior, name), getattr(locator.prior, name)), name
+    with pytest.raises(InputError, match="another anatomy"):
+        load(path, replace(body, craniotomy=body.craniotomy & (body.mesh.nodes[:, 0] > 0.04)))
+    path.write_bytes(path.read_bytes()[:-4000])
+    with pytest.raises(InputError, match="locator"):
+        load(path, body)
+    prior = locator.prior
+    for spoilt in (
+        replace(prior, shape=np.full_like(prior.shape, np.nan)),
+        replace(prior, kind=prior.kind + 4),
+        replace(prior, place=prior.place[1:]),
+    ):
+        save(tmp_path / "wild.npz", Locator(spoilt, locator.tried))
+        with pytest.raises(InputError, match="do not fit"):
+            load(tmp_path / "wild.npz", body)
+
+
+def test_most_of_the_tumours_motion_is_found_and_ellipsoids_hold_it(locator, body, truth):
+    """Other tissue, loads and errors than the ensemble knows; the covariance holds for nine of ten at least."""
+    left, all_of_it, held = 0.0, 0.0, []
+    for seed, (motion, _) in enumerate(truth):
+        found = locator.locate(observed(body, motion, seed))
+        middle = middle_of(body, motion[None])[0]
+        off = found.centroid - middle
+        left, all_of_it = left + np.linalg.norm(off), all_of_it + np.linalg.norm(middle)
+        held.append(off @ np.linalg.solve(found.centroid_covariance, off) < 7.815)
+        assert np.linalg.eigvalsh(found.centroid_covariance).min() > 0.0
+        covariance = found.covariance(body.tumour_nodes)
+        assert covariance.shape == (len(body.tumour_nodes), 3, 3) and np.linalg.eigvalsh(covariance).min() > 0.0
+        assert sum(found.causes.values()) == pytest.approx(1.0) and found.calibrated
+    assert left < 0.35 * all_of_it and np.mean(held) > 0.85
+
+
+def test_a_rigid_error_is_no_motion(locator, body, truth):
+    """Most of a translation of 2 mm along the surface goes into the bias, and little of it into the tumour."""
+    moved, known = [], []
+    for seed, (motion, _) in enumerate(truth[::2]):
+        without = locator.locate(observed(body, motion, seed))
+        found = locator.locate(observed(body, motion, seed, bias=2e-3))
+        moved.append(np.linalg.norm(found.centroid - without.centroid))
+        known.append((found.bias - without.bias) @ [0.6, -0.8, 0.0])
+    assert np.median(known) > 1e-3 and np.median(moved) < 1e-3
+
+
+def test_a_cloud_without_names_tells_the_motion_along_the_surfaces_normal(locator, body, truth):
+    left, all_of_it = 0.0, 0.0
+    for seed, (motion, _) in enumerate(truth):
+        named = observed(body, motion, seed, count=150, noise=0.2)
+        found = locator.locate(Observation(named.now, sigma=np.full(150, 0.15e-3)))
+        middle = middle_of(body, motion[None])[0]
+        left, all_of_it = left + abs((found.centroid - middle)[2]), all_of_it + abs(middle[2])
+    assert left < 0.4 * all_of_it
+
+
+def test_wild_points_change_nothing_much(locator, body, truth):
+    motion = truth[0][0]
+    clean = observed(body, motion, 3)
+    now = clean.now.copy()
+    now[[5, 17, 29, 41, 53]] += [0.0, 0.012, -0.015]
+    found, without = locator.locate(replace(clean, now=now)), locator.locate(clean)
+    assert set(found.outliers) >= {5, 17, 29, 41, 53}
+    assert np.linalg.norm(found.centroid - without.centroid) < 0.3 * np.linalg.norm(without.centroid) + 0.2e-3
+
+
+def test_causes_are_named(locator, body, truth):
+    """Of motions by fluid that drains, drainage has the largest share, more often than not."""
+    found = [(kind, locator.locate(observed(body, motion, 1, noise=0.2)).causes) for motion, kind in truth]
+    drained = [max(causes, key=causes.get) for kind, causes in found if kind == "drainage"]
+    assert np.mean([name == "drainage" for name in drained]) > 0.5
+    assert all(set(causes) == set(KINDS) for _, causes in found)
+
+
+def along_x(points):
+    """The same without their spread across."""
+    middle = points.mean(axis=0)
+    return middle + (points - middle) * [1.0, 1e-3, 1e-3]
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "match"),
+    [
+        (lambda o: replace(o, now=1e3 * o.now, rest=1e3 * o.rest), "micrometres"),
+        (lambda o: replace(o, now=1e-3 * o.now, rest=1e-3 * o.rest), "in metres"),
+        (lambda o: replace(o, rest=o.rest + [0.0, 0.0, 0.05]), "another brain or frame"),
+        (lambda o: replace(o, now=o.now + 0.2), "which no brain does"),
+        (lambda o: replace(o, now=o.now[:5], rest=o.rest[:5]), "5 points say too little"),
+        (lambda o: replace(o, now=along_x(o.rest), rest=along_x(o.rest)), "on a line"),
+        (lambda o: replace(o, now=np.where(np.arange(60)[:, None] == 7, np.nan, o.now)), "not finite"),
+        (lambda o: replace(o, sigma=np.zeros(60)), "a sigma is not positive"),
+        (lambda o: replace(o, now=o.rest + 0.01 * np.random.default_rng(0).standard_normal((60, 3))), "fit"),
+    ],
+)
+def test_bad_observations_are_refused_with_the_reason(locator, body, truth, spoilt, match):
+    with pytest.raises(InputError, match=match):
+        locator.locate(spoilt(observed(body, truth[0][0])))
+
+
+def test_a_file_in_lps_is_named_as_such(locator, body):
+    there = observed(body, np.zeros_like(body.mesh.nodes))
+    turned = replace(there, now=there.now * [-1.0, -1.0, 1.0], rest=there.rest * [-1.0, -1.0, 1.0])
+    with pytest.raises(InputError, match=r"the file is LPS\. Give RAS"):
+        locator.locate(turned)

@@ -1,0 +1,177 @@
+"""The Gaussian that is left of a prior once points are seen: against closed formulas, draws and planted faults."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+from scipy.stats import multivariate_normal
+
+from sim.geometry.locate import Located
+from surrogate.locating.causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
+from surrogate.locating.evidence import SIGMA, of_motions
+from surrogate.locating.posterior import MIXED, Sight, conditioned, rigid_scale, sight_of
+from surrogate.locating.prior import NOWHERE, SETS, WITH_PLACE, Prior
+
+POINTS = 30
+
+
+@pytest.fixture(scope="module")
+def prior():
+    """Smooth random motions of a box as shapes of every cause in three skulls, and of tools on two places."""
+    random, box = np.random.default_rng(0), make_box()
+    labels = [(kind, skull, NOWHERE) for kind in (DRAINAGE, SWELLING, TUMOUR_SWELLING) for skull in range(3)]
+    labels += [(TOOL, skull, place) for skull in range(2) for place in (NOWHERE, 0, 1)]
+    kind, skull, place = np.repeat(np.array(labels), 3, axis=0).T
+    wave = random.normal(scale=60.0, size=(len(kind), 3))
+    shape = np.sin(box.mesh.nodes @ wave.T + random.uniform(0, 6, len(kind))).T[:, :, None]
+    shape = 1e-3 * shape * random.normal(size=(len(kind), 1, 3))
+    return Prior(box, shape.astype(np.float32), kind, skull, place)
+
+
+def seen(prior, motion, count=POINTS):
+    """Some vertices as points that are seen to move."""
+    some = np.random.default_rng(9).permutation(len(motion))[:count]
+    place = Located(np.repeat(some[:, None], 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
+    return of_motions(place, prior.anatomy.mesh.nodes[some], motion[some], np.full(count, SIGMA))
+
+
+def drawn(prior, random, number=0):
+    """Weights and a rigid error (r + 6,) as a hypothesis with its first place has them, and what is seen."""
+    hypothesis = prior.hypotheses[number]
+    unknown = np.zeros(len(prior.kind) + 6)
+    unknown[hypothesis.rows] = 3.0 * hypothesis.size * random.standard_normal(len(hypothesis.rows))
+    unknown[hypothesis.places[:1]] = 3.0 * random.standard_normal(3)
+    unknown[-6:] = hypothesis.rigid * rigid_scale() * random.standard_normal(6)
+    evidence = seen(prior, np.tensordot(unknown[:-6], prior.shape, 1))
+    noise = np.linalg.cholesky(evidence.noise()) @ random.standard_normal(len(evidence))
+    return unknown, replace(evidence, value=evidence.value + evidence.rigid @ unknown[-6:] + noise)
+
+
+def seen_unknowns(prior, evidence):
+    """What unit weights, and a rigid error of one standard deviation, do at the points (m, r + 6)."""
+    moved = np.einsum("mc,rmci->rmi", evidence.place.weights, prior.shape[:, evidence.place.vertices])
+    return np.hstack([np.einsum("rmi,mi->mr", moved, evidence.axis), evidence.rigid * rigid_scale()])
+
+
+def test_what_is_seen_of_shapes_is_their_motion_at_the_points(prior):
+    evidence = seen(prior, np.zeros((len(prior.anatomy.mesh.nodes), 3)))
+    found = np.hstack([prior.seen(evidence.place, evidence.axis), evidence.rigid * rigid_scale()])
+    assert found == pytest.approx(seen_unknowns(prior, evidence), abs=1e-9)
+
+
+def test_hypotheses_are_sets_of_causes_in_one_skull_with_and_without_a_tool(prior):
+    assert len(prior.hypotheses) == 3 * len(SETS) * 2
+    taking = set()
+    for number, hypothesis in enumerate(prior.hypotheses):
+        kinds, skull = prior.kind[hypothesis.rows], number // (2 * len(SETS))
+        taking.add((skull, tuple(sorted(set(kinds.tolist())))))
+        assert set(prior.skull[hypothesis.rows[kinds != TOOL]]) <= {skull}
+        pressed = set(prior.skull[hypothesis.rows[kinds == TOOL]]) | set(prior.skull[hypothesis.places.ravel()])
+        assert pressed == {min(skull, 1)}, "a skull that lets go is pressed as one in which the brain slides"
+        causes = tuple(sorted(set(kinds.tolist()) - {TOOL}))
+        assert len(hypothesis.places) == (2 if causes in WITH_PLACE else 0)
+    assert taking == {(skull, tuple(sorted((*some, TOOL)))) for skull in range(3) for some in SETS}
+    assert {hypothesis.rigid for hypothesis in prior.hypotheses} == {0.1, 1.0}
+
+
+def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_covariance(prior):
+    """Bayes' formula by precisions instead of covariances, and the density of what is seen, with a place or without."""
+    _, evidence = drawn(prior, np.random.default_rng(1), 2)
+    sight = sight_of(prior, evidence)
+    noise = evidence.noise(np.sqrt((evidence.value**2).sum() / POINTS))
+    unknown = seen_unknowns(prior, evidence).T
+    logs, density = [], []
+    for hypothesis in prior.hypotheses[:5]:
+        weighed = sight.weighed(hypothesis)
+        for number, log in enumerate(weighed):
+            place = hypothesis.places[number - 1] if number else np.zeros(0, int)
+            answer = sight.answer(hypothesis, place, 1.0)
+            size = np.concatenate(
+                [sight.scale * hypothesis.size, np.full(6, hypothesis.rigid), np.full(len(place), sight.scale)]
+            )
+            some = unknown[answer.rows]
+            spread = np.linalg.inv(some @ np.linalg.solve(noise, some.T) + np.diag(size**-2.0))
+            assert answer.back.T @ answer.back == pytest.approx(spread, rel=1e-4, abs=1e-8)
+            mean = spread @ some @ np.linalg.solve(noise, evidence.value)
+            assert answer.mean == pytest.approx(mean, rel=1e-4, abs=1e-6)
+            logs.append(log)
+            density.append(multivariate_normal(cov=noise + (some.T * size**2) @ some).logpdf(evidence.value))
+    assert np.diff(logs) == pytest.approx(np.diff(density), rel=1e-4, abs=1e-4)
+
+
+def test_axes_that_are_alike_are_whitened_as_all_rows_together(prior):
+    """The short way for whole motions gives what the long one gives, which single rows take."""
+    _, evidence = drawn(prior, np.random.default_rng(2))
+    short = evidence.whitening(1e-3)
+    turned = evidence.rows(np.random.default_rng(0).permutation(len(evidence)))
+    long = turned.whitening(1e-3)
+    assert (short.copies, long.copies) == (3, 1)
+    for one, other in ((short, evidence), (long, turned)):
+        inverse = np.linalg.inv(other.noise(1e-3))
+        rows = np.random.default_rng(1).standard_normal((len(other), 2))
+        white = one.white(rows)
+        assert white.T @ white == pytest.approx(rows.T @ inverse @ rows)
+        assert one.back(white) == pytest.approx(inverse @ rows)
+        table = np.arange(len(other)).reshape(-1, 3)
+        assert one.precision(table) == pytest.approx(
+            inverse[table[:, :, None], table[:, None]], abs=1e-6 * inverse.max()
+        )
+
+
+def test_ellipsoids_hold_what_is_drawn(prior):
+    random, hypothesis, square = np.random.default_rng(3), prior.hypotheses[2], []
+    for _ in range(200):
+        truth, evidence = drawn(prior, random, 2)
+        sight = sight_of(prior, evidence)
+        # What shapes lack is no part of these draws, and their size is known.
+        exact = evidence.whitening(0.0)
+        unknown = seen_unknowns(prior, evidence)
+        sight = Sight(prior, 3.0, exact, exact.white(unknown), exact.white(evidence.value))
+        answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
+        scale = np.append(np.ones(len(prior.kind)), rigid_scale())
+        off = answer.mean - (truth / scale)[answer.rows]
+        square.append(off @ np.linalg.solve(answer.back.T @ answer.back, off))
+    degrees = len(answer.rows)
+    assert np.mean(square) == pytest.approx(degrees, abs=4.0 * np.sqrt(2.0 * degrees / 200))
+
+
+def test_a_mixture_lies_between_its_hypotheses(prior):
+    _, evidence = drawn(prior, np.random.default_rng(4))
+    found = conditioned(prior, evidence)
+    assert not len(found.outliers) and 0.2 < found.surprise < 1.6
+    assert np.linalg.eigvalsh(found.spread).min() > -1e-12 and np.linalg.eigvalsh(found.rigid_spread).min() > 0.0
+    answers = sight_of(prior, evidence).answers()
+    assert len(answers) == MIXED and sum(answer.share for answer in answers) == pytest.approx(1.0)
+    means = np.zeros((len(answers), len(prior.kind) + 6))
+    for row, answer in zip(means, answers, strict=True):
+        row[answer.rows] = answer.mean
+    share = np.array([answer.share for answer in answers])
+    assert (np.diff(share) <= 0.0).all()
+    assert np.append(found.weight, found.rigid / rigid_scale()) == pytest.approx(share @ means)
+
+
+def test_gross_errors_are_left_out_and_named(prior):
+    truth, evidence = drawn(prior, np.random.default_rng(5))
+    wrong = np.isin(evidence.point, [3, 11, 24])
+    spoilt = replace(evidence, value=evidence.value + np.where(wrong, 0.03, 0.0))
+    found, clean = conditioned(prior, spoilt), conditioned(prior, evidence)
+    assert found.outliers.tolist() == [3, 11, 24] and not len(clean.outliers)
+    off, without = (np.linalg.norm((each.weight - truth[:-6]) @ prior.middle) for each in (found, clean))
+    assert off < 2.0 * without + 0.3e-3
+
+
+def test_points_with_one_row_are_left_out_too(prior):
+    """Motions along one axis only, as those of a cloud."""
+    _, evidence = drawn(prior, np.random.default_rng(6))
+    single = replace(evidence.rows(np.arange(0, len(evidence), 3)), point=np.arange(POINTS))
+    assert not len(conditioned(prior, single).outliers)
+    wrong = np.arange(POINTS) == 7
+    found = conditioned(prior, replace(single, value=single.value + np.where(wrong, 0.05, 0.0)))
+    assert found.outliers.tolist() == [7] and np.isfinite(found.weight).all()
+
+
+def test_what_no_shape_explains_surprises(prior):
+    motion = 0.01 * np.random.default_rng(7).standard_normal(prior.anatomy.mesh.nodes.shape)
+    found = conditioned(prior, seen(prior, motion))
+    assert found.surprise > 2.5 or len(found.outliers) > 10
