@@ -7,6 +7,11 @@ from .data.tool_poses import draw_poses
 from .evaluation.certificate import Certificate, certify
 from .evaluation.coverage import Coverage, coverage
 from .evaluation.score import Score, score
+from .locating.locator import Location, Locator
+from .locating.locator_files import load_locator, save_locator
+from .locating.observation import Observation
+from .locating.observed_files import read_observation
+from .locating.setup import make_locator
 from .model.learned import Learned
 from .model.own_learners import learner
 from .model.store import load, save
@@ -19,6 +24,9 @@ __all__ = [
     "Coverage",
     "Dataset",
     "Learned",
+    "Location",
+    "Locator",
+    "Observation",
     "Regressor",
     "Score",
     "Trained",
@@ -28,9 +36,13 @@ __all__ = [
     "draw_poses",
     "learner",
     "load",
+    "load_locator",
+    "make_locator",
     "onnx_model",
     "read_dataset",
+    "read_observation",
     "save",
+    "save_locator",
     "score",
     "simulate",
     "train",

@@ -14,7 +14,7 @@ from surrogate.locating.calibration import trials
 from surrogate.locating.causes import KINDS
 from surrogate.locating.ensemble import Ensemble
 from surrogate.locating.locator import Locator
-from surrogate.locating.locator_files import save
+from surrogate.locating.locator_files import save_locator
 from surrogate.locating.presses import Presses
 from surrogate.locating.prior import prior_of
 
@@ -44,7 +44,7 @@ def files(body, tmp_path_factory):
     dents = np.array([[motion() for _ in range(3)] for _ in points], np.float32)[None]
     presses = Presses(points, {"bonded": dents, "slide": dents})
     with one_thread():
-        save(folder / "box.locator.npz", Locator(prior_of(ensemble, presses), trials(ensemble, presses)))
+        save_locator(folder / "box.locator.npz", Locator(prior_of(ensemble, presses), trials(ensemble, presses)))
     truth = motion()
     triangles = body.open_surface[random.integers(len(body.open_surface), size=50)]
     share = random.dirichlet(np.ones(3), 50)

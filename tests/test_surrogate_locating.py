@@ -11,10 +11,10 @@ from surrogate.locating import ensemble as ensembles
 from surrogate.locating.causes import KINDS, LETS_GO, Causes, drainages, groups, pushes
 from surrogate.locating.ensemble import members, solved, surface_size
 from surrogate.locating.locator import Locator
-from surrogate.locating.locator_files import load, save
+from surrogate.locating.locator_files import load_locator, save_locator
 from surrogate.locating.observation import Observation
 from surrogate.locating.prior import NOWHERE, PLACES, middle_of
-from surrogate.locating.setup import made
+from surrogate.locating.setup import make_locator
 
 FEW = Causes(
     poisson=(0.45, 0.485),
@@ -47,7 +47,7 @@ def parts(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def locator(body, parts):
-    return made(body, causes=FEW, device="cpu", folder=parts)
+    return make_locator(body, causes=FEW, device="cpu", folder=parts)
 
 
 @pytest.fixture(scope="module")
@@ -136,25 +136,25 @@ def test_a_stopped_ensemble_goes_on(body, tmp_path, monkeypatch, ensemble):
 
 def test_files_of_locators_are_read_as_they_were_and_refused_where_they_do_not_belong(locator, body, tmp_path):
     path = tmp_path / "box.locator.npz"
-    save(path, locator)
-    again = load(path, body)
+    save_locator(path, locator)
+    again = load_locator(path, body)
     assert np.array_equal(again.tried, locator.tried)
     for name in ("shape", "kind", "skull", "place"):
         assert np.array_equal(getattr(again.prior, name), getattr(locator.prior, name)), name
     with pytest.raises(InputError, match="another anatomy"):
-        load(path, replace(body, craniotomy=body.craniotomy & (body.mesh.nodes[:, 0] > 0.04)))
+        load_locator(path, replace(body, craniotomy=body.craniotomy & (body.mesh.nodes[:, 0] > 0.04)))
     path.write_bytes(path.read_bytes()[:-4000])
     with pytest.raises(InputError, match="locator"):
-        load(path, body)
+        load_locator(path, body)
     prior = locator.prior
     for spoilt in (
         replace(prior, shape=np.full_like(prior.shape, np.nan)),
         replace(prior, kind=prior.kind + 4),
         replace(prior, place=prior.place[1:]),
     ):
-        save(tmp_path / "wild.npz", Locator(spoilt, locator.tried))
+        save_locator(tmp_path / "wild.npz", Locator(spoilt, locator.tried))
         with pytest.raises(InputError, match="do not fit"):
-            load(tmp_path / "wild.npz", body)
+            load_locator(tmp_path / "wild.npz", body)
 
 
 def test_most_of_the_tumours_motion_is_found_and_ellipsoids_hold_it(locator, body, truth):

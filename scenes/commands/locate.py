@@ -77,12 +77,12 @@ def _locator(args: argparse.Namespace, anatomy: Anatomy) -> Locator:
 
     from tqdm import tqdm
 
-    from surrogate.locating.locator_files import load, save
-    from surrogate.locating.setup import made
+    from surrogate.locating.locator_files import load_locator, save_locator
+    from surrogate.locating.setup import make_locator
 
     path = args.locator or Path(args.anatomy).with_suffix(".locator.npz")
     if path.is_file():
-        return load(path, anatomy)
+        return load_locator(path, anatomy)
     path = claimed(path, ".npz", "a locator of `sulcus locate`", args.force)
     folder = path.with_suffix(".parts")
     print(f"sulcus locate: {path} is made first; if it is stopped, the same command goes on", file=sys.stderr)
@@ -92,8 +92,8 @@ def _locator(args: argparse.Namespace, anatomy: Anatomy) -> Locator:
             bar.total, bar.n = total, done
             bar.set_description(stage)
 
-        locator = made(anatomy, args.seed, args.device, folder=folder, progress=progress)
-    save(path, locator)
+        locator = make_locator(anatomy, args.seed, args.device, folder=folder, progress=progress)
+    save_locator(path, locator)
     shutil.rmtree(folder, ignore_errors=True)
     return locator
 

@@ -106,7 +106,7 @@ class Location:
 
 @dataclass(frozen=True, eq=False)
 class Locator:
-    """Answers observations of one anatomy; made once (`setup.made`), it answers any number of them.
+    """Answers observations of one anatomy; made once (`make_locator`), it answers any number of them.
 
     Parameters
     ----------

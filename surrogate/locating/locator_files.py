@@ -23,7 +23,7 @@ FORMAT = "sulcus locator 1"
 LABELS = ("kind", "skull", "place")
 
 
-def save(path: str | Path, locator: Locator) -> None:
+def save_locator(path: str | Path, locator: Locator) -> None:
     """Write a locator; the file appears whole or not at all.
 
     Raises
@@ -38,7 +38,7 @@ def save(path: str | Path, locator: Locator) -> None:
         np.savez(unfinished, header=np.array(json.dumps(header)), tried=locator.tried, **arrays)  # pyright: ignore[reportArgumentType]
 
 
-def load(path: str | Path, anatomy: Anatomy) -> Locator:
+def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
     """Read the locator of an anatomy.
 
     Raises

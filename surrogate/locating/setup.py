@@ -16,7 +16,7 @@ from .presses import pressed
 from .prior import PRESSED, prior_of
 
 
-def made(
+def make_locator(
     anatomy: Anatomy,
     seed: int = 0,
     device: str = "auto",
