@@ -139,7 +139,7 @@ def test_files_of_locators_are_read_as_they_were_and_refused_where_they_do_not_b
     save_locator(path, locator)
     again = load_locator(path, body)
     assert np.array_equal(again.tried, locator.tried)
-    for name in ("shape", "kind", "skull", "place"):
+    for name in ("shape", "kind", "skull", "place", "centre"):
         assert np.array_equal(getattr(again.prior, name), getattr(locator.prior, name)), name
     with pytest.raises(InputError, match="another anatomy"):
         load_locator(path, replace(body, craniotomy=body.craniotomy & (body.mesh.nodes[:, 0] > 0.04)))
@@ -151,6 +151,7 @@ def test_files_of_locators_are_read_as_they_were_and_refused_where_they_do_not_b
         replace(prior, shape=np.full_like(prior.shape, np.nan)),
         replace(prior, kind=prior.kind + 4),
         replace(prior, place=prior.place[1:]),
+        replace(prior, centre=prior.centre[1:]),
     ):
         save_locator(tmp_path / "wild.npz", Locator(spoilt, locator.tried))
         with pytest.raises(InputError, match="do not fit"):

@@ -26,7 +26,8 @@ def prior():
     wave = random.normal(scale=60.0, size=(len(kind), 3))
     shape = np.sin(box.mesh.nodes @ wave.T + random.uniform(0, 6, len(kind))).T[:, :, None]
     shape = 1e-3 * shape * random.normal(size=(len(kind), 1, 3))
-    return Prior(box, shape.astype(np.float32), kind, skull, place)
+    centre = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
+    return Prior(box, shape.astype(np.float32), kind, skull, place, centre)
 
 
 def seen(prior, motion, count=POINTS):
@@ -127,7 +128,7 @@ def test_ellipsoids_hold_what_is_drawn(prior):
         # What shapes lack is no part of these draws, and their size is known.
         exact = evidence.whitening(0.0)
         unknown = seen_unknowns(prior, evidence)
-        sight = Sight(prior, 3.0, exact, exact.white(unknown), exact.white(evidence.value))
+        sight = Sight(prior, 3.0, exact, exact.white(unknown), exact.white(evidence.value), np.zeros(3))
         answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
         scale = np.append(np.ones(len(prior.kind)), rigid_scale())
         off = answer.mean - (truth / scale)[answer.rows]
@@ -175,3 +176,18 @@ def test_what_no_shape_explains_surprises(prior):
     motion = 0.01 * np.random.default_rng(7).standard_normal(prior.anatomy.mesh.nodes.shape)
     found = conditioned(prior, seen(prior, motion))
     assert found.surprise > 2.5 or len(found.outliers) > 10
+
+
+def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
+    """The odds of a place fall with its distance from the nearest tip; without tips all are alike."""
+    _, evidence = drawn(prior, np.random.default_rng(8))
+    without, near = (
+        sight_of(prior, evidence),
+        sight_of(prior, evidence, np.array([[0.02, 0.004, 0.0], [1.0, 1.0, 1.0]])),
+    )
+    assert not without.odds.any()
+    assert near.odds == pytest.approx([np.log(0.05), -0.5 * (0.02**2 + 0.004**2) / 0.004**2, -0.5])
+    hypothesis = prior.hypotheses[0]
+    assert near.weighed(hypothesis) - without.weighed(hypothesis) == pytest.approx(near.odds)
+    last = prior.hypotheses[-1]  # with which no tool may press
+    assert near.weighed(last) - without.weighed(last) == pytest.approx(near.odds[:1])

@@ -138,12 +138,12 @@ class Locator:
     def _located(self, observation: Observation) -> Location:
         begun, prior = time.perf_counter(), self.prior
         evidence = placed(self.anatomy, observation)
-        found = conditioned(prior, evidence)
+        found = conditioned(prior, evidence, observation.tips)
         if observation.rest is None or len(observation.tips):
             for _ in range(ROUNDS):
                 motion = np.tensordot(found.weight, prior.shape, 1)
                 evidence = placed_anew(self.anatomy, observation, motion, found.bias_at)
-                found = conditioned(prior, evidence)
+                found = conditioned(prior, evidence, observation.tips)
         _demand_explained(found, len(np.unique(evidence.point)))
         found = scaled(found, covering_factor(self.tried, found.evidence))
         root = np.linalg.cholesky(prior.middle.T @ found.spread @ prior.middle)

@@ -17,10 +17,11 @@ from sim.runtime.outside_files import read_as
 from ..model.npz_archive import Archive
 from .causes import KINDS
 from .locator import Locator
-from .prior import NOWHERE, PLACES, Prior
+from .prior import NOWHERE, Prior
 
 FORMAT = "sulcus locator 1"
 LABELS = ("kind", "skull", "place")
+ARRAYS = ("shape", *LABELS, "centre")
 
 
 def save_locator(path: str | Path, locator: Locator) -> None:
@@ -33,7 +34,7 @@ def save_locator(path: str | Path, locator: Locator) -> None:
     """
     prior = locator.prior
     header = {"format": FORMAT, "anatomy": prior.anatomy.digest, "version": version("sulcus"), "kinds": KINDS}
-    arrays = {name: getattr(prior, name) for name in ("shape", *LABELS)}
+    arrays = {name: getattr(prior, name) for name in ARRAYS}
     with written_whole(path, ".npz") as unfinished:
         np.savez(unfinished, header=np.array(json.dumps(header)), tried=locator.tried, **arrays)  # pyright: ignore[reportArgumentType]
 
@@ -53,7 +54,7 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
             raise InputError(f"{path}: is no locator of this version: delete it, and it is made anew.")
         if header["anatomy"] != anatomy.digest:
             raise InputError(f"{path}: was made for another anatomy: delete it, and it is made anew.")
-        arrays = archive.arrays(["shape", *LABELS, "tried"])
+        arrays = archive.arrays([*ARRAYS, "tried"])
         _check(path, anatomy, arrays)
         tried = arrays.pop("tried")
         return Locator(Prior(anatomy, **arrays), tried)
@@ -64,8 +65,9 @@ def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) ->
     shape, tried = arrays["shape"], arrays["tried"]
     fits = shape.ndim == 3 and shape.shape[1:] == anatomy.mesh.nodes.shape and tried.ndim == 2 and tried.shape[1] == 3
     fits = fits and all(arrays[name].shape == (len(shape),) for name in LABELS) and len(shape) and len(tried)
-    limits = ((0, len(KINDS)), (0, len(SKULLS)), (NOWHERE, PLACES))
+    fits = fits and arrays["centre"].ndim == 2 and arrays["centre"].shape[1] == 3
+    limits = ((0, len(KINDS)), (0, len(SKULLS)), (NOWHERE, len(arrays["centre"])))
     for name, (low, high) in zip(LABELS, limits, strict=True):
         fits = fits and arrays[name].dtype.kind == "i" and arrays[name].min() >= low and arrays[name].max() < high
-    if not fits or not (np.isfinite(shape).all() and np.isfinite(tried).all()):
+    if not fits or not all(np.isfinite(arrays[name]).all() for name in ("shape", "centre", "tried")):
         raise InputError(f"{path}: has arrays that do not fit the anatomy: delete it, and it is made anew.")

@@ -20,6 +20,7 @@ from .prior import Hypothesis, Prior
 
 # A point is taken for an outlier if a better one is so improbable; so few points are not tested against each other.
 IMPROBABLE, FEWEST = 1e-4, 4
+NO_TIPS = np.zeros((0, 3))
 # So many of the most probable hypotheses make a mixture.
 MIXED = 24
 
@@ -89,6 +90,8 @@ class Sight:
         (m, r + 6): what unit weights and a rigid error of one standard deviation do, whitened.
     value
         (m,): what is seen, whitened.
+    odds
+        As `Prior.odds`.
     """
 
     prior: Prior
@@ -96,6 +99,7 @@ class Sight:
     whitening: Whitening
     unknown: np.ndarray
     value: np.ndarray
+    odds: np.ndarray
 
     @cached_property
     def pull(self) -> np.ndarray:
@@ -120,7 +124,7 @@ class Sight:
         return self.unknown.T @ self.unknown
 
     def weighed(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Logarithms of the evidence (1 + p,): without a tool, and with one on each place; less what all share."""
+        """Logarithms of evidence and odds (1 + p,): without a tool, with one on each place; less what all share."""
         own, size = self._base(hypothesis)
         lower = self._lower(own, size)
         half = solve_triangular(lower, size * self.pull[own], lower=True, check_finite=False)
@@ -134,7 +138,8 @@ class Sight:
         blocks = self.scale**2 * self.gram[table[:, :, None], table[:, None]]
         schur = np.eye(table.shape[1]) + blocks - apart @ apart.transpose(0, 2, 1)
         gain = np.einsum("pi,pi->p", rest, np.linalg.solve(schur, rest[..., None])[..., 0])
-        return np.append(alone, alone + 0.5 * (gain - np.linalg.slogdet(schur)[1]))
+        own_odds = self.odds[: 1 + len(table)]
+        return own_odds + np.append(alone, alone + 0.5 * (gain - np.linalg.slogdet(schur)[1]))
 
     def answer(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> Answer:
         """What a hypothesis says with some more rows (q,), those of one place."""
@@ -160,22 +165,22 @@ def rigid_scale() -> np.ndarray:
     return np.repeat([TRANSLATION, ROTATION], 3)
 
 
-def sight_of(prior: Prior, evidence: Evidence) -> Sight:
-    """How a prior is seen by some evidence."""
+def sight_of(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> Sight:
+    """How a prior is seen by some evidence, where tips of tools (k, 3) [m] touch the cortex."""
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
     whitening = evidence.whitening(seen)
     unknown = np.concatenate([prior.seen(evidence.place, evidence.axis), evidence.rigid * rigid_scale()], axis=1)
     # A motion and a rigid error may cancel, so that little is seen of either.
     scale = 1e3 * float(np.hypot(seen, np.sqrt(3.0) * TRANSLATION))
-    return Sight(prior, scale, whitening, whitening.white(unknown), whitening.white(evidence.value))
+    return Sight(prior, scale, whitening, whitening.white(unknown), whitening.white(evidence.value), prior.odds(tips))
 
 
-def conditioned(prior: Prior, evidence: Evidence) -> Posterior:
-    """Condition a prior on evidence, without points that no other supports."""
+def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> Posterior:
+    """Condition a prior on evidence, without points that no other supports. Tips (k, 3) [m] touch the cortex."""
     kept, point = np.ones(len(evidence), bool), evidence.point
     while True:
         some = evidence.rows(kept)
-        sight = sight_of(prior, some)
+        sight = sight_of(prior, some, tips)
         answers = sight.answers()
         odd = _oddness(sight, max(answers, key=lambda answer: answer.share), some.point)
         excess = odd / chi2.isf(IMPROBABLE, np.unique(some.point, return_counts=True)[1])

@@ -37,6 +37,8 @@ SETS = ((), (DRAINAGE,), (SWELLING,), (DRAINAGE, SWELLING), (DRAINAGE, SWELLING,
 # With one of these a tool may press on one place.
 WITH_PLACE = SETS[:4]
 NOWHERE = -1
+# A tip that touches presses on a place so near [m] as a standard deviation, and so seldom on none.
+TOUCHED, UNTOUCHED = 4e-3, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +78,8 @@ class Prior:
         (r,) indices into `KINDS` and into the names of `sim.effects.SKULLS`.
     place
         (r,) number of the place that a tool presses on, or `NOWHERE`.
+    centre
+        (p, 3) [m] of these places, at rest.
     """
 
     anatomy: Anatomy
@@ -83,6 +87,7 @@ class Prior:
     kind: np.ndarray
     skull: np.ndarray
     place: np.ndarray
+    centre: np.ndarray
 
     @cached_property
     def middle(self) -> np.ndarray:
@@ -101,6 +106,13 @@ class Prior:
         np.add.at(weights, (np.arange(len(axis))[:, None], number.reshape(place.vertices.shape)), place.weights)
         moved = (weights @ self._by_vertex[vertices]).reshape(len(axis), -1, 3)
         return np.einsum("mri,mi->mr", moved, axis)
+
+    def odds(self, tips: np.ndarray) -> np.ndarray:
+        """Logarithms (1 + p,) of how likely no tool presses, or one on each place, where tips (k, 3) [m] touch."""
+        if not len(tips):
+            return np.zeros(1 + len(self.centre))
+        away = ((self.centre[:, None] - tips) ** 2).sum(axis=2).min(axis=1)
+        return np.append(np.log(UNTOUCHED), -away / (2.0 * TOUCHED**2))
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
@@ -151,9 +163,9 @@ def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = 
                 (alike(anatomy, principal(some.reshape(-1, *motion.shape[-2:]), PLACE_SHAPES)), TOOL, skull, place)
             )
     shapes, *labels = zip(*parts, strict=True)
-    return Prior(
-        anatomy, np.concatenate(shapes), *(np.repeat(label, [len(shape) for shape in shapes]) for label in labels)
-    )
+    counts = [len(shape) for shape in shapes]
+    labels = [np.repeat(label, counts) for label in labels]
+    return Prior(anatomy, np.concatenate(shapes), *labels, presses.points[centres])
 
 
 def unit(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
