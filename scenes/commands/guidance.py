@@ -60,6 +60,7 @@ next: open the table in a spreadsheet""",
   sulcus bench
   sulcus bench throughput
   sulcus bench solver --peers tled --tolerance 1e-4 1e-6
+  sulcus bench locate --twins 8
   sulcus bench all --json new.json
 next: sulcus report --quick""",
     "report": """example:

@@ -1,0 +1,183 @@
+"""How else a tumour's motion is estimated from points that are seen to move: rivals of `sulcus locate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.interpolate import RBFInterpolator
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from sim.accuracy import REFERENCE
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.compile import compile_problem
+from sim.effects import Elasticity, Held
+from sim.geometry.closest_point import closest
+from sim.geometry.surface import areas
+from sim.material import Material
+from sim.runtime.device import find_device
+from surrogate.locating.prior import Prior
+
+from .kelvinlets import kelvinlets
+
+Rival = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Motion (q, 3) [m] of the tumour's vertices by points (n, 3) [m] at rest and how each was seen to move (n, 3) [m]."""
+# The ridge of forces, as a share of what the points' own forces do there.
+RIDGE = 1e-2
+# Smoothings that leaving one point out chooses from, of coordinates in units of the points' spread.
+SMOOTHINGS = 10.0 ** np.arange(-6.0, 3.0)
+# Linear tissue, and a tumour twice as stiff; E in Pa.
+YOUNG, POISSON, STIFFER = 3000.0, 0.45, 2.0
+# Springs of the skull along every direction [N/m for each m^2], and of each seen point [N/m]. Of 1e2 to 1e6 and of 1 to
+# 100 these removed most of 20 other twins, at all levels of noise together (100 points on 36 % of the cortex).
+SKULL, POINT = 3e3, 30.0
+TOGETHER = 64
+
+
+def nothing(at: np.ndarray) -> Rival:
+    """The tumour is where the scan shows it; places `at` are (q, 3) [m]."""
+    return lambda rest, motion: np.zeros_like(at)
+
+
+def rigid(at: np.ndarray) -> Rival:
+    """The points' best rigid motion, at places (q, 3) [m]: Kabsch 1976, Acta Cryst. A 32:922-923."""
+
+    def moved(rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        middle, now = rest.mean(axis=0), rest + motion
+        turn = Rotation.align_vectors(now - now.mean(axis=0), rest - middle)[0]
+        return turn.apply(at - middle) + now.mean(axis=0) - at
+
+    return moved
+
+
+def thin_plates(at: np.ndarray) -> Rival:
+    """Thin-plate splines at places (q, 3) [m], by the smoothing that best predicts points that are left out.
+
+    The error of leaving a point out is its coefficient over the diagonal of the inverse: Wahba 1990, "Spline Models for
+    Observational Data", section 4.2.
+    """
+
+    def moved(rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        middle, spread = rest.mean(axis=0), rest.std()
+        own, there = (rest - middle) / spread, (at - middle) / spread
+        smoothing = min(SMOOTHINGS, key=lambda each: _left_out(own, motion, each))
+        return RBFInterpolator(own, motion, smoothing=smoothing, kernel="thin_plate_spline")(there)
+
+    return moved
+
+
+def _left_out(points: np.ndarray, values: np.ndarray, smoothing: float) -> float:
+    """Sum of squares by which splines through all other points miss each of the points (n, 3) with values (n, k)."""
+    count = len(points)
+    square = ((points[:, None] - points) ** 2).sum(axis=2)
+    kernel = 0.5 * square * np.log(np.where(square > 0.0, square, 1.0))
+    linear = np.column_stack([np.ones(count), points])
+    whole = np.block([[kernel + smoothing * np.eye(count), linear], [linear.T, np.zeros((4, 4))]])
+    inverse = np.linalg.inv(whole)[:count, :count]
+    return float(((inverse @ values / np.diagonal(inverse)[:, None]) ** 2).sum())
+
+
+def kelvin_forces(at: np.ndarray) -> Rival:
+    """Regularised Kelvinlets of forces at the points, by least squares with a ridge, at places (q, 3) [m]."""
+
+    def moved(rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        size = 3 * len(rest)
+        own, there = (kelvinlets(places, rest).reshape(size, -1).T for places in (rest, at))
+        ridge = RIDGE * np.trace(own) / size
+        force = np.linalg.solve(own.T @ own + ridge**2 * np.eye(size), own.T @ motion.ravel())
+        return (there @ force).reshape(-1, 3)
+
+    return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Springs:
+    """Linear finite elements on springs, reduced to what points on the open cortex and the tumour have to do with it.
+
+    Parameters
+    ----------
+    anatomy
+        The body.
+    compliance
+        (m, 3, m + q, 3) [m/N]: what unit forces at the m vertices of the open cortex do to these and to the tumour's q.
+    point
+        Stiffness [N/m] of the spring that pulls at each point.
+    """
+
+    anatomy: Anatomy
+    compliance: np.ndarray
+    point: float = POINT
+
+    def __call__(self, rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        """As `Rival`: forces (n, 3) at the points answer (C + 1/k) f = motion."""
+        size, count = 3 * len(rest), len(self.compliance)
+        weights = _on_surface(self.anatomy, rest)
+        pulled = np.einsum("nm,miva->niva", weights, self.compliance, optimize=True)
+        seen = np.einsum("niva,kv->nika", pulled[:, :, :count], weights, optimize=True).reshape(size, size)
+        force = cho_solve(cho_factor(seen + np.eye(size) / self.point), motion.ravel())
+        return (force @ pulled[:, :, count:].reshape(size, -1)).reshape(-1, 3)
+
+
+def springs(anatomy: Anatomy, skull: float = SKULL, point: float = POINT) -> Springs:
+    """Assemble linear tetrahedra on springs (`skull` [Pa/m], `point` [N/m]), and solve for forces on the open cortex.
+
+    Nodes that the skull covers or that are held are on springs along all directions. A node's spring has the area of
+    the surface that is nearest to it.
+    """
+    mesh = anatomy.mesh
+    stiff = [Material("linear", YOUNG * times, POISSON) for times in (1.0, STIFFER)]
+    tissue = Elasticity(stiff[0], {TUMOUR_LABEL: stiff[1]})
+    stiffness = compile_problem((tissue, Held()), anatomy, find_device("cpu", REFERENCE.precision)).rest_curvature()
+    covered = anatomy.slide_normal.any(axis=1) | anatomy.held.any(axis=1)
+    area = np.zeros(len(mesh.nodes))
+    np.add.at(area, mesh.surface, np.repeat(areas(mesh.nodes[mesh.surface])[:, None] / 3.0, 3, axis=1))
+    spring = np.repeat(np.where(covered, skull * area, 0.0), 3)
+    factor = splu(sp.csc_matrix(stiffness + sp.diags_array(spring)), "MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    cortex = np.unique(anatomy.open_surface)
+    unknowns = (3 * cortex[:, None] + np.arange(3)).ravel()
+    unit = np.zeros((len(spring), len(unknowns)))
+    unit[unknowns, np.arange(len(unknowns))] = 1.0
+    asked = np.concatenate([cortex, anatomy.tumour_nodes])
+    moved = factor.solve(unit).reshape(len(mesh.nodes), 3, -1)[asked]
+    return Springs(anatomy, np.moveaxis(moved, 2, 0).reshape(len(cortex), 3, len(asked), 3), point)
+
+
+def _on_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
+    """Weights (n, m) of the open cortex's vertices, in their order, at the places nearest to points (n, 3) [m]."""
+    triangles, corners = anatomy.open_surface, anatomy.mesh.nodes[anatomy.open_surface]
+    vertices = np.unique(triangles)
+    weights = np.zeros((len(points), len(vertices)))
+    for first in range(0, len(points), TOGETHER):
+        found = closest(points[first : first + TOGETHER], corners)
+        row = first + np.arange(len(found.triangle))
+        weights[row[:, None], np.searchsorted(vertices, triangles[found.triangle])] = found.weights
+    return weights
+
+
+def rivals(anatomy: Anatomy) -> dict[str, Rival]:
+    """Every rival, by name; what each makes once for a body is made here."""
+    at = anatomy.mesh.nodes[anatomy.tumour_nodes]
+    return {
+        "nothing moved": nothing(at),
+        "best rigid": rigid(at),
+        "thin-plate spline": thin_plates(at),
+        "Kelvinlets": kelvin_forces(at),
+        "finite elements on springs": springs(anatomy),
+    }
+
+
+def oracle(prior: Prior, motion: np.ndarray) -> np.ndarray:
+    """What no sum of a prior's shapes beats: motion (q, 3) [m] of the tumour's vertices.
+
+    The sum is nearest, in least squares at the open cortex and the tumour, to a true motion (V, 3) [m].
+    """
+    anatomy = prior.anatomy
+    cortex, tumour = np.unique(anatomy.open_surface), anatomy.tumour_nodes
+    nodes = np.concatenate([cortex, tumour])
+    shape = prior.shape[:, nodes].astype(float).reshape(len(prior.shape), -1)
+    weight = np.linalg.lstsq(shape.T, motion[nodes].ravel(), rcond=None)[0]
+    return np.tensordot(weight, prior.shape[:, tumour], 1)

@@ -1,0 +1,204 @@
+"""Truths to locate a tumour in: another mesh, law, stiffness and skull than an estimator knows, moved by some cause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import Accuracy
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.bodies.fluid_level import fluid_level
+from sim.bodies.open_cortex import open_cortex
+from sim.effects import Bonded, Effect, Elasticity, Gravity, Held, Pulsation, SkullContact, Slide, ToolForce, Wave
+from sim.elements import RECOMMENDED
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.geometry.locate import locate
+from sim.geometry.tetmesh import digest_of
+from sim.loads import Loads, Posture, Pushed
+from sim.material import MATERIALS, Ogden
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import read_as
+from surrogate.data.tool_loads import draw as drawn_loads
+from surrogate.model.npz_archive import Archive
+
+CAUSES = ("tool", "drainage", "swelling", "drainage and tool")
+"""What moves twins, one after the other: each takes part in a quarter of them, or in half."""
+SKULLS = {"contact": SkullContact(2e-4), "bonded": Bonded(), "slide": Slide()}
+"""What the skulls of twins do."""
+# How probable each is; fluid that drains alone leaves a brain that sinks, which only the first lets it do.
+PROBABLE = (0.2, 0.4, 0.4)
+# Of the tissue: its stiffness over that of `MATERIALS["minutes"]`, the tumour's over the brain's; both log-uniform.
+STIFFNESS, RATIO, POISSON = (0.5, 1.3), (0.5, 3.0), 0.49
+# Change of the brain's volume, and how often it grows; share of the fluid that is left; how gravity deviates from the
+# opening's axis, as a Gaussian's deviation along each axis.
+SWELLING, SWOLLEN, LEFT, TILT = (0.02, 0.06), 0.7, (0.1, 0.5), 0.35
+TOOLS = ("palpation", "spatula")
+ACCURACY = Accuracy(tolerance=1e-3)
+# How far [m] tumours' middles may be apart in two meshes of one brain.
+SAME = 3e-3
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What a twin is.
+
+    Parameters
+    ----------
+    number
+        From 0.
+    cause, skull, tool
+        One of `CAUSES`, a name of `SKULLS`, one of `TOOLS`.
+    stiffness, ratio
+        Of the tissue over `MATERIALS["minutes"]`, and of the tumour over the brain.
+    swelling
+        Change of the brain's volume, if that is the cause.
+    left
+        Share of the fluid that is left, if some drains.
+    tilt
+        (3,): gravity pulls along the opening's inward axis and this, together made a unit vector.
+    push
+        Seed of the tool's load.
+    """
+
+    number: int
+    cause: str
+    skull: str
+    tool: str
+    stiffness: float
+    ratio: float
+    swelling: float
+    left: float
+    tilt: tuple[float, ...]
+    push: int
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A draw, and the motion (V, 3) [m] of the vertices of the mesh that is asked about."""
+
+    draw: Draw
+    motion: np.ndarray
+
+
+def drawn(seed: int, number: int) -> Draw:
+    """The draw of a number; it depends on that and the seed alone."""
+    random = np.random.default_rng([seed, number])
+    cause = CAUSES[number % len(CAUSES)]
+    stiffness, ratio = (float(np.exp(random.uniform(*np.log(limits)))) for limits in (STIFFNESS, RATIO))
+    skull = str(random.choice(list(SKULLS), p=PROBABLE))
+    swelling = float(random.uniform(*SWELLING)) * (1.0 if random.uniform() < SWOLLEN else -1.0)
+    left, tilt = float(random.uniform(*LEFT)), tuple((TILT * random.standard_normal(3)).tolist())
+    tool, push = str(random.choice(TOOLS)), int(random.integers(2**31))
+    return Draw(
+        number, cause, "contact" if cause == "drainage" else skull, tool, stiffness, ratio, swelling, left, tilt, push
+    )
+
+
+def effects_of(draw: Draw) -> tuple[Effect, ...]:
+    """What a twin's finite elements are made of."""
+    minutes = MATERIALS["minutes"].tissue
+    assert isinstance(minutes, Ogden)
+    (c, m), *_ = minutes.terms
+
+    def tissue(share: float) -> Ogden:
+        bulk = share * c * (1.0 + POISSON) / (3.0 * (1.0 - 2.0 * POISSON))
+        return Ogden(((share * c, m),), bulk)
+
+    tumour = {TUMOUR_LABEL: tissue(draw.stiffness * draw.ratio)}
+    swells = Pulsation(Wave(0.25, abs(draw.swelling)), Wave(0.25, 0.0))
+    skull = SKULLS[draw.skull]
+    return Elasticity(tissue(draw.stiffness), tumour), Held(), skull, ToolForce(), Gravity(), swells
+
+
+def loads_of(anatomy: Anatomy, draw: Draw) -> Loads:
+    """What moves a twin of this body."""
+    pushed = drawn_loads(draw.tool, anatomy, 1, draw.push).of(Pushed)
+    assert pushed is not None
+    if "tool" not in draw.cause:
+        pushed = Pushed(pushed.point, 0.0 * pushed.force, pushed.footprint)
+    # As in the scan, supine in a full skull; only the change acts.
+    down, left = np.array(Gravity().direction), 1.0
+    if "drainage" in draw.cause:
+        down, left = open_cortex(anatomy).axis + draw.tilt, draw.left
+        down /= np.linalg.norm(down)
+    level = fluid_level(anatomy.mesh.nodes, down, left)
+    # The wave has its crest after a second, and its trough a second before.
+    time = float(np.sign(draw.swelling)) if draw.cause == "swelling" else 0.0
+    return Loads((pushed, Posture(down[None], np.array([level]), np.ones(1))), np.array([time]))
+
+
+def solved(anatomy: Anatomy, draw: Draw, device: str = "auto", element: str = RECOMMENDED) -> np.ndarray | None:
+    """The motion (V, 3) [m] of a twin's own mesh; None where no equilibrium was found."""
+    answer = Fem(anatomy, effects_of(draw), ACCURACY, device, element=element).deform(loads_of(anatomy, draw))
+    return answer.displacement[0] if answer.outcome[0].good else None
+
+
+def twins(
+    body: Anatomy,
+    finer: Anatomy,
+    count: int,
+    seed: int = 0,
+    device: str = "auto",
+    element: str = RECOMMENDED,
+    folder: Path | None = None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Iterator[Twin | None]:
+    """So many twins of `finer`, read at the vertices of `body`; None for one of which no equilibrium was found.
+
+    Those that a `folder` keeps from a run that was stopped are read. `progress` hears how many are done, and of how
+    many.
+
+    Raises
+    ------
+    InputError
+        Bodies of two brains; bodies without tumour or open cortex.
+    """
+    check_same(body, finer)
+    place = locate(finer.mesh, body.mesh.nodes)
+    for number in range(count):
+        draw = drawn(seed, number)
+        motion = _kept(finer, draw, device, element, folder)
+        progress(number + 1, count)
+        yield None if motion is None else Twin(draw, place.read(motion[None].astype(float))[0])
+
+
+def check_same(body: Anatomy, finer: Anatomy) -> None:
+    """Refuse two meshes that are not of one brain.
+
+    Raises
+    ------
+    InputError
+        A mesh without a tumour; tumours in two places.
+    """
+    for one in (body, finer):
+        if not len(one.tumour_nodes):
+            raise InputError("an anatomy has no tumour to locate: make one that has.")
+        open_cortex(one)
+    middles = [one.mesh.nodes[one.tumour_nodes].mean(axis=0) for one in (body, finer)]
+    apart = float(np.linalg.norm(middles[0] - middles[1]))
+    if apart > SAME:
+        raise InputError(
+            f"the tumours of both meshes lie {1e3 * apart:.0f} mm apart: make both of one brain, with --nodes alone "
+            "different."
+        )
+
+
+def _kept(anatomy: Anatomy, draw: Draw, device: str, element: str, folder: Path | None) -> np.ndarray | None:
+    """The motion of a twin's own mesh, from the folder if it is there, of the same draw."""
+    stated = digest_of(np.frombuffer(repr((anatomy.digest, draw, element)).encode(), np.uint8))
+    path = None if folder is None else folder / f"twin-{draw.number:04d}-{stated}.npz"
+    if path is not None and path.exists():
+        with read_as(path, "a twin", "Delete it: it is made anew."), path.open("rb") as raw:
+            motion = Archive(raw).arrays(["motion"])["motion"]
+            if motion.shape not in (anatomy.mesh.nodes.shape, (0, 3)):
+                raise InputError(f"holds motions of {len(motion)} vertices: delete it, and it is made anew.")
+            return motion if len(motion) else None
+    motion = solved(anatomy, draw, device, element)
+    if path is not None:
+        with written_whole(path, ".npz") as unfinished:
+            np.savez(unfinished, motion=np.zeros((0, 3)) if motion is None else motion)
+    return motion

@@ -1,0 +1,361 @@
+"""Twin experiments: rivals on motions that are known by formula, figures by hand, and twins that are kept."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import make_box
+from scipy.spatial.transform import Rotation
+
+from scenes.bench import locate_twins
+from scenes.bench.kelvinlets import kelvinlets
+from scenes.bench.locate_rivals import kelvin_forces, oracle, rigid, springs, thin_plates
+from scenes.bench.locate_study import OURS, Estimate, Sight, estimate, observed, ours, row, rows, sights_of, spoilt
+from scenes.bench.locate_twins import CAUSES, Twin, drawn, effects_of, loads_of, solved, twins
+from scenes.cli import main
+from sim.accuracy import REFERENCE
+from sim.bodies.meshfile import write_anatomy
+from sim.bodies.refine import refined
+from sim.effects import Bonded, Elasticity, Held, NodalForce
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Nodal, Posture, Pushed
+from sim.material import Material
+from surrogate.locating import setup
+from surrogate.locating.locator import Locator
+from surrogate.locating.prior import NOWHERE, Prior, middle_of
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A small box on a floor that is held, with a skull round its sides, off the origin as openings are."""
+    box = make_box(cells=(8, 8, 5), spacing=9e-3, tumour=12e-3, opening=30e-3)
+    nodes = box.mesh.nodes
+    normal, held = np.zeros_like(nodes), box.held.copy()
+    for axis in (0, 1):
+        side = (np.abs(nodes[:, axis]) > 36e-3 - 1e-9) & (nodes[:, 2] > -45e-3 + 1e-9) & ~normal.any(axis=1)
+        normal[side] = np.sign(nodes[side]) * np.eye(3)[axis]
+        held[side] = False
+    mesh = replace(box.mesh, nodes=nodes + [0.04, 0.03, 0.02])
+    return replace(box, mesh=mesh, held=held, slide_normal=normal)
+
+
+@pytest.fixture(scope="module")
+def tumour(body):
+    return body.mesh.nodes[body.tumour_nodes]
+
+
+@pytest.fixture(scope="module")
+def locator(body):
+    """Smooth shapes of every cause in every skull, and of a tool that presses on one of two places."""
+    labels = [(kind, skull, NOWHERE) for kind in (1, 2, 3) for skull in (0, 1, 2) for _ in range(2)]
+    labels += [(0, skull, place) for skull in (0, 1) for place in (NOWHERE, 0, 1) for _ in range(3)]
+    random, nodes = np.random.default_rng(0), body.mesh.nodes
+    source = random.choice(nodes[np.unique(body.open_surface)], len(labels)) - random.uniform(
+        0.0, 0.02, (len(labels), 3)
+    )
+    force = random.standard_normal((len(labels), 3))
+    shape = np.einsum("nivj,ni->nvj", kelvinlets(nodes, source, 25e-3), force)
+    shape *= 1e-3 / np.sqrt((shape**2).sum(axis=2).mean(axis=1))[:, None, None]
+    prior = Prior(body, shape.astype(np.float32), *np.array(labels).T, centre=np.zeros((2, 3)))
+    return Locator(prior, np.tile([[0.0, 3.0, 3.0], [3.0, 6.0, 3.0]], (20, 1)))
+
+
+def some_motion(locator, number):
+    """A motion (V, 3) of 3 mm by two of its shapes."""
+    pair = locator.prior.shape[[number % 6, 18 + number % 3]].astype(float)
+    return 3.0 * np.tensordot([0.8, 0.6], pair, 1)
+
+
+def scattered(count, seed=0):
+    return np.random.default_rng(seed).uniform(0.0, 0.08, (count, 3))
+
+
+def test_the_best_rigid_motion_is_one(tumour):
+    rest = scattered(30)
+    turn = Rotation.from_rotvec([0.02, -0.05, 0.03])
+
+    def motion(at):
+        return turn.apply(at) + [1e-3, 2e-3, -3e-3] - at
+
+    assert rigid(tumour)(rest, motion(rest)) == pytest.approx(motion(tumour), abs=1e-12)
+
+
+def test_thin_plates_go_on_linearly_and_smooth_noise_away(tumour):
+    rest = scattered(40)
+
+    def motion(at):
+        return at @ (0.05 * np.arange(9.0).reshape(3, 3) - 0.2) + [1e-3, 0.0, -2e-3]
+
+    assert thin_plates(tumour)(rest, motion(rest)) == pytest.approx(motion(tumour), abs=1e-9)
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(rest.shape)
+    smooth = thin_plates(rest)(rest, motion(rest) + noise)
+    assert np.linalg.norm(smooth - motion(rest)) < 0.6 * np.linalg.norm(noise)
+    wavy = 5e-3 * np.sin(40.0 * rest)  # what is no noise is kept
+    assert thin_plates(rest)(rest, wavy) == pytest.approx(wavy, abs=1e-4)
+
+
+def test_kelvinlets_meet_kelvins_solution_far_away_and_are_symmetric():
+    """Kelvin 1848: u = (1 / r) ((3 - 4 nu) I + r r^T / r^2) f / (16 pi mu (1 - nu)), times 4 pi mu."""
+    nu, arm = 0.49, np.array([0.3, -0.2, 0.4])
+    found = kelvinlets(arm[None], np.zeros((1, 3)), spread=1e-4)[0, :, 0]
+    length = np.linalg.norm(arm)
+    kelvin = ((3.0 - 4.0 * nu) * np.eye(3) + np.outer(arm, arm) / length**2) / (4.0 * (1.0 - nu) * length)
+    assert found == pytest.approx(kelvin, rel=1e-5)
+    points = np.random.default_rng(0).uniform(size=(5, 3))
+    whole = kelvinlets(points, points).reshape(15, 15)
+    assert whole == pytest.approx(whole.T) and np.linalg.eigvalsh(whole).min() > 0.0
+
+
+def test_forces_at_the_points_are_found_again(tumour):
+    """All but what the ridge takes; forces that differ along each axis, so that no axis is mistaken for another."""
+    rest = scattered(12)
+    force = np.random.default_rng(2).standard_normal((12, 3)) * [1e-5, 2e-5, 3e-5]
+    seen, there = (np.einsum("nivj,ni->vj", kelvinlets(at, rest), force) for at in (rest, tumour))
+    found = kelvin_forces(tumour)(rest, seen)
+    assert np.linalg.norm(found - there) < 0.05 * np.linalg.norm(there)
+    twice, torn = np.concatenate([rest, rest[:1] + 1e-9]), np.zeros((13, 3))
+    torn[[0, 12]] = [[1e-3, 0.0, 0.0], [-1e-3, 0.0, 0.0]]  # two points in one place that part
+    assert np.abs(kelvin_forces(tumour)(twice, torn)).max() < 1e-3
+
+
+def test_a_body_on_soft_springs_goes_along_and_one_on_stiff_springs_stays(body):
+    motion = np.cross([0.02, 0.01, -0.03], body.mesh.nodes - body.mesh.nodes.mean(axis=0)) + [1e-3, 2e-3, -3e-3]
+    seen, true = observed(body, motion, Sight(40, 60, 0), (0,)), motion[body.tumour_nodes]
+    found = springs(body, skull=1.0, point=100.0)(seen.rest, seen.now - seen.rest)
+    assert found == pytest.approx(true, abs=1e-5)
+    held = springs(body, skull=1e9, point=100.0)(seen.rest, seen.now - seen.rest)
+    assert 0.05 < np.linalg.norm(held, axis=1).mean() / np.linalg.norm(true, axis=1).mean() < 0.9
+
+
+def test_on_stiff_springs_compliance_is_that_of_held_tissue(body):
+    """As the finite elements have it, of linear tissue under a force at one vertex."""
+    cortex = np.unique(body.open_surface)
+    force = np.zeros((1, len(body.mesh.nodes), 3))
+    force[0, cortex[7]] = [0.0, 0.02, -0.01]
+    stiff = [Material("linear", 3000.0 * times, 0.45) for times in (1.0, 2.0)]
+    effects = (Elasticity(stiff[0], {2: stiff[1]}), Held(), Bonded(), NodalForce())
+    true = Fem(body, effects, REFERENCE, "cpu", element="p1").deform(Loads((Nodal(force),)))
+    found = np.tensordot(force[0, cortex[7]], springs(body, skull=1e11).compliance[7], 1)
+    assert found == pytest.approx(true.displacement[0, np.append(cortex, body.tumour_nodes)], rel=1e-3, abs=1e-8)
+
+
+def test_the_oracle_finds_what_its_shapes_can_make(locator, body):
+    motion = some_motion(locator, 1)
+    assert oracle(locator.prior, motion) == pytest.approx(motion[body.tumour_nodes], abs=1e-7)
+    other = np.where(np.arange(len(motion))[:, None] % 2, 1e-3, -1e-3) * np.ones(3)
+    off = oracle(locator.prior, other) - other[body.tumour_nodes]
+    assert 0.1e-3 < np.linalg.norm(off, axis=1).mean() < 2e-3
+
+
+def test_figures_of_a_row_are_those_by_hand():
+    zeros = np.zeros((3, 3))
+    true = 1e-3 * np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [3.0, 0.0, 0.0]])
+    exact = estimate(true, true, 7.8, 0.010)
+    half = estimate(true - [0.0, 1e-3, 0.0], true, 7.9, 0.030)
+    refused = estimate(zeros, true, None, None, refused=True)
+    assert half.error == pytest.approx(np.full(3, 1e-3)) and half.motion == pytest.approx([5e-3, 2e-3, 3e-3])
+    found = row(Sight(30, 20, 1), "it", [exact, half])
+    assert (found.points, found.cover, found.noise, found.estimator) == (30, 20, 1, "it")
+    assert found.removed == pytest.approx(100.0 * (1.0 - 3.0 / 20.0)) and found.mean == pytest.approx(0.5)
+    assert (found.held, found.milliseconds) == (50.0, pytest.approx(20.0)) and (found.twins, found.refused) == (2, 0)
+    with_refused = row(Sight(30, 20, 1), "it", [exact, half, refused])
+    assert with_refused.removed == pytest.approx(100.0 * (1.0 - 13.0 / 30.0)) and with_refused.held == 50.0
+    assert with_refused.refused == 1 and with_refused.milliseconds == pytest.approx(20.0)
+    alone = row(Sight(30, 20, 1), "it", [refused])
+    assert (alone.held, alone.milliseconds, alone.removed) == (None, None, pytest.approx(0.0))
+    hundred = Estimate(1e-3 * np.arange(101.0), np.ones(101), None, 0.0)
+    assert row(Sight(30, 20, 1), "it", [hundred]).p95 == pytest.approx(95.0)
+
+
+def test_squares_are_by_the_stated_covariance_of_the_centroid(locator, body):
+    motion = some_motion(locator, 0)
+    seen = observed(body, motion, Sight(60, 60, 1), (0, 0))
+    found, answer = ours(locator, motion, seen), locator.locate(seen)
+    off = answer.centroid - middle_of(body, motion[None])[0]
+    assert found.square == pytest.approx(off @ np.linalg.inv(answer.centroid_covariance) @ off)
+    wild = replace(seen, now=seen.rest + 0.01 * np.random.default_rng(0).standard_normal(seen.rest.shape))
+    refused = ours(locator, motion, wild)
+    assert refused.refused and refused.square is None and np.array_equal(refused.error, refused.motion)
+
+
+def test_what_is_seen_lies_on_the_same_points_at_every_level_of_noise(locator, body):
+    motion = some_motion(locator, 2)
+    exact, low, high = (observed(body, motion, Sight(50, 36, noise), (3, 1)) for noise in (0, 1, 2))
+    assert np.array_equal(exact.rest, low.rest) and np.array_equal(exact.rest, high.rest)
+    assert exact.sigma == pytest.approx(np.full(50, 0.05e-3)) and low.sigma is None and high.sigma is None
+    at = np.linalg.norm(body.mesh.nodes[:, None] - exact.rest, axis=2)
+    on_vertex = at.argmin(axis=0)
+    assert np.linalg.norm(exact.now - exact.rest - motion[on_vertex], axis=1).max() < 1e-3
+    again = observed(body, motion, Sight(50, 36, 1), (3, 1))
+    assert np.array_equal(again.now, low.now)
+    others = [observed(body, motion, Sight(50, 36, 1), seed).rest for seed in ((3, 2), (4, 1))]
+    assert not any(np.array_equal(low.rest, other) for other in others)
+    wide = observed(body, motion, Sight(50, 100, 0), (3, 1))
+    assert np.ptp(exact.rest[:, :2], axis=0).max() < 0.8 * np.ptp(wide.rest[:, :2], axis=0).max()
+
+
+def test_levels_of_noise_have_their_translations(locator, body):
+    """Mean squares over many observations: those of white and smooth errors are the same at both levels."""
+    still, square = np.zeros_like(body.mesh.nodes), []
+    for noise in (1, 2):
+        seen = [observed(body, still, Sight(60, 60, noise), (0, number)) for number in range(60)]
+        square.append(np.mean([1e6 * ((one.now - one.rest).mean(axis=0) ** 2).sum() for one in seen]))
+    assert 1.0 < square[0] < 1.5 and square[1] - square[0] == pytest.approx(3.0, abs=0.6)
+
+
+def test_every_twin_is_seen_on_points_of_its_own(locator, body):
+    some = [Twin(drawn(0, number), some_motion(locator, number)) for number in (0, 1)]
+    given = []
+    spy = {"spy": lambda rest, motion: given.append(rest) or np.zeros((len(body.tumour_nodes), 3))}
+    found = list(rows(some, sights_of([30], [50], [0, 1]), spy, locator))
+    assert [(each.noise, each.estimator) for each in found[::3]] == [(0, "spy"), (1, "spy")] and len(found) == 6
+    assert np.array_equal(given[0], given[2]) and not np.array_equal(given[0], given[1])
+    with pytest.raises(InputError, match="level 3"):
+        list(rows(some, sights_of([30], [50], [3]), spy, locator))
+    with pytest.raises(InputError, match="no twin"):
+        list(rows([], sights_of([30], [50], [0]), spy, locator))
+
+
+@pytest.mark.parametrize("translation", [1e-3, 2e-3])
+def test_errors_are_as_large_as_is_said(translation):
+    """Of pairs far from other pairs: white and smooth errors by their differences, the rigid one by a fit."""
+    random = np.random.default_rng(0)
+    site = random.uniform(-0.6, 0.6, (250, 3))
+    way = random.standard_normal(site.shape)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    for apart, expected in ((0.0, 2.0 * 0.3**2), (15e-3, 2.0 * 0.3**2 + 2.0 * 0.5**2 * (1.0 - np.exp(-0.5)))):
+        rest = np.concatenate([site, site + apart * way])
+        now = rest + [0.01, 0.0, 0.02]  # what has moved is turned about where it was
+        off = spoilt(rest, now, translation, np.random.default_rng(4)) - now
+        turn = Rotation.align_vectors(now + off - (now + off).mean(axis=0), now - now.mean(axis=0))[0]
+        assert np.degrees(turn.magnitude()) == pytest.approx(0.5, abs=0.01)
+        left = off - (turn.apply(now - rest.mean(axis=0)) + rest.mean(axis=0) - now)
+        assert np.linalg.norm(left.mean(axis=0)) == pytest.approx(translation, abs=0.1e-3)
+        difference = 1e3 * (left[250:] - left[:250])
+        assert (difference**2).mean() == pytest.approx(expected, rel=0.15)
+        assert 1e6 * left.var(axis=0).mean() == pytest.approx(0.3**2 + 0.5**2, rel=0.15)
+
+
+def test_twins_depend_on_seed_and_number_alone_and_have_what_is_said():
+    many = [drawn(0, number) for number in range(200)]
+    assert drawn(0, 5) == many[5] != replace(drawn(0, 9), number=5) and drawn(1, 5) != many[5]
+    assert [one.cause for one in many[:8]] == [*CAUSES, *CAUSES]
+    assert {one.skull for one in many if one.cause == "drainage"} == {"contact"}
+    assert {one.skull for one in many if one.cause != "drainage"} == {"contact", "bonded", "slide"}
+    for name, low, high in (("stiffness", 0.5, 1.3), ("ratio", 0.5, 3.0), ("left", 0.1, 0.5)):
+        values = np.array([getattr(one, name) for one in many])
+        assert low <= values.min() < 1.1 * low and 0.93 * high < values.max() <= high, name
+    swelling = np.array([one.swelling for one in many])
+    assert np.abs(swelling).min() >= 0.02 and 0.055 < np.abs(swelling).max() <= 0.06
+    assert 0.6 < (swelling > 0.0).mean() < 0.8
+
+
+def test_twins_have_their_own_tissue_and_only_their_cause(body):
+    for number in range(4):
+        draw = drawn(3, number)
+        elasticity = effects_of(draw)[0]
+        for law, times in ((elasticity.default, 1.0), (elasticity.regions[2], draw.ratio)):
+            mu, lam = law.lame
+            assert mu == pytest.approx(670.0 * draw.stiffness * times) and law.terms[0][1] == -19.0
+            assert lam / (2.0 * (lam + mu)) == pytest.approx(0.49)
+        loads = loads_of(body, draw)
+        pushed, posture = loads.of(Pushed), loads.of(Posture)
+        assert pushed.force.any() == ("tool" in draw.cause)
+        assert (loads.times[0] != 0.0) == (draw.cause == "swelling")
+        height = -body.mesh.nodes @ posture.direction[0]
+        full = posture.csf_level[0] > height.max()
+        assert full == ("drainage" not in draw.cause) and np.linalg.norm(posture.direction) == pytest.approx(1.0)
+
+
+def test_a_twin_is_an_equilibrium_of_its_loads(body):
+    """A tool that pushes moves the open cortex along its push, and the tumour less."""
+    draw = replace(drawn(0, 0), skull="slide", stiffness=1.0)
+    motion = solved(body, draw, "cpu", "p1")
+    pushed = loads_of(body, draw).of(Pushed)
+    near = np.linalg.norm(body.mesh.nodes - pushed.point[0], axis=1).argmin()
+    assert motion[near] @ pushed.force[0] > 0.7 * np.linalg.norm(motion[near]) * np.linalg.norm(pushed.force[0])
+    deep = np.linalg.norm(motion[body.tumour_nodes], axis=1).mean()
+    assert 0.02e-3 < deep < np.linalg.norm(motion[near])
+
+
+def test_twins_are_kept_one_by_one_and_read_at_the_bodys_vertices(body, tmp_path, monkeypatch):
+    finer, made = refined(body), []
+
+    def linear(anatomy, draw, device, element):
+        made.append(draw.number)
+        if made == [0, 1, 2]:
+            raise KeyboardInterrupt
+        return None if draw.number == 1 else 0.1 * draw.stiffness * anatomy.mesh.nodes
+
+    monkeypatch.setattr(locate_twins, "solved", linear)
+    with pytest.raises(KeyboardInterrupt):
+        list(twins(body, finer, 3, seed=7, folder=tmp_path))
+    heard = []
+    found = list(twins(body, finer, 3, seed=7, folder=tmp_path, progress=lambda *each: heard.append(each)))
+    assert made == [0, 1, 2, 2] and heard == [(1, 3), (2, 3), (3, 3)] and found[1] is None
+    for twin in (found[0], found[2]):
+        assert twin.motion == pytest.approx(0.1 * twin.draw.stiffness * body.mesh.nodes, abs=1e-9)
+    list(twins(body, finer, 1, seed=8, folder=tmp_path))  # another draw, element or mesh is another twin
+    list(twins(body, finer, 1, seed=7, element="p1", folder=tmp_path))
+    list(twins(body, body, 1, seed=7, folder=tmp_path))
+    assert made[4:] == [0, 0, 0]
+    kept = sorted(tmp_path.glob("twin-0000-*.npz"))
+    assert len(kept) == 4
+    for path in kept:
+        path.write_bytes(path.read_bytes()[:-300])
+    with pytest.raises(InputError, match="made anew"):
+        list(twins(body, finer, 1, seed=7, folder=tmp_path))
+
+
+def test_two_brains_have_no_twins(body):
+    moved = replace(body, mesh=replace(body.mesh, nodes=body.mesh.nodes + [0.0, 0.01, 0.0]))
+    with pytest.raises(InputError, match="10 mm apart"):
+        list(twins(body, moved, 1))
+    with pytest.raises(InputError, match="no tumour"):
+        list(twins(body, replace(body, mesh=replace(body.mesh, region=np.ones_like(body.mesh.region))), 1))
+
+
+def test_the_command_prints_a_row_for_each_estimator_and_goes_on(body, locator, tmp_path, monkeypatch, capsys):
+    made = []
+
+    def some(anatomy, draw, device, element):
+        made.append(draw.number)
+        return None if draw.number == 2 else some_motion(locator, draw.number)
+
+    monkeypatch.setattr(locate_twins, "solved", some)
+    monkeypatch.setattr(setup, "make_locator", lambda *each, **named: made.append("locator") or locator)
+    path, folder = tmp_path / "body.vtu", tmp_path / "kept"
+    write_anatomy(path, body)
+    words = ["bench", "locate", "--anatomy", str(path), "--finer", str(path), "--twins", "4", "--points", "60", "80"]
+    words += ["--cover", "50", "--noise", "0", "1", "--folder", str(folder), "--device", "cpu"]
+    assert main(words) == 1  # one twin failed
+    out, err = capsys.readouterr()
+    lines = [line for line in out.splitlines() if line.startswith("| ")]
+    assert len(lines) == 1 + 2 * 2 * 7 and "3 twins" in out and "of twins [2]" in err
+    assert main([*words, "--json"]) == 1
+    assert made == [0, 1, 2, 3, "locator"]
+    found = json.loads(capsys.readouterr().out)
+    assert found["failed"] == [2] and len(found["rows"]) == 28
+    by_name = {each["estimator"]: each for each in found["rows"] if (each["points"], each["noise"]) == (80, 0)}
+    assert by_name["nothing moved"]["removed"] == pytest.approx(0.0)
+    assert 60.0 < by_name[OURS]["removed"] < 100.0 and by_name[OURS]["milliseconds"] > 0.0
+    assert by_name[OURS]["held"] in (pytest.approx(100.0 * count / 3.0) for count in range(4))
+    assert by_name["best sum of its shapes"]["removed"] > 99.9
+    assert by_name["best sum of its shapes"]["milliseconds"] is None and by_name["Kelvinlets"]["held"] is None
+
+
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        (["--twins", "0"], "--twins is 0"),
+        (["--points", "5"], "--points is 5"),
+        (["--cover", "101"], "--cover 101"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["--anatomy", "own.vtu"], "--anatomy needs --finer"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_before_anything_is_solved(words, match, capsys):
+    assert main(["bench", "locate", *words]) == 2
+    assert match in capsys.readouterr().err
