@@ -174,6 +174,19 @@ def test_most_of_the_tumours_motion_is_found_and_ellipsoids_hold_it(locator, bod
     assert left < 0.35 * all_of_it and np.mean(held) > 0.85
 
 
+def test_covariances_grow_by_what_trials_ask_for(locator, body, truth):
+    """Errors twice as large in trials make covariances four times as large, and the radius twice."""
+    seen = observed(body, truth[0][0])
+    found = locator.locate(seen)
+    wider = Locator(locator.prior, locator.tried * [1.0, 1.0, 4.0]).locate(seen)
+    assert wider.centroid == pytest.approx(found.centroid)
+    assert wider.centroid_covariance == pytest.approx(4.0 * found.centroid_covariance)
+    assert wider.p95 == pytest.approx(2.0 * found.p95)
+    random = np.random.default_rng(5)
+    drawn = random.multivariate_normal(np.zeros(3), found.centroid_covariance, 4000)
+    assert np.mean(np.linalg.norm(drawn, axis=1) < found.p95) == pytest.approx(0.95, abs=0.012)
+
+
 def test_a_rigid_error_is_no_motion(locator, body, truth):
     """Most of a translation of 2 mm along the surface goes into the bias, and little of it into the tumour."""
     moved, known = [], []

@@ -191,3 +191,10 @@ def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
     assert near.weighed(hypothesis) - without.weighed(hypothesis) == pytest.approx(near.odds)
     last = prior.hypotheses[-1]  # with which no tool may press
     assert near.weighed(last) - without.weighed(last) == pytest.approx(near.odds[:1])
+
+
+def test_what_is_seen_may_be_little_because_a_motion_and_a_rigid_error_cancel(prior):
+    """Motions may then be as large as a rigid error: its prior's translation has a length of 1.4 mm."""
+    little, much = (seen(prior, np.full_like(prior.anatomy.mesh.nodes, each)) for each in (1e-5, 3e-3))
+    assert sight_of(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
+    assert sight_of(prior, much).scale == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
