@@ -95,14 +95,16 @@ def test_people_read_sentences(files, capsys, words):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("", "its first line is ''"),
+        ("", "is empty"),
         ("a,b,c\n1,2,3\n", "give the header x,y,z"),
         ("x,y,z,x\n1,2,3,4\n", "give the header"),
         ("x,y,z\n1,2\n", "row 2 is '1,2', not 3 numbers"),
         ("x,y,z\n1,2,three\n", "row 2 is '1,2,three'"),
         ("x,y,z\n1,2,nan\n", "row 2 has a number that is not finite"),
         ("x,y,z\n1,2,3\n", "1 points say too little"),
-        ("x,y,z\n" + "1,2,3\n" * 20, "lie on a line"),
+        ("x;y;z\n1;2;3\n", "with commas between"),
+        ("x,y,z\n" + "40,30,20\n" * 20, "1 places say too little"),
+        ("x,y,z\n" + "".join(f"{31 + k},30,20\n" for k in range(20)), "lie on a line"),
         ("x,y,z," + "d" * 2000 + "\n", "longer ones than a list of points has"),
         ("\x00\x01", "its first line"),
     ],

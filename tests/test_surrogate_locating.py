@@ -218,6 +218,40 @@ def test_wild_points_change_nothing_much(locator, body, truth):
     assert np.linalg.norm(found.centroid - without.centroid) < 0.3 * np.linalg.norm(without.centroid) + 0.2e-3
 
 
+def test_points_off_the_cortex_are_left_out_and_named(locator, body, truth):
+    """They change nothing but the number of points; more than a third of them are refused."""
+    clean = observed(body, truth[0][0], 3)
+    few, many = (np.arange(60) % 10 < number for number in (1, 4))
+    spoilt = [
+        replace(clean, rest=np.where(some[:, None], clean.rest - [0.0, 0.0, 0.03], clean.rest)) for some in (few, many)
+    ]
+    found = locator.locate(spoilt[0])
+    assert found.outliers.tolist() == np.flatnonzero(few).tolist()
+    without = locator.locate(Observation(clean.now[~few], clean.rest[~few]))
+    assert found.centroid == pytest.approx(without.centroid) and found.p95 == pytest.approx(without.p95)
+    with pytest.raises(InputError, match="24 of 60 points lie off the open cortex"):
+        locator.locate(spoilt[1])
+
+
+def test_a_tip_without_support_is_left_out_and_says_nothing_of_the_tool(locator, body, truth):
+    clean = observed(body, truth[0][0], 3, noise=0.1)
+    sure = replace(clean, sigma=np.full(60, 1e-4))
+    wrong = replace(sure, tips=clean.now[:1] + [0.0, 0.0, 0.025])
+    found, without = locator.locate(wrong), locator.locate(sure)
+    assert found.tips_left_out.tolist() == [0] and not len(found.outliers)
+    assert found.centroid == pytest.approx(without.centroid, abs=1e-9)
+    right = locator.locate(replace(sure, tips=clean.now[:1]))
+    assert not len(right.tips_left_out)
+
+
+def test_where_nothing_moved_nothing_is_claimed(locator, body):
+    found = locator.locate(
+        replace(observed(body, np.zeros_like(body.mesh.nodes)), now=observed(body, np.zeros_like(body.mesh.nodes)).rest)
+    )
+    assert not found.centroid.any() and found.explained == 0.0 and not found.calibrated
+    assert found.causes == dict.fromkeys(KINDS, 0.0) and found.p95 > 0.0
+
+
 def test_causes_are_named(locator, body, truth):
     """Of motions by fluid that drains, drainage has the largest share, more often than not."""
     found = [(kind, locator.locate(observed(body, motion, 1, noise=0.2)).causes) for motion, kind in truth]
@@ -235,10 +269,18 @@ def along_x(points):
 @pytest.mark.parametrize(
     ("spoilt", "match"),
     [
-        (lambda o: replace(o, now=1e3 * o.now, rest=1e3 * o.rest), "micrometres"),
-        (lambda o: replace(o, now=1e-3 * o.now, rest=1e-3 * o.rest), "in metres"),
+        (lambda o: replace(o, now=1e3 * o.now, rest=1e3 * o.rest), "a thousandth of that: files are in mm"),
+        (lambda o: replace(o, now=1e-3 * o.now, rest=1e-3 * o.rest), "a thousand times of that"),
         (lambda o: replace(o, rest=o.rest + [0.0, 0.0, 0.05]), "another brain or frame"),
         (lambda o: replace(o, now=o.now + 0.2), "which no brain does"),
+        (lambda o: replace(o, tips=o.now[:1] + [0.0, 0.0, 0.1]), r"tip 1 lies \d+ mm off the open cortex"),
+        (lambda o: replace(o, now=o.now[:50]), "50 points have 60 places at rest"),
+        (lambda o: replace(o, now=o.now[:, :2]), "no array of shape"),
+        (lambda o: replace(o, sigma=np.ones(3)), "60 points have a sigma of shape"),
+        (
+            lambda o: replace(o, now=np.repeat(o.now[:5], 12, 0), rest=np.repeat(o.rest[:5], 12, 0)),
+            "5 places say too little",
+        ),
         (lambda o: replace(o, now=o.now[:5], rest=o.rest[:5]), "5 points say too little"),
         (lambda o: replace(o, now=along_x(o.rest), rest=along_x(o.rest)), "on a line"),
         (lambda o: replace(o, now=np.where(np.arange(60)[:, None] == 7, np.nan, o.now)), "not finite"),
@@ -254,5 +296,5 @@ def test_bad_observations_are_refused_with_the_reason(locator, body, truth, spoi
 def test_a_file_in_lps_is_named_as_such(locator, body):
     there = observed(body, np.zeros_like(body.mesh.nodes))
     turned = replace(there, now=there.now * [-1.0, -1.0, 1.0], rest=there.rest * [-1.0, -1.0, 1.0])
-    with pytest.raises(InputError, match=r"the file is LPS\. Give RAS"):
+    with pytest.raises(InputError, match=r"they are LPS\. Give RAS"):
         locator.locate(turned)

@@ -41,8 +41,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="what is made once for an anatomy; made where there is none, which takes minutes (default: beside it)",
     )
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, to make that on (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of what is made (default %(default)s)")
+    parser.add_argument(
+        "--device",
+        default="auto",
+        help="auto, cpu or cuda: where a locator is made; without effect where there is one (default %(default)s)",
+    )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="of a locator that is made; without effect where there is one (default %(default)s)",
+    )
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
 
@@ -50,11 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Locate the tumour. 0: done; what fits no cause is bad input."""
     from sim.bodies.meshfile import read_anatomy, write_mesh
+    from sim.runtime.device import find_device
     from surrogate.locating.observation import placed
     from surrogate.locating.observed_files import read_observation
 
     out = claimed(args.out, ".vtu", "a result of `sulcus locate`", args.force, [args.anatomy])
     at_least("--seed", args.seed, 0)
+    find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
     observation = read_observation(args.observed, args.tool)
     placed(anatomy, observation)  # what cannot be placed need not wait for a locator
@@ -109,6 +120,7 @@ def _numbers(found: Location, points: int, out: Path) -> dict[str, object]:
         "bias_degrees": np.degrees(found.rotation).tolist(),
         "points": points,
         "outliers": found.outliers.tolist(),
+        "tips_left_out": found.tips_left_out.tolist(),
         "calibrated": found.calibrated,
         "milliseconds": 1e3 * found.seconds,
         "of": "the tumour, as far as the causes that were tried go; not of a model",
@@ -119,14 +131,22 @@ def _numbers(found: Location, points: int, out: Path) -> dict[str, object]:
 def _sentences(found: Location, out: Path) -> str:
     x, y, z = 1e3 * found.centroid
     causes = ", ".join(f"{name} {share:.0%}" for name, share in found.causes.items() if share > 0.005)
+    sure = "With a probability of 95 %" if found.calibrated else "At a guess"
     lines = [
         f"The middle of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",
-        f"With a probability of 95 % it is within {1e3 * found.p95:.1f} mm of there.",
+        f"{sure} it is within {1e3 * found.p95:.1f} mm of there.",
         f"The motion explains {found.explained:.0%} of what was seen. Causes: {causes}.",
         f"The observation as a whole seems off by {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
     ]
     if not found.calibrated:
-        lines.append("The 95 % were not tried on so few or so many points, or on such motions: take them as a guess.")
+        lines.append(
+            "It is a guess, as ellipsoids were not tried on so few or many points, or on motions so near errors."
+        )
     if len(found.outliers):
-        lines.append(f"Left out, as no other point supports them: points {', '.join(map(str, found.outliers[:20]))}.")
+        rows = ", ".join(str(number + 2) for number in found.outliers[:20]) + (
+            " ..." if len(found.outliers) > 20 else ""
+        )
+        lines.append(f"Left out, off the open cortex or without support by other points: rows {rows} of the file.")
+    for number in found.tips_left_out:
+        lines.append(f"Left out, as the points do not support it: tip {number + 1}.")
     return "\n".join([*lines, f"written: {out}"])

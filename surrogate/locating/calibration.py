@@ -27,6 +27,8 @@ ALONE = (TOOL, DRAINAGE, SWELLING)
 # Points of a trial, the share of the open cortex that they lie on, how much softer its tissue is than the ensemble's,
 # and errors as shares of the usual.
 POINTS, COVER, SOFTER, ERRORS = (20, 300), (0.2, 0.6), (0.7, 2.0), (0.1, 1.0)
+# Of motion over error, so that its logarithm is finite.
+LITTLE = 1e-3
 # A member that moves the open cortex by less [m] is in no trial.
 LEAST_SEEN = 0.5e-3
 
@@ -67,7 +69,8 @@ def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:
 def likeness(evidence: Evidence) -> np.ndarray:
     """Logarithms (2,) of the seen motion over its error, and of the number of points."""
     count = len(np.unique(evidence.point))
-    return np.log([np.sqrt((evidence.value**2).sum() / count) / np.median(evidence.sigma), count])
+    seen = np.sqrt((evidence.value**2).sum() / count)
+    return np.log([max(seen / np.median(evidence.sigma), LITTLE), count])
 
 
 def _trial(

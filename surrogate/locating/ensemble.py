@@ -98,7 +98,7 @@ def _kept(
     anatomy: Anatomy, group: Group, seed: int, device: str, causes: Causes, folder: Path | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The motions and kinds of a group, from the folder if they are there, of the same draw."""
-    stated = digest_of(np.frombuffer(repr((anatomy.digest, group, seed, causes)).encode(), np.uint8))
+    stated = digest_of(np.frombuffer(repr((anatomy.digest, group, seed, causes, ACCURACY)).encode(), np.uint8))
     path = None if folder is None else folder / f"{group.number:03d}-{stated}.npz"
     if path is not None and path.exists():
         with read_as(path, "a group of an ensemble", "Delete it: it is made anew."), path.open("rb") as raw:

@@ -37,6 +37,8 @@ class Location:
         The weights of its shapes and the rigid error, with covariances that were made to hold.
     p95
         [m]: with probability 0.95 the middle of the tumour is no farther from `centroid`.
+    outliers, tips_left_out
+        Numbers of points, and of tips, from 0. They lie off the open cortex, or no other point supports them.
     calibrated
         Whether covariances were tried on observations like this: on so many points, and motions so far above errors.
     seconds
@@ -46,6 +48,8 @@ class Location:
     prior: Prior
     posterior: Posterior
     p95: float
+    outliers: np.ndarray
+    tips_left_out: np.ndarray
     calibrated: bool
     seconds: float
 
@@ -81,27 +85,22 @@ class Location:
         return self.posterior.rigid[3:]
 
     @property
-    def outliers(self) -> np.ndarray:
-        """Numbers of the points, from 0, that no other supports; they were left out."""
-        return self.posterior.outliers
-
-    @property
     def explained(self) -> float:
         """Share of the seen motion, in mean square, that the mean motion and the rigid error explain."""
         evidence, found = self.posterior.evidence, self.posterior
         left = evidence.value - self.prior.seen(evidence.place, evidence.axis) @ found.weight
         left -= evidence.rigid @ found.rigid
-        return float(max(0.0, 1.0 - (left @ left) / (evidence.value @ evidence.value)))
+        whole = float(evidence.value @ evidence.value)
+        return max(0.0, 1.0 - float(left @ left) / whole) if whole else 0.0
 
     @property
     def causes(self) -> dict[str, float]:
-        """Share of each of `KINDS` in the mean motion of the open cortex; they sum to 1."""
+        """Share of each of `KINDS` in what they move the open cortex by, in mean square; they sum to 1."""
         weight = self.posterior.weight
         shape = self.prior.shape[:, np.unique(self.prior.anatomy.open_surface)].reshape(len(weight), -1)
-        whole = weight @ shape
-        own = [float((weight[rows] @ shape[rows]) @ whole) for rows in map(self.prior.kind.__eq__, range(len(KINDS)))]
-        total = float(whole @ whole) or 1.0
-        return {name: part / total for name, part in zip(KINDS, own, strict=True)}
+        parts = [weight[rows] @ shape[rows] for rows in map(self.prior.kind.__eq__, range(len(KINDS)))]
+        squares = np.array([part @ part for part in parts], float)
+        return dict(zip(KINDS, (squares / (squares.sum() or 1.0)).tolist(), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,23 +135,34 @@ class Locator:
             return self._located(observation)
 
     def _located(self, observation: Observation) -> Location:
-        begun, prior = time.perf_counter(), self.prior
+        begun, prior, count = time.perf_counter(), self.prior, len(observation.now)
         evidence = placed(self.anatomy, observation)
-        found = conditioned(prior, evidence, observation.tips)
-        if observation.rest is None or len(observation.tips):
+        named = np.unique(evidence.point[evidence.point < count])
+        found, tips = conditioned(prior, evidence, observation.tips), observation.tips
+        if observation.rest is None or len(tips):
             for _ in range(ROUNDS):
                 motion = np.tensordot(found.weight, prior.shape, 1)
-                evidence = placed_anew(self.anatomy, observation, motion, found.bias_at)
-                found = conditioned(prior, evidence, observation.tips)
-        _demand_explained(found, len(np.unique(evidence.point)))
+                evidence = placed_anew(self.anatomy, observation, named, motion, found.bias_at)
+                supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
+                found = conditioned(prior, evidence, tips[supported])
+        off = np.setdiff1d(np.arange(count), named) if observation.rest is not None else np.zeros(0, int)
+        outliers = np.union1d(off, found.outliers[found.outliers < count])
+        _demand_explained(found, len(outliers), len(off) + int((np.unique(evidence.point) < count).sum()))
         found = scaled(found, covering_factor(self.tried, found.evidence))
         root = np.linalg.cholesky(prior.middle.T @ found.spread @ prior.middle)
         radius = np.linalg.norm(np.random.default_rng(0).standard_normal((DRAWS, 3)) @ root.T, axis=1)
-        seconds = time.perf_counter() - begun
-        return Location(prior, found, float(np.quantile(radius, 0.95)), was_tried(self.tried, found.evidence), seconds)
+        return Location(
+            prior,
+            found,
+            float(np.quantile(radius, 0.95)),
+            outliers,
+            found.outliers[found.outliers >= count] - count,
+            was_tried(self.tried, found.evidence),
+            time.perf_counter() - begun,
+        )
 
 
-def _demand_explained(found: Posterior, points: int) -> None:
+def _demand_explained(found: Posterior, outliers: int, points: int) -> None:
     """Refuse an observation that the ensemble does not know.
 
     Raises
@@ -160,10 +170,10 @@ def _demand_explained(found: Posterior, points: int) -> None:
     InputError
         Too many outliers, or residuals that are no noise.
     """
-    if len(found.outliers) > MOST_OUTLIERS * points:
+    if outliers > MOST_OUTLIERS * points:
         raise InputError(
-            f"{len(found.outliers)} of {points} points fit no motion that the others support: check that the points "
-            "belong to this brain, and raise sigma if they are less sure."
+            f"{outliers} of {points} points lie off the open cortex, or fit no motion of the others: check that "
+            "they are of this brain. If they are less sure, raise sigma."
         )
     if found.surprise > MOST_SURPRISE:
         raise InputError(

@@ -47,13 +47,16 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
     InputError
         A file that is missing, no locator of this version, damaged, or of another anatomy.
     """
-    with read_as(path, "a locator", "Delete it: `sulcus locate` makes it anew."), Path(path).open("rb") as raw:
+    with (
+        read_as(path, "a locator", "Give one that `save_locator` wrote, or none: `sulcus locate` makes it."),
+        Path(path).open("rb") as raw,
+    ):
         archive = Archive(raw)
         header = json.loads(archive.text("header"))
         if header["format"] != FORMAT or tuple(header["kinds"]) != KINDS:
-            raise InputError(f"{path}: is no locator of this version: delete it, and it is made anew.")
+            raise InputError(f"{path}: is no locator of this version: move it away, and `sulcus locate` makes it anew.")
         if header["anatomy"] != anatomy.digest:
-            raise InputError(f"{path}: was made for another anatomy: delete it, and it is made anew.")
+            raise InputError(f"{path}: was made for another anatomy: give that one, or another locator.")
         arrays = archive.arrays([*ARRAYS, "tried"])
         _check(path, anatomy, arrays)
         tried = arrays.pop("tried")
@@ -70,4 +73,6 @@ def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) ->
     for name, (low, high) in zip(LABELS, limits, strict=True):
         fits = fits and arrays[name].dtype.kind == "i" and arrays[name].min() >= low and arrays[name].max() < high
     if not fits or not all(np.isfinite(arrays[name]).all() for name in ("shape", "centre", "tried")):
-        raise InputError(f"{path}: has arrays that do not fit the anatomy: delete it, and it is made anew.")
+        raise InputError(
+            f"{path}: has arrays that do not fit the anatomy: move it away, and `sulcus locate` makes it anew."
+        )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +21,8 @@ FEWEST = 6
 THIN = 0.05
 # How far [m] half of the points may lie off the surface they are said to be of, and how far any may.
 NEAR, FAR = 6e-3, 12e-3
+# Farther than this no tip touches the cortex [m], however it has moved; points nearer than that are one place [m].
+FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
 # Motions [m] beyond which no brain goes.
 LONGEST_MOTION = 0.05
 # Points of a cloud that are looked at together, and at most.
@@ -67,6 +70,7 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
     off = _off_surface(anatomy, where)
     if np.median(off) > NEAR:
         raise InputError(_elsewhere(anatomy, where, float(np.median(off))))
+    _demand_spread(where)
     if observation.rest is not None:
         motion = np.median(np.linalg.norm(observation.now - observation.rest, axis=1))
         if motion > LONGEST_MOTION:
@@ -74,39 +78,54 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
                 f"half of the points move by more than {1e3 * motion:.0f} mm, which no brain does: give motions in "
                 "millimetres, rather than new positions."
             )
-    if observation.rest is not None:
-        near = np.flatnonzero(off <= FAR)
-        here = observation.rest[near]
-        evidence = of_motions(locate(anatomy.mesh, here), here, observation.now[near] - here, observation.sigmas[near])
-        return evidence
-    return placed_anew(anatomy, observation, np.zeros_like(anatomy.mesh.nodes), lambda at: np.zeros_like(at))
+    for number, away in enumerate(_off_surface(anatomy, observation.tips), start=1):
+        if away > FARTHEST_TIP:
+            raise InputError(
+                f"tip {number} lies {1e3 * away:.0f} mm off the open cortex, so that it cannot touch it: give "
+                "millimetres, RAS, or leave it out."
+            )
+    named = np.flatnonzero(off <= FAR) if observation.rest is not None else np.zeros(0, int)
+    return placed_anew(anatomy, observation, named, np.zeros_like(anatomy.mesh.nodes), lambda at: np.zeros_like(at))
 
 
-def placed_anew(anatomy: Anatomy, observation: Observation, motion: np.ndarray, bias) -> Evidence:
+def placed_anew(
+    anatomy: Anatomy,
+    observation: Observation,
+    named: np.ndarray,
+    motion: np.ndarray,
+    bias: Callable[[np.ndarray], np.ndarray],
+) -> Evidence:
     """The observation as evidence where the body is believed to have moved by `motion` (V, 3) [m].
 
-    Points without a name are those of the surface that are nearest to them; they tell of its motion along its normal.
-    `bias` gives the rigid error (n, 3) [m] that is believed in at places (n, 3).
+    Of points with a place at rest only those `named` (k,) by number count. Points without one, and tips, are those of
+    the surface that are nearest to them; they tell of its motion along its normal. `bias` gives the rigid error
+    (n, 3) [m] that is believed in at places (n, 3). Tips are numbered after the points.
     """
-    parts = []
+    parts, count = [], len(observation.now)
+    cloud, number = observation.tips, count + np.arange(len(observation.tips))
+    sigma = np.full(len(observation.tips), SIGMA)
     if observation.rest is not None:
-        here = observation.rest
-        parts.append(of_motions(locate(anatomy.mesh, here), here, observation.now - here, observation.sigmas))
-        cloud, sigma = observation.tips, np.full(len(observation.tips), SIGMA)
+        here = observation.rest[named]
+        moved = of_motions(locate(anatomy.mesh, here), here, observation.now[named] - here, observation.sigmas[named])
+        parts.append(replace(moved, point=named[moved.point]))
     else:
-        cloud = np.concatenate([observation.now, observation.tips])
-        sigma = np.concatenate([observation.sigmas, np.full(len(observation.tips), SIGMA)])
-    some = np.unique(np.linspace(0, len(cloud) - 1, min(len(cloud), MOST)).round().astype(int)) if len(cloud) else []
-    if len(some):
-        first = 0 if not parts else int(parts[0].point.max()) + 1
-        parts.append(_along_normals(anatomy, cloud[some], sigma[some], motion, bias, first))
+        some = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
+        cloud, number = np.concatenate([observation.now[some], cloud]), np.concatenate([some, number])
+        sigma = np.concatenate([observation.sigmas[some], sigma])
+    if len(cloud):
+        parts.append(_along_normals(anatomy, cloud, sigma, number, motion, bias))
     return parts[0] if len(parts) == 1 else _joined(parts)
 
 
 def _along_normals(
-    anatomy: Anatomy, cloud: np.ndarray, sigma: np.ndarray, motion: np.ndarray, bias, first: int
+    anatomy: Anatomy,
+    cloud: np.ndarray,
+    sigma: np.ndarray,
+    number: np.ndarray,
+    motion: np.ndarray,
+    bias: Callable[[np.ndarray], np.ndarray],
 ) -> Evidence:
-    """One row a point: how far along the moved surface's normal the surface moved to be there."""
+    """One row a point, of its `number` (n,): how far along the moved surface's normal the surface moved to be there."""
     triangles, nodes = anatomy.open_surface, anatomy.mesh.nodes
     corners = (nodes + motion)[triangles]
     asked = cloud - bias(cloud)
@@ -119,7 +138,7 @@ def _along_normals(
     # A fourth vertex of no weight makes it a place of the mesh.
     place = Located(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(len(at))]))
     value = np.einsum("ni,ni->n", cloud - at, normal)
-    return Evidence(place, at, normal, value, sigma, first + np.arange(len(at)))
+    return Evidence(place, at, normal, value, sigma, number)
 
 
 def _joined(parts: list[Evidence]) -> Evidence:
@@ -131,18 +150,31 @@ def _joined(parts: list[Evidence]) -> Evidence:
 
 
 def _check(observation: Observation) -> None:
-    arrays = {"positions": observation.now, "sigma": observation.sigmas, "tips": observation.tips}
+    arrays = {"now": observation.now, "tips": observation.tips}
     if observation.rest is not None:
-        arrays["points at rest"] = observation.rest
+        arrays["rest"] = observation.rest
     for name, array in arrays.items():
+        if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 3:
+            raise InputError(f"`{name}` of an observation is no array of shape (n, 3): give one, in metres.")
+    count, sigma = len(observation.now), np.asarray(observation.sigmas)
+    if observation.rest is not None and len(observation.rest) != count:
+        raise InputError(f"{count} points have {len(observation.rest)} places at rest: give one for each.")
+    if sigma.shape != (count,):
+        raise InputError(f"{count} points have a sigma of shape {sigma.shape}: give one number for each point.")
+    for name, array in {**arrays, "sigma": sigma}.items():
         if not np.isfinite(array).all():
-            raise InputError(f"the {name} have a value that is not finite: leave such points out.")
-    count = len(observation.now)
+            raise InputError(f"`{name}` has a value that is not finite: leave such points out.")
+    if not (sigma > 0.0).all():
+        raise InputError("a sigma is not positive: give each point the standard deviation of its error [mm].")
     if count < FEWEST:
         raise InputError(f"{count} points say too little: give at least {FEWEST}, spread over the open cortex.")
-    if not (observation.sigmas > 0.0).all():
-        raise InputError("a sigma is not positive: give each point the standard deviation of its error [mm].")
-    where = observation.now if observation.rest is None else observation.rest
+
+
+def _demand_spread(where: np.ndarray) -> None:
+    """Raise InputError where points (n, 3) [m] are of few places, or of a line."""
+    places = len(np.unique(np.round(where / ONE_PLACE), axis=0))
+    if places < FEWEST:
+        raise InputError(f"{places} places say too little: give at least {FEWEST} points, spread over the open cortex.")
     along, across, _ = np.linalg.svd(where - where.mean(axis=0), compute_uv=False)
     if not across > THIN * along:
         raise InputError("the points lie on a line: spread them over the open cortex.")
@@ -152,15 +184,16 @@ def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     """Distances (n,) [m] from the open cortex."""
     corners = open_cortex(anatomy).corners
     parts = [points[some : some + TOGETHER] for some in range(0, len(points), TOGETHER)]
-    return np.concatenate([np.linalg.norm(closest(part, corners).point - part, axis=1) for part in parts])
+    away = [np.linalg.norm(closest(part, corners).point - part, axis=1) for part in parts]
+    return np.concatenate([np.zeros(0), *away])
 
 
 def _elsewhere(anatomy: Anatomy, points: np.ndarray, off: float) -> str:
     """Why points may be so far off the open cortex [m]."""
     start = f"half of the points lie more than {1e3 * off:.3g} mm off the open cortex"
-    for scale, unit_meant in ((1e-3, "the file is in micrometres, or a thousandth"), (1e3, "the file is in metres")):
+    for scale, unit_meant in ((1e-3, "a thousandth"), (1e3, "a thousand times")):
         if np.median(_off_surface(anatomy, scale * points)) <= NEAR:
-            return f"{start}: {unit_meant}. Give millimetres."
+            return f"{start}, and would lie on it if they were {unit_meant} of that: files are in mm, arrays in metres."
     if np.median(_off_surface(anatomy, points * [-1.0, -1.0, 1.0])) <= NEAR:
-        return f"{start}, and would lie on it if x and y were turned: the file is LPS. Give RAS."
+        return f"{start}, and would lie on it if x and y were turned: they are LPS. Give RAS."
     return f"{start}: they are of another brain or frame. Give the scan's own RAS, in millimetres."

@@ -53,9 +53,13 @@ def _columns(path: str | Path, allowed: set[tuple[str, ...]]) -> dict[str, np.nd
     if len(lines) > MOST_ROWS or any(len(line) > LONGEST_LINE for line in lines):
         raise InputError(f"{path}: has more than {MOST_ROWS:,} rows, or longer ones than a list of points has.")
     rows = [row for row in csv.reader(lines) if row]
-    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
+    if not rows:
+        raise InputError(f"{path}: is empty: give a table with the header {known}.")
+    header = tuple(cell.strip().lower() for cell in rows[0])
     if set(header) not in map(set, allowed) or len(set(header)) < len(header):
-        raise InputError(f"{path}: its first line is {','.join(header)[:80]!r}: give the header {known}.")
+        raise InputError(
+            f"{path}: its first line is {','.join(rows[0])[:80]!r}: give the header {known}, with commas between."
+        )
     values = np.empty((len(rows) - 1, len(header)))
     for number, row in enumerate(rows[1:], start=2):
         try:
