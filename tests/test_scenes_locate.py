@@ -103,7 +103,7 @@ def test_people_read_sentences(files, capsys, words):
         ("x,y,z\n1,2,nan\n", "row 2 has a number that is not finite"),
         ("x,y,z\n1,2,3\n", "1 points say too little"),
         ("x;y;z\n1;2;3\n", "with commas between"),
-        ("x,y,z\n" + "40,30,20\n" * 20, "1 places say too little"),
+        ("x,y,z\n" + "40,30,20\n" * 20, "1 places a millimetre apart say too little"),
         ("x,y,z\n" + "".join(f"{31 + k},30,20\n" for k in range(20)), "lie on a line"),
         ("x,y,z," + "d" * 2000 + "\n", "longer ones than a list of points has"),
         ("\x00\x01", "its first line"),

@@ -279,7 +279,7 @@ def along_x(points):
         (lambda o: replace(o, sigma=np.ones(3)), "60 points have a sigma of shape"),
         (
             lambda o: replace(o, now=np.repeat(o.now[:5], 12, 0), rest=np.repeat(o.rest[:5], 12, 0)),
-            "5 places say too little",
+            "5 places a millimetre apart say too little",
         ),
         (lambda o: replace(o, now=o.now[:5], rest=o.rest[:5]), "5 points say too little"),
         (lambda o: replace(o, now=along_x(o.rest), rest=along_x(o.rest)), "on a line"),

@@ -130,7 +130,7 @@ def _numbers(found: Location, points: int, out: Path) -> dict[str, object]:
 
 def _sentences(found: Location, out: Path) -> str:
     x, y, z = 1e3 * found.centroid
-    causes = ", ".join(f"{name} {share:.0%}" for name, share in found.causes.items() if share > 0.005)
+    causes = ", ".join(f"{name} {share:.0%}" for name, share in found.causes.items() if share > 0.005) or "none"
     sure = "With a probability of 95 %" if found.calibrated else "At a guess"
     lines = [
         f"The middle of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",

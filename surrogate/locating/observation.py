@@ -174,7 +174,9 @@ def _demand_spread(where: np.ndarray) -> None:
     """Raise InputError where points (n, 3) [m] are of few places, or of a line."""
     places = len(np.unique(np.round(where / ONE_PLACE), axis=0))
     if places < FEWEST:
-        raise InputError(f"{places} places say too little: give at least {FEWEST} points, spread over the open cortex.")
+        raise InputError(
+            f"{places} places a millimetre apart say too little: give {FEWEST} at least, spread over the open cortex."
+        )
     along, across, _ = np.linalg.svd(where - where.mean(axis=0), compute_uv=False)
     if not across > THIN * along:
         raise InputError("the points lie on a line: spread them over the open cortex.")
