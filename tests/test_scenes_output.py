@@ -90,6 +90,9 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
     for name, words in (("data", "sulcus data 1"), ("episode", "sulcus episode 1"), ("other", "mine")):
         with h5py.File(tmp_path / f"{name}.h5", "w") as file:
             file.attrs["format"] = words
+    located = {"displacement": box.mesh.nodes, "deviation": box.mesh.nodes[:, 0]}
+    write_mesh(tmp_path / "located.vtu", box.mesh, located)
+    np.savez(tmp_path / "locator.npz", header=np.array(json.dumps({"format": "sulcus locator 1"})))
     np.savez(tmp_path / "model.npz", header=np.array(json.dumps({"format": "sulcus model 2"})))
     np.savez(tmp_path / "arrays.npz", mine=np.zeros(3))
     (tmp_path / "graph.onnx").write_bytes(b"\x08\x08 sulcus onnx 1")
@@ -105,6 +108,8 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         "an anatomy of sulcus": "anatomy.vtu",
         "a scan that sulcus put beside an anatomy": "scan.t1.nii.gz",
         "a result of `sulcus solve`": "solution.vtu",
+        "a result of `sulcus locate`": "located.vtu",
+        "a locator of `sulcus locate`": "locator.npz",
         "a data set of `sulcus simulate`": "data.h5",
         "an episode of `sulcus collect`": "episode.h5",
         "a model of `sulcus train`": "model.npz",
