@@ -1,5 +1,7 @@
 """Label volumes of many kinds become meshes in their own frame, or are refused in a sentence."""
 
+from pathlib import Path
+
 import nibabel
 import numpy as np
 import pytest
@@ -284,3 +286,12 @@ def test_intensities_are_read_where_their_own_affine_says(tmp_path):
     subject = volume_subject(path, (1, 2), (3, 4), tmp_path / "t1.nii")
     beside = places[bright] + 1e-3 * np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, -4.0, 0.0], [0.0, 0.0, 4.0]])
     np.testing.assert_allclose(255.0 * subject.intensity.at(beside), [100.0, 20.0, 20.0, 20.0], rtol=1e-3)
+
+
+def test_a_tumour_as_rough_as_its_voxels_is_meshed():
+    """12 ml with a rough surface, 2 mm under the cortex of a folded brain, on few nodes: nothing is refused or lost."""
+    subject = volume_subject(Path(__file__).parent / "data" / "rough.nii.gz", (1,), (2,))
+    mesh = make_anatomy(subject, MeshPlan(nodes=5300)).mesh
+    tumour = mesh.volumes[mesh.region == TUMOUR_LABEL].sum()
+    assert tumour == pytest.approx(subject.tumour_volume, rel=0.01)
+    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 15.0

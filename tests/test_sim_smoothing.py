@@ -6,7 +6,7 @@ import pytest
 from sim.bodies.bcc_lattice import graded_lattice
 from sim.bodies.isosurface_stuffing import cut, whole
 from sim.bodies.manifold_repair import clean, ears
-from sim.bodies.mesh_smoothing import Smoothing, enclosed_volume, fitted, improved, smallest_sines
+from sim.bodies.mesh_smoothing import Smoothing, enclosed_volume, fitted, improved, smallest_sines, unfolded
 from sim.bodies.signed_distance import onto_level
 from sim.geometry.tetmesh import dihedral_angles, faces_once, row_keys, signed_volumes
 
@@ -46,6 +46,27 @@ def test_fitting_brings_the_surface_nearer_and_encloses_the_volume(body):
     assert distance(moved) < 0.65 * distance(body.nodes)
     still = fitted(body.nodes, triangles, ball, ~movable, volume)
     np.testing.assert_array_equal(still, body.nodes)
+
+
+def test_what_a_fit_folds_stays_where_it_was(body):
+    """One node is pushed through its neighbours: it stays, and all others are where the fit put them."""
+    wanted = body.nodes + 1e-5
+    node = body.tets[len(body.tets) // 2, 0]
+    wanted[node] += [0.02, 0.0, 0.0]
+    assert (smallest_sines(wanted[body.tets]) <= 0.0).any()
+    kept = unfolded(body.nodes, wanted, body.tets)
+    assert (smallest_sines(kept[body.tets]) > 0.0).all()
+    np.testing.assert_array_equal(kept[node], body.nodes[node])
+    moved = (kept == wanted).all(axis=1)
+    beside = np.unique(body.tets[(body.tets == node).any(axis=1)])
+    assert np.setdiff1d(np.flatnonzero(~moved), beside).size == 0 and moved.mean() > 0.9
+
+
+def test_where_a_field_is_flat_points_take_short_steps():
+    """Half way between two surfaces the slope is noise, and a Newton step would go anywhere."""
+    points = np.array([[1e-6, 0.0, 0.0], [5e-3, 0.0, 0.0]])
+    moved = onto_level(lambda p: 1e-3 + 0.5 * p[:, 0] ** 2, points, np.zeros(2))
+    assert np.linalg.norm(moved - points, axis=1).max() < 2e-3
 
 
 def test_bad_angles_improve_and_surface_nodes_stay_on_the_surface(body):

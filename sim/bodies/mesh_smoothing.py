@@ -99,6 +99,17 @@ def fitted(
     return nodes
 
 
+def unfolded(nodes: np.ndarray, moved: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Nodes (V, 3) [m] as `moved` (V, 3), but where that turns a tetrahedron inside out: there they stay."""
+    kept = moved.copy()
+    while True:
+        folded = np.unique(tets[smallest_sines(kept[tets]) <= 0.0])
+        astray = folded[(kept[folded] != nodes[folded]).any(axis=1)]
+        if len(astray) == 0:
+            return kept
+        kept[astray] = nodes[astray]
+
+
 def enclosed_volume(nodes: np.ndarray, triangles: np.ndarray) -> float:
     """Volume [m^3] inside a closed surface of triangles (S, 3), outwards."""
     a, b, c = (nodes[triangles[:, k]] for k in range(3))

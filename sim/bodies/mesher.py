@@ -15,7 +15,7 @@ from ..geometry.tetmesh import TetMesh, faces_once
 from .bcc_lattice import graded_lattice
 from .isosurface_stuffing import Pieces, Stuffing, cut, whole
 from .manifold_repair import clean, ears
-from .mesh_smoothing import Projection, Smoothing, fitted, improved, smallest_sines
+from .mesh_smoothing import Projection, Smoothing, fitted, improved, smallest_sines, unfolded
 from .signed_distance import Field, onto_level
 
 TOO_COARSE = "so few nodes do not show the brain or the tumour: ask for more nodes, or check the labels."
@@ -161,23 +161,34 @@ def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
 
 
 def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | None:
-    """The surfaces fitted, what is flat on them trimmed, the bad angles improved; None: some remain inside out."""
+    """The pieces fitted and improved; None: some remain inside out, even where what a fit folds is not fitted."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
+    for fold in (True, False):
+        found = _improved(solids, _fitted(solids, pieces, settings, fold), settings)
+        if (smallest_sines(found.nodes[found.tets]) > 0.0).all():
+            return TetMesh(found.nodes, found.tets, np.where(found.inside, TUMOUR_LABEL, BRAIN_LABEL))
+    return None
+
+
+def _fitted(solids: Solids, pieces: Pieces, settings: Meshing, fold: bool) -> Pieces:
+    """The surfaces fitted, the outer one first; nodes stay where that turns a piece inside out, unless it may `fold`."""
     (surface, _), smoothing = _surfaces(pieces), settings.smoothing
-    nodes = fitted(pieces.nodes, faces_once(pieces.tets), solids.brain, surface, settings=smoothing)
-    inner = faces_once(pieces.tets[pieces.inside])
-    nodes = fitted(nodes, inner, solids.tumour, ~surface, solids.tumour_volume, smoothing)
-    pieces = replace(pieces, nodes=nodes)
+    outer, inner = faces_once(pieces.tets), faces_once(pieces.tets[pieces.inside])
+    nodes = fitted(pieces.nodes, outer, solids.brain, surface, settings=smoothing)
+    nodes = nodes if fold else unfolded(pieces.nodes, nodes, pieces.tets)
+    moved = fitted(nodes, inner, solids.tumour, ~surface, solids.tumour_volume, smoothing)
+    return replace(pieces, nodes=moved if fold else unfolded(nodes, moved, pieces.tets))
+
+
+def _improved(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces:
+    """What is flat on the surfaces trimmed, the bad angles improved."""
     for slack in settings.slacks:
-        bad = smallest_sines(pieces.nodes[pieces.tets]) < smoothing.good_sine
+        bad = smallest_sines(pieces.nodes[pieces.tets]) < settings.smoothing.good_sine
         pieces = pieces.kept(~ears(pieces.tets, bad))
         projection = _projection(solids, pieces, slack)
-        pieces = replace(pieces, nodes=improved(pieces.nodes, pieces.tets, projection, smoothing))
-    if (smallest_sines(pieces.nodes[pieces.tets]) <= 0.0).any():
-        return None
-    region = np.where(pieces.inside, TUMOUR_LABEL, BRAIN_LABEL)
-    return TetMesh(pieces.nodes, pieces.tets, region)
+        pieces = replace(pieces, nodes=improved(pieces.nodes, pieces.tets, projection, settings.smoothing))
+    return pieces
 
 
 def _surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:

@@ -80,11 +80,15 @@ def gradient(field: Field, points: np.ndarray, probe: float = 2e-4) -> np.ndarra
     return np.stack([field(points + step) - field(points - step) for step in steps], axis=1) / (2.0 * probe)
 
 
-def onto_level(field: Field, points: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Points (n, 3) [m] moved along the gradient to where the field has the value `level` (n,): two Newton steps."""
+def onto_level(field: Field, points: np.ndarray, level: np.ndarray, flat: float = 0.1) -> np.ndarray:
+    """Points (n, 3) [m] moved along the gradient to where the field has the value `level` (n,): two Newton steps.
+
+    A distance has slope 1. Slopes below `flat` lie between two surfaces or far from any, and their direction is noise:
+    the flatter the field, the shorter the step.
+    """
     for _ in range(2):
         slope = gradient(field, points)
         square = np.einsum("ni,ni->n", slope, slope)
-        excess = (field(points) - level) / np.where(square > 0.0, square, np.inf)
+        excess = (field(points) - level) / np.maximum(square, flat**2)
         points = points - excess[:, None] * slope
     return points
