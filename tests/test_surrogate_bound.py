@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from surrogate.model.conformal import LEVELS, conformal, fitted_bound
+from surrogate.model.conformal import LEVELS, MOST_GROWTH, USUAL_GROWTH, conformal, fitted_bound, fitted_growth
+from surrogate.model.training_range import Outside
+
+
+def lying(count, away=0.0, beyond=0.0):
+    """So many loads at a distance [m] from the nearest training load, and so far beyond their range otherwise."""
+    return Outside(np.full(count, away), np.full(count, beyond), np.full(count, beyond))
 
 
 def drawn(count, seed):
@@ -23,7 +29,7 @@ def bound():
 
 def test_fresh_loads_are_covered_in_every_class(bound):
     features, force, error = drawn(20000, 2)
-    stated = bound.of(features, force, np.zeros(len(force)))
+    stated = bound.of(features, force, lying(len(force)))
     covered = error.max(axis=1) <= stated
     for level, row in zip(LEVELS, covered, strict=True):
         assert abs(row.mean() - level) < 0.01
@@ -36,8 +42,40 @@ def test_fresh_loads_are_covered_in_every_class(bound):
 
 def test_outside_it_grows(bound):
     features, force, _ = drawn(10, 3)
-    inside, outside = (bound.of(features, force, np.full(10, excess)) for excess in (0.0, 1.0))
+    inside, outside = (bound.of(features, force, lying(10, beyond=excess)) for excess in (0.0, 1.0))
     assert (outside > 2.0 * inside).all()
+
+
+def far_and_near(growth, seed, near=400, far=300):
+    """Errors over a plain bound, and distances [m] to training loads, of which the errors grow by `growth` [1/m]."""
+    random = np.random.default_rng(seed)
+    for count, most in ((near, 1e-3), (far, 6e-3)):
+        away = random.uniform(0.0, most, count)
+        yield 0.4 * random.exponential(size=count) * (1.0 + growth * away), away
+
+
+@pytest.mark.parametrize("growth", [0.0, 300.0, 1500.0])
+def test_growth_is_that_by_which_errors_grow_with_the_distance(growth):
+    found = np.array([fitted_growth(*far_and_near(growth, seed)) for seed in range(20)])
+    assert abs(np.median(found) - growth) < 0.3 * growth + 40.0
+
+
+def test_too_few_far_loads_tell_no_growth_and_none_is_beyond_all_bounds():
+    near, far = far_and_near(300.0, 0)
+    assert fitted_growth(near, (far[0][:18], far[1][:18])) == USUAL_GROWTH
+    assert fitted_growth(near, (1e9 * far[0], far[1])) == MOST_GROWTH
+
+
+def test_bounds_that_grow_with_the_distance_hold_near_and_far():
+    features, force, error = drawn(3000, 5)
+    away = np.random.default_rng(6).uniform(0.0, 6e-3, 3000)
+    error = error * (1.0 + 800.0 * away)[:, None]
+    near = np.flatnonzero(away < 2e-3)
+    known = features[near], force[near], error[near]
+    bound = fitted_bound((features, error.max(axis=1)), *known, away=away[near], growth=800.0)
+    stated = bound.of(features, force, Outside(away, 0.0 * away, 0.0 * away))[0]
+    held = error.max(axis=1) <= stated
+    assert abs(held[near].mean() - 0.95) < 0.02 and abs(held[away > 4e-3].mean() - 0.95) < 0.03
 
 
 def test_weak_vertices_have_a_small_share(bound):
@@ -55,7 +93,7 @@ def test_loads_of_one_force_are_one_class():
     features, _, error = drawn(500, 4)
     bound = fitted_bound((features, error.max(axis=1)), features, np.full(500, 0.2), error)
     assert not len(bound.edges) and bound.quantile.shape == (2, 1)
-    stated = bound.of(features, np.full(500, 0.2), np.zeros(500))
+    stated = bound.of(features, np.full(500, 0.2), lying(500))
     assert np.mean(error.max(axis=1) <= stated[0]) >= 0.95
 
 
@@ -75,7 +113,7 @@ def test_a_scale_seen_in_few_discs_does_not_run_away_between_them(curved):
     features, _, error = placed(400, 5, discs)
     bound = fitted_bound((features, error[:, 0]), *placed(1000, 6), curved=curved)
     features, force, error = placed(5000, 7)
-    stated = bound.of(features, force, np.zeros(len(force)))
+    stated = bound.of(features, force, lying(len(force)))
     assert abs(np.mean(error[:, 0] <= stated[0]) - 0.95) < 0.02
     # The 95th percentile of an exponential distribution is three times its mean.
     ideal = 3e-4 * np.exp(1.2 * features[:, 0] - 0.8 * features[:, 1])
@@ -87,5 +125,5 @@ def test_a_scale_is_of_the_load_and_the_same_everywhere(curved):
     features, _, error = placed(400, 5)
     bound = fitted_bound((features, error[:, 0]), *placed(1000, 6), curved=curved)
     elsewhere = features + [0.0, 0.0, 0.0, 0.0, 9.0, -9.0, 30.0]
-    at = [bound.of(some, np.full(400, 0.2), np.zeros(400)) for some in (features, elsewhere)]
+    at = [bound.of(some, np.full(400, 0.2), lying(400)) for some in (features, elsewhere)]
     np.testing.assert_array_equal(*at)

@@ -20,10 +20,10 @@ from surrogate.data.disc_split import APART
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.evaluation.coverage import coverage
-from surrogate.model.conformal import features_of, fitted_bound
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
-from surrogate.model.training_range import envelope_of, measured
+from surrogate.model.training_range import envelope_of
+from surrogate.training.bounds import TUMOUR, bound_by, growth_by, missed
 from surrogate.training.shared_inputs import EXPANDED
 from surrogate.training.train import LEARNERS, train
 
@@ -166,23 +166,23 @@ def test_how_bounds_hold_in_the_discs_left_out_is_reported_of_a_model_that_knows
     apart = np.arange(len(good)) >= len(good) - trained.calibrated
     beside = np.flatnonzero(apart & (place > trained.split.radius))
     assert 38 <= len(beside) < trained.calibrated
-    discs = np.flatnonzero(trained.split.test)
+    split = trained.split
     for name in ("linear", "svr"):
         model = scored.models[name]
 
-        def rows_of(rows, model=model):
+        def seen(rows, model=model):
             loads = good.rows(rows)
-            known = measured(open_patch(data.anatomy), loads.of(Pushed))
-            within = known._replace(magnitude=np.clip(known.magnitude, *model.envelope.force))
             answer = model.deform(loads, at=data.anatomy.tumour_nodes).displacement
             error = np.linalg.norm(answer - truth[rows], axis=2)
-            return features_of(loads.of(Pushed), within), known.magnitude, error
+            return missed(model, open_patch(data.anatomy), loads.of(Pushed), error)
 
-        features, _, error = rows_of(beside[::3])
-        bounds = fitted_bound((features, error.max(axis=1)), *rows_of(np.delete(beside, np.s_[::3])))
-        held = rows_of(discs)[2].max(axis=1) <= replace(model, bounds=bounds).deform(good.rows(discs)).bound
-        found = trained.left_out[name]
-        assert found.loads == len(discs) and found.held == pytest.approx(held.mean(axis=1))
+        near, held = seen(beside), []
+        for disc in range(len(split.centres)):
+            here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
+            bounds = bound_by(near, TUMOUR, growth_by(near, seen(others), TUMOUR))
+            held.append(seen(here).worst <= replace(model, bounds=bounds).deform(good.rows(here)).bound)
+        found, held = trained.left_out[name], np.concatenate(held, axis=1)
+        assert found.loads == held.shape[1] == split.test.sum() and found.held == pytest.approx(held.mean(axis=1))
     assert scored.left_out == {}
 
 

@@ -13,10 +13,11 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model.conformal import Bound
+from surrogate.model.conformal import GROWTH, Bound
 from surrogate.model.learned import Part
 from surrogate.model.npz_archive import Archive
 from surrogate.model.store import load, save
+from surrogate.model.training_range import Outside
 from surrogate.training.train import train
 
 
@@ -139,6 +140,24 @@ def rewritten(stored, path, change):
             else:
                 target.writestr(name, raw)
     return path
+
+
+def test_bounds_of_older_files_grow_beyond_the_reach_alone(stored, models, box, tmp_path):
+    def older(text):
+        header = json.loads(text)
+        for model in header["models"].values():
+            for bound in (model["bounds"], model["tip"]["bound"]):
+                del bound["growth"], bound["near"]
+        return json.dumps(header)
+
+    found = load(rewritten(stored, tmp_path / "model.npz", older), box)["svr"]
+    reach = models["svr"].envelope.reach
+    for bound in (found.bounds, found.tip.bound):
+        assert (float(bound.growth), float(bound.near)) == (1e3 * GROWTH, reach)
+    away = np.array([0.0, reach, reach + 1e-3])
+    outside = Outside(away, 0.0 * away, 0.0 * away)
+    stated = found.bounds.of(np.tile(found.bounds.mean, (3, 1)), np.full(3, 0.2), outside)[0]
+    assert stated[0] == stated[1] and stated[2] == pytest.approx((1.0 + GROWTH) * stated[0])
 
 
 def test_declared_sizes_are_held_against_what_there_is(stored, box, tmp_path):

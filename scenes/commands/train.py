@@ -102,10 +102,7 @@ def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
             "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
             table(trained.scores, 1e3 * trained.motion),
             f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}",
-            *(
-                f"on those discs, where nothing is promised, bounds of {name} held for {found}"
-                for name, found in trained.left_out.items()
-            ),
+            *(f"on those discs bounds of {name} held for {found}" for name, found in trained.left_out.items()),
             *(
                 f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"
                 for name, found in trained.distance_left_out.items()

@@ -172,7 +172,7 @@ def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | No
 
 
 def _fitted(solids: Solids, pieces: Pieces, settings: Meshing, fold: bool) -> Pieces:
-    """The surfaces fitted, the outer one first; nodes stay where that turns a piece inside out, unless it may `fold`."""
+    """The surfaces fitted, the outer one first. Nodes stay where that turns a piece inside out, unless it may fold."""
     (surface, _), smoothing = _surfaces(pieces), settings.smoothing
     outer, inner = faces_once(pieces.tets), faces_once(pieces.tets[pieces.inside])
     nodes = fitted(pieces.nodes, outer, solids.brain, surface, settings=smoothing)

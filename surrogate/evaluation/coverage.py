@@ -91,15 +91,20 @@ def _demand_tenths(loads: Loads) -> None:
         raise InputError(f"{len(loads)} loads have no tenths: simulate at least {TENTHS}.")
 
 
-def _covered(model: Learned, loads: Loads, answer: Deformation, error: np.ndarray, bound: np.ndarray) -> Coverage:
-    """Errors (B,) [m] against bounds (2, B) [m]."""
+def covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
+    """How often errors (B,) [m] lie below bounds (2, B) [m], under forces (B,) [N]; so many loads lie outside."""
     held = error <= bound
-    by_force = np.array_split(np.argsort(directions(model.asked(loads))[0], kind="stable"), TENTHS)
+    by_force = np.array_split(np.argsort(force, kind="stable"), TENTHS)
     return Coverage(
-        len(loads),
+        len(error),
         (float(held[0].mean()), float(held[1].mean())),
         tuple(float(held[0][rows].mean()) for rows in by_force),
         1e3 * float(np.median(bound[0])),
         1e3 * float(np.median(error)),
-        answer.outcome.count(Outcome.EXTRAPOLATED),
+        extrapolated,
     )
+
+
+def _covered(model: Learned, loads: Loads, answer: Deformation, error: np.ndarray, bound: np.ndarray) -> Coverage:
+    force = directions(model.asked(loads))[0]
+    return covered(force, error, bound, answer.outcome.count(Outcome.EXTRAPOLATED))

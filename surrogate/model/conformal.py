@@ -16,7 +16,7 @@ from sim.loads import Pushed
 
 from ..array_functions import taken
 from ..regressors.protocol import standardisation
-from .training_range import Measured
+from .training_range import Measured, Outside
 
 LEVELS = (0.95, 0.99)
 # So many calibration loads make a class of force, of which there are at most so many.
@@ -29,8 +29,9 @@ LOAD = 4
 BENDS = 150
 # Standard deviations beyond which a feature counts no further; and the share of the mean below which no error counts.
 FARTHEST, LEAST = 4.0, 1e-3
-# How much a bound grows outside the training range, for each unit of `Envelope.excess`.
-GROWTH = 4.0
+# How much a bound grows beyond the range of training loads, for each unit of `Outside.beyond`. With the distance from
+# the nearest training load it grows by so much [1/m] where no loads tell how much, and never by more than the last.
+GROWTH, USUAL_GROWTH, MOST_GROWTH = 4.0, 1e3, 2e4
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,8 @@ class Bound:
         (2, k): of error over scale, for `LEVELS` and each class.
     profile
         (n,) at most one: each vertex's share of the bound, in the order of `Anatomy.tumour_nodes`.
+    growth, near
+        () [1/m], with the distance from the nearest training load, of which the first part () [m] does not count.
     """
 
     mean: np.ndarray
@@ -59,11 +62,16 @@ class Bound:
     edges: np.ndarray
     quantile: np.ndarray
     profile: np.ndarray
+    growth: np.ndarray
+    near: np.ndarray
 
-    def of(self, features: np.ndarray, force: np.ndarray, excess: np.ndarray) -> np.ndarray:
-        """Bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N] and `Envelope.excess` (B,)."""
+    def of(self, features: np.ndarray, force: np.ndarray, outside: Outside) -> np.ndarray:
+        """Bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N], and where the B loads lie."""
         scale = np.exp(_monomials(_standard(features, self.mean, self.deviation)) @ self.weights)
-        return taken(np.searchsorted(self.edges, force), self.quantile.T).T * scale * (1.0 + GROWTH * excess)
+        scale = (
+            scale * (1.0 + self.growth * np.maximum(outside.away - self.near, 0.0)) * (1.0 + GROWTH * outside.beyond)
+        )
+        return taken(np.searchsorted(self.edges, force), self.quantile.T).T * scale
 
 
 def fitted_bound(
@@ -74,6 +82,8 @@ def fitted_bound(
     each: int = CLASS,
     *,
     curved: bool = True,
+    away: np.ndarray | float = 0.0,
+    growth: float = 0.0,
 ) -> Bound:
     """A bound whose scale follows what was `seen`, calibrated on other loads.
 
@@ -90,6 +100,8 @@ def fitted_bound(
         Calibration loads of a class of force, at least: fewer than 99 promise nothing at 0.99.
     curved
         Whether the scale's logarithm is quadratic in the load's features, if `BENDS` loads were seen, or linear.
+    away, growth
+        (n,) [m] of the calibration loads from the nearest training load, and how much the bound grows with that [1/m].
     """
     mean, deviation = standardisation(seen[0])
     used = _used(len(mean), LOAD if curved and len(seen[1]) >= BENDS else 0)
@@ -100,14 +112,38 @@ def fitted_bound(
     weights = np.zeros(len(used))
     weights[used] = np.linalg.solve(design.T @ design + penalty, design.T @ wanted)
     worst = error.max(axis=1)
-    ratio = worst / np.exp(_monomials(_standard(features, mean, deviation)) @ weights)
+    scale = np.exp(_monomials(_standard(features, mean, deviation)) @ weights)
+    ratio = worst / (scale * (1.0 + growth * away))
     count = int(np.clip(len(ratio) // each, 1, CLASSES))
     edges = np.unique(np.quantile(force, np.arange(1, count) / count))
     edges = edges[edges < force.max()]  # equal forces are of one class
     count, member = len(edges) + 1, np.searchsorted(edges, force)
     quantile = np.array([[conformal(ratio[member == k], level) for k in range(count)] for level in LEVELS])
     share = np.quantile(error / np.maximum(worst, np.finfo(float).tiny)[:, None], LEVELS[0], axis=0)
-    return Bound(mean, deviation, weights, edges, quantile, share)
+    return Bound(mean, deviation, weights, edges, quantile, share, np.array(growth), np.zeros(()))
+
+
+def fitted_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.ndarray]) -> float:
+    """The growth [1/m] by which the first of `LEVELS` is met as well far from training loads as near them.
+
+    Parameters
+    ----------
+    near, far
+        Errors over a bound that does not grow (n,), and distances (n,) [m] from the nearest training load: of loads
+        drawn as the training loads, and of others. Fewer than 19 of these tell nothing: `USUAL_GROWTH`.
+    """
+
+    def larger(growth: float) -> bool:
+        asked, promised = (conformal(ratio / (1.0 + growth * away), LEVELS[0]) for ratio, away in (far, near))
+        return asked > promised
+
+    if not np.isfinite(conformal(far[0], LEVELS[0])):
+        return USUAL_GROWTH
+    least, most = 0.0, MOST_GROWTH
+    for _ in range(40):
+        middle = 0.5 * (least + most)
+        least, most = (middle, most) if larger(middle) else (least, middle)
+    return most
 
 
 def features_of(pushed: Pushed, known: Measured) -> np.ndarray:

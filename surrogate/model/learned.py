@@ -26,7 +26,7 @@ from ..data.indentation import indented
 from ..regressors.protocol import Fitted
 from .conformal import LEVELS, Bound, features_of
 from .tip_distance import Distance, TipModel
-from .training_range import Envelope, Measured, measured
+from .training_range import Envelope, Measured, Outside, measured
 
 # Times the strongest force, or the widest footprint, of the training. Of three loads so strong on the template's brain
 # the finite elements find an equilibrium of none, and at twice the force a prediction is off by up to 31 %.
@@ -198,11 +198,11 @@ class Learned:
     def _summed(self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float) -> Deformation:
         """The sum of the parts, asked at `begun` [s]."""
         known = measured(self._patch, pushed)
-        excess = self.envelope.excess(pushed, known)
-        small = pushed.footprint < self.envelope.reach + STORED
-        self._demand_answerable(pushed, np.flatnonzero((excess > 0.0) | small))
-        promised = self.promised(self.bounds, pushed, known, excess)
-        return predicted(self.motion(pushed, nodes), nodes, loads, excess > 0.0, begun, promised, self.source)
+        outside = self.envelope.outside(pushed, known)
+        far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED
+        self._demand_answerable(pushed, np.flatnonzero(far | small))
+        promised = self.promised(self.bounds, pushed, known, outside)
+        return predicted(self.motion(pushed, nodes), nodes, loads, far, begun, promised, self.source)
 
     def motion(self, pushed: Pushed, nodes: np.ndarray, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
         """Displacements (B, n, 3) [m] of mesh vertices `nodes` (n,) by the model alone, without limits and bound.
@@ -222,14 +222,14 @@ class Learned:
         ]
         return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
 
-    def promised(self, bound: Bound | None, pushed: Pushed, known: Measured, excess: np.ndarray) -> np.ndarray:
+    def promised(self, bound: Bound | None, pushed: Pushed, known: Measured, outside: Outside) -> np.ndarray:
         """The bounds (2, B) [m] of loads; NaN where there is none."""
         if bound is None:
-            return np.stack([np.nan * excess] * len(LEVELS))
+            return np.stack([np.nan * outside.excess] * len(LEVELS))
         # As the motion, so its error: in proportion to a force weaker than any of the training.
         weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
         features = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *self.envelope.force)))
-        return np.where(weaker > 0.0, bound.of(features, known.magnitude, excess), 0.0) * weaker
+        return np.where(weaker > 0.0, bound.of(features, known.magnitude, outside), 0.0) * weaker
 
     def distance(self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None) -> Distance:
         """Predict the distance from the tool's tip to the tumour, both in the deformed brain: see `TipGauge`.
@@ -256,7 +256,7 @@ class Learned:
         within = np.clip(magnitude, *self.envelope.force)[:, None] * direction
         found = tip.corrected(apart, self._patch, replace(pushed, force=within), magnitude)
         known = measured(self._patch, pushed)
-        return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.excess(pushed, known)))
+        return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.outside(pushed, known)))
 
     def asked(self, loads: Loads) -> Pushed:
         """What the model is asked: pushes, or the poses of its ball as `indentation.indented` has them.

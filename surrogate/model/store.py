@@ -28,7 +28,7 @@ from ..regressors.pcr import Pcr
 from ..regressors.protocol import Fitted, Regressor
 from ..regressors.series_residual import Remainder
 from ..regressors.svr import Svr
-from .conformal import Bound
+from .conformal import GROWTH, Bound
 from .learned import Learned, Part
 from .npz_archive import Archive
 from .own_learners import find_own, name_of
@@ -170,22 +170,26 @@ def _described_tip(tip: TipModel, put: Any) -> dict[str, Any]:
     return {"correction": correction, "bound": _put_bound(tip.bound, put)}
 
 
-def _rebuilt_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray]) -> TipModel | None:
+def _rebuilt_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], reach: float) -> TipModel | None:
     if description is None:
         return None
     known = description["correction"]
     state = {} if known is None else {name: arrays[key] for name, key in known.items()}
     demand_finite(state)
     correction = None if known is None else Gp.restored(state)
-    return TipModel(correction, _rebuilt_bound(description["bound"], arrays))
+    return TipModel(correction, _rebuilt_bound(description["bound"], arrays, reach))
 
 
 def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
     return None if bound is None else {name: put(array) for name, array in vars(bound).items()}
 
 
-def _rebuilt_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray]) -> Bound | None:
-    return None if names is None else Bound(**{name: arrays[key] for name, key in names.items()})
+def _rebuilt_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray], reach: float) -> Bound | None:
+    """A bound; those of older files grow beyond the reach of the training loads alone."""
+    if names is None:
+        return None
+    older = {"growth": np.array(1e3 * GROWTH), "near": np.array(reach)}
+    return Bound(**(older | {name: arrays[key] for name, key in names.items()}))
 
 
 def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:
@@ -204,9 +208,9 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         tuple(parts),
         Envelope(**envelope),
         description["bound"],
-        _rebuilt_bound(description["bounds"], arrays),
+        _rebuilt_bound(description["bounds"], arrays, envelope["reach"]),
         description["training"],
         # Older files do not have these.
         description.get("ball"),
-        _rebuilt_tip(description.get("tip"), arrays),
+        _rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
     )

@@ -26,6 +26,25 @@ class Measured(NamedTuple):
     overhang: np.ndarray
 
 
+class Outside(NamedTuple):
+    """Where loads lie to the training range, (B,) each.
+
+    `away` is the distance from the nearest training load [m]. `beyond` says how far a load leaves the range otherwise.
+    It is the largest of some numbers: millimetres over the rim, radians beyond the angle, and the shares by which
+    force, radius and force over radius are too large or too small. `excess` counts millimetres beyond the reach too,
+    and is zero inside.
+    """
+
+    away: np.ndarray
+    beyond: np.ndarray
+    excess: np.ndarray
+
+    @property
+    def here(self) -> Outside:
+        """The same loads, if they were training loads."""
+        return Outside(*(0.0 * each for each in self))
+
+
 @dataclass(frozen=True, eq=False)
 class Envelope:
     """Bounds of the training loads.
@@ -58,7 +77,7 @@ class Envelope:
 
     def holds(self, patch: Patch, pushed: Pushed) -> np.ndarray:
         """(B,) bool: whether each load lies inside."""
-        return self.excess(pushed, measured(patch, pushed)) == 0.0
+        return self.outside(pushed, measured(patch, pushed)).excess == 0.0
 
     def repeats(self, point: np.ndarray, corners: np.ndarray) -> bool:
         """Whether some of the points (B, 3) [m] are points of the training, to the last bit.
@@ -68,16 +87,12 @@ class Envelope:
         asked, known, free = (set(map(tuple, place.astype(np.float32))) for place in (point, self.points, corners))
         return bool((asked & known) - free)
 
-    def excess(self, pushed: Pushed, known: Measured) -> np.ndarray:
-        """How far outside each load lies (B,), in shares of the training range; zero inside.
-
-        The largest of three: millimetres beyond the reach or over the rim, radians beyond the angle, and shares. The
-        shares are those by which force, radius and force over radius are too large or too small.
-        """
+    def outside(self, pushed: Pushed, known: Measured) -> Outside:
+        """Where loads lie to the range."""
         magnitude, angle, overhang = known
+        away = np.sqrt(squared_distances(pushed.point, self.points).min(axis=1))
         beyond = np.stack(
             [
-                1e3 * (np.sqrt(squared_distances(pushed.point, self.points).min(axis=1)) - self.reach - SLACK),
                 1e3 * (overhang - self.overhang - SLACK),
                 np.where(magnitude == 0.0, 0.0, angle - self.angle - SLACK),
                 magnitude / self.force[1] - 1.0 - SLACK,
@@ -86,7 +101,8 @@ class Envelope:
                 pushed.footprint / self.footprint[1] - 1.0 - SLACK,
             ]
         )
-        return np.maximum(beyond.max(axis=0), 0.0)
+        beyond = np.maximum(beyond.max(axis=0), 0.0)
+        return Outside(away, beyond, np.maximum(beyond, 1e3 * (away - self.reach - SLACK)))
 
 
 def envelope_of(patch: Patch, trained: Pushed) -> Envelope:

@@ -120,6 +120,8 @@ def _check_bounds(bounds: Bound, count: int) -> None:
         "weights": (terms,),
         "quantile": (len(LEVELS), len(bounds.edges) + 1),
         "profile": (count,),
+        "growth": (),
+        "near": (),
     }
     for name, shape in shapes.items():
         _demand(getattr(bounds, name).shape == shape, f"{name!r} of its bounds have another shape")
@@ -127,6 +129,7 @@ def _check_bounds(bounds: Bound, count: int) -> None:
     _demand(bool(np.isfinite(numbers).all() and (bounds.deviation > 0.0).all()), "the scale of its bounds is none")
     _demand(bounds.edges.ndim == 1 and bool((np.diff(bounds.edges) > 0.0).all()), "its classes of force do not rise")
     _demand(bool((bounds.quantile >= 0.0).all()), "its bounds are negative")
+    _demand(0.0 <= float(bounds.growth) < np.inf and 0.0 <= float(bounds.near) < np.inf, "its bounds do not grow")
     _demand(bool((bounds.quantile[1] >= bounds.quantile[0]).all()), "its bounds shrink with their probability")
     _demand(bool(((bounds.profile >= 0.0) & (bounds.profile <= 1.0)).all()), "a vertex's share of its bounds is none")
 

@@ -52,7 +52,7 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
 
     Outputs, as `Learned.deform` answers: `displacement` (B, n, 3) [m] of the mesh vertices `nodes` (n,), which lie at
     `rest` (n, 3) [m]. `bound` (B, 2) [m] of the tumour, at the metadata's levels, is NaN where nothing was calibrated.
-    Then come `excess` (B,), that of `Envelope`; and `extrapolated` (B,), whether it is more than zero. All in single
+    Then come `excess` (B,), that of `Outside`; and `extrapolated` (B,), whether it is more than zero. All in single
     precision, but in between in the precision that the model has.
 
     Raises
@@ -83,8 +83,9 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
 
     displacement: Any = model.motion(pushed, nodes, {"tool": tool_features, "nodal": nodal_shares})
     known = measured(patch, pushed)
-    excess: Any = envelope.excess(pushed, known)
-    bound: Any = model.promised(model.bounds, pushed, known, excess)
+    outside = envelope.outside(pushed, known)
+    excess: Any = outside.excess
+    bound: Any = model.promised(model.bounds, pushed, known, outside)
     rest = model.anatomy.mesh.nodes[nodes]
     sheet.output(displacement, Port("displacement", np.float32, ("B", len(nodes), 3), "of the vertices `nodes` [m]"))
     sheet.output(bound.T, Port("bound", np.float32, ("B", len(LEVELS)), "no tumour vertex is farther off [m]"))

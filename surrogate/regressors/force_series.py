@@ -88,12 +88,6 @@ class Series:
         table = state["share"].astype(np.float32) * state["unit"]
         return cls(state["corners"], state["triangles"], state["radii"], table)
 
-    def from_second_order(self) -> Self:
-        """The same without its first order: what nonlinearity adds."""
-        table = self.table.copy()
-        table[:, :, SPANS[0]] = 0.0
-        return type(self)(self.corners, self.triangles, self.radii, table)
-
     @cached_property
     def _frames(self) -> np.ndarray:
         """(S, 4, 4): from (point, 1) to the shares of a triangle's three corners and the height over it [m]."""

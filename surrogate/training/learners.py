@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -44,17 +44,14 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part,
     known = inputs.expansion
     trained = partial(_trained, known.patch, examples.loads)
     if name in EXPANDED:
-        tumour, more = inputs.series
-        cortex = () if more is None else (*known.cortex_table, more)
+        added = inputs.series
         if name == "series":
-            return (tumour, *cortex)
-        learnt = trained(("tool", Remainder), (tumour,), tumour.basis, examples.tumour)
-        if more is None:
-            return (tumour, learnt)
-        left = trained(("tool", Remainder), cortex, more.basis, examples.cortex)
-        return (tumour, learnt, *cortex, left)
+            return (*known.tables, *added)
+        both = zip(known.tables, added, (examples.tumour, examples.cortex), strict=False)
+        left = [trained(("tool", Remainder), parts, parts[1].basis, truth) for *parts, truth in both]
+        return (*known.tables, *added, *left)
     if name == "linear":
-        return (inputs.table, *known.cortex_table)
+        return known.tables
     if name in TOUCHED:
         contact, left = _touched(known, examples)
         if name == "contact":
@@ -63,9 +60,10 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part,
     if known.data.ball is not None:
         both = ((known.tumour, examples.tumour), (known.cortex, examples.cortex))
         return tuple(trained(_learnt(name), (), nodes, truth) for nodes, truth in both if len(nodes))
-    before = (inputs.table,) if name == "residual" else ()
+    tumour, *cortex = known.tables
+    before = (tumour,) if name == "residual" else ()
     learnt = trained(_learnt(name), before, known.tumour, examples.tumour)
-    return (*before, learnt, *known.cortex_table)
+    return (*before, learnt, *cortex)
 
 
 def _learnt(name: str) -> tuple[str, Callable[[], Teachable]]:
@@ -93,7 +91,7 @@ def _trained(
     patch: Patch,
     loads: Pushed,
     kind: tuple[str, Callable[[], Teachable]],
-    before: tuple[Part, ...],
+    before: Sequence[Part],
     on: Basis | np.ndarray,
     truth: np.ndarray,
 ) -> Part:

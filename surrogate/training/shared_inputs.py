@@ -22,7 +22,7 @@ from sim.runtime.outside_files import read_as
 from ..data.cortex_patch import Patch, open_patch
 from ..data.dataset import Dataset
 from ..data.disc_split import Split
-from ..data.encode import ENCODERS, Basis, directions, reduce
+from ..data.encode import Basis, directions, nodal_shares, reduce
 from ..data.tool_loads import spread
 from ..evaluation.solve_counts import SolveCounts
 from ..model.applicability import trained_skull
@@ -34,10 +34,11 @@ from ..regressors.left_out_tables import filled
 from .condense_contact import condensed, side_by_side
 from .tabulate_series import radii_between, tabulated, with_middles
 
-# Share of the responses that a learner's basis may lose, and its most modes; the same of the tables, and of the series.
+# Share of the responses that a learner's basis may lose, and its most modes; the same of what the series adds to the
+# compliance, a tenth of the motion, and of compliance.
 COARSE = (1e-3, 60)
+ADDED = (5e-3, 160)
 TABLE_TOLERANCE = 1e-4
-FINE = (2e-4, 64)
 # The same of the bases that series are tabulated in, made of what is had at so many places far from each other.
 WIDE, FEW = (1e-5, 192), 40
 # Learners that ask the finite elements how linear tissue gives; the second learns what that leaves.
@@ -110,30 +111,28 @@ class Expansion:
         return with_middles(self.patch)[1]
 
     @cached_property
-    def table(self) -> Part:
-        """The tumour's compliance."""
-        return self.compliance(self.tumour)
+    def tables(self) -> tuple[Part, ...]:
+        """The tumour's compliance, and the cortex's, if there is more: exact at every node of the open cortex.
 
-    @cached_property
-    def cortex_table(self) -> tuple[Part, ...]:
-        """The cortex's compliance, if there is more than the tumour."""
-        return (self.compliance(self.cortex),) if len(self.cortex) else ()
+        In as many modes as the unit responses need.
+        """
+        return tuple(self._compliance(nodes) for nodes in self._known)
 
     def bases(self, examples: Examples, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
         """What a set of examples does to the tumour, and to the cortex, if there is more, beyond its compliance.
 
-        `tumour` and `cortex` are what may be left of it, as a share, and the most modes.
+        A dent as small as its tool is no sum of a few modes, but what nonlinearity adds to it is. `tumour` and `cortex`
+        are what may be left of it, as a share, and the most modes.
         """
         size = directions(examples.loads)[0][:, None, None]
-        at_tumour = reduce(self.tumour, examples.tumour / size, *tumour)
-        if not len(self.cortex):
-            return [at_tumour]
-        # A dent as small as its tool is no sum of a few modes, but what nonlinearity adds to it is.
-        linear = sum(part.response(ENCODERS[part.encoder](self.patch, examples.loads)) for part in self.cortex_table)
-        return [at_tumour, reduce(self.cortex, examples.cortex / size - linear, *cortex)]
+        shares = nodal_shares(self.patch, examples.loads)
+        both = zip(self.tables, (examples.tumour, examples.cortex), (tumour, cortex), strict=False)
+        return [
+            reduce(table.basis.nodes, moved / size - table.response(shares), *limits) for table, moved, limits in both
+        ]
 
     def on(self, bases: list[Basis], left_out: np.ndarray) -> list[Series]:
-        """The series as coefficients of the `bases` of examples, without some places (P,) bool.
+        """What the series adds to compliance, as coefficients of the `bases` of examples, without some places (P,).
 
         Raises
         ------
@@ -141,12 +140,31 @@ class Expansion:
             Data that do not state what tissue they are of.
         """
         triangles = with_middles(self.patch)[0]
+        inside = self.patch.rim_distance(self.places)[:, None] > self.radii
         found = []
-        for table, wide, basis in zip(self.tabulated.tables, self.tabulated.bases, bases, strict=True):
-            known = filled(self.places, table @ (wide.modes @ basis.modes.T), left_out)
+        for table, linear, wide, basis in zip(self._series, self.tables, self.tabulated.bases, bases, strict=True):
+            added = table.copy()
+            first = linear.regressor.predict(self._unit_shares) @ (linear.basis.modes @ wide.modes.T)
+            # Footprints over the rim press on nodes beyond the open cortex. Of others nothing is left.
+            added[:, :, SPANS[0]] -= first.reshape(added[:, :, SPANS[0]].shape)
+            known = filled(self.places, added @ (wide.modes @ basis.modes.T), left_out)
+            known[inside, SPANS[0]] = 0.0
             exact = Series(self.patch.points, triangles, self.radii, known)
             found.append(Series.restored(exact.state()))  # what is used is what can be stored
         return found
+
+    @cached_property
+    def _unit_shares(self) -> np.ndarray:
+        """Forces (3 P R, 3 m) at the patch's nodes of one newton along each axis, at each place and radius."""
+        point = np.repeat(self.places, 3 * len(self.radii), axis=0)
+        radius = np.tile(np.repeat(self.radii, 3), len(self.places))
+        return nodal_shares(self.patch, Pushed(point, np.tile(np.eye(3), (len(point) // 3, 1)), radius))
+
+    @property
+    def _series(self) -> list[np.ndarray]:
+        """The part of the table of the series that each of its bases has."""
+        cuts = np.cumsum([len(basis.modes) for basis in self.tabulated.bases])[:-1]
+        return np.split(self.tabulated.table, cuts, axis=-1)
 
     @cached_property
     def contact(self) -> tuple[Contact, list[Basis], float]:
@@ -161,15 +179,8 @@ class Expansion:
         contact, bases = condensed(self.fem(), self._known)
         return contact, bases, time.perf_counter() - begun
 
-    def compliance(self, nodes: np.ndarray, left_out: np.ndarray | None = None) -> Part:
-        """The compliance table of some vertices, from the unit responses, in as many modes as it needs.
-
-        Those of nodes of the open cortex that are `left_out` (m,) bool are interpolated from the others'.
-        """
+    def _compliance(self, nodes: np.ndarray) -> Part:
         response = self.data.unit_response(nodes)
-        if left_out is not None:
-            by_node = response.reshape(len(left_out), 3, len(nodes), 3)
-            response = filled(self.patch.points, by_node, left_out).reshape(response.shape)
         basis = reduce(nodes, response, TABLE_TOLERANCE, len(response))
         return Part("nodal", Linear().fit(np.eye(len(response)), basis.encode(response)), basis)
 
@@ -271,18 +282,13 @@ class Tabulated:
     table: np.ndarray
     seconds: float
 
-    @property
-    def tables(self) -> list[np.ndarray]:
-        """The part of each basis."""
-        return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
-
 
 @dataclass(frozen=True, eq=False)
 class SharedInputs:
     """What every learner of a data set is given, made when it is asked for.
 
-    Finite-element answers of the tumour under forces inside the discs left out are not among it. Answers of the cortex
-    beside the tumour are all given: a dent is no sum of dents elsewhere. So it is with contact, which is made of them.
+    Answers to loads inside the discs left out are not among it, nor are terms of the series. How linear tissue gives is
+    given at every node: a dent is no sum of dents elsewhere, and what lies under one follows it.
 
     Parameters
     ----------
@@ -299,26 +305,21 @@ class SharedInputs:
     split: Split | None = None
 
     @cached_property
-    def series(self) -> tuple[Part, Part | None]:
-        """The finite elements' series at the tumour, and at the cortex what it adds to the compliance there."""
-        bases = self.expansion.bases(self.basis_from, FINE, COARSE)
+    def series(self) -> tuple[Part, ...]:
+        """What the finite elements' series adds to compliance, at the tumour and at the cortex, if there is more."""
+        bases = self.expansion.bases(self.basis_from, ADDED, COARSE)
         found = self.expansion.on(bases, self._left_out(self.expansion.places))
-        at_cortex = Part("tool", found[1].from_second_order(), bases[1]) if len(bases) > 1 else None
-        return Part("tool", found[0], bases[0]), at_cortex
-
-    @cached_property
-    def table(self) -> Part:
-        """The tumour's compliance."""
-        left_out = self._left_out(self.expansion.patch.points)
-        return self.expansion.compliance(self.expansion.tumour, left_out) if left_out.any() else self.expansion.table
+        return tuple(Part("tool", part, basis) for part, basis in zip(found, bases, strict=True))
 
     def solve_counts(self, name: str, examples: Examples) -> SolveCounts:
         """The solves that a learner of `LEARNERS` or `OF_POSES` is given, a user's own too."""
         known, data, loads = self.expansion, self.expansion.data, len(examples.loads.point)
         units = series = inside = 0
         seconds = [data.seconds("load", loads)]
-        if data.ball is None and (len(known.cortex) or name in ("linear", "residual")):
+        of_tumour = name in ("linear", "residual", *EXPANDED)
+        if data.ball is None and (len(known.cortex) or of_tumour):
             units = len(data.unit_good)
+            inside = 3 * of_tumour * int(self._left_out(known.patch.points).sum())
             seconds.append(data.seconds("unit response", units))
         if name in TOUCHED:
             contact, _, took = known.contact

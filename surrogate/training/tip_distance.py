@@ -9,14 +9,8 @@ import numpy as np
 from sim.loads import Loads
 
 from ..data.cortex_patch import Patch
-from ..data.encode import directions
-from ..model.conformal import fitted_bound
 from ..model.learned import Learned
 from ..model.tip_distance import MOST, TipModel, fitted_correction
-
-# Calibration loads of a class of force. A tip snaps through with the cortex, so that the tail of its errors grows with
-# the force: classes are as small as 99 in 100 allows.
-CLASS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,32 +37,8 @@ def with_correction(model: Learned, patch: Patch, known: Measured) -> Learned:
     return replace(model, tip=TipModel(fitted_correction(patch, model.asked(some.loads), off)))
 
 
-def corrected_if_better(
-    model: Learned, patch: Patch, trained: Measured, held_out: Measured
-) -> tuple[Learned, np.ndarray]:
-    """The model with a correction, if that brings held-out distances nearer on average; and their errors (B,) [m]."""
+def corrected_if_better(model: Learned, patch: Patch, trained: Measured, held_out: Measured) -> Learned:
+    """The model with a correction, if that brings held-out distances nearer on average."""
     candidates = [replace(model, tip=TipModel()), with_correction(model, patch, trained)]
-    error = [distance_errors(each, held_out) for each in candidates]
-    best = int(error[1].mean() < error[0].mean())
-    return candidates[best], error[best]
-
-
-def calibrated_distance(
-    model: Learned, seen: tuple[np.ndarray, np.ndarray], features: np.ndarray, known: Measured
-) -> Learned:
-    """The model with a bound of its distance, whose scale follows what was `seen`, calibrated on other loads.
-
-    The logarithm of its scale is linear in the load: a tip snaps through with the cortex here and there.
-
-    Parameters
-    ----------
-    seen
-        Features (m, f) and errors (m,) [m] of loads that are not of the model's training.
-    features, known
-        (B, f), and the finite elements' distances, of the calibration loads.
-    """
-    assert model.tip is not None
-    force = directions(model.asked(known.loads))[0]
-    error = distance_errors(model, known)[:, None]
-    bound = fitted_bound(seen, features, force, error, CLASS, curved=False)
-    return replace(model, tip=replace(model.tip, bound=bound))
+    plain, corrected = (distance_errors(each, held_out).mean() for each in candidates)
+    return candidates[int(corrected < plain)]

@@ -15,30 +15,26 @@ from sim.runtime.timing import stage
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
 from ..data.disc_split import APART, MOST_APART, Split, leave_discs_out
-from ..data.encode import directions
 from ..data.indentation import indented
-from ..evaluation.coverage import TENTHS, Coverage, coverage, distance_coverage
+from ..evaluation.coverage import TENTHS, Coverage
 from ..evaluation.score import Score, errors, score
-from ..model.conformal import CLASS, LEVELS, conformal, features_of, fitted_bound
+from ..model.conformal import LEVELS, USUAL_GROWTH, conformal
 from ..model.learned import Learned, only_pushed
 from ..model.own_learners import OWN, find_own
-from ..model.training_range import Envelope, envelope_of, measured
+from ..model.tip_distance import TipModel
+from ..model.training_range import envelope_of
+from .bounds import TIP, TUMOUR, Missed, bound_by, covered_on_discs, growth_by, missed
 from .learners import LEARNT, POSED, parts_of
 from .shared_inputs import EXPANDED, TOUCHED, Examples, Expansion, SharedInputs
-from .tip_distance import (
-    Measured,
-    calibrated_distance,
-    corrected_if_better,
-    distance_errors,
-    with_correction,
-)
+from .tip_distance import Measured, corrected_if_better, distance_errors, with_correction
 
 # Of pushes, and of poses.
 LEARNERS = ("linear", *LEARNT, *EXPANDED)
 OF_POSES = (*TOUCHED, *POSED)
-# Fewer could not promise 95 in 100. With so many, one in three fits the bounds' scale too: they are drawn as what is
-# promised. With fewer, the errors on the discs fit it.
-FEWEST_APART, ENOUGH_APART, SCALE = 19, 3 * CLASS, 3
+# Fewer could not promise 95 in 100.
+FEWEST_APART = 19
+# Of the errors at the tumour, and of the distance to it.
+WAYS = (TUMOUR, TIP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +43,9 @@ class Trained:
 
     `motion` is the mean displacement [m] of the tumour over the held-out loads. `calibrated` counts the loads that
     calibrated the models' bounds, and the field after it counts the training loads. `left_out` gives by learner how
-    often bounds held on the discs left out, where nothing is promised. These are bounds of the scored model, from loads
-    outside the discs: one in three fits the scale, the others the quantiles. `distance_left_out` gives the same for the
-    distance from tip to tumour.
+    often bounds held on the discs left out. These are bounds of the scored model, from loads outside the discs. By how
+    much they grow with the distance from training loads is told by the other discs. `distance_left_out` gives the same
+    for the distance from tip to tumour.
     """
 
     models: dict[str, Learned]
@@ -155,16 +151,19 @@ def train(
     def examples(rows: np.ndarray) -> Examples:
         return Examples(_rows(pushed, rows), truth[rows], cortex[rows])
 
+    def unseen(model: Learned, rows: np.ndarray) -> tuple[Missed, Missed]:
+        """How far a model is off at the tumour, and in its distance, on the chosen rows (B,) bool."""
+        some, asked, known = np.flatnonzero(rows), _rows(pushed, rows), distances.rows(rows)
+        of_tumour = errors(model, loads.rows(some), truth[rows], nodes)
+        of_tip = distance_errors(model, known)[:, None]
+        return missed(model, patch, asked, of_tumour), missed(model, patch, asked, of_tip)
+
     chosen = [_first(split.train, most), *([_first(~apart, most)] if apart.any() else [])]
     example_sets = [examples(rows) for rows in chosen]
     inputs = [SharedInputs(each, shared, left) for each, left in zip(example_sets, (split, None), strict=False)]
-    test, fresh = (loads.rows(np.flatnonzero(rows)) for rows in (split.test, apart))
-    tested, left = (_rows(pushed, rows) for rows in (split.test, apart))
-    beside = np.zeros(0, int)
-    envelopes = [envelope_of(patch, example_sets[0].loads)]
-    if apart.any():
-        beside = np.flatnonzero(~split.covers(left.point))
-        envelopes.append(envelope_of(patch, example_sets[1].loads))
+    test = loads.rows(np.flatnonzero(split.test))
+    beside = apart & ~split.covers(pushed.point)
+    envelopes = [envelope_of(patch, each.loads) for each in example_sets]
     models, scores, left_out, distance_left_out = {}, [], {}, {}
     for name in wanted:
         with stage(f"learn {name}"):
@@ -178,32 +177,29 @@ def train(
         with stage("score"):
             solves = inputs[0].solve_counts(name, example_sets[0])
             scores.append(score(name, model, test, truth[split.test], nodes, solves))
-            held_out = errors(model, test, truth[split.test], nodes).max(axis=1)
-            model, off = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
-        features = _features(patch, tested, envelopes[0])
-        seen, seen_distance = (features, held_out), (features, off)
-        models[name] = replace(model, bound=min(conformal(held_out, LEVELS[0]), float(held_out.max())))
-        if len(beside) >= 2 * FEWEST_APART and len(test) >= TENTHS:
+            model = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
+            far = unseen(model, split.test)
+        models[name] = replace(model, bound=min(conformal(far[0].worst, LEVELS[0]), float(far[0].worst.max())))
+        growth = [USUAL_GROWTH, USUAL_GROWTH]
+        if beside.sum() >= 2 * FEWEST_APART and len(test) >= TENTHS:
             with stage("calibrate"):
-                known = fresh.rows(beside), truth[apart][beside]
-                left_out[name] = coverage(_bounded(model, patch, *known, nodes), test, truth[split.test])
-                bounded = _distance_bounded(model, patch, distances.rows(apart).rows(beside))
-                distance_left_out[name] = distance_coverage(bounded, test, distances.distance[split.test])
+                near = unseen(model, beside)
+                both = list(zip(near, far, WAYS, strict=True))
+                growth = [growth_by(here, there, way) for here, there, way in both]
+                held = [covered_on_discs(model, here, there, split, way) for here, there, way in both]
+                left_out[name], distance_left_out[name] = held
         if apart.any():
             with stage(f"learn {name}"):
                 parts = parts_of(name, inputs[1], example_sets[1])
                 models[name] = replace(models[name], parts=parts, envelope=envelopes[1])
                 if model.tip is not None and model.tip.correction is not None:
                     models[name] = with_correction(models[name], patch, distances.rows(chosen[1]))
-        if apart.sum() >= ENOUGH_APART:
+        if apart.sum() >= FEWEST_APART:
             with stage("calibrate"):
-                models[name] = _bounded(models[name], patch, fresh, truth[apart], nodes)
-                models[name] = _distance_bounded(models[name], patch, distances.rows(apart))
-        elif apart.sum() >= FEWEST_APART:
-            with stage("calibrate"):
-                models[name] = _calibrated(models[name], patch, seen, fresh, truth[apart], nodes)
-                features = _features(patch, left, models[name].envelope)
-                models[name] = calibrated_distance(models[name], seen_distance, features, distances.rows(apart))
+                used = models[name]
+                every = zip(unseen(used, apart), WAYS, growth, far, strict=True)
+                bounds, tip = (bound_by(near, way, grown, seen) for near, way, grown, seen in every)
+                models[name] = replace(used, bounds=bounds, tip=replace(used.tip or TipModel(), bound=tip))
         progress(name)
     motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
     return Trained(
@@ -216,49 +212,6 @@ def train(
         left_out,
         distance_left_out,
     )
-
-
-def _bounded(model: Learned, patch: Patch, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> Learned:
-    """With bounds from these loads alone: some fit the scale, the others the quantiles."""
-    scale, share = _scale_and_share(len(loads))
-    known = loads.rows(scale)
-    error = errors(model, known, truth[scale], nodes).max(axis=1)
-    seen = _features(patch, model.asked(known), model.envelope), error
-    return _calibrated(model, patch, seen, loads.rows(share), truth[share], nodes)
-
-
-def _distance_bounded(model: Learned, patch: Patch, known: Measured) -> Learned:
-    """The same of the distance from tip to tumour."""
-    scale, share = (known.rows(rows) for rows in _scale_and_share(len(known.loads)))
-    features = [_features(patch, model.asked(some.loads), model.envelope) for some in (scale, share)]
-    return calibrated_distance(model, (features[0], distance_errors(model, scale)), features[1], share)
-
-
-def _scale_and_share(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which of `count` loads fit the bounds' scale, one in `SCALE`, and which its quantiles."""
-    fits = np.arange(count) % SCALE == 0
-    return np.flatnonzero(fits), np.flatnonzero(~fits)
-
-
-def _calibrated(
-    model: Learned,
-    patch: Patch,
-    seen: tuple[np.ndarray, np.ndarray],
-    loads: Loads,
-    truth: np.ndarray,
-    nodes: np.ndarray,
-) -> Learned:
-    """With bounds whose scale follows what was `seen` (features and errors), calibrated on other loads."""
-    pushed = model.asked(loads)
-    error = errors(model, loads, truth, nodes)
-    features = _features(patch, pushed, model.envelope)
-    return replace(model, bounds=fitted_bound(seen, features, directions(pushed)[0], error))
-
-
-def _features(patch: Patch, pushed: Pushed, envelope: Envelope) -> np.ndarray:
-    """The features (B, 7) of a model's bounds, as in `Learned.deform`."""
-    known = measured(patch, pushed)
-    return features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *envelope.force)))
 
 
 def _first(rows: np.ndarray, most: int | None) -> np.ndarray:
@@ -286,5 +239,5 @@ def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
 
 
 def _rows(pushed: Pushed, rows: np.ndarray) -> Pushed:
-    """Those of the chosen rows (B,) bool."""
+    """Those of the chosen rows, (B,) bool or by number."""
     return Pushed(pushed.point[rows], pushed.force[rows], pushed.footprint[rows])

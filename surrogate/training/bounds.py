@@ -1,0 +1,117 @@
+"""Calibrating what a model promises: by loads that no fit has seen, near its training loads and far from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.loads import Pushed
+
+from ..data.cortex_patch import Patch
+from ..data.disc_split import Split
+from ..evaluation.coverage import Coverage, covered
+from ..model.conformal import CLASS, Bound, features_of, fitted_bound, fitted_growth
+from ..model.learned import Learned
+from ..model.training_range import Measured, Outside, measured
+
+SCALE, ENOUGH = 3, CLASS
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a bound is fitted: calibration loads of a class of force, and whether its scale is quadratic in the load."""
+
+    each: int
+    curved: bool
+
+
+TUMOUR = Way(CLASS, True)
+# A tip snaps through with the cortex here and there, so that the tail of its errors grows with the force: classes are
+# as small as 99 in 100 allows, and the scale's logarithm is linear.
+TIP = Way(100, False)
+
+
+@dataclass(frozen=True, eq=False)
+class Missed:
+    """How far a model is off on loads that no fit of it has seen.
+
+    Parameters
+    ----------
+    pushed, known, outside
+        B loads, and how they lie to the model's training range.
+    features
+        (B, f), of the scale of its bounds.
+    error
+        (B, k) [m]: at k vertices, or of one distance.
+    """
+
+    pushed: Pushed
+    known: Measured
+    outside: Outside
+    features: np.ndarray
+    error: np.ndarray
+
+    def rows(self, some: np.ndarray) -> Missed:
+        """Some of them, by number or (B,) bool."""
+        pushed = Pushed(self.pushed.point[some], self.pushed.force[some], self.pushed.footprint[some])
+        known, outside = Measured(*(each[some] for each in self.known)), Outside(*(each[some] for each in self.outside))
+        return Missed(pushed, known, outside, self.features[some], self.error[some])
+
+    @property
+    def worst(self) -> np.ndarray:
+        """(B,) [m]."""
+        return self.error.max(axis=1)
+
+    @property
+    def force(self) -> np.ndarray:
+        """(B,) [N]."""
+        return self.known.magnitude
+
+
+def missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> Missed:
+    """Errors (B, k) [m] of a model on loads as it is asked them."""
+    known, envelope = measured(patch, pushed), model.envelope
+    features = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *envelope.force)))
+    return Missed(pushed, known, envelope.outside(pushed, known), features, error)
+
+
+def bound_by(near: Missed, way: Way, growth: float, seen: Missed | None = None) -> Bound:
+    """A bound calibrated `near` the training loads, of a `growth` [1/m] by distance from these.
+
+    One in `SCALE` of these loads fits its scale, and the others its quantiles: they are drawn as what is promised. Of
+    fewer than `ENOUGH` loads all calibrate, and its scale follows what was `seen`, if anything.
+    """
+    if seen is None or len(near.error) >= ENOUGH:
+        fits = _fits(near)
+        seen, near = near.rows(fits), near.rows(~fits)
+    known = near.features, near.force, near.error
+    return fitted_bound(
+        (seen.features, seen.worst), *known, way.each, curved=way.curved, away=near.outside.away, growth=growth
+    )
+
+
+def growth_by(near: Missed, far: Missed, way: Way) -> float:
+    """The growth [1/m] by which a bound holds as often `far` from training loads as near them."""
+    plain, calibrating = bound_by(near, way, 0.0), near.rows(~_fits(near))
+    ratios = [
+        (each.worst / plain.of(each.features, each.force, each.outside.here)[0], each.outside.away)
+        for each in (calibrating, far)
+    ]
+    return fitted_growth(*ratios)
+
+
+def _fits(near: Missed) -> np.ndarray:
+    """Which of the loads fit the scale: (B,) bool."""
+    return np.arange(len(near.error)) % SCALE == 0
+
+
+def covered_on_discs(model: Learned, near: Missed, far: Missed, split: Split, way: Way) -> Coverage:
+    """How often bounds hold on each disc left out, of a growth that the other discs tell."""
+    disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
+    for each in np.unique(disc):
+        here, others = disc == each, far.rows(disc != each)
+        own = bound_by(near, way, growth_by(near, others, way))
+        some = far.rows(here)
+        bound[:, here] = model.promised(own, some.pushed, some.known, some.outside)
+    return covered(far.force, far.worst, bound, int((far.outside.excess > 0.0).sum()))
