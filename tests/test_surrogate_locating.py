@@ -98,6 +98,22 @@ def test_a_skull_that_lets_go_is_not_asked_for_swollen_fluid_tissue(body):
     assert (LETS_GO, 0.45) in made and (LETS_GO, 0.485) not in made and ("slide", 0.485) in made
 
 
+def test_each_skull_has_soft_and_stiff_tumours_and_tissue_that_stiffens_little_and_much(body):
+    """One in each part of the range, for every seed; at small strain all have what their group says."""
+    for seed in range(20):
+        for skull in ("bonded", "slide"):
+            some = [
+                group for group in groups(body, seed, replace(FEW, poisson=(0.45, 0.47, 0.49))) if group.skull == skull
+            ]
+            for name, (low, high) in (("ratio", FEW.stiffness), ("exponent", FEW.exponent)):
+                share = [np.log(getattr(group, name) / low) / np.log(high / low) for group in some]
+                assert np.floor(3.0 * np.sort(share)).tolist() == [0.0, 1.0, 2.0], (seed, skull, name)
+    elasticity = some[0].effects(FEW.swellings)[0]
+    (mu, lam), (hard, _) = elasticity.default.lame, elasticity.regions[2].lame
+    assert lam / (2.0 * (lam + mu)) == pytest.approx(0.45) and hard / mu == pytest.approx(some[0].ratio)
+    assert elasticity.default.terms[0][1] == -some[0].exponent
+
+
 def test_an_ensemble_has_every_cause_in_every_skull(ensemble, body):
     assert {(kind, skull) for kind, skull in zip(ensemble.kind, ensemble.skull, strict=True)} == {
         (kind, skull) for kind in range(len(KINDS)) for skull in range(3)

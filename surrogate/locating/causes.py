@@ -11,7 +11,7 @@ from sim.bodies.fluid_level import fluid_level
 from sim.bodies.open_cortex import open_cortex
 from sim.effects import SKULLS, Effect, Elasticity, Gravity, Held, Pulsation, ToolForce, Wave
 from sim.loads import Loads, Posture, Pushed
-from sim.material import Material
+from sim.material import Material, Ogden
 
 from ..data.tool_loads import draw
 
@@ -34,6 +34,8 @@ class Causes:
         The greatest one in a skull that lets go: beyond, swelling is solved for minutes, and explains no more.
     stiffness
         Least and greatest tumour stiffness over the brain's, log-uniform.
+    exponent
+        Least and greatest -m of Ogden's law, log-uniform: -4.7 of Miller, Chinzei 2002, -19 of `sim.MATERIALS`.
     tools
         Members of this kind in one group; of a skull that lets go, whose loads are solved one by one.
     drainages
@@ -49,6 +51,7 @@ class Causes:
     poisson: tuple[float, ...] = (0.45, 0.47, 0.49)
     poisson_let_go: float = 0.48
     stiffness: tuple[float, float] = (0.5, 3.0)
+    exponent: tuple[float, float] = (4.7, 19.0)
     tools: tuple[int, int] = (12, 4)
     drainages: int = 6
     levels: tuple[float, ...] = (0.75, 0.55, 0.35, 0.15)
@@ -58,6 +61,8 @@ class Causes:
 
 
 USUAL = Causes()
+# Young's modulus [Pa] at small strain; motions are made equally large, so that it hardly matters.
+YOUNG = 3000.0
 # Radius [m] over which a force is spread on the cortex.
 SPREAD = 7e-3
 # The one of the skulls that lets go.
@@ -76,36 +81,49 @@ class Group:
         From 0: what is drawn depends on it and the seed alone.
     skull
         One of `sim.effects.SKULLS`.
-    poisson, ratio
-        Of the brain; tumour stiffness over the brain's.
+    poisson, ratio, exponent
+        Of the brain; tumour stiffness over the brain's; -m of Ogden's law, by which both stiffen.
     """
 
     number: int
     skull: str
     poisson: float
     ratio: float
+    exponent: float
 
     def effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
         """What its finite elements are made of, if these regions (None: all) swell by at most such shares."""
-        brain = Material("neo-hookean", 3000.0, self.poisson)
-        tumour = Material("neo-hookean", 3000.0 * self.ratio, self.poisson)
+        brain, tumour = (self._tissue(YOUNG * times) for times in (1.0, self.ratio))
         swells = Pulsation(Wave(RISE.frequency, max(map(abs, swelling))), RISE, regions)
         return (
             Elasticity(brain, {TUMOUR_LABEL: tumour}), Held(), SKULLS[self.skull], ToolForce(), Gravity(), swells,
         )  # fmt: skip
 
+    def _tissue(self, young: float) -> Ogden:
+        """Tissue with Young's modulus `young` [Pa] at small strain."""
+        mu, lam = Material("neo-hookean", young, self.poisson).lame
+        return Ogden(((2.0 * mu, -self.exponent),), lam + 2.0 * mu / 3.0)
+
 
 def groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Group, ...]:
-    """Groups with each skull and each Poisson's ratio; skulls only where the anatomy has one."""
-    made = []
-    for skull in SKULLS if anatomy.slide_normal.any() else ():
-        for poisson in causes.poisson:
-            if skull == LETS_GO and poisson > causes.poisson_let_go:
-                continue
-            low, high = np.log(causes.stiffness)
-            ratio = float(np.exp(np.random.default_rng([seed, len(made)]).uniform(low, high)))
-            made.append(Group(len(made), skull, poisson, ratio))
+    """Groups with each skull and each Poisson's ratio; skulls only where the anatomy has one.
+
+    Each skull has soft and stiff tumours, and tissue that stiffens little and much: a group in every part of the range.
+    """
+    made: list[Group] = []
+    for number, skull in enumerate(SKULLS if anatomy.slide_normal.any() else ()):
+        some = [poisson for poisson in causes.poisson if skull != LETS_GO or poisson <= causes.poisson_let_go]
+        random = np.random.default_rng([seed, number])
+        ratio, exponent = (_all_over(random, len(some), limits) for limits in (causes.stiffness, causes.exponent))
+        made += [Group(len(made) + n, skull, *each) for n, each in enumerate(zip(some, ratio, exponent, strict=True))]
     return tuple(made)
+
+
+def _all_over(random: np.random.Generator, count: int, limits: tuple[float, float]) -> list[float]:
+    """Numbers, one in each of `count` parts of a range that have equal ratios, in an order by chance."""
+    low, high = np.log(limits)
+    share = (random.permutation(count) + random.uniform(size=count)) / max(count, 1)
+    return np.exp(low + share * (high - low)).tolist()
 
 
 def pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> Loads:

@@ -19,7 +19,7 @@ from .causes import KINDS
 from .locator import Locator
 from .prior import NOWHERE, Prior
 
-FORMAT = "sulcus locator 1"
+FORMAT = "sulcus locator 2"
 LABELS = ("kind", "skull", "place")
 ARRAYS = ("shape", *LABELS, "centre")
 
