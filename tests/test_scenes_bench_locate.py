@@ -185,6 +185,7 @@ def test_what_is_seen_lies_on_the_same_points_at_every_level_of_noise(locator, b
     exact, low, high = (observed(body, motion, Sight(50, 36, noise), (3, 1)) for noise in (0, 1, 2))
     assert np.array_equal(exact.rest, low.rest) and np.array_equal(exact.rest, high.rest)
     assert exact.sigma == pytest.approx(np.full(50, 0.05e-3)) and low.sigma is None and high.sigma is None
+    assert np.sqrt(3.0) * np.array([each.rigid for each in (exact, low, high)]) == pytest.approx([0.0, 1e-3, 2e-3])
     at = np.linalg.norm(body.mesh.nodes[:, None] - exact.rest, axis=2)
     on_vertex = at.argmin(axis=0)
     assert np.linalg.norm(exact.now - exact.rest - motion[on_vertex], axis=1).max() < 1e-3

@@ -83,6 +83,20 @@ def test_the_result_is_a_mesh_and_numbers_in_millimetres(files, body, capsys):
     assert json.loads(capsys.readouterr().out)["centroid_mm"] == said["centroid_mm"]
 
 
+def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
+    """Of no rigid error none is found; what no tracker does is refused before anything is written."""
+    folder, _ = files
+    out, bias = folder / "rigid.vtu", []
+    words = ["locate", str(folder / "box.vtu"), str(folder / "plain.csv"), "--out", str(out), "--json", "--rigid"]
+    for rigid in ("-1", "nan", "20.5"):
+        assert main([*words, rigid]) == 2 and not out.exists()
+        assert f"a rigid error of {rigid} mm is none that a tracker has" in capsys.readouterr().err
+    for rigid in ("0", "0.8", "20"):
+        assert main([*words, rigid]) == 0
+        bias.append(np.linalg.norm(json.loads(capsys.readouterr().out)["bias_mm"]))
+    assert bias[0] == 0.0 < bias[1] < bias[2]
+
+
 @pytest.mark.parametrize("words", [["plain.csv"], ["cloud.csv"], ["cloud.csv", "--tool", "tips.csv"]])
 def test_people_read_sentences(files, capsys, words):
     folder, _ = files

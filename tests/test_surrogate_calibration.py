@@ -1,11 +1,15 @@
 """Covariances that hold: the factor by which they grow, and the patches on which they are tried."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import make_box
 from scipy.stats import chi2
 
-from surrogate.locating.calibration import covering_factor, likeness, seen_patch, was_tried
+from sim.errors import InputError
+from surrogate.locating.calibration import covering_factor, left_out, likeness, seen_patch, trials, was_tried
+from surrogate.locating.ensemble import Ensemble
 from surrogate.locating.prior import middle_of
 
 MOTION = np.array([1e-3, -2e-3, 2e-3])
@@ -34,7 +38,25 @@ def test_points_lie_on_a_patch_of_the_open_cortex_and_move_with_it(body, evidenc
 
 
 def test_likeness_is_of_motion_over_error_and_of_the_number_of_points(evidence):
-    assert likeness(evidence) == pytest.approx(np.log([3e-3 / evidence.sigma[0], 60.0]))
+    exact, shifted = (replace(evidence, sigma=np.full(180, 3e-4), shift=shift) for shift in (0.0, 4e-4))
+    assert likeness(exact) == pytest.approx(np.log([3e-3 / 3e-4, 60.0]))
+    assert likeness(shifted) == pytest.approx(np.log([3e-3 / 5e-4, 60.0]))
+
+
+def some_members(body, skull, group):
+    """Motions that do not matter, in such skulls and groups."""
+    count = len(group)
+    still = np.zeros((count, *body.mesh.nodes.shape), np.float32)
+    return Ensemble(body, still, np.zeros(count, int), np.array(skull), np.array(group))
+
+
+def test_whole_groups_are_left_out_one_of_each_skull(body):
+    """A trial's tissue is unknown to its estimator, and each skull is known to every estimator."""
+    some = some_members(body, [0, 0, 0, 0, 0, 1, 1, 1, 2, 2], [0, 0, 1, 1, 2, 3, 4, 4, 5, 5])
+    turn = left_out(some)
+    assert turn.tolist() == [0, 0, 1, 1, 2, 0, 1, 1, -1, -1]
+    with pytest.raises(InputError, match="several Poisson's ratios"):
+        trials(some_members(body, [0, 0, 1], [0, 0, 1]), None)
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 4.0])

@@ -214,6 +214,17 @@ def test_a_rigid_error_is_no_motion(locator, body, truth):
     assert np.median(known) > 1e-3 and np.median(moved) < 1e-3
 
 
+def test_a_rigid_error_that_is_stated_is_found(locator, body, truth):
+    """One of 4 mm is believed if it is said that there may be one, and none is if it is said that there is none."""
+    off = np.zeros(3)
+    for seed, (motion, _) in enumerate(truth[::2]):
+        seen = observed(body, motion, seed, bias=4e-3)
+        found = [locator.locate(replace(seen, rigid=rigid)) for rigid in (0.0, 0.8e-3, 2.5e-3)]
+        assert not found[0].bias.any() and not found[0].rotation.any()
+        off += [np.linalg.norm(each.centroid - middle_of(body, motion[None])[0]) for each in found]
+    assert off[2] < off[1] < off[0]
+
+
 def test_a_cloud_without_names_tells_the_motion_along_the_surfaces_normal(locator, body, truth):
     left, all_of_it = 0.0, 0.0
     for seed, (motion, _) in enumerate(truth):
@@ -301,6 +312,9 @@ def along_x(points):
         (lambda o: replace(o, now=along_x(o.rest), rest=along_x(o.rest)), "on a line"),
         (lambda o: replace(o, now=np.where(np.arange(60)[:, None] == 7, np.nan, o.now)), "not finite"),
         (lambda o: replace(o, sigma=np.zeros(60)), "a sigma is not positive"),
+        (lambda o: replace(o, rigid=-1e-3), "a rigid error of -1 mm is none that a tracker has"),
+        (lambda o: replace(o, rigid=0.8), "a rigid error of 800 mm .* from 0 to 20 mm"),
+        (lambda o: replace(o, rigid=np.nan), "a rigid error of nan mm"),
         (lambda o: replace(o, now=o.rest + 0.01 * np.random.default_rng(0).standard_normal((60, 3))), "fit"),
     ],
 )

@@ -9,8 +9,8 @@ from scipy.stats import multivariate_normal
 
 from sim.geometry.locate import Located
 from surrogate.locating.causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
-from surrogate.locating.evidence import SIGMA, of_motions
-from surrogate.locating.posterior import MIXED, Sight, conditioned, rigid_scale, sight_of
+from surrogate.locating.evidence import SHIFT, SIGMA, TURN, of_motions
+from surrogate.locating.posterior import COARSENED, MIXED, Sight, conditioned, sight_of
 from surrogate.locating.prior import NOWHERE, SETS, WITH_PLACE, Prior
 
 POINTS = 30
@@ -37,13 +37,17 @@ def seen(prior, motion, count=POINTS):
     return of_motions(place, prior.anatomy.mesh.nodes[some], motion[some], np.full(count, SIGMA))
 
 
+# Of a rigid error, as it is unless something else is known.
+RIGID = np.repeat([SHIFT, TURN * SHIFT], 3)
+
+
 def drawn(prior, random, number=0):
     """Weights and a rigid error (r + 6,) as a hypothesis with its first place has them, and what is seen."""
     hypothesis = prior.hypotheses[number]
     unknown = np.zeros(len(prior.kind) + 6)
     unknown[hypothesis.rows] = 3.0 * hypothesis.size * random.standard_normal(len(hypothesis.rows))
     unknown[hypothesis.places[:1]] = 3.0 * random.standard_normal(3)
-    unknown[-6:] = hypothesis.rigid * rigid_scale() * random.standard_normal(6)
+    unknown[-6:] = hypothesis.rigid * RIGID * random.standard_normal(6)
     evidence = seen(prior, np.tensordot(unknown[:-6], prior.shape, 1))
     noise = np.linalg.cholesky(evidence.noise()) @ random.standard_normal(len(evidence))
     return unknown, replace(evidence, value=evidence.value + evidence.rigid @ unknown[-6:] + noise)
@@ -52,12 +56,12 @@ def drawn(prior, random, number=0):
 def seen_unknowns(prior, evidence):
     """What unit weights, and a rigid error of one standard deviation, do at the points (m, r + 6)."""
     moved = np.einsum("mc,rmci->rmi", evidence.place.weights, prior.shape[:, evidence.place.vertices])
-    return np.hstack([np.einsum("rmi,mi->mr", moved, evidence.axis), evidence.rigid * rigid_scale()])
+    return np.hstack([np.einsum("rmi,mi->mr", moved, evidence.axis), evidence.rigid * evidence.rigid_scale])
 
 
 def test_what_is_seen_of_shapes_is_their_motion_at_the_points(prior):
     evidence = seen(prior, np.zeros((len(prior.anatomy.mesh.nodes), 3)))
-    found = np.hstack([prior.seen(evidence.place, evidence.axis), evidence.rigid * rigid_scale()])
+    found = np.hstack([prior.seen(evidence.place, evidence.axis), evidence.rigid * evidence.rigid_scale])
     assert found == pytest.approx(seen_unknowns(prior, evidence), abs=1e-9)
 
 
@@ -98,7 +102,7 @@ def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_
             assert answer.mean == pytest.approx(mean, rel=1e-4, abs=1e-6)
             logs.append(log)
             density.append(multivariate_normal(cov=noise + (some.T * size**2) @ some).logpdf(evidence.value))
-    assert np.diff(logs) == pytest.approx(np.diff(density), rel=1e-4, abs=1e-4)
+    assert COARSENED * np.diff(logs) == pytest.approx(np.diff(density), rel=1e-4, abs=1e-4)
 
 
 def test_axes_that_are_alike_are_whitened_as_all_rows_together(prior):
@@ -130,7 +134,7 @@ def test_ellipsoids_hold_what_is_drawn(prior):
         unknown = seen_unknowns(prior, evidence)
         sight = Sight(prior, 3.0, exact, exact.white(unknown), exact.white(evidence.value), np.zeros(3))
         answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
-        scale = np.append(np.ones(len(prior.kind)), rigid_scale())
+        scale = np.append(np.ones(len(prior.kind)), RIGID)
         off = answer.mean - (truth / scale)[answer.rows]
         square.append(off @ np.linalg.solve(answer.back.T @ answer.back, off))
     degrees = len(answer.rows)
@@ -149,7 +153,7 @@ def test_a_mixture_lies_between_its_hypotheses(prior):
         row[answer.rows] = answer.mean
     share = np.array([answer.share for answer in answers])
     assert (np.diff(share) <= 0.0).all()
-    assert np.append(found.weight, found.rigid / rigid_scale()) == pytest.approx(share @ means)
+    assert np.append(found.weight, found.rigid / RIGID) == pytest.approx(share @ means)
 
 
 def test_gross_errors_are_left_out_and_named(prior):
@@ -198,3 +202,19 @@ def test_what_is_seen_may_be_little_because_a_motion_and_a_rigid_error_cancel(pr
     little, much = (seen(prior, np.full_like(prior.anatomy.mesh.nodes, each)) for each in (1e-5, 3e-3))
     assert sight_of(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
     assert sight_of(prior, much).scale == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
+    exact = replace(much, shift=0.0)
+    assert sight_of(prior, exact).scale == pytest.approx(np.sqrt(3.0) * 3.0, rel=1e-3)
+
+
+def test_a_rigid_error_is_believed_to_be_as_large_as_is_stated(prior):
+    """A shift beyond what was stated moves the tumour; of none, none is found."""
+    truth, evidence = drawn(prior, np.random.default_rng(10), 2)
+    shifted = replace(evidence, value=evidence.value + evidence.rigid[:, :3] @ [2e-3, -2e-3, 2e-3])
+    off, bias = [], []
+    for shift in (0.0, 0.2e-3, 2e-3):
+        found = conditioned(prior, replace(shifted, shift=shift))
+        off.append(np.linalg.norm((found.weight - truth[:-6]) @ prior.middle))
+        bias.append(np.linalg.norm(found.rigid[:3]))
+        spread = np.sqrt(np.diagonal(found.rigid_spread))  # of a mixture: means differ too
+        assert (spread <= 2.0 * shift * np.repeat([1.0, TURN], 3)).all()
+    assert bias[0] == 0.0 and bias[1] < 0.5 * bias[2] and off[2] < 0.5 * off[0]

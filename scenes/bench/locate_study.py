@@ -97,14 +97,18 @@ class Row:
 
 
 def observed(body: Anatomy, motion: np.ndarray, sight: Sight, seed: tuple[int, ...]) -> Observation:
-    """What is seen of a motion (V, 3) [m]; where the points lie is the same at every level of noise."""
+    """What is seen of a motion (V, 3) [m], with how far a tracker like this is off.
+
+    Where the points lie is the same at every level of noise.
+    """
     place = np.random.default_rng([*seed, sight.points, sight.cover])
     evidence = seen_patch(body, motion, place, sight.points, 1e-2 * sight.cover)
     rest, moved = evidence.at[::3], evidence.value.reshape(-1, 3)
     if not sight.noise:
-        return Observation(rest + moved, rest, np.full(len(rest), EXACT))
+        return Observation(rest + moved, rest, np.full(len(rest), EXACT), rigid=0.0)
     random = np.random.default_rng([*seed, sight.points, sight.cover, sight.noise])
-    return Observation(spoilt(rest, rest + moved, TRANSLATIONS[sight.noise], random), rest)
+    translation = TRANSLATIONS[sight.noise]
+    return Observation(spoilt(rest, rest + moved, translation, random), rest, rigid=translation / np.sqrt(3.0))
 
 
 def spoilt(rest: np.ndarray, now: np.ndarray, translation: float, random: np.random.Generator) -> np.ndarray:

@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--noise", nargs="+", type=int, default=[0, 1, 2], choices=(0, 1, 2),
         help="levels (default 0 1 2). 0: none. 1 and 2: white 0.3 mm, smooth 0.5 mm, and a rigid error of half a "
-        "degree and 1 or 2 mm",
+        "degree and 1 or 2 mm, whose size `sulcus locate` is given",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the twins and of what is seen (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tool", metavar="TIPS.csv", help="`x,y,z`: where tips of tools touch the cortex, as further evidence"
     )
+    parser.add_argument(
+        "--rigid", type=float, default=0.8, metavar="MM",
+        help="how far all points may be off together, as trackers are: a standard deviation along each axis, with a "
+        "rotation in proportion (default %(default)s)",
+    )  # fmt: skip
     parser.add_argument(
         "--out", required=True, metavar="RESULT.vtu", help="mean motion, deviation and covariance of every vertex"
     )
@@ -67,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     at_least("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
-    observation = read_observation(args.observed, args.tool)
+    observation = replace(read_observation(args.observed, args.tool), rigid=1e-3 * args.rigid)
     placed(anatomy, observation)  # what cannot be placed need not wait for a locator
     found = _locator(args, anatomy).locate(observation)
     every = np.arange(len(anatomy.mesh.nodes))

@@ -18,8 +18,10 @@ LENGTH = 15e-3
 # What no sum of shapes is nearer than to a true motion: white and smooth errors as shares of what is seen, and the
 # length of the smooth one [m].
 LACK_WHITE, LACK_SMOOTH, LACK_LENGTH = 0.08, 0.1, 5e-3
-# Of the rigid error: a translation [m] along each axis, and a rotation [rad] about each.
-TRANSLATION, ROTATION = 0.8e-3, float(np.radians(0.3))
+SHIFT = 0.8e-3
+"""What all points together are off by along each axis, if nothing else is known [m]: a standard deviation."""
+# How far they are turned about each axis [rad], for each metre of that.
+TURN = float(np.radians(0.3)) / SHIFT
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,8 @@ class Evidence:
         (m,) [m]: standard deviation of what is not rigid in the error.
     point
         (m,) number of the observed point that each row belongs to.
+    shift
+        [m]: standard deviation of the rigid error's translation along each axis.
     """
 
     place: Located
@@ -48,6 +52,7 @@ class Evidence:
     value: np.ndarray
     sigma: np.ndarray
     point: np.ndarray
+    shift: float = SHIFT
 
     def __len__(self) -> int:
         return len(self.value)
@@ -67,6 +72,11 @@ class Evidence:
     def rigid(self) -> np.ndarray:
         """What a rigid error does (m, 6), by translation [m] and rotation [rad] about the middle."""
         return np.concatenate([self.axis, np.cross(self.at - self.middle, self.axis)], axis=1)
+
+    @property
+    def rigid_scale(self) -> np.ndarray:
+        """Standard deviations (6,) of the prior of a rigid error: translation [m], rotation [rad]."""
+        return np.repeat([self.shift, TURN * self.shift], 3)
 
     def noise(self, scale: float = 0.0) -> np.ndarray:
         """Covariance (m, m) [m^2] of errors that are not rigid, and of what shapes lack where `scale` [m] is seen."""
@@ -118,7 +128,7 @@ class Whitening:
         return np.where(alike, inverse[point[:, :, None], point[:, None]], 0.0)
 
 
-def of_motions(place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray) -> Evidence:
+def of_motions(place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT) -> Evidence:
     """Points (n, 3) [m] at rest and how each was seen to move (n, 3) [m]; three rows a point."""
     count = len(at)
     point = np.repeat(np.arange(count), 3)
@@ -129,4 +139,5 @@ def of_motions(place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.nda
         motion.ravel(),
         sigma[point],
         point,
+        shift,
     )

@@ -14,7 +14,7 @@ from sim.geometry.closest_point import closest
 from sim.geometry.locate import Located, locate
 from sim.geometry.surface import unit
 
-from .evidence import SIGMA, Evidence, of_motions
+from .evidence import SHIFT, SIGMA, Evidence, of_motions
 
 FEWEST = 6
 # Spread of points across a line, as a share of that along it: less is a line.
@@ -23,8 +23,8 @@ THIN = 0.05
 NEAR, FAR = 6e-3, 12e-3
 # Farther than this no tip touches the cortex [m], however it has moved; points nearer than that are one place [m].
 FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
-# Motions [m] beyond which no brain goes.
-LONGEST_MOTION = 0.05
+# Motions [m] beyond which no brain goes, and rigid errors that no tracker has.
+LONGEST_MOTION, FARTHEST_OFF = 0.05, 0.02
 # Points of a cloud that are looked at together, and at most.
 TOGETHER, MOST = 64, 400
 
@@ -43,12 +43,15 @@ class Observation:
         (n,): standard deviation of each point's error, of what is not rigid.
     tips
         (k, 3): where tips of tools touch the surface.
+    rigid
+        Standard deviation of the rigid error along each axis: how far all points may be off together.
     """
 
     now: np.ndarray
     rest: np.ndarray | None = None
     sigma: np.ndarray | None = None
     tips: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    rigid: float = SHIFT
 
     @property
     def sigmas(self) -> np.ndarray:
@@ -62,8 +65,9 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
     Raises
     ------
     InputError
-        Numbers that are not finite, too few points, points on a line, a sigma that is not positive, motions beyond any
-        brain's. Points that lie off the brain's surface, with the likely reason: units, LPS for RAS, another anatomy.
+        Numbers that are not finite, too few points, points on a line, a sigma that is not positive, a rigid error
+        beyond any tracker's, motions beyond any brain's. Points that lie off the brain's surface, with the likely
+        reason: units, LPS for RAS, another anatomy.
     """
     _check(observation)
     where = observation.now if observation.rest is None else observation.rest
@@ -106,14 +110,21 @@ def placed_anew(
     sigma = np.full(len(observation.tips), SIGMA)
     if observation.rest is not None:
         here = observation.rest[named]
-        moved = of_motions(locate(anatomy.mesh, here), here, observation.now[named] - here, observation.sigmas[named])
+        moved = of_motions(
+            locate(anatomy.mesh, here),
+            here,
+            observation.now[named] - here,
+            observation.sigmas[named],
+            observation.rigid,
+        )
         parts.append(replace(moved, point=named[moved.point]))
     else:
         some = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
         cloud, number = np.concatenate([observation.now[some], cloud]), np.concatenate([some, number])
         sigma = np.concatenate([observation.sigmas[some], sigma])
     if len(cloud):
-        parts.append(_along_normals(anatomy, cloud, sigma, number, motion, bias))
+        along = _along_normals(anatomy, cloud, sigma, number, motion, bias)
+        parts.append(replace(along, shift=observation.rigid))
     return parts[0] if len(parts) == 1 else _joined(parts)
 
 
@@ -146,7 +157,8 @@ def _joined(parts: list[Evidence]) -> Evidence:
         return {name: np.concatenate([getattr(of(part), name) for part in parts]) for name in names}
 
     place = Located(**joined(lambda part: part.place, ("vertices", "weights")))
-    return Evidence(place=place, **joined(lambda part: part, ("at", "axis", "value", "sigma", "point")))
+    arrays = joined(lambda part: part, ("at", "axis", "value", "sigma", "point"))
+    return Evidence(place=place, shift=parts[0].shift, **arrays)
 
 
 def _check(observation: Observation) -> None:
@@ -166,6 +178,11 @@ def _check(observation: Observation) -> None:
             raise InputError(f"`{name}` has a value that is not finite: leave such points out.")
     if not (sigma > 0.0).all():
         raise InputError("a sigma is not positive: give each point the standard deviation of its error [mm].")
+    if not 0.0 <= observation.rigid <= FARTHEST_OFF:
+        raise InputError(
+            f"a rigid error of {1e3 * observation.rigid:g} mm is none that a tracker has: give its standard deviation "
+            f"along each axis, from 0 to {1e3 * FARTHEST_OFF:g} mm."
+        )
     if count < FEWEST:
         raise InputError(f"{count} points say too little: give at least {FEWEST}, spread over the open cortex.")
 

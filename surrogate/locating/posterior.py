@@ -2,8 +2,9 @@
 
 A prior motion is a sum of shapes with independent weights (Rasmussen, Williams 2006, "Gaussian Processes for Machine
 Learning", section 2.1). What takes part is a hypothesis; hypotheses are weighed by their evidence (equation 5.8).
-Leaving points out: Sundararajan, Keerthi 2001, "Predictive approaches for choosing hyperparameters in Gaussian
-processes", Neural Comput. 13:1103-1118.
+Shapes only resemble tissue, so that evidence counts less than its formula says: Miller, Dunson 2019, "Robust Bayesian
+inference via coarsening", J. Am. Stat. Assoc. 114:1113-1125. Leaving points out: Sundararajan, Keerthi 2001,
+"Predictive approaches for choosing hyperparameters in Gaussian processes", Neural Comput. 13:1103-1118.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.stats import chi2
 
-from .evidence import ROTATION, TRANSLATION, Evidence, Whitening
+from .evidence import Evidence, Whitening
 from .prior import Hypothesis, Prior
 
 # A point is taken for an outlier if a better one is so improbable; so few points are not tested against each other.
 IMPROBABLE, FEWEST = 1e-4, 4
 NO_TIPS = np.zeros((0, 3))
+# Evidence counts as one part in so many: hypotheses are seldom as wrong as they look.
+COARSENED = 2.0
 # So many of the most probable hypotheses make a mixture.
 MIXED = 24
 
@@ -124,7 +127,7 @@ class Sight:
         return self.unknown.T @ self.unknown
 
     def weighed(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Logarithms of evidence and odds (1 + p,): without a tool, with one on each place; less what all share."""
+        """Logarithms of odds and coarsened evidence (1 + p,): no tool, one on each place; less what all share."""
         own, size = self._base(hypothesis)
         lower = self._lower(own, size)
         half = solve_triangular(lower, size * self.pull[own], lower=True, check_finite=False)
@@ -139,7 +142,8 @@ class Sight:
         schur = np.eye(table.shape[1]) + blocks - apart @ apart.transpose(0, 2, 1)
         gain = np.einsum("pi,pi->p", rest, np.linalg.solve(schur, rest[..., None])[..., 0])
         own_odds = self.odds[: 1 + len(table)]
-        return own_odds + np.append(alone, alone + 0.5 * (gain - np.linalg.slogdet(schur)[1]))
+        pressed = alone + 0.5 * (gain - np.linalg.slogdet(schur)[1])
+        return own_odds + np.append(alone, pressed) / COARSENED
 
     def answer(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> Answer:
         """What a hypothesis says with some more rows (q,), those of one place."""
@@ -160,18 +164,13 @@ class Sight:
         return np.append(hypothesis.rows, rigid), size
 
 
-def rigid_scale() -> np.ndarray:
-    """Standard deviations (6,) of the prior of a rigid error: translation [m], rotation [rad]."""
-    return np.repeat([TRANSLATION, ROTATION], 3)
-
-
 def sight_of(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> Sight:
     """How a prior is seen by some evidence, where tips of tools (k, 3) [m] touch the cortex."""
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
     whitening = evidence.whitening(seen)
-    unknown = np.concatenate([prior.seen(evidence.place, evidence.axis), evidence.rigid * rigid_scale()], axis=1)
+    unknown = np.concatenate([prior.seen(evidence.place, evidence.axis), evidence.rigid * evidence.rigid_scale], axis=1)
     # A motion and a rigid error may cancel, so that little is seen of either.
-    scale = 1e3 * float(np.hypot(seen, np.sqrt(3.0) * TRANSLATION))
+    scale = 1e3 * float(np.hypot(seen, np.sqrt(3.0) * evidence.shift))
     return Sight(prior, scale, whitening, whitening.white(unknown), whitening.white(evidence.value), prior.odds(tips))
 
 
@@ -194,7 +193,7 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) ->
     spread = (share * (means - mean).T) @ (means - mean)
     for answer in answers:
         spread[np.ix_(answer.rows, answer.rows)] += answer.share * answer.back.T @ answer.back
-    scale = rigid_scale()
+    scale = evidence.rigid_scale
     return Posterior(
         some, mean[:-6], spread[:-6, :-6], scale * mean[-6:], np.outer(scale, scale) * spread[-6:, -6:],
         float(odd.sum() / len(some)), np.setdiff1d(point, some.point),

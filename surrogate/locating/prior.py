@@ -28,7 +28,7 @@ PLACES, PLACE_SHAPES, REACH = 30, 6, 6e-3
 # Sizes as shares of the seen motion: of what takes part; of a tumour's swelling where a brain swells; of forces all
 # over the cortex, which make good what the other shapes lack.
 FULL, LESS, LEAST = 1.0, 0.3, 0.15
-# The rigid error, as shares of its prior: a brain that sinks looks much like one.
+# The rigid error, as shares of what an observation states: a brain that sinks looks much like one.
 RIGIDS = (0.1, 1.0)
 # A skull that lets go holds what tools press against it, as one does in which the brain slides.
 PRESSED = {"bonded": "bonded", "slide": "slide", "contact": "slide"}
@@ -52,7 +52,7 @@ class Hypothesis:
     size
         (k,) standard deviations of their weights, as shares of the seen motion.
     rigid
-        That of the rigid error, as a share of its prior.
+        That of the rigid error, as a share of what an observation states.
     places
         (p, q) rows of shapes, of which those of one line may take part too: of a tool that presses on one place.
     """
