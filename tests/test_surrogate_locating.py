@@ -220,7 +220,10 @@ def test_a_rigid_error_that_is_stated_is_found(locator, body, truth):
     for seed, (motion, _) in enumerate(truth[::2]):
         seen = observed(body, motion, seed, bias=4e-3)
         found = [locator.locate(replace(seen, rigid=rigid)) for rigid in (0.0, 0.8e-3, 2.5e-3)]
-        assert not found[0].bias.any() and not found[0].rotation.any()
+        cloud = Observation(seen.now, sigma=np.full(60, 3e-3), rigid=0.0)
+        tipped = replace(seen, tips=seen.now[:1], rigid=0.0)
+        for exact in (found[0], locator.locate(cloud), locator.locate(tipped)):
+            assert not exact.bias.any() and not exact.rotation.any()
         off += [np.linalg.norm(each.centroid - middle_of(body, motion[None])[0]) for each in found]
     assert off[2] < off[1] < off[0]
 
