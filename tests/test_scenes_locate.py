@@ -14,7 +14,7 @@ from surrogate.locating.calibration import trials
 from surrogate.locating.causes import KINDS
 from surrogate.locating.ensemble import Ensemble
 from surrogate.locating.locator import Locator
-from surrogate.locating.locator_files import save_locator
+from surrogate.locating.locator_files import load_locator, save_locator
 from surrogate.locating.presses import Presses
 from surrogate.locating.prior import prior_of
 
@@ -140,3 +140,36 @@ def test_what_cannot_be_placed_does_not_wait_for_a_locator(tmp_path, capsys, bod
     assert main(["locate", str(tmp_path / "box.vtu"), str(far), "--out", str(tmp_path / "out.vtu")]) == 2
     assert "they are of another brain or frame" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["box.vtu", "far.csv"]
+
+
+def test_a_small_locator_has_no_result_of_every_vertex(files, body, tmp_path, capsys):
+    folder, _ = files
+    path = tmp_path / "small.npz"
+    save_locator(path, load_locator(folder / "box.locator.npz", body).small())
+    words = ["locate", str(folder / "box.vtu"), str(folder / "vessels.csv"), "--locator", str(path)]
+    assert main([*words, "--out", str(tmp_path / "out.vtu")]) == 2
+    assert "is small" in capsys.readouterr().err and not (tmp_path / "out.vtu").exists()
+
+
+def test_a_locator_is_made_beside_its_anatomy(files, body, tmp_path, capsys, monkeypatch):
+    folder, _ = files
+    whole, asked = load_locator(folder / "box.locator.npz", body), []
+
+    def make(anatomy, seed, device, folder, progress):
+        folder.mkdir()
+        asked.append((anatomy.digest, seed, device))
+        return whole
+
+    monkeypatch.setattr("surrogate.locating.setup.make_locator", make)
+    path = tmp_path / "box.vtu"
+    write_anatomy(path, body)
+    assert main(["locator", str(path), "--device", "cpu", "--seed", "3"]) == 0
+    beside = tmp_path / "box.locator.npz"
+    assert asked == [(body.digest, 3, "cpu")] and str(beside) in capsys.readouterr().out
+    assert np.array_equal(load_locator(beside, body).prior.shape, whole.prior.shape)
+    assert main(["locator", str(path), "--small", "--json"]) == 0  # over its own file
+    said, small = json.loads(capsys.readouterr().out), load_locator(beside, body)
+    assert not said["whole"] and np.array_equal(small.prior.nodes, whole.small().prior.nodes)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["box.locator.npz", "box.vtu"]
+    beside.write_text("mine")
+    assert main(["locator", str(path)]) == 2 and "not recognised as a locator" in capsys.readouterr().err

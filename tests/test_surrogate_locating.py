@@ -150,6 +150,42 @@ def test_a_stopped_ensemble_goes_on(body, tmp_path, monkeypatch, ensemble):
         assert np.array_equal(getattr(found, name), getattr(ensemble, name)), name
 
 
+def test_a_small_locator_answers_as_the_whole_one_does_where_it_can(locator, body, truth, tmp_path):
+    """Points with names, a cloud, and tips; read from its file, which is much smaller on a body with more inside."""
+    save_locator(tmp_path / "small.npz", locator.small())
+    small = load_locator(tmp_path / "small.npz", body)
+    nodes = small.prior.nodes
+    assert len(nodes) < len(body.mesh.nodes) == len(locator.prior.shape[0])
+    assert np.isin(body.tumour_nodes, nodes).all() and np.isin(body.open_surface, nodes).all()
+    for number, (motion, _) in enumerate(truth):
+        seen = observed(body, motion, number)
+        cloud = Observation(seen.now, sigma=seen.sigma)
+        for each in (seen, cloud, replace(seen, tips=seen.now[:1])):
+            ours, whole = small.locate(each), locator.locate(each)
+            assert ours.centroid == pytest.approx(whole.centroid, abs=1e-6)
+            assert ours.p95 == pytest.approx(whole.p95, rel=1e-3)
+            assert ours.at(nodes) == pytest.approx(whole.at(nodes), abs=1e-6)
+            assert ours.covariance(body.tumour_nodes) == pytest.approx(whole.covariance(body.tumour_nodes), rel=1e-3)
+            assert ours.causes == pytest.approx(whole.causes, abs=1e-3)
+
+
+def test_a_small_locator_refuses_what_it_does_not_know(locator, body, truth):
+    small = locator.small()
+    seen = observed(body, truth[0][0])
+    other = np.setdiff1d(np.arange(len(body.mesh.nodes)), small.prior.nodes)
+    for asked in (other[:1], np.append(body.tumour_nodes, other[-1])):
+        with pytest.raises(InputError, match="this locator knows"):
+            small.locate(seen).at(asked)
+    with pytest.raises(InputError, match="this locator knows"):
+        small.prior.restricted(other)
+    deep = replace(seen, rest=seen.rest - [0.0, 0.0, 11e-3], now=seen.now - [0.0, 0.0, 11e-3])
+    deep = replace(
+        deep, **{name: np.concatenate([getattr(seen, name), getattr(deep, name)]) for name in ("rest", "now")}
+    )
+    with pytest.raises(InputError, match="this locator knows"):
+        small.locate(replace(deep, sigma=None))
+
+
 def test_files_of_locators_are_read_as_they_were_and_refused_where_they_do_not_belong(locator, body, tmp_path):
     path = tmp_path / "box.locator.npz"
     save_locator(path, locator)
@@ -170,6 +206,11 @@ def test_files_of_locators_are_read_as_they_were_and_refused_where_they_do_not_b
         replace(prior, centre=prior.centre[1:]),
     ):
         save_locator(tmp_path / "wild.npz", Locator(spoilt, locator.tried))
+        with pytest.raises(InputError, match="do not fit"):
+            load_locator(tmp_path / "wild.npz", body)
+    small = locator.small().prior
+    for nodes in (small.nodes[::-1], small.nodes[1:], small.nodes + len(body.mesh.nodes), small.nodes + 0.5):
+        save_locator(tmp_path / "wild.npz", Locator(replace(small, nodes=nodes), locator.tried))
         with pytest.raises(InputError, match="do not fit"):
             load_locator(tmp_path / "wild.npz", body)
 

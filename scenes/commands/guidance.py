@@ -36,6 +36,10 @@ next: sulcus demo --anatomy patient.vtu""",
   sulcus locate patient.vtu vessels.csv --out located.vtu
   sulcus locate patient.vtu cloud.csv --tool tips.csv --out located.vtu --json
 next: open located.vtu in ParaView; `displacement` and `deviation` are in metres""",
+    "locator": """examples:
+  sulcus locator patient.vtu
+  sulcus locator patient.vtu --small
+next: sulcus demo sag --anatomy patient.vtu, which finds patient.locator.npz beside the mesh""",
     "scenes": """examples:
   sulcus scenes
   sulcus scenes --out pictures

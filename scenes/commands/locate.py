@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,8 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.arguments import at_least
+from sim.errors import InputError
 
 from .json_line import json_line
+from .locator import KIND, forget_parts, made
 from .outputs import add_force, claimed
 
 if TYPE_CHECKING:
@@ -89,29 +90,28 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _locator(args: argparse.Namespace, anatomy: Anatomy) -> Locator:
-    """The locator that lies beside the anatomy, or a new one."""
-    import shutil
+    """The locator that lies beside the anatomy, or a new one; it knows every vertex.
 
-    from tqdm import tqdm
+    Raises
+    ------
+    InputError
+        As `load_locator`; a small one.
+    """
+    from surrogate.locating.locator_files import load_locator, locator_path, save_locator
 
-    from surrogate.locating.locator_files import load_locator, save_locator
-    from surrogate.locating.setup import make_locator
-
-    path = args.locator or Path(args.anatomy).with_suffix(".locator.npz")
+    path = args.locator or locator_path(args.anatomy)
     if path.is_file():
-        return load_locator(path, anatomy)
-    path = claimed(path, ".npz", "a locator of `sulcus locate`", args.force)
-    folder = path.with_suffix(".parts")
-    print(f"sulcus locate: {path} is made first; if it is stopped, the same command goes on", file=sys.stderr)
-    with tqdm(file=sys.stderr) as bar:
-
-        def progress(stage: str, done: int, total: int) -> None:
-            bar.total, bar.n = total, done
-            bar.set_description(stage)
-
-        locator = make_locator(anatomy, args.seed, args.device, folder=folder, progress=progress)
+        locator = load_locator(path, anatomy)
+        if locator.prior.nodes is not None:
+            raise InputError(
+                f"{path}: is small, and knows nothing of most vertices that a result has. Name another file by "
+                "--locator: a whole one is made there."
+            )
+        return locator
+    path = claimed(path, ".npz", KIND, args.force)
+    locator = made(path, anatomy, args.seed, args.device)
     save_locator(path, locator)
-    shutil.rmtree(folder, ignore_errors=True)
+    forget_parts(path)
     return locator
 
 

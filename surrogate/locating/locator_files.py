@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,11 @@ LABELS = ("kind", "skull", "place")
 ARRAYS = ("shape", *LABELS, "centre")
 
 
+def locator_path(anatomy: str | Path) -> Path:
+    """Where the locator of an anatomy file is looked for: MESH.locator.npz beside MESH.vtu."""
+    return Path(anatomy).with_suffix(".locator.npz")
+
+
 def save_locator(path: str | Path, locator: Locator) -> None:
     """Write a locator; the file appears whole or not at all.
 
@@ -33,8 +39,11 @@ def save_locator(path: str | Path, locator: Locator) -> None:
         A name that does not end in .npz, or a folder that cannot be written to.
     """
     prior = locator.prior
-    header = {"format": FORMAT, "anatomy": prior.anatomy.digest, "version": version("sulcus"), "kinds": KINDS}
-    arrays = {name: getattr(prior, name) for name in ARRAYS}
+    header = {
+        "format": FORMAT, "anatomy": prior.anatomy.digest, "version": version("sulcus"), "kinds": KINDS,
+        "whole": prior.nodes is None,
+    }  # fmt: skip
+    arrays = {name: getattr(prior, name) for name in _names(header)}
     with written_whole(path, ".npz") as unfinished:
         np.savez(unfinished, header=np.array(json.dumps(header)), tried=locator.tried, **arrays)  # pyright: ignore[reportArgumentType]
 
@@ -57,16 +66,23 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
             raise InputError(f"{path}: is no locator of this version: move it away, and `sulcus locate` makes it anew.")
         if header["anatomy"] != anatomy.digest:
             raise InputError(f"{path}: was made for another anatomy: give that one, or another locator.")
-        arrays = archive.arrays([*ARRAYS, "tried"])
+        arrays = archive.arrays([*_names(header), "tried"])
         _check(path, anatomy, arrays)
         tried = arrays.pop("tried")
         return Locator(Prior(anatomy, **arrays), tried)
 
 
+def _names(header: dict[str, Any]) -> tuple[str, ...]:
+    """The arrays of a prior that is whole, or known at some vertices."""
+    return ARRAYS if header.get("whole", True) else (*ARRAYS, "nodes")
+
+
 def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) -> None:
     """Raise InputError where arrays do not fit the anatomy or each other."""
-    shape, tried = arrays["shape"], arrays["tried"]
-    fits = shape.ndim == 3 and shape.shape[1:] == anatomy.mesh.nodes.shape and tried.ndim == 2 and tried.shape[1] == 3
+    shape, tried, every = arrays["shape"], arrays["tried"], np.arange(len(anatomy.mesh.nodes))
+    nodes = arrays.get("nodes", every)
+    fits = nodes.dtype.kind == "i" and np.array_equal(nodes, np.intersect1d(nodes, every))
+    fits = fits and shape.ndim == 3 and shape.shape[1:] == (len(nodes), 3) and tried.ndim == 2 and tried.shape[1] == 3
     fits = fits and all(arrays[name].shape == (len(shape),) for name in LABELS) and len(shape) and len(tried)
     fits = fits and arrays["centre"].ndim == 2 and arrays["centre"].shape[1] == 3
     limits = ((0, len(KINDS)), (0, len(SKULLS)), (NOWHERE, len(arrays["centre"])))

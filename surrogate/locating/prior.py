@@ -6,7 +6,7 @@ ensemble. Those of tools are what smooth forces on the open cortex do to linear 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.effects import SKULLS
+from sim.errors import InputError
 from sim.geometry.locate import Located
 
 from .causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
@@ -72,14 +73,16 @@ class Prior:
     anatomy
         The body.
     shape
-        (r, V, 3) float32 [m]. Those of one kind, skull and place together, with weights of variance 1, move the open
-        cortex or the tumour by 1 mm in root mean square.
+        (r, n, 3) float32 [m] at `nodes`. Those of one kind, skull and place together, with weights of variance 1, move
+        the open cortex or the tumour by 1 mm in root mean square.
     kind, skull
         (r,) indices into `KINDS` and into the names of `sim.effects.SKULLS`.
     place
         (r,) number of the place that a tool presses on, or `NOWHERE`.
     centre
         (p, 3) [m] of these places, at rest.
+    nodes
+        (n,) sorted mesh vertices that shapes are known at; None: at all.
     """
 
     anatomy: Anatomy
@@ -88,15 +91,47 @@ class Prior:
     skull: np.ndarray
     place: np.ndarray
     centre: np.ndarray
+    nodes: np.ndarray | None = None
+
+    def at(self, nodes: np.ndarray) -> np.ndarray:
+        """The shapes (r, k, 3) [m] at some vertices (k,).
+
+        Raises
+        ------
+        InputError
+            A vertex that is not among `nodes`.
+        """
+        return self.shape[:, self._columns(nodes)]
+
+    def restricted(self, nodes: np.ndarray) -> Prior:
+        """The same, known at some vertices (k,) alone; it raises InputError as `at` does.
+
+        Answers stay the same wherever they can be given. An observation that touches other vertices is refused.
+        """
+        some = np.unique(nodes)
+        return replace(self, shape=self.at(some), nodes=some)
 
     @cached_property
     def middle(self) -> np.ndarray:
         """(r, 3) [m]: how each shape moves the middle of the tumour's volume."""
-        return middle_of(self.anatomy, self.shape)
+        tumour = self.anatomy.tumour_nodes
+        return np.einsum("v,rvi->ri", tumour_share(self.anatomy)[tumour], self.at(tumour))
+
+    def _columns(self, nodes: np.ndarray) -> np.ndarray:
+        """Where vertices (k,) are among those that are known."""
+        if self.nodes is None:
+            return nodes
+        column = np.searchsorted(self.nodes, nodes).clip(max=len(self.nodes) - 1)
+        if (self.nodes[column] != nodes).any():
+            raise InputError(
+                f"this locator knows {len(self.nodes)} vertices of {len(self.anatomy.mesh.nodes)}, and more are asked "
+                "for: give points on the open cortex itself, or a whole locator, as `sulcus locator` makes it."
+            )
+        return column
 
     @cached_property
     def _by_vertex(self) -> np.ndarray:
-        """(V, r * 3) float32 [m]: the shapes, so that those at a few places are near each other."""
+        """(n, r * 3) float32 [m]: the shapes, so that those at a few places are near each other."""
         return np.ascontiguousarray(self.shape.transpose(1, 0, 2)).reshape(self.shape.shape[1], -1)
 
     def seen(self, place: Located, axis: np.ndarray) -> np.ndarray:
@@ -104,7 +139,7 @@ class Prior:
         vertices, number = np.unique(place.vertices, return_inverse=True)
         weights = np.zeros((len(axis), len(vertices)), np.float32)
         np.add.at(weights, (np.arange(len(axis))[:, None], number.reshape(place.vertices.shape)), place.weights)
-        moved = (weights @ self._by_vertex[vertices]).reshape(len(axis), -1, 3)
+        moved = (weights @ self._by_vertex[self._columns(vertices)]).reshape(len(axis), -1, 3)
         return np.einsum("mri,mi->mr", moved, axis)
 
     def odds(self, tips: np.ndarray) -> np.ndarray:
@@ -194,8 +229,13 @@ def principal(motion: np.ndarray, most: int) -> np.ndarray:
 
 def middle_of(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
     """How motions (n, V, 3) [m] move the middle of the tumour's volume (n, 3) [m]."""
+    return np.einsum("v,nvi->ni", tumour_share(anatomy), motion)
+
+
+def tumour_share(anatomy: Anatomy) -> np.ndarray:
+    """Share (V,) of each vertex in the middle of the tumour's volume."""
     mesh = anatomy.mesh
     inside = mesh.region == TUMOUR_LABEL
     share = np.zeros(len(mesh.nodes))
     np.add.at(share, mesh.tets[inside], np.repeat(mesh.volumes[inside][:, None] / 4.0, 4, axis=1))
-    return np.einsum("v,nvi->ni", share / share.sum(), motion)
+    return share / share.sum()
