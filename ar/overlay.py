@@ -25,6 +25,8 @@ Style = Literal["window", "contour", "fill", "none"]
 DOUBTFUL = (1.0, 0.68, 0.16)
 WARNING = (1.0, 0.84, 0.5)
 BEFORE = (0.86, 0.88, 0.90)
+SEEN = (255.0, 245.0, 190.0)
+"""Ink of points that are seen."""
 # Of the outline's brightness: that of the margin round it, which is no place of the surface.
 FAINT = 0.75
 # Lengths of the outlines' strokes and gaps [pixel].
@@ -76,6 +78,18 @@ class Overlaid:
     taken: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """The outline of another surface, in its layer's colour: strokes and gaps of so many pixels, and a dot at a point.
+
+    The point is `dot` (3,) [m].
+    """
+
+    layer: Layer
+    pattern: tuple[int, int]
+    dot: np.ndarray
+
+
 def load_kernels(device: str = "cpu") -> None:
     """Load all kernels that draw a picture with its overlay, so that the first does not wait for them."""
     load(device, place, rasteriser, shade, window)
@@ -91,6 +105,8 @@ def composite(
     gauge: Gauge | None = None,
     before: Layer | None = None,
     doubt: str = "",
+    traces: Sequence[Trace] = (),
+    moved: tuple[float, float] | None = None,
 ) -> Overlaid:
     """The picture with a hidden surface drawn into it. On a card, no depth comes back from it.
 
@@ -116,6 +132,10 @@ def composite(
         Why the surface's place may not be relied on. It is written at the picture's foot, see `doubt_lines`, whatever
         the style. The outline is amber and broken. Nothing is promised: no margin is drawn, and the number beside the
         line has no error.
+    traces
+        Outlines of other surfaces, drawn under the hidden one's.
+    moved
+        Length and error [m] to be written in place of the mean motion and the largest margin.
 
     Raises
     ------
@@ -140,6 +160,7 @@ def composite(
         normals = vertex_normals(hidden.vertices, hidden.triangles)
         grown = replace(hidden, vertices=hidden.vertices + np.reshape(margin, (-1, 1)) * normals)
     surfaces = [layer.vertices for layer in (hidden, grown, before) if layer is not None]
+    surfaces += [trace.layer.vertices for trace in traces]
     box = box_around(camera, np.concatenate(surfaces))
     around = box if gauge is None else joined(box, box_around(camera, np.stack([gauge.tip, gauge.nearest])))
     if around is None:
@@ -156,6 +177,8 @@ def composite(
             dash(under, outlines(margin_mask), [FAINT * share for share in ink], DASHED, 1)
         if doubt:
             dash(under, outlines(found.mask), ink, BROKEN)
+        for trace in traces:
+            draw_trace(under, part, trace)
         if gauge is not None:
             above = blank(part)
             draw_line(above, part, gauge)
@@ -165,7 +188,8 @@ def composite(
     # The corner first, so that its words never move; then by importance, for where there is no room some are left out.
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
-        lay(out, taken, [f"moved {millimetres(motion, float(np.max(margin)) or None)}"], (0, camera.height))
+        length, error = moved or (motion, float(np.max(margin)))
+        lay(out, taken, [f"moved {millimetres(length, error or None)}"], (0, camera.height))
     write_doubt(drawn, doubt)
     if gauge is not None:
         write_gauge(drawn, camera, gauge, cv2.LUT(picture.segmentation, covering(tuple(occluders))))
@@ -260,6 +284,29 @@ def dash(
     if width > 1:
         cv2.polylines(out, strokes, False, (*DARK, OPAQUE), width + 2, cv2.LINE_AA)
     cv2.polylines(out, strokes, False, (*ink, OPAQUE), width, cv2.LINE_AA)
+
+
+def draw_trace(sheet: np.ndarray, camera: Camera, trace: Trace) -> None:
+    """Draw a trace, in place; nothing when its dot lies behind the camera."""
+    (at,), (depth,) = camera.project(np.asarray(trace.dot)[None])
+    if depth <= 0.0:
+        return
+    ink = ink_of(trace.layer.colour)
+    dash(sheet, outlines(silhouette(camera, trace.layer.vertices, trace.layer.triangles)), ink, trace.pattern)
+    column, row = np.clip(at, -1e4, 1e4).round().astype(int).tolist()
+    pale = [0.5 * (share + 255.0) for share in ink]  # so that pixels of the ink are the outline's alone
+    for colour, radius in ((DARK, 4), (pale, 3)):
+        cv2.circle(sheet, (column, row), radius, (*colour, OPAQUE), -1, cv2.LINE_AA)
+
+
+def draw_points(drawn: Overlaid, camera: Camera, points: np.ndarray, where: np.ndarray) -> None:
+    """Draw a small dot at each of the points (n, 3) [m] where `where` (H, W) bool is true and no line is; in place."""
+    pixels, depth = camera.project(points)
+    here = pixels[depth > 0.0].round().astype(int)
+    here = here[((here >= 0) & (here < (camera.width, camera.height))).all(axis=1)]
+    for column, row in here[where[here[:, 1], here[:, 0]] & (drawn.taken[here[:, 1], here[:, 0]] == 0)].tolist():
+        cv2.circle(drawn.colour, (column, row), 2, DARK, -1)
+        cv2.circle(drawn.colour, (column, row), 1, SEEN, -1)
 
 
 def draw_line(sheet: np.ndarray, camera: Camera, gauge: Gauge) -> None:

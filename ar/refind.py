@@ -20,7 +20,9 @@ CUT = 5
 APART = 8
 
 
-def outline_gap(colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray) -> float:
+def outline_gap(
+    colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray, least: int = 1
+) -> float:
     """How far the outline drawn in a picture is from the one that should be there [pixel].
 
     The larger of two 95th percentiles: from pixels of the ink to the true outline, and from the true outline to them.
@@ -34,18 +36,29 @@ def outline_gap(colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, cove
         (H, W) bool: the true silhouette.
     covered
         (H, W) bool: what lies in front of the overlay.
+    least
+        Fewer pixels than this are nothing, and each is held against all of the other outline: what can be seen of a
+        broken line may be a gap.
     """
-    found = np.abs(colour.astype(int) - np.rint(ink).astype(int)).max(axis=2) <= SAME
+    found = of_ink(colour, ink)
     true = np.zeros(mask.shape, np.uint8)
     for outline in outlines(mask):
         cv2.polylines(true, [outline], True, (1,))
     shut = cv2.dilate(np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT + 1,) * 2, np.uint8))
     seen = shut[1:-1, 1:-1] == 0
     wanted = (true > 0) & seen
-    if not wanted.any() or not (found & seen).any():
-        return 0.0 if not wanted.any() and not (found & seen).any() else np.inf
-    astray, missing = _distance(true > 0)[found & seen], _distance(found)[wanted]
-    return float(max(np.percentile(astray, SHARE), np.percentile(missing, SHARE)))
+    if max(np.count_nonzero(wanted), np.count_nonzero(found & seen)) < least:
+        return 0.0
+    there = (true > 0, found) if least > 1 else (wanted, found & seen)
+    if not all(each.any() for each in there):
+        return np.inf
+    apart = _distance(true > 0)[found & seen], _distance(found)[wanted]
+    return float(max(np.percentile(each, SHARE) for each in apart if len(each)))
+
+
+def of_ink(colour: np.ndarray, ink: Sequence[float]) -> np.ndarray:
+    """(H, W) bool: the pixels of a picture (H, W, 3) uint8 that have an ink's colour (3,) in 0 .. 255."""
+    return np.abs(colour.astype(int) - np.rint(ink).astype(int)).max(axis=2) <= SAME
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:

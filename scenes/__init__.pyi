@@ -7,6 +7,7 @@ from .script.debulking import Debulking
 from .script.head_posture import Lying
 from .script.scene import Bounds, Scene, Viewpoint, find_scene
 from .script.shipped_files import template_path
+from .script.sight import Sight
 from .script.site import Site, site_of
 from .script.tool import Blade, Instrument, Probe
 from .script.tool_paths import Touch, draw, idle, lay, palpate, press, slide, wander
@@ -21,6 +22,7 @@ __all__ = [
     "Player",
     "Probe",
     "Scene",
+    "Sight",
     "Site",
     "Theatre",
     "Touch",

@@ -19,6 +19,7 @@ from .demo import add_theatre, deformer_name, scene_asked
 if TYPE_CHECKING:
     from sim.deformation import Deformation
 
+    from ..play.checks import Figures
     from ..play.deformers import Theatre
     from ..play.player import Frame
     from ..script.scene import Scene
@@ -67,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
             f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}: the tumour is off by {figures.error_mm:.3f} "
             f"mm of the {figures.motion_mm:.2f} mm that it moves. Its outline is off by {figures.drawn:.1f} px, "
             f"overlap {figures.overlap:.3f} (1 is best). {figures.leaked:.0%} leaks out of the "
-            f"skull{_bond(figures.bond)}",
+            f"skull{_bond(figures.bond)}{_estimates(figures)}",
             file=table,
         )
         if args.certify:
@@ -83,6 +84,14 @@ def run(args: argparse.Namespace) -> int:
 def _bond(share: float) -> str:
     """How near the skull's bond comes to tearing, where there is one."""
     return f", whose bond bears {share:.0%} of its strength" if math.isfinite(share) else ""
+
+
+def _estimates(figures: Figures) -> str:
+    """What estimates of a scene with a sight are worth."""
+    if not math.isfinite(figures.covered):
+        return ""
+    held = f"Its middle is in the ellipsoid in {figures.covered:.0%} of the frames"
+    return f". {held}; estimates remove {figures.removed:.0%} of its motion"
 
 
 def _certificates(

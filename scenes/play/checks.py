@@ -8,22 +8,24 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ar.camera import Camera, project_cv2
-from ar.hud import FINE, WHITE, millimetres
+from ar.hud import FINE, NARROW, WHITE, folded, millimetres
 from ar.layer import Layer
 from ar.overlay import DOUBTFUL, GAUGE, ink_of, iou, silhouette
 from ar.raycast import raycast
-from ar.refind import outline_gap, stands
+from ar.refind import of_ink, outline_gap, stands
 from sim.deformation import Deformation
+from surrogate.locating.prior import middle_of
 from surrogate.model.learned import Learned
 
 from ..script.scene import Bounds
-from .player import Frame, Player
-from .stage import TOOL, TUMOUR_COLOUR
+from .player import TRUE_STROKES, Frame, Player
+from .stage import TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 
 # Barycentric weights (q, 3) at which the tumour's triangles are sampled: corners, edges and insides.
 STEPS = 24
 SAMPLES = np.array([(i, j, STEPS - i - j) for i in range(STEPS + 1) for j in range(STEPS + 1 - i)]) / STEPS
 
+TRUE_INK = ink_of(TRUTH_COLOUR)
 NOWHERE = 0.0, np.inf, np.inf, np.inf
 """How far off a tumour is whose place is no number: overlap, distance [m], distance in the picture [pixel]."""
 
@@ -58,6 +60,9 @@ class Figures:
     bond
         The largest traction between brain and skull, as a share of what their bond bears: above 1 it would tear. NaN
         where nothing is bonded. It is reported and has no limit.
+    covered, removed
+        In a scene with a sight: share of frames whose ellipsoid holds the tumour's true middle, and share of the
+        tumour's motion, summed over frames, that the estimate removes. NaN in others.
     """
 
     overlap: float
@@ -71,6 +76,8 @@ class Figures:
     in_step: bool
     leaked: float
     bond: float
+    covered: float = np.nan
+    removed: float = np.nan
     doubt: str = ""
 
     def broken(self, bounds: Bounds) -> list[str]:
@@ -85,6 +92,11 @@ class Figures:
             "a number is not finite": self.finite,
             f"an answer is not good: {self.doubt}": self.answered,
             "a picture shows the answer to another moment": self.in_step,
+            f"the ellipsoid holds the tumour's middle in {self.covered:.0%} of the frames, less than "
+            f"{bounds.covered:.0%}": not self.covered < bounds.covered,
+            f"estimates remove {self.removed:.0%} of the tumour's motion, less than {bounds.removed:.0%}": not (
+                self.removed < bounds.removed
+            ),
         }
         return [sentence for sentence, kept in rules.items() if not kept]
 
@@ -122,8 +134,37 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
         ),
         leaked=float(truth.leaked.max()),
         bond=float(truth.bond.max()),
+        covered=_covered(player, frames, truth),
+        removed=_removed(player, frames, truth) if all(finite) else np.nan,
         doubt="" if not doubts else doubts[0] + (f" ({len(doubts) - 1} more)" if doubts[1:] else ""),
     )
+
+
+def _covered(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
+    """Share of frames whose ellipsoid, as it is drawn, holds the tumour's middle by the finite elements."""
+    anatomy, held = player.site.anatomy, []
+    for row, frame in enumerate(frames):
+        ellipsoid = None if frame.estimate is None else frame.estimate.ellipsoid()
+        middle = middle_of(anatomy, player.positions(truth, row)[None])[0]
+        held.append(ellipsoid is not None and within(ellipsoid, middle))
+    return float(np.mean(held)) if any(frame.estimate for frame in frames) else np.nan
+
+
+def within(closed: Layer, point: np.ndarray) -> bool:
+    """Whether a closed convex surface, whose triangles point outwards, holds a point (3,) [m]."""
+    a, b, c = np.moveaxis(closed.vertices[closed.triangles], 1, 0)
+    return bool((np.einsum("fi,fi->f", np.cross(b - a, c - a), point - a) <= 0.0).all())
+
+
+def _removed(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
+    """Share of the tumour's motion, summed over its vertices and the frames, that estimates remove."""
+    if not any(frame.estimate for frame in frames):
+        return np.nan
+    nodes, rest = player.site.anatomy.tumour_nodes, player.site.anatomy.mesh.nodes
+    true = np.stack([player.positions(truth, row)[nodes] for row in range(len(frames))])
+    believed = np.stack([player.believed(frame)[nodes] for frame in frames])
+    left, moved = (np.linalg.norm(apart, axis=2).sum() for apart in (believed - true, true - rest[nodes]))
+    return float(1.0 - left / moved) if moved > 0.0 else np.nan
 
 
 def _doubts(frames: Sequence[Frame], truth: Deformation) -> list[str]:
@@ -142,30 +183,37 @@ def _finite(frame: Frame) -> bool:
 def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
     """Between a frame and the truth: overlap, mean distance [m], largest in the picture [pixel], and the outline's."""
     stage = player.stage.at(frame.loads)
-    shown = stage.tumour(player.positions(frame.deformation))
+    believed = player.believed(frame)
+    shown = stage.tumour(believed)
     true = stage.tumour(player.positions(truth, row))
     drawn = silhouette(frame.camera, shown.vertices, shown.triangles)
     overlap = iou(drawn, silhouette(camera, true.vertices, true.triangles))
     nodes = stage.anatomy.tumour_nodes
-    off = frame.deformation.at(nodes).displacement[0] - truth.at(nodes).displacement[row]
+    off = (believed - player.positions(truth, row))[nodes]
     ours = frame.camera.project(shown.vertices)[0]
     pixels = np.linalg.norm(ours - project_cv2(camera, shown.vertices), axis=1).max()
     mean = float(np.linalg.norm(off, axis=1).mean())
-    # Not a number: behind the camera.
-    return overlap, mean, np.inf if np.isnan(pixels) else float(pixels), _drawn(camera, frame, true)
-
-
-def _drawn(camera: Camera, frame: Frame, true: Layer) -> float:
-    """How far the outline in a frame's picture is from where the finite elements have it [pixel]."""
-    mask = raycast(camera, true.vertices, true.triangles).mask
     ink = ink_of(DOUBTFUL if frame.doubt else TUMOUR_COLOUR)
-    words = (frame.shown == np.asarray(WHITE, np.uint8)).all(axis=2)
-    return outline_gap(frame.shown, ink, mask, (frame.picture.segmentation == TOOL) | words)
+    drawn = _drawn(camera, frame, true if frame.estimate is None else shown, ink)
+    if frame.estimate is not None:  # both are in the picture
+        drawn = max(drawn, _drawn(camera, frame, true, TRUE_INK))
+    # Not a number: behind the camera.
+    return overlap, mean, np.inf if np.isnan(pixels) else float(pixels), drawn
+
+
+def _drawn(camera: Camera, frame: Frame, true: Layer, ink: tuple[float, float, float]) -> float:
+    """How far the outline of this ink in a frame's picture is from where a tumour should be [pixel]."""
+    mask = raycast(camera, true.vertices, true.triangles).mask
+    above = (frame.shown == np.asarray(WHITE, np.uint8)).all(axis=2) | (frame.picture.segmentation == TOOL)
+    if ink == TRUE_INK:  # the tumour's own outline is drawn over it
+        above |= of_ink(frame.shown, ink_of(TUMOUR_COLOUR))
+        return outline_gap(frame.shown, ink, mask, above, 2 * sum(TRUE_STROKES))
+    return outline_gap(frame.shown, ink, mask, above)
 
 
 def _printed(player: Player, frame: Frame) -> bool:
-    """Whether a picture says its frame's number, and how far the tip is from the tumour: both as found here."""
-    if not stands(frame.shown, f"frame {frame.number}", FINE):
+    """Whether a picture says its frame's number, how far the tip is from the tumour, and what an estimate says."""
+    if not stands(frame.shown, f"frame {frame.number}", FINE) or not _estimate_printed(player, frame):
         return False
     if frame.tip is None:
         return True
@@ -176,9 +224,24 @@ def _printed(player: Player, frame: Frame) -> bool:
     return any(stands(frame.shown, text, GAUGE) for text in near)
 
 
+def _estimate_printed(player: Player, frame: Frame) -> bool:
+    """Whether a picture says how far the tumour moved, as is estimated, and how far off that is: as found here."""
+    found = frame.estimate
+    if found is None or found.location is None:
+        return True
+    anatomy, rest = player.site.anatomy, player.site.anatomy.mesh.nodes
+    true, moved = middle_of(
+        anatomy, np.stack([player.positions(frame.deformation) - rest, player.believed(frame) - rest])
+    )
+    off, length = float(np.linalg.norm(moved - true)), float(np.linalg.norm(moved))
+    lines = folded(frame.remark, NARROW * frame.shown.shape[1])
+    said = f"moved {millimetres(length, found.location.p95)}", *lines
+    return frame.remark.endswith(f"{1e3 * off:.1f} mm off") and all(stands(frame.shown, text, FINE) for text in said)
+
+
 def _distance(player: Player, frame: Frame, tip: np.ndarray) -> float:
     """From tip to tumour [m] by samples of the drawn surfaces, with what the model knows it to be off by."""
-    positions = player.positions(frame.deformation)
+    positions = player.believed(frame)
     corners = positions[player.stage.at(frame.loads).anatomy.tumour_surface]
     apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", SAMPLES, corners) - tip, axis=2).min())
     if not isinstance(player.deformer, Learned):

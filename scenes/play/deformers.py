@@ -20,6 +20,8 @@ from sim.fem import Fem, solver_named
 from sim.loads import Loads
 from sim.resected_fem import Operated, finite_elements
 from sim.runtime.device import find_device
+from surrogate.locating.locator import Locator
+from surrogate.locating.locator_files import load_locator, locator_path
 from surrogate.model.applicability import refusal
 from surrogate.model.learned import Learned
 from surrogate.model.store import load
@@ -27,27 +29,58 @@ from surrogate.model.store import load
 from ..script.scene import Scene
 from ..script.shipped_files import template_path
 from ..script.site import Site, site_of
+from .observer import Observer
 from .player import Player
 from .stage import Stage
 
 
 @dataclass(frozen=True, eq=False)
 class Theatre:
-    """An anatomy, its T1 scan if there is one, and models by name, learnt from one data set."""
+    """An anatomy, its T1 scan if there is one, and models by name, learnt from one data set.
+
+    `locator_file` is where the locator of its tumour is, for scenes with a sight.
+    """
 
     anatomy: Anatomy
     intensity: Intensity | None
     models: Mapping[str, Learned]
     device: str = "auto"
+    locator_file: Path | None = None
 
     @cached_property
     def site(self) -> Site:
         """The open cortex."""
         return site_of(self.anatomy)
 
+    @cached_property
+    def locator(self) -> Locator:
+        """What locates its tumour.
+
+        Raises
+        ------
+        InputError
+            There is no such file, or it is of another anatomy.
+        """
+        path = self.locator_file
+        if path is None or not path.is_file():
+            beside = "" if path is None else f" at {path}"
+            raise InputError(
+                f"the tumour cannot be located: this anatomy has no locator{beside}. `sulcus locator ANATOMY.vtu` "
+                "makes it, in 6 to 8 minutes on two cores."
+            )
+        return load_locator(path, self.anatomy)
+
     def stage(self, scene: Scene) -> Stage:
-        """A scene's stage on this anatomy, drawn on this theatre's device."""
-        return Stage(scene, self.site, self.intensity, device=find_device(self.device, LIVE.precision).name)
+        """A scene's stage on this anatomy, drawn on this theatre's device.
+
+        Raises
+        ------
+        InputError
+            A scene with a sight, on an anatomy without a locator.
+        """
+        observer = None if scene.sight is None else Observer(self.site, self.locator, scene.sight)
+        device = find_device(self.device, LIVE.precision).name
+        return Stage(scene, self.site, self.intensity, device=device, observer=observer)
 
     def refusals(self, scene: Scene) -> dict[str, str | None]:
         """Why each learnt model may not answer a scene, by name; None if it may.
@@ -153,4 +186,4 @@ def open_theatre(anatomy: Path | None = None, model: Path | None = None, device:
     scan = sidecar(path)
     learnt = model_path(path) if model is None else Path(model)
     models = load(learnt, body) if model is not None or learnt.is_file() else {}
-    return Theatre(body, read_intensity(scan) if scan.is_file() else None, models, device)
+    return Theatre(body, read_intensity(scan) if scan.is_file() else None, models, device, locator_path(path))

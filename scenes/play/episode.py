@@ -46,7 +46,8 @@ MEANINGS = {
     "bound": "(frames, 2): the largest error of a tumour vertex, in 95 and in 99 of 100 loads; NaN: none is stated",
     "tumour_nodes": "mesh vertices of the rows of tumour_*", "tumour_left": "which of them are not cut out",
     "outcome_predicted": "how the deformer's answer came about", "outcome_fem": "the same of the finite elements",
-    "tumour_predicted": "positions, by the deformer", "tumour_fem": "positions, by the finite elements",
+    "tumour_predicted": "positions, by the deformer, or by what is seen where the scene has a sight",
+    "tumour_fem": "positions, by the finite elements",
     "tumour_rest": "positions in the scan",
     "reaction_fem": "(frames, tools, 6): force that each tool exerts, and its moment about the tool's lowest point",
     "time": "since the scene began", "seconds": "what each stage of the picture took",
@@ -112,7 +113,7 @@ def collect(
 def encoded(frame: Frame, player: Player) -> dict[str, np.ndarray]:
     """The frame's pictures as compressed bytes, by name."""
     picture = frame.picture
-    tumour = player.stage.at(frame.loads).tumour(player.positions(frame.deformation))
+    tumour = player.stage.at(frame.loads).tumour(player.believed(frame))
     mask = silhouette(frame.camera, tumour.vertices, tumour.triangles)
     depth = np.clip(np.rint(picture.depth / DEPTH_SCALE), 0, np.iinfo(np.uint16).max).astype(np.uint16)
     quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
@@ -133,7 +134,7 @@ def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
         "T_camera_world": frame.camera.T_camera_world,
         **({} if frame.pose is None or frame.tip is None else held(frame, frame.pose, frame.tip)),
         **caused(frame.loads),
-        "tumour_predicted": player.positions(frame.deformation)[nodes],
+        "tumour_predicted": player.believed(frame)[nodes],
         "tumour_left": ~player.stage.at(frame.loads).anatomy.orphaned[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],

@@ -356,10 +356,13 @@ class Demo:
 
     def show(self, frame: Frame, player: Player) -> None:
         """Put the bodies of the 3-D view where a frame has them."""
-        positions = player.positions(frame.deformation)
+        positions = player.believed(frame)
         stage = self.stage.at(frame.loads)
         for layer in (stage.cortex(positions), stage.tumour(positions)):
             self.browser.move(layer.name, layer.vertices, layer.triangles)
+        ellipsoid = None if frame.estimate is None else frame.estimate.ellipsoid()
+        if ellipsoid is not None:
+            self.browser.move(ellipsoid.name, ellipsoid.vertices)
         tool = self.stage.scene.tool
         if tool is not None and frame.pose is not None:
             self.browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])

@@ -17,6 +17,7 @@ from ..script.site import Site
 from ..script.tool_paths import Touch
 from .deformers import Theatre
 from .load_text import acting
+from .observer import Estimate
 from .page_tally import Row
 from .player import Frame
 from .stage import Stage
@@ -25,8 +26,14 @@ SEEN = (
     "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; "
     "the green outline shows where it is computed to be now, while the tissue moves."
 )
+ESTIMATED = (
+    "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; the green "
+    "outline shows where it is estimated to be, from the dots on the cortex alone. No force and no stiffness is known."
+)
 RESEARCH = "Research only. Not a medical device."
 MIDLINE = 5e-3
+# A cause of a smaller share is not named.
+LEAST_CAUSE = 0.005
 ELEMENTS = {"p1": "linear tetrahedra", "p2": "quadratic tetrahedra", "smoothed": "smoothed linear tetrahedra"}
 EFFECTS = {
     "ToolForce": "push of the tool",
@@ -49,20 +56,29 @@ def effect_words(name: str) -> str:
 def words(theatre: Theatre, scene: Scene, anatomy: str) -> str:
     """What stands under the picture: what is seen, what the lines mean, and whose brain it is."""
     title = " ".join(scene.title.split())
+    seen = SEEN if scene.sight is None else ESTIMATED
     return (
-        f"<p>{SEEN} <b>{RESEARCH}</b></p><p>Scene: {escape(title)}</p>{legend(scene)}"
+        f"<p>{seen} <b>{RESEARCH}</b></p><p>Scene: {escape(title)}</p>{legend(scene)}"
         f'<p class="dim">{escape(about(theatre, scene, anatomy))}</p>'
     )
 
 
 def legend(scene: Scene) -> str:
     """What the lines mean, each beside a piece of it."""
+    scan = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
     keys = [
         ('stroke="#4cf28c" stroke-width="3"', "tumour now (predicted)"),
         ('stroke="#4cf28c" stroke-width="1.5" stroke-dasharray="4 3"', "bound of its error"),
-        ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan"),
+        scan,
         ('stroke="#f259bf" stroke-width="1.5"', "finite elements (3-D view)"),
     ]
+    if scene.sight is not None:
+        keys = [
+            ('stroke="#4cf28c" stroke-width="3"', "tumour now (estimate)"),
+            ('stroke="#f259bf" stroke-width="2" stroke-dasharray="8 3"', "tumour now (truth: finite elements)"),
+            ('stroke="#57b5f7" stroke-width="2" stroke-dasharray="5 3"', "its middle, with 95 % probability"),
+            scan,
+        ]
     if scene.tool is not None:
         keys.append(('stroke="#fff" stroke-width="1.5"', "tip to tumour, in mm"))
     lines = (
@@ -159,8 +175,9 @@ def report(
     left, nodes = stage.at(frame.loads).left, stage.site.anatomy.mesh.nodes
     acts = acting(frame.loads, frame.deformation, nodes) if frame.loads.causes else ""
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([acts] if acts else [])]
-    facts += [f"tumour moved {1e3 * frame.moved:.2f} mm"]
+    facts += [f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"]
     parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {read(frame)}</p>']
+    parts += [] if frame.estimate is None else estimated(frame.estimate)
     parts += [trust(frame.deformation, name), f"<p>{escape('; '.join(facts))}</p>"]
     if without:
         parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
@@ -169,6 +186,26 @@ def report(
     spent = {"deform": "answer", "render": "camera picture", "overlay": "overlay"}
     took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
     return "".join([*parts, verdict, table(rows), f'<p class="dim">milliseconds: {took}</p>'])
+
+
+def estimated(found: Estimate) -> list[str]:
+    """What an estimate says, how far it is from the truth, and what it was told; or why it was refused."""
+    truth = f"truly {hud.millimetres(float(np.linalg.norm(found.true)))}"
+    if found.location is None:
+        return [
+            f'<p class="number">where the tumour is was not told ({truth})</p>',
+            f'<p class="warn">What is seen was refused: {escape(found.refusal)}</p>',
+        ]
+    moved = hud.millimetres(found.moved, found.location.p95).replace("+-", "\N{PLUS-MINUS SIGN}")
+    held = "inside" if found.held else "outside of"
+    causes = ", ".join(f"{cause} {share:.0%}" for cause, share in found.location.causes.items() if share > LEAST_CAUSE)
+    guess = "" if found.location.calibrated else " It is a guess: such observations were not tried."
+    still = "" if found.noticed else " No motion is seen beyond its error."
+    return [
+        f'<p class="number">tumour moved {moved} by the estimate ({truth})</p>',
+        f"<p><b>estimate</b> from {escape(found.source)}: {1e3 * found.off:.1f} mm off the truth, which is {held} the "
+        f"ellipsoid. Causes: {causes or 'none'}.{still}{guess}</p>",
+    ]
 
 
 def read(frame: Frame) -> str:

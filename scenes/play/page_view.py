@@ -7,17 +7,20 @@ import numpy as np
 from ar.page_parts import Body, Sign, Viewpoint
 
 from ..script.site import Site
-from .stage import CORTEX_COLOUR, TOOL_COLOUR, TUMOUR_COLOUR, Stage
+from .observer import BALL, ELLIPSOID_COLOUR
+from .stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 
-FEM_COLOUR = (0.95, 0.35, 0.75)
+FEM_COLOUR = TRUTH_COLOUR
 STALE_COLOUR = (0.45, 0.45, 0.45)
 """Of the finite elements' tumour while it belongs to another load than the one that is shown."""
+# Radius of an ellipsoid before there is one [m].
+SMALL = 1e-4
 # How far the patient's sides stand from the brain [m].
 BESIDE = 12e-3
 
 
 def bodies_of(stage: Stage) -> list[Body]:
-    """Brain, open cortex, tumour, the finite elements' tumour and the tool, at rest."""
+    """Brain, open cortex, tumour, the finite elements' tumour, an estimate's ellipsoid and the tool, at rest."""
     positions = stage.site.anatomy.mesh.nodes
     tool, site = stage.scene.tool, stage.site
     brain, cortex, tumour = stage.brain, stage.cortex(positions), stage.tumour(positions)
@@ -27,6 +30,10 @@ def bodies_of(stage: Stage) -> list[Body]:
         Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
         Body("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True),
     ]
+    if stage.observer is not None:
+        middle = tumour.vertices.mean(axis=0)
+        at = middle + SMALL * np.asarray(BALL.vertices)
+        bodies.append(Body("ellipsoid", at, BALL.faces, ELLIPSOID_COLOUR, wireframe=True))
     if tool is not None:
         pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
         at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]

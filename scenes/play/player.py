@@ -12,7 +12,7 @@ import numpy as np
 from ar.camera import Camera
 from ar.hud import NARROW, folded, lay, panel
 from ar.layer import Layer
-from ar.overlay import Gauge, Overlaid, Style, composite
+from ar.overlay import Gauge, Overlaid, Style, Trace, composite, draw_points
 from ar.renderer import Picture
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
@@ -26,9 +26,15 @@ from ..script.site import Site
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, lifted
 from .load_text import acting, doubt_of
-from .stage import TOOL, Stage
+from .observer import Estimate, Observer
+from .stage import CORTEX, TOOL, Stage
 from .tip_reading import reading
 
+REFUSED = "what is seen was refused, and the scan is shown: do not rely on it"
+# Strokes and gaps of the outlines of the truth and of the ellipsoid [pixel].
+TRUE_STROKES, ELLIPSOID_STROKES = (12, 4), (8, 5)
+LINES = {"estimate": "green, the estimate", "truth": "pink, the truth", "ellipsoid": "blue, its middle at 95 %"}
+"""What lines beside an estimate are."""
 IN_BONE = "the bone is where this push needs the tool: do not rely on it"
 # Tissue may carry a tool into the bone's edge by so much before it is drawn elsewhere, and before its load counts as
 # none that a tool can make [m].
@@ -64,13 +70,15 @@ class Frame:
     distance_error
         How far off that may be [m], as printed; None where nobody knows.
     moved
-        Mean distance of the tumour's predicted surface from where the scan has it [m].
+        Mean distance of the tumour's predicted surface from where the scan has it [m]; by an estimate, its middle's.
     doubt
         Why the answer may not be relied on, in the words that are in the picture; empty where it may.
     remark
         What else is said in the picture, as of a tool that the bone stops; mostly empty.
     seconds
-        Wall time by stage, see `STAGES`.
+        Wall time by stage, see `STAGES`; of an estimate too, as "locate".
+    estimate
+        Where the tumour is by what is seen, in a scene with a sight: that is drawn, and `deformation` is the truth.
     """
 
     number: int
@@ -90,6 +98,7 @@ class Frame:
     doubt: str
     remark: str
     seconds: Mapping[str, float]
+    estimate: Estimate | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,20 +171,36 @@ class Player:
         stage = self.stage.at(loads)
         picture = stage.picture(self.camera, positions, None if held is None else held.pose)
         rendered = clock.perf_counter()
-        tumour, rest = stage.tumour(positions), stage.tumour_at_rest
+        estimate = None if stage.observer is None else self._estimate(stage.observer, number, positions, held)
+        located = 0.0 if estimate is None else estimate.seconds
+        tumour, rest = stage.tumour(_believed(positions, estimate)), stage.tumour_at_rest
         doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
+        doubt = doubt or (REFUSED if estimate is not None and estimate.location is None else "")
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
-        over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt)
-        remark = self.scene.stopped(self.site, touch)
+        traces = () if estimate is None else traces_of(estimate, stage.truth(positions))
+        moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
+        over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt, traces, moved)
+        if estimate is not None and self.style != "none":
+            draw_points(over, self.camera, estimate.observation.now, picture.segmentation == CORTEX)
+        remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
+        remark = "; ".join(words for words in remarks if words)
         annotate(over, number, remark)
-        spent = seconds, rendered - begun, clock.perf_counter() - rendered
+        spent = seconds, rendered - begun, clock.perf_counter() - rendered - located
+        took = dict(zip(STAGES, spent, strict=True)) | ({} if estimate is None else {"locate": located})
         return Frame(
             number, float(loads.times[0]), touch, loads, deformation, self.camera,
             None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
             None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
-            float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()),
-            doubt, remark, dict(zip(STAGES, spent, strict=True)),
+            float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()) if moved is None else moved[0],
+            doubt, remark, took, estimate,
         )  # fmt: skip
+
+    def _estimate(self, observer: Observer, number: int, positions: np.ndarray, held: HeldTool | None) -> Estimate:
+        """Where the tumour is by what is seen of a body at `positions` (V, 3) [m], and of the tool."""
+        if held is None or self.scene.tool is None:
+            return observer.estimate(number, positions)
+        corners = np.asarray(self.scene.tool.mesh.vertices) @ held.pose[:3, :3].T + held.pose[:3, 3]
+        return observer.estimate(number, positions, corners)
 
     def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
         """From the tip to the tumour, and how far off that may be as far as the deformer knows."""
@@ -204,6 +229,10 @@ class Player:
         positions[deformation.nodes] += deformation.displacement[row]
         return positions
 
+    def believed(self, frame: Frame) -> np.ndarray:
+        """Where all mesh vertices are (V, 3) [m] by what is drawn: the tumour's, in a scene with a sight, by that."""
+        return _believed(self.positions(frame.deformation), frame.estimate)
+
     def tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> HeldTool:
         """Where the tool is: of one that pushes, where it comes to rest on the deformed cortex from outside.
 
@@ -223,6 +252,18 @@ class Player:
         return HeldTool(tip, pose, beyond)
 
 
+def _believed(positions: np.ndarray, estimate: Estimate | None) -> np.ndarray:
+    return positions if estimate is None else estimate.carried(positions)
+
+
+def traces_of(estimate: Estimate, truth: Layer) -> tuple[Trace, ...]:
+    """What is drawn beside an estimate: its ellipsoid, and the tumour's true surface with its middle."""
+    ellipsoid, true = estimate.ellipsoid(), Trace(truth, TRUE_STROKES, estimate.middle + estimate.true)
+    if ellipsoid is None:
+        return (true,)
+    return Trace(ellipsoid, ELLIPSOID_STROKES, estimate.middle + estimate.motion), true
+
+
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
     """From a tip (3,) [m] to the nearest point of a hidden surface."""
     return Gauge(tip, closest(tip[None], hidden.vertices[hidden.triangles]).point[0])
@@ -236,11 +277,14 @@ def annotate(over: Overlaid, number: int, remark: str) -> None:
 
 
 def labelled(frame: Frame, name: str) -> np.ndarray:
-    """The shown picture (H, W, 3) with a panel: deformer, what acts, and milliseconds by stage."""
+    """The shown picture (H, W, 3) with a panel: deformer, what acts, and milliseconds by stage; of an estimate too."""
     stages = "  ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
     acts = acting(frame.loads, frame.deformation)
     lines = [frame.deformation.source or name, f"t {frame.time:.2f} s   tumour moved {1e3 * frame.moved:.2f} mm"]
     lines += [*([acts] if acts else []), f"ms: {stages}"]
+    if frame.estimate is not None:
+        lines[0] = f"truth: {lines[0]}"
+        lines += [f"estimate: {frame.estimate.source}", "lines: " + ", ".join(LINES.values())]
     if not frame.deformation.outcome[0].good:
         lines.append(frame.deformation.outcome[0].value)
     return panel(frame.shown, lines)

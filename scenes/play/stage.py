@@ -18,6 +18,7 @@ from sim.loads import Loads, Resected
 
 from ..script.scene import Scene
 from ..script.site import HOLE, Site
+from .observer import Observer
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 """Segmentation ids."""
@@ -28,6 +29,8 @@ CORTEX_COLOUR = (0.86, 0.60, 0.54)
 DRAPE_COLOUR = (0.16, 0.36, 0.42)
 TOOL_COLOUR = (0.78, 0.80, 0.83)
 TUMOUR_COLOUR = (0.30, 0.95, 0.55)
+TRUTH_COLOUR = (0.95, 0.35, 0.75)
+"""Of the tumour where the finite elements have it."""
 # Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
 READ_BELOW = 2.0e-3
 # So far under the bone the cortex may come to light [m].
@@ -58,7 +61,7 @@ class Cortex:
 class Stage:
     """The drawn parts of a scene; positions are those of all mesh vertices (V, 3) [m].
 
-    `device` is the Warp device that draws.
+    `device` is the Warp device that draws; `observer` says where the tumour is in a scene with a sight.
     """
 
     scene: Scene
@@ -66,6 +69,7 @@ class Stage:
     intensity: Intensity | None = None
     left: Remains | None = None
     device: str = "cpu"
+    observer: Observer | None = None
 
     @property
     def anatomy(self) -> Anatomy:
@@ -145,6 +149,10 @@ class Stage:
         """The tumour's surface at `positions` (V, 3) [m]."""
         vertices, triangles = self._tumour
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
+
+    def truth(self, positions: np.ndarray) -> Layer:
+        """The same, where finite elements have it and an estimate is drawn beside it."""
+        return replace(self.tumour(positions), name="truth", colour=np.array(TRUTH_COLOUR))
 
     @cached_property
     def tumour_at_rest(self) -> Layer:

@@ -34,6 +34,7 @@ from sim.runtime.user_script import error_text, run_script
 
 from .debulking import Debulking
 from .head_posture import Lie, supine
+from .sight import Sight
 from .site import Site
 from .tool import Instrument, Probe
 from .tool_paths import AIR, Path, Touch, idle
@@ -78,13 +79,19 @@ class Bounds:
     pixels
         Largest difference between our projection and OpenCV's [pixel].
     drawn
-        How far the outline in the picture may be from where the finite elements have it [pixel].
+        How far the outline in the picture may be from where the finite elements have it [pixel]. In a scene with a
+        sight, the estimate's from where the estimate has it.
+    covered, removed
+        In a scene with a sight: least share of frames whose ellipsoid holds the tumour's true middle, and least share
+        of the tumour's motion, over all frames, that the estimate removes.
     """
 
     overlap: float = 0.95
     error: float = 0.3e-3
     pixels: float = 1e-3
     drawn: float = 2.0
+    covered: float = 0.9
+    removed: float = 0.0
 
 
 PALPATION = Probe()
@@ -106,6 +113,9 @@ class Scene:
         How the head lies, where `Gravity` is asked for.
     surgery
         What is cut, if anything.
+    sight
+        What is seen of the open cortex, if an estimate shall say from that where the tumour is; the deformer's answer
+        is then the truth.
     element
         One of `sim.elements.ELEMENTS`; None: the one that is recommended for the mesh.
 
@@ -124,6 +134,7 @@ class Scene:
     tool: Instrument | None = PALPATION
     lying: Lie = supine
     surgery: Debulking | None = None
+    sight: Sight | None = None
     viewpoint: Viewpoint = Viewpoint()
     element: str | None = None
     accuracy: Accuracy = LIVE
@@ -243,7 +254,9 @@ def _resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
     return surgery.resection(anatomy)
 
 
-SCENES = ("press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation")
+SCENES = (
+    "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag", "lost_force",
+)  # fmt: skip
 """The built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
 
 

@@ -1,0 +1,26 @@
+"""A tool presses with a force that nobody measures; where the tumour is, is told from its pose and the cortex alone."""
+
+import numpy as np
+
+from sim.anatomy import TUMOUR_LABEL
+from sim.effects import Bonded, Elasticity, Held, ToolForce
+from sim.material import Material
+
+from ..script.scene import Bounds, Scene, Viewpoint
+from ..script.sight import Sight
+from ..script.tool_paths import press
+
+# Softer than usual, with a stiffer tumour: the estimate is told neither.
+BRAIN = Material("linear", young=1800.0, poisson=0.49)
+TUMOUR = Material("linear", young=3200.0, poisson=0.49)
+
+SCENE = Scene(
+    "lost_force",
+    __doc__ or "",
+    press(force=0.35, rise=1.5, hold=0.5, at=(-0.004, 0.003)),
+    duration=4.0,
+    effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Bonded(), ToolForce()),
+    sight=Sight(),
+    viewpoint=Viewpoint(fov=np.radians(13.0), width=800, height=600),
+    bounds=Bounds(overlap=0.75, error=2e-3, removed=0.4),
+)

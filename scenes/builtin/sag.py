@@ -1,0 +1,25 @@
+"""Fluid drains and the brain sinks; where the tumour is now is told from a hundred points of the cortex alone."""
+
+from sim.anatomy import TUMOUR_LABEL
+from sim.effects import Elasticity, Gravity, Held, Slide
+from sim.material import Material
+
+from ..script.head_posture import drained
+from ..script.scene import Bounds, Scene, Viewpoint
+from ..script.sight import Sight
+
+# Softer than usual, with a stiffer tumour: the estimate is told neither.
+BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)
+TUMOUR = Material("neo-hookean", young=3200.0, poisson=0.45)
+
+SCENE = Scene(
+    "sag",
+    __doc__ or "",
+    duration=4.0,
+    effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity()),
+    tool=None,
+    lying=drained(3.0, to=0.2),
+    sight=Sight(),
+    viewpoint=Viewpoint(width=800, height=600),
+    bounds=Bounds(overlap=0.7, error=3e-3, removed=0.5),
+)

@@ -1,0 +1,209 @@
+"""Who sees the open cortex and says where the tumour is: without a force, a stiffness or a cause."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from ar.layer import Layer
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.geometry.closest_point import closest
+from surrogate.locating.evidence import LENGTH
+from surrogate.locating.locator import Location, Locator
+from surrogate.locating.observation import Observation
+from surrogate.locating.prior import middle_of
+
+from ..script.sight import Sight
+from ..script.site import HOLE, Site
+
+LEVEL = 0.95
+"""Probability with which the tumour's middle is said to lie in its ellipsoid."""
+# A tool so near to the cortex touches it; it hides points that are so near to it [m].
+TOUCHES, HIDES = 1e-3, 4e-3
+# Of a tool's corners so many that are nearest to those of the cortex are looked at, for where it touches.
+CORNERS = 32
+ELLIPSOID_COLOUR = (0.34, 0.71, 0.97)
+ELLIPSOID = 5
+"""Segmentation id of the ellipsoid's layer, which no picture holds."""
+BALL = trimesh.creation.icosphere(subdivisions=2)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the tumour is by what is seen, beside the truth.
+
+    Parameters
+    ----------
+    anatomy
+        The body at rest.
+    observation
+        What was seen.
+    location
+        What the locator says; None where it refuses the observation.
+    refusal
+        Why, in its words; else empty.
+    middle, true
+        (3,) [m]: the middle of the tumour's volume in the scan, and how far it truly moved.
+    seconds
+        What seeing and locating took.
+    """
+
+    anatomy: Anatomy
+    observation: Observation
+    location: Location | None
+    refusal: str
+    middle: np.ndarray
+    true: np.ndarray
+    seconds: float
+
+    @property
+    def motion(self) -> np.ndarray:
+        """(3,) [m]: how far the tumour's middle moved, as a mean; nothing is believed to move where that is refused."""
+        return np.zeros(3) if self.location is None else self.location.centroid
+
+    @property
+    def moved(self) -> float:
+        """Its length [m]."""
+        return float(np.linalg.norm(self.motion))
+
+    @property
+    def off(self) -> float:
+        """How far the tumour's middle is from where it is believed to be [m]."""
+        return float(np.linalg.norm(self.motion - self.true))
+
+    @property
+    def noticed(self) -> bool:
+        """Whether the motion is more than it may be off by."""
+        return self.location is not None and self.moved > self.location.p95
+
+    @property
+    def held(self) -> bool:
+        """Whether the ellipsoid holds the tumour's true middle; what is refused has none."""
+        if self.location is None:
+            return False
+        away = self.true - self.motion
+        return bool(away @ np.linalg.solve(self.location.centroid_covariance, away) <= chi2.ppf(LEVEL, 3))
+
+    @property
+    def words(self) -> str:
+        """What is said beside the picture, in a few words."""
+        if self.location is None:
+            return ""
+        still = "" if self.noticed else "no motion beyond its error; "
+        return f"{still}estimate {1e3 * self.off:.1f} mm off"
+
+    @property
+    def source(self) -> str:
+        """What it was told, in words; or why it was refused."""
+        if self.location is None:
+            return f"refused, {self.refusal}"
+        tip = ", and where the tool touches" if len(self.observation.tips) else ""
+        return f"{len(self.observation.now)} points of the cortex{tip}; no force, no stiffness"
+
+    def carried(self, positions: np.ndarray) -> np.ndarray:
+        """Positions (V, 3) [m] with the tumour's vertices where they are believed to be."""
+        nodes, believed = self.anatomy.tumour_nodes, positions.copy()
+        believed[nodes] = self.anatomy.mesh.nodes[nodes]
+        if self.location is not None:
+            believed[nodes] += self.location.at(nodes)
+        return believed
+
+    def ellipsoid(self) -> Layer | None:
+        """The surface that holds the tumour's middle with a probability of 95 %; None where all is refused."""
+        if self.location is None:
+            return None
+        root = np.linalg.cholesky(self.location.centroid_covariance)
+        at = np.sqrt(chi2.ppf(LEVEL, 3)) * np.asarray(BALL.vertices) @ root.T
+        return Layer("ellipsoid", ELLIPSOID, self.middle + self.motion + at, BALL.faces, ELLIPSOID_COLOUR)
+
+
+@dataclass(frozen=True, eq=False)
+class Observer:
+    """Sees the points of a `Sight`, with its errors, and asks a locator. It knows no loads."""
+
+    site: Site
+    locator: Locator
+    sight: Sight
+
+    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Estimate:
+        """What is said in a frame by its number, of a body at `positions` (V, 3) [m].
+
+        `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is seen.
+        """
+        begun, anatomy = clock.perf_counter(), self.site.anatomy
+        observation, location, refusal = self.seen(number, positions, tool), None, ""
+        try:
+            location = self.locator.locate(observation)
+        except InputError as error:
+            refusal = str(error)
+        rest = anatomy.mesh.nodes
+        middle, true = middle_of(anatomy, np.stack([rest, positions - rest]))
+        return Estimate(anatomy, observation, location, refusal, middle, true, clock.perf_counter() - begun)
+
+    def seen(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
+        """What is seen in a frame; arguments as of `estimate`."""
+        sight, random = self.sight, np.random.default_rng([self.sight.seed, 1 + number])
+        now = self._at(positions)
+        off = self._smooth + sight.white * random.standard_normal(now.shape)
+        shown, tips = np.ones(len(now), bool), np.zeros((0, 3))
+        if tool is not None:
+            shown = KDTree(tool).query(now)[0] > HIDES
+            tips = self._touched(positions, tool)
+            tips = self._as_a_whole(tips + sight.white * random.standard_normal(tips.shape))
+        sigma = np.full(shown.sum(), np.hypot(sight.white, sight.smooth))
+        return Observation(self._as_a_whole(now + off)[shown], self._at(self._rest)[shown], sigma, tips)
+
+    def _touched(self, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
+        """The place of the cortex (1, 3) [m] that a tool touches; (0, 3) where it is in the air."""
+        triangles = self.site.anatomy.open_surface
+        near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:CORNERS]]
+        place = closest(near, positions[triangles]).point
+        away = np.linalg.norm(place - near, axis=1)
+        return place[[away.argmin()]] if away.min() < TOUCHES else np.zeros((0, 3))
+
+    @property
+    def _rest(self) -> np.ndarray:
+        return self.site.anatomy.mesh.nodes
+
+    def _at(self, positions: np.ndarray) -> np.ndarray:
+        """Where the points are (n, 3) [m]."""
+        vertices, weights = self._places
+        return np.einsum("nc,nci->ni", weights, positions[vertices])
+
+    def _as_a_whole(self, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) [m] with the rigid error."""
+        turn, shift, middle = *self._rigid, self._at(self._rest).mean(axis=0)
+        return middle + Rotation.from_rotvec(turn).apply(points - middle) + shift
+
+    @cached_property
+    def _places(self) -> tuple[np.ndarray, np.ndarray]:
+        """The points: vertices (n, 3) of the mesh, and weights (n, 3)."""
+        site, random = self.site, np.random.default_rng([self.sight.seed, 0])
+        triangles = site.anatomy.open_surface
+        corners = self._rest[triangles]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        area *= (site.across(corners.reshape(-1, 3)).reshape(-1, 3) < HOLE * site.clearance).all(axis=1)
+        some = random.choice(len(area), self.sight.points, p=area / area.sum())
+        return triangles[some], random.dirichlet(np.ones(3), len(some))
+
+    @cached_property
+    def _smooth(self) -> np.ndarray:
+        """(n, 3) [m]: the error that neighbours share."""
+        at, random = self._at(self._rest), np.random.default_rng([self.sight.seed, 0, 1])
+        square = ((at[:, None] - at) ** 2).sum(axis=2)
+        value, vector = np.linalg.eigh(np.exp(-0.5 * square / LENGTH**2))
+        return self.sight.smooth * (vector * np.sqrt(value.clip(0.0))) @ random.standard_normal(at.shape)
+
+    @cached_property
+    def _rigid(self) -> tuple[np.ndarray, np.ndarray]:
+        """The rigid error: a rotation vector (3,) [rad], and a translation (3,) [m]."""
+        turn, shift = np.random.default_rng([self.sight.seed, 0, 2]).standard_normal((2, 3))
+        return self.sight.turn * turn / np.linalg.norm(turn), self.sight.shift * shift / np.linalg.norm(shift)
