@@ -28,7 +28,7 @@ from .page_referee import Referee, Truth
 from .page_requests import HAND, SCRIPT, Wish
 from .page_tally import Tally
 from .page_text import effect_words, pending_words, plan_words, report, words, work_words
-from .page_verdict import Judged, changed, judge, verdict_words
+from .page_verdict import OWN, TRUTH, Judged, changed, judge, verdict_words
 from .page_view import FEM_COLOUR, STALE_COLOUR, bodies_of, signs_of, viewpoint_of
 from .player import Frame, Player
 from .stage import Stage
@@ -237,7 +237,8 @@ class Demo:
     def _rest(self, now: Moment) -> None:
         """Show the body at rest while nothing else can be shown."""
         number, _, touch, _ = self.asked
-        player = Player(self.stage, AtRest(self.stage.site.anatomy), self.wish.style)
+        stage = replace(self.stage, observer=None)  # there is no truth yet to be seen
+        player = Player(stage, AtRest(stage.site.anatomy), self.wish.style)
         frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.touch(number))
         self.show(frame, player)
         self.browser.show(number, pictured(frame), RESTS)
@@ -303,7 +304,8 @@ class Demo:
             shown, whole = now.frame.deformation, self.cast.player(name)
             verdict = changed(truth, whole, shown, gone) if fresh else verdict_words(None, True, WAITS)
         else:
-            verdict = verdict_words(now.judged if truth is not None else None, not fresh, WAITS)
+            own = OWN if now.frame.estimate is None else TRUTH
+            verdict = verdict_words(now.judged if truth is not None else None, not fresh, WAITS, own)
         plan = self.cast.solver(off).plan or self.referee.plan
         if plan != now.plan:
             now.plan = plan

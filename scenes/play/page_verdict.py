@@ -17,6 +17,8 @@ from .page_referee import Truth
 from .player import Player
 from .tip_reading import measured
 
+OWN, TRUTH = "this is the finite elements' own answer", "the truth is the finite elements' own answer"
+
 
 @dataclass(frozen=True)
 class Judged:
@@ -50,11 +52,14 @@ def judge(truth: Truth, player: Player, own: bool) -> Judged:
     return Judged(truth.number, truth.seconds, truth.deformation.outcome[0].good, motion, *off, distance)
 
 
-def verdict_words(judged: Judged | None, stale: bool, waits: str) -> str:
-    """The verdict; of an earlier load it is greyed and says so, and what the finite elements do meanwhile."""
+def verdict_words(judged: Judged | None, stale: bool, waits: str, own: str = OWN) -> str:
+    """The verdict; of an earlier load it is greyed and says so, and what the finite elements do meanwhile.
+
+    `own` says that an answer is the finite elements' own.
+    """
     if judged is None:
         return f'<p class="stale">{escape(waits)}</p>'
-    said = "this is the finite elements' own answer"
+    said = own
     if judged.mean is not None and judged.largest is not None:
         said = f"error against FEM: mean {1e3 * judged.mean:.3f}, largest {1e3 * judged.largest:.3f} mm"
     tip = "" if judged.distance is None else f"tip to tumour {millimetres(judged.distance)}, "
