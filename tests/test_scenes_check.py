@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from theatres import PUSHING, player, put, small, theatre_of
+from theatres import PUSHING, SIGHTED, player, put, small, theatre_of
 
 from ar.hud import millimetres
 from ar.overlay import composite
@@ -22,7 +22,7 @@ from sim.deformation import Outcome
 
 GOOD = Figures(
     overlap=0.99, error_mm=0.1, motion_mm=1.0, pixels=1e-9, drawn=0.5, printed=True, finite=True, answered=True,
-    in_step=True, leaked=0.0, bond=0.1,
+    in_step=True, leaked=0.0, bond=0.1, covered=0.95, removed=0.5,
 )  # fmt: skip
 SENTENCES = {
     "overlap": (0.90, "overlap 0.9000 is below 0.95"),
@@ -34,6 +34,8 @@ SENTENCES = {
     "finite": (False, "not finite"),
     "answered": (False, "answer is not good"),
     "in_step": (False, "another moment"),
+    "covered": (0.89, "in 89% of the frames, less than 90%"),
+    "removed": (-0.1, "remove -10% of the tumour's motion, less than 0%"),
 }
 
 
@@ -240,12 +242,14 @@ class TestCommand:
         out, err = capsys.readouterr()
         report = json.loads(out)
         assert out.count("\n") == 1 and report["passed"]
-        assert [row["scene"] for row in report["scenes"]] == list(SCENES)
+        plain = [name for name in SCENES if name not in SIGHTED]
+        assert [row["scene"] for row in report["scenes"]] == plain
+        assert f"no {', '.join(SIGHTED)}: this anatomy has no locator" in err
         played = {row["scene"]: row["deformer"] for row in report["scenes"]}
-        assert played == {name: "linear" if name in PUSHING else "fem" for name in SCENES}
+        assert played == {name: "linear" if name in PUSHING else "fem" for name in plain}
         for row in report["scenes"]:
             assert row["frames"] >= 5 and row["broken"] == [] and row["motion_mm"] > 0.03
-        assert err.count("passes") == len(SCENES)
+        assert err.count("passes") == len(plain)
 
     def test_one_scene_by_finite_elements(self, anatomy, capsys):
         words = ["check", "draw", "--anatomy", str(anatomy), "--every", "40", "--deformer", "fem", "--device", "cpu"]

@@ -6,17 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import make_box
+from locators import dent, locator_of
 
 from scenes.cli import main
 from sim.bodies.meshfile import read_mesh, write_anatomy
-from sim.runtime.threads import one_thread
-from surrogate.locating.calibration import trials
 from surrogate.locating.causes import KINDS
-from surrogate.locating.ensemble import Ensemble
-from surrogate.locating.locator import Locator
 from surrogate.locating.locator_files import load_locator, save_locator
-from surrogate.locating.presses import Presses
-from surrogate.locating.prior import prior_of
 
 
 @pytest.fixture(scope="module")
@@ -27,25 +22,11 @@ def body():
 
 @pytest.fixture(scope="module")
 def files(body, tmp_path_factory):
-    """An anatomy with a locator by formula: dents that reach into the depth, shears and stretches; and a truth."""
+    """An anatomy with a locator by formula, and a truth."""
     folder, random = tmp_path_factory.mktemp("locate"), np.random.default_rng(0)
     write_anatomy(folder / "box.vtu", body)
-    at = body.mesh.nodes - [0.04, 0.03, 0.02]
-
-    def motion():
-        middle = np.append(random.uniform(-0.02, 0.02, 2), 0.0)
-        fall = np.exp(-0.5 * (((at - middle) / [0.025, 0.025, 0.03]) ** 2).sum(axis=1))
-        return 3e-3 * fall[:, None] * (random.normal(size=3) * [0.3, 0.3, 1.0])
-
-    members = np.array([motion() for _ in range(48)], np.float32)
-    count = np.arange(48)
-    ensemble = Ensemble(body, members, count % 4, count // 4 % 3, count // 12)
-    points = body.mesh.nodes[np.unique(body.open_surface)]
-    dents = np.array([[motion() for _ in range(3)] for _ in points], np.float32)[None]
-    presses = Presses(points, {"bonded": dents, "slide": dents})
-    with one_thread():
-        save_locator(folder / "box.locator.npz", Locator(prior_of(ensemble, presses), trials(ensemble, presses)))
-    truth = motion()
+    save_locator(folder / "box.locator.npz", locator_of(body))
+    truth = dent(body, random)
     triangles = body.open_surface[random.integers(len(body.open_surface), size=50)]
     share = random.dirichlet(np.ones(3), 50)
     rest, moved = (np.einsum("nc,nci->ni", share, field[triangles]) for field in (body.mesh.nodes, truth))

@@ -28,8 +28,10 @@ from surrogate.data.tool_loads import draw
 from surrogate.model.store import save
 from surrogate.training.train import train
 
-PUSHING = tuple(name for name in SCENES if ToolForce() in find_scene(name).effects)
-"""The built-in scenes in which a tool pushes."""
+SIGHTED = tuple(name for name in SCENES if find_scene(name).sight is not None)
+"""The built-in scenes in which a tumour is located."""
+PUSHING = tuple(name for name in SCENES if ToolForce() in find_scene(name).effects and name not in SIGHTED)
+"""The others in which a tool pushes."""
 
 
 @cache

@@ -39,7 +39,9 @@ def run(args: argparse.Namespace) -> int:
     except InputError as error:
         raise InputError(f"{error} What else is measured has a word of its own: `sulcus bench --help`.") from error
     if not any(isinstance(effect, ToolForce) for effect in scene.effects):
-        pushing = ", ".join(name for name in SCENES if ToolForce() in find_scene(name).effects)
+        pushing = ", ".join(
+            name for name in SCENES if find_scene(name).sight is None and ToolForce() in find_scene(name).effects
+        )
         raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")
     theatre = open_theatre(args.anatomy, args.model, args.device)
     name = deformer_name(args, theatre, scene)

@@ -14,7 +14,7 @@ from sim.accuracy import TRAIN
 from sim.arguments import at_least
 from sim.errors import InputError
 
-from .demo import add_theatre, deformer_name, scene_asked
+from .demo import add_theatre, deformer_name, playable, scene_asked
 
 if TYPE_CHECKING:
     from sim.deformation import Deformation
@@ -48,6 +48,7 @@ def run(args: argparse.Namespace) -> int:
     at_least("--every", args.every, 1)
     scenes = [scene_asked(args, name) for name in args.scenes or SCENES]
     theatre = open_theatre(args.anatomy, args.model, args.device)
+    scenes = playable(args, theatre, scenes)
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
         name = deformer_name(args, theatre, scene)

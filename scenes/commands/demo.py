@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
@@ -64,6 +65,16 @@ def scene_asked(args: argparse.Namespace, name: str) -> Scene:
     from ..script.scene import find_scene
 
     return find_scene(name).made_of(tissue_asked(args), args.element)
+
+
+def playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:
+    """The scenes that were named; of none, those of all that the anatomy has a locator for, and the others are said."""
+    left = [] if args.scenes else [scene for scene in scenes if theatre.lacks_locator(scene)]
+    if left:
+        names = ", ".join(scene.name for scene in left)
+        said = f"no {names}: this anatomy has no locator, which `sulcus locator` makes"
+        print(f"sulcus {args.command}: {said}", file=sys.stderr)
+    return [scene for scene in scenes if scene not in left]
 
 
 def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
+from .demo import playable
 from .outputs import add_force, claimed, claimed_folder
 
 
@@ -42,7 +43,8 @@ def run(args: argparse.Namespace) -> int:
             claimed(args.out / f"{name}.png", ".png", "a picture of sulcus", args.force)
     theatre = open_theatre(args.anatomy, device=args.device)
     lines = sys.stderr if args.json else sys.stdout
-    rows, pictures = [], []
+    drawn = [] if args.out is None else [scene.name for scene in playable(args, theatre, list(scenes.values()))]
+    rows, pictures = [], {}
     drawing = tqdm(total=len(scenes), unit="scene", leave=False, disable=args.out is None, file=sys.stderr)
     with drawing as bar:
         for name, scene in scenes.items():
@@ -52,10 +54,10 @@ def run(args: argparse.Namespace) -> int:
             known["solver"] = solver = theatre.described("fem", scene)
             bar.write(f"{name}: {scene.title}\n  acting: {', '.join(names)}", file=lines)
             bar.write(f"  can be played by: {players}\n  fem: {solver}", file=lines)
-            if args.out is not None:
+            if name in drawn:
                 best = theatre.best(scene)
                 found = thumbnail(theatre.player(best, scene), best)
-                pictures.append(found.colour)
+                pictures[name] = found.colour
                 known |= {"milliseconds": found.milliseconds, "moved_mm": found.moved_mm, "played_by": best}
                 cost = f"{found.total:.0f} ms a frame by {best}"
                 bar.write(f"  {cost}; the tumour moves by up to {found.moved_mm:.2f} mm", file=lines)
@@ -64,9 +66,9 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         try:
             args.out.mkdir(parents=True, exist_ok=True)
-            for name, picture in zip(scenes, pictures, strict=True):
+            for name, picture in pictures.items():
                 write_png(args.out / f"{name}.png", picture)
-            write_png(args.out / "sheet.png", sheet(pictures))
+            write_png(args.out / "sheet.png", sheet(list(pictures.values())))
         except OSError as error:
             raise InputError(f"{args.out}: the pictures cannot be written ({why(error)}). {REMEDY}") from error
     if args.json:

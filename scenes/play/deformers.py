@@ -33,6 +33,8 @@ from .observer import Observer
 from .player import Player
 from .stage import Stage
 
+TRUTH = "what an estimate is held against is the truth, as finite elements have it"
+
 
 @dataclass(frozen=True, eq=False)
 class Theatre:
@@ -70,6 +72,10 @@ class Theatre:
             )
         return load_locator(path, self.anatomy)
 
+    def lacks_locator(self, scene: Scene) -> bool:
+        """Whether a scene has a sight, and no locator lies beside this anatomy."""
+        return scene.sight is not None and (self.locator_file is None or not self.locator_file.is_file())
+
     def stage(self, scene: Scene) -> Stage:
         """A scene's stage on this anatomy, drawn on this theatre's device.
 
@@ -85,8 +91,11 @@ class Theatre:
     def refusals(self, scene: Scene) -> dict[str, str | None]:
         """Why each learnt model may not answer a scene, by name; None if it may.
 
-        A model answers the effects, the tissue and the element that it learned from, and no others.
+        A model answers the effects, the tissue and the element that it learned from, and no others. None is the truth
+        that an estimate is held against.
         """
+        if scene.sight is not None:
+            return dict.fromkeys(self.models, TRUTH)
         effects, element = scene.effects_on(self.anatomy), self.element_of(scene)
         return {name: refusal(model, effects, element) for name, model in self.models.items()}
 

@@ -98,7 +98,8 @@ class Estimate:
         if self.location is None:
             return ""
         still = "" if self.noticed else "no motion beyond its error; "
-        return f"{still}estimate {1e3 * self.off:.1f} mm off"
+        guess = "" if self.location.calibrated else "a guess; "
+        return f"{still}{guess}estimate {1e3 * self.off:.1f} mm off"
 
     @property
     def source(self) -> str:

@@ -1,0 +1,39 @@
+"""Locators by formula, of any small body: they take seconds."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.bodies.open_cortex import open_cortex
+from sim.runtime.threads import one_thread
+from surrogate.locating.calibration import trials
+from surrogate.locating.ensemble import Ensemble
+from surrogate.locating.locator import Locator
+from surrogate.locating.presses import Presses, pressed
+from surrogate.locating.prior import prior_of
+
+
+def dent(body: Anatomy, random: np.random.Generator) -> np.ndarray:
+    """A motion (V, 3) [m] that fades away from some place of the open cortex, mostly along the axis."""
+    frame = open_cortex(body)
+    at = (body.mesh.nodes - frame.origin) @ np.column_stack([frame.right, frame.up, frame.axis])
+    middle = np.append(random.uniform(-0.02, 0.02, 2), 0.0)
+    fall = np.exp(-0.5 * (((at - middle) / [0.025, 0.025, 0.03]) ** 2).sum(axis=1))
+    way = random.normal(size=3) * [0.3, 0.3, 1.0]
+    return 3e-3 * fall[:, None] * (way @ np.stack([frame.right, frame.up, frame.axis]))
+
+
+def locator_of(body: Anatomy, solved: bool = False) -> Locator:
+    """Of dents: each cause in each skull, and tools on every place. What tools do may be solved."""
+    random = np.random.default_rng(0)
+    members, count = np.array([dent(body, random) for _ in range(48)], np.float32), np.arange(48)
+    ensemble = Ensemble(body, members, count % 4, count // 4 % 3, count // 12)
+    points = body.mesh.nodes[np.unique(body.open_surface)]
+    dents = np.array([[dent(body, random) for _ in range(3)] for _ in points], np.float32)[None]
+    presses = Presses(points, {"bonded": dents, "slide": dents})
+    if solved:
+        found = pressed(body, ("bonded",), "cpu")
+        presses = replace(found, motion=dict.fromkeys(presses.motion, found.motion["bonded"]))
+    with one_thread():
+        return Locator(prior_of(ensemble, presses), trials(ensemble, presses))

@@ -1,0 +1,240 @@
+"""Scenes in which the tumour is located: what is seen, what is drawn of an estimate, and what the checks hold it to."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from locators import locator_of
+from theatres import SIGHTED, short, small
+
+from ar.overlay import ink_of
+from ar.refind import of_ink
+from scenes.cli import main
+from scenes.play.checks import measure, within
+from scenes.play.deformers import Theatre, open_theatre
+from scenes.play.observer import ELLIPSOID_COLOUR, Observer
+from scenes.play.page_text import estimated, legend, report
+from scenes.play.player import REFUSED, labelled
+from scenes.play.reference import truth_of
+from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
+from scenes.script.scene import Bounds, find_scene
+from scenes.script.shipped_files import template_path
+from scenes.script.sight import Sight
+from scenes.script.tool_paths import press
+from sim.bodies.meshfile import write_anatomy
+from sim.errors import InputError
+from surrogate.locating.locator_files import locator_path, save_locator
+from surrogate.locating.prior import middle_of
+
+# Small errors, as a tumour in a box moves little.
+SIGHT = Sight(points=80, white=1e-4, smooth=1e-4, shift=1e-4, turn=0.0)
+
+
+@pytest.fixture(scope="module")
+def theatre(box, tmp_path_factory):
+    path = tmp_path_factory.mktemp("sight") / "box.locator.npz"
+    save_locator(path, locator_of(box, solved=True).small())
+    return Theatre(box, None, {}, "cpu", path)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    near = replace(find_scene("press").viewpoint, width=480, height=360)
+    return replace(small(path=press(0.3, rise=1.0, hold=0.5)), viewpoint=near, sight=SIGHT)
+
+
+@pytest.fixture(scope="module")
+def play(theatre, scene):
+    return theatre.player("fem", scene)
+
+
+@pytest.fixture(scope="module")
+def frames(play):
+    return list(play.frames(every=40))
+
+
+@pytest.fixture(scope="module")
+def truth(theatre, scene, frames):
+    return truth_of(theatre, scene, [frame.loads for frame in frames])
+
+
+@pytest.fixture(scope="module")
+def still(box):
+    """An observer and the body at rest, with errors as they are by default, and many points."""
+    return Observer(Theatre(box, None, {}, "cpu").site, None, Sight(points=400)), box.mesh.nodes
+
+
+def test_what_is_seen_has_the_errors_that_are_stated(still):
+    observer, rest = still
+    seen = np.array([observer.seen(number, rest).now - observer.seen(number, rest).rest for number in range(40)])
+    steady = seen.mean(axis=0)
+    assert (seen - steady).std() == pytest.approx(0.3e-3, rel=0.05)
+    assert np.linalg.norm(steady.mean(axis=0)) == pytest.approx(0.7e-3, abs=0.5e-3)  # the smooth one is in it
+    bare = replace(observer, sight=replace(observer.sight, white=0.0, smooth=0.0))
+    rigid = bare.seen(0, rest).now - bare.seen(0, rest).rest
+    assert np.linalg.norm(rigid.mean(axis=0)) == pytest.approx(0.7e-3, rel=1e-6)
+    turned = rigid - rigid.mean(axis=0)
+    assert 0.0 < np.abs(turned).max() < 1.01 * np.radians(0.3) * np.ptp(bare.seen(0, rest).rest, axis=0).max()
+    smooth = replace(observer, sight=replace(observer.sight, white=0.0, shift=0.0, turn=0.0)).seen(3, rest)
+    off = smooth.now - smooth.rest
+    assert np.sqrt((off**2).mean()) == pytest.approx(0.5e-3, rel=0.5)
+    apart = np.linalg.norm(smooth.rest[:, None] - smooth.rest, axis=2)
+    near = (apart > 0.0) & (apart < 2e-3)
+    assert np.linalg.norm(off[:, None] - off, axis=2)[near].mean() < 0.3e-3
+    assert smooth.sigmas == pytest.approx(0.5e-3)
+
+
+def test_the_same_seed_sees_the_same_and_another_does_not(still):
+    observer, rest = still
+    again = replace(observer)
+    other = replace(observer, sight=replace(observer.sight, seed=1))
+    assert np.array_equal(observer.seen(7, rest).now, again.seen(7, rest).now)
+    assert not np.array_equal(observer.seen(7, rest).now, observer.seen(8, rest).now)
+    assert not np.array_equal(observer.seen(7, rest).rest, other.seen(7, rest).rest)
+
+
+def test_what_the_tool_hides_is_not_seen_and_where_it_touches_is(still, play):
+    observer, rest = still
+    held = play.tool(play.scene.tool, play.touch(40), rest)
+    corners = np.asarray(play.scene.tool.mesh.vertices) @ held.pose[:3, :3].T + held.pose[:3, 3]
+    seen, all_seen = observer.seen(0, rest, corners), observer.seen(0, rest)
+    assert 0 < len(all_seen.now) - len(seen.now) < 300 and len(seen.rest) == len(seen.now) == len(seen.sigmas)
+    away = np.linalg.norm(seen.rest - held.tip, axis=1)
+    assert away.min() > 3e-3 and len(seen.tips) == 1
+    assert np.linalg.norm(seen.tips[0] - held.tip) < 3e-3
+    lifted = observer.seen(0, rest, corners - 4e-3 * play.site.axis)
+    assert not len(lifted.tips) and len(seen.now) < len(lifted.now)
+
+
+def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
+    frame = frames[1]
+    found = frame.estimate
+    assert found.location is not None and found.held and found.off < 0.7 * np.linalg.norm(found.true)
+    assert frame.moved == found.moved == pytest.approx(np.linalg.norm(found.location.centroid))
+    for ink, least in ((TUMOUR_COLOUR, 200), (ELLIPSOID_COLOUR, 10), (TRUTH_COLOUR, 10)):
+        assert np.count_nonzero(of_ink(frame.shown, ink_of(ink))) >= least
+    nodes = play.site.anatomy.tumour_nodes
+    believed, positions = play.believed(frame), play.positions(frame.deformation)
+    assert not np.allclose(believed[nodes], positions[nodes], atol=1e-5)
+    others = np.setdiff1d(np.arange(len(positions)), nodes)
+    assert np.array_equal(believed[others], positions[others])  # the camera sees the true cortex
+    moved = middle_of(play.site.anatomy, (believed - play.site.anatomy.mesh.nodes)[None])[0]
+    assert moved == pytest.approx(found.motion, abs=1e-6)
+    assert "locate" in frame.seconds and frame.remark.endswith(f"estimate {1e3 * found.off:.1f} mm off")
+
+
+def test_the_checks_pass_and_tell_what_an_estimate_is_worth(play, frames, truth):
+    figures = measure(play, play.camera, frames, truth)
+    assert figures.broken(Bounds(overlap=0.5, error=3e-3)) == []
+    assert figures.covered == 1.0 and 0.3 < figures.removed < 1.0 and figures.error_mm > 0.01
+
+
+def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
+    frame, others = frames[1], [frames[0], *frames[2:]]
+
+    def sentences(wrong):
+        figures = measure(play, play.camera, [others[0], wrong, *others[1:]], truth)
+        return " ".join(figures.broken(Bounds(overlap=0.0, error=1.0, covered=1.0)))
+
+    plain = replace(play, stage=replace(play.stage, observer=None))
+    undrawn = plain.drawn(frame.number, frame.touch, frame.loads, frame.deformation, 0.1)
+    assert "the drawn outline" in sentences(replace(undrawn, estimate=frame.estimate))
+    astray = replace(frame.estimate, middle=frame.estimate.middle + 0.01)
+    assert "ellipsoid holds the tumour's middle in" in sentences(replace(frame, estimate=astray))
+    silent = replace(frame, remark="estimate 9.9 mm off")
+    assert "does not say its frame's number or" in sentences(silent)
+    other = replace(frame, estimate=replace(frame.estimate, true=np.full(3, 1.0)))
+    assert sentences(other) == ""  # the truth is that of the finite elements
+    assert sentences(frame) == ""
+
+
+def test_an_ellipsoid_holds_what_its_covariance_says(frames):
+    found = frames[1].estimate
+    closed, root = found.ellipsoid(), np.linalg.cholesky(found.location.centroid_covariance)
+    at, way = found.middle + found.motion, np.array([0.6, 0.0, 0.8])
+    assert within(closed, at + 2.7 * root @ way) and not within(closed, at + 2.85 * root @ way)
+    assert replace(found, true=found.motion + 2.79 * root @ way).held  # chi-square of three, 95 %: 2.795
+    assert not replace(found, true=found.motion + 2.8 * root @ way).held
+
+
+def test_where_nothing_moves_that_is_said(play, frames):
+    found = frames[0].estimate
+    assert not found.noticed and frames[0].remark.startswith("no motion beyond its error; ")
+    assert "No motion is seen beyond its error." in " ".join(estimated(found))
+    tried, guess = (replace(found, location=replace(found.location, calibrated=known)) for known in (True, False))
+    assert "guess" not in tried.words + " ".join(estimated(tried))
+    assert "; a guess; " in guess.words and "It is a guess" in " ".join(estimated(guess))
+
+
+@pytest.fixture(scope="module")
+def refused(theatre, scene):
+    """A frame whose points are off by far more than they say."""
+    play = theatre.player("fem", scene)
+    stage = replace(play.stage, observer=Wild(play.stage.observer))
+    return replace(play, stage=stage), replace(play, stage=stage).draw(40, 4 / 3, play.touch(40))
+
+
+class Wild:
+    """An observer whose points are scattered."""
+
+    def __init__(self, observer):
+        self.observer = observer
+
+    def estimate(self, number, positions, tool=None):
+        wild = replace(self.observer, sight=replace(self.observer.sight, white=8e-3, smooth=1e-4))
+        sigma = replace(wild.seen(number, positions, tool), sigma=None)
+        return _estimated(replace(wild), sigma, positions)
+
+
+def _estimated(observer, seen, positions):
+    with pytest.raises(InputError) as refusal:
+        observer.locator.locate(seen)
+    return replace(observer.estimate(0, positions), observation=seen, location=None, refusal=str(refusal.value))
+
+
+def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
+    play, frame = refused
+    found, said = frame.estimate, []
+    assert frame.doubt == REFUSED and found.ellipsoid() is None and not found.held and frame.remark == ""
+    nodes = play.site.anatomy.tumour_nodes
+    assert np.array_equal(play.believed(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
+    assert not of_ink(frame.shown, ink_of(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
+    assert np.count_nonzero(of_ink(frame.shown, ink_of(TRUTH_COLOUR))) > 10
+    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines: said.extend(lines) or colour)
+    labelled(frame, "fem")
+    assert any(line == f"estimate: refused, {found.refusal}" for line in said)
+    assert "What is seen was refused" in report(frame, play.stage, "fem", "", (), 100)
+
+
+def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
+    said = legend(play.scene)
+    assert all(words in said for words in ("estimate", "truth", "95 %", "scan", "tip to tumour"))
+    assert "estimate" not in legend(replace(play.scene, sight=None))
+    found = frames[1].estimate
+    words = " ".join(estimated(found))
+    assert f"{1e3 * found.off:.1f} mm off the truth, which is inside the ellipsoid" in words
+    assert f"{len(found.observation.now)} points of the cortex, and where the tool touches; no force" in words
+    assert "outside of" in " ".join(estimated(replace(found, true=np.ones(3))))
+
+
+def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
+    with pytest.raises(InputError, match="sulcus locator"):
+        Theatre(box, None, {}, "cpu").stage(replace(short(), sight=SIGHT))
+    write_anatomy(tmp_path / "box.vtu", box)
+    words = ["--anatomy", str(tmp_path / "box.vtu"), "--device", "cpu", "--out", str(tmp_path / "out")]
+    assert main(["render", "sag", *words]) == 2
+    assert "has no locator at" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_no_trained_model_is_the_truth(scene):
+    theatre = open_theatre(device="cpu")
+    assert theatre.names(scene) == ("fem",) and theatre.names(replace(scene, sight=None)) != ("fem",)
+
+
+@pytest.mark.parametrize("name", SIGHTED)
+def test_what_ships_locates_its_tumour(name, capsys):
+    assert locator_path(template_path()).stat().st_size < 8_000_000
+    assert main(["check", name, "--every", "40", "--device", "cpu", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["scenes"]
+    assert row["covered"] >= 0.9 and row["removed"] > 0.4 and row["motion_mm"] > 1.5 and row["deformer"] == "fem"
