@@ -119,8 +119,12 @@ def rounded_up(value: float, digits: int) -> float:
     return math.ceil(round(value * 10**digits, 6)) / 10**digits
 
 
-def panel(colour: np.ndarray, lines: Sequence[str], corner: Corner = "top left", scale: float = 0.45) -> np.ndarray:
+def panel(
+    colour: np.ndarray, lines: Sequence[str], corner: Corner = "top left", scale: float = 0.45, below: int = 0
+) -> np.ndarray:
     """The picture (H, W, 3) uint8 with lines of ASCII text on a dark translucent ground in one corner; a copy.
+
+    One at the top begins `below` so many rows.
 
     Raises ValueError for an unknown corner.
     """
@@ -133,7 +137,7 @@ def panel(colour: np.ndarray, lines: Sequence[str], corner: Corner = "top left",
     sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in lines]
     step = max(height for _, height in sizes) + PAD
     height, width = step * len(lines) + PAD, max(width for width, _ in sizes) + 2 * PAD
-    top = PAD if "top" in corner else max(out.shape[0] - height - PAD, 0)
+    top = PAD + below if "top" in corner else max(out.shape[0] - height - PAD, 0)
     left = PAD if "left" in corner else max(out.shape[1] - width - PAD, 0)
     ground = out[top : top + height, left : left + width]
     ground[:] = ground * 0.35 + np.array([6.0, 9.0, 11.0])

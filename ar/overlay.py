@@ -127,7 +127,7 @@ def composite(
         Draws the line from the tip to the hidden surface, and its length in millimetres.
     before
         Where the hidden surface was before, as in the scan: a dotted grey outline, with an arrow from there to here and
-        the mean motion in millimetres. The error of that motion is the largest margin.
+        the mean motion in millimetres.
     doubt
         Why the surface's place may not be relied on. It is written at the picture's foot, see `doubt_lines`, whatever
         the style. The outline is amber and broken. Nothing is promised: no margin is drawn, and the number beside the
@@ -188,8 +188,8 @@ def composite(
     # The corner first, so that its words never move; then by importance, for where there is no room some are left out.
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
-        length, error = moved or (motion, float(np.max(margin)))
-        lay(out, taken, [f"moved {millimetres(length, error or None)}"], (0, camera.height))
+        said = millimetres(motion) if moved is None else millimetres(*moved)
+        lay(out, taken, [f"moved {said}"], (0, camera.height))
     write_doubt(drawn, doubt)
     if gauge is not None:
         write_gauge(drawn, camera, gauge, cv2.LUT(picture.segmentation, covering(tuple(occluders))))

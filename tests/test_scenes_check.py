@@ -105,7 +105,7 @@ def drawn(play, frame, positions, camera=None, tip=None):
     tumour, rest = (stage.tumour(each) for each in (positions, play.site.anatomy.mesh.nodes))
     gauge = gauged(at, tumour)
     if tip is None:
-        gauge = replace(gauge, read=frame.distance, error=frame.distance_error)
+        gauge = replace(gauge, read=frame.distance)
     shown = composite(frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauge, before=rest)
     annotate(shown, frame.number, frame.remark)
     return replace(frame, shown=shown.colour)

@@ -19,6 +19,7 @@ from scenes.play.stage import Stage
 from scenes.play.waiting_notice import NOTICED, Busy
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
+from scenes.script.uncertainty import TumourError
 from sim.accuracy import LIVE
 from sim.deformation import Outcome, guess
 from sim.effects import Elasticity, Held, Slide, ToolForce
@@ -38,7 +39,9 @@ def answer(outcome: Outcome, bound: float = 1e-3):
 class TestTrust:
     def test_a_bound_is_reported_of_a_load_inside_the_range(self):
         said = trust(answer(Outcome.PREDICTED), "svr")
-        assert "In 95 of 100 loads" in said and "1.00 mm" in said and "warn" not in said
+        assert (
+            "in 95 of 100 loads" in said and "Error of the model" in said and "1.00 mm" in said and "warn" not in said
+        )
 
     @pytest.mark.parametrize(
         "outcome", [Outcome.EXTRAPOLATED, Outcome.BUDGET, Outcome.STALLED, Outcome.NOT_FINITE, Outcome.PIERCED]
@@ -56,7 +59,7 @@ class TestTrust:
     @pytest.mark.parametrize(("bound", "words"), [(1e-7, "0.01 mm"), (6e-6, "0.01 mm"), (1.231e-3, "1.24 mm")])
     def test_a_bound_is_not_reported_too_small(self, bound, words):
         bounded = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
-        assert f"is off by more than {words}." in trust(bounded, "svr")
+        assert f"is more than {words} from where its finite elements have it" in trust(bounded, "svr")
 
     def test_where_nothing_moves_nothing_is_promised(self):
         still = answer(Outcome.PREDICTED)
@@ -220,17 +223,24 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
 
 
 def test_the_page_reads_what_the_frame_holds(theatre):
-    """Distance with its bound, motion, force and milliseconds, each as a person reads it."""
+    """Distance, motion, force and milliseconds, and whose error is how large, each as a person reads it."""
     player = theatre.player("linear", short())
     seconds = {"deform": 12.3e-3, "render": 4.5e-3, "overlay": 0.7e-3}
     known = {"distance": 12.34e-3, "distance_error": 2.46e-3, "moved": 1.234e-3, "seconds": seconds}
     frame = replace(player.draw(3, 0.1, Touch(force=0.25)), **known)
     said = report(frame, player.stage, "linear", "", (), 7)
     for line in (
-        "tip to tumour 12.3 \N{PLUS-MINUS SIGN} 2.5 mm<",
-        "<p>frame 3 of 6; 0.10 s; force 0.25 N; tumour moved 1.23 mm</p>",
+        ">tip to tumour 12.3 mm<",
+        "<p>frame 3 of 6; 0.10 s; force 0.25 N; tumour moved 1.23 mm; ",
+        "; tip to tumour within 2.5 mm of the model&#x27;s finite elements (95 %)</p>",
+        "<p>Error of the tumour: not known.",
         "milliseconds: answer 12.3, camera picture 4.5, overlay 0.7<",
     ):
         assert line in said
     plain = report(replace(frame, distance_error=None), player.stage, "linear", "", (), 7)
-    assert "tip to tumour 12.3 mm<" in plain
+    assert "tip to tumour 12.3 mm<" in plain and "tip to tumour within" not in plain
+    known = TumourError(4.61e-3, "E"), TumourError(4.61e-3, "E", 1.11e-3)
+    prior, seen = (report(replace(frame, tumour_error=one), player.stage, "linear", "", (), 7) for one in known)
+    where = "95 of 100 times no point of it is more than"
+    assert f"<p>Error of the tumour: {where} 4.7 mm from where it is; most of that is E.</p>" in prior
+    assert f"<p>Error of the tumour: {where} 1.2 mm from where it is; without observation 4.7 mm.</p>" in seen

@@ -151,6 +151,7 @@ class TestEpisode:
             "tumour_predicted": "m", "tumour_fem": "m", "seconds": "s", "tumour_rest": "m", "bound": "m",
             "reaction_fem": "N, N m", "K": "pixel", "tumour_nodes": "1", "tumour_left": "1",
             "outcome_predicted": "text", "outcome_fem": "text", "distance": "m", "distance_error": "m",
+            "model_error": "m", "tumour_error": "m", "tumour_error_unobserved": "m",
         }  # fmt: skip
         assert "1e-05 m" in file["pictures/depth"].attrs["unit"]
         assert file.attrs["anatomy"] == theatre.anatomy.digest and file.attrs["deformer"] == "linear"

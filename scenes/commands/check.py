@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ..play.deformers import Theatre
     from ..play.player import Frame
     from ..script.scene import Scene
+    from ..script.uncertainty import TumourError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,6 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..play.checks import measure
     from ..play.deformers import open_theatre
+    from ..play.error_text import error_lines
     from ..play.reference import truth_of
     from ..script.scene import SCENES
 
@@ -64,7 +66,10 @@ def run(args: argparse.Namespace) -> int:
         figures = measure(player, player.camera, frames, truth)
         broken = figures.broken(scene.bounds)
         played = {"scene": scene.name, "deformer": name, "solver": theatre.described(name, scene)}
+        promised, error = _errors(frames)
         rows.append({**played, "frames": len(frames), **figures.row(), "broken": broken})
+        rows[-1] |= {"model_error_mm": _mm(promised), "tumour_error_mm": _mm(error.bound), "mostly": error.largest}
+        rows[-1] |= {"tumour_error_unobserved_mm": _mm(error.prior)}
         print(
             f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}: the tumour is off by {figures.error_mm:.3f} "
             f"mm of the {figures.motion_mm:.2f} mm that it moves. Its outline is off by {figures.drawn:.1f} px, "
@@ -72,6 +77,8 @@ def run(args: argparse.Namespace) -> int:
             f"skull{_bond(figures.bond)}{_estimates(figures)}",
             file=table,
         )
+        for sentence in error_lines(name != "fem", promised, error):
+            print(f"{'':11s} {sentence}", file=table)
         if args.certify:
             rows[-1]["certificates"] = _certificates(theatre, scene, frames, truth, table)
         for sentence in broken:
@@ -80,6 +87,18 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"passed": passed, "scenes": rows}))
     return 0 if passed else 1
+
+
+def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
+    """The largest of a scene's frames: what the model promises [m], and how far the tumour may be off."""
+    from ..play.error_text import worst
+
+    promised = [frame.model_error for frame in frames if frame.model_error is not None]
+    return max(promised, default=None), worst([frame.tumour_error for frame in frames])
+
+
+def _mm(metres: float | None) -> float | None:
+    return None if metres is None else 1e3 * metres
 
 
 def _bond(share: float) -> str:

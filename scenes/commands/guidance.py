@@ -60,6 +60,10 @@ next: read it by h5py; its attributes give units and frames""",
     "sensitivity": """example:
   sulcus sensitivity --count 8 --out sensitivity.csv
 next: open the table in a spreadsheet""",
+    "uncertainty": """examples:
+  sulcus uncertainty press --anatomy patient.vtu
+  sulcus uncertainty press palpate --draws 40 --twins 20 --out tried.json
+next: sulcus demo press --anatomy patient.vtu, whose picture and words have it""",
     "bench": """examples:
   sulcus bench
   sulcus bench throughput

@@ -218,9 +218,8 @@ def _printed(player: Player, frame: Frame) -> bool:
     if frame.tip is None:
         return True
     distance = _distance(player, frame, frame.tip)
-    error = None if frame.doubt else frame.distance_error
     # Samples are never nearer than the surface: by less than what is printed.
-    near = {millimetres(distance - off, error) for off in (0.0, 0.5e-4, 1e-4)}
+    near = {millimetres(distance - off) for off in (0.0, 0.5e-4, 1e-4)}
     return any(stands(frame.shown, text, GAUGE) for text in near)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -29,6 +29,7 @@ from surrogate.model.store import load
 from ..script.scene import Scene
 from ..script.shipped_files import template_path
 from ..script.site import Site, site_of
+from ..script.uncertainty import Uncertainty, mark_of, read_uncertainties, uncertainty_path
 from .observer import Observer
 from .player import Player
 from .stage import Stage
@@ -38,7 +39,7 @@ TRUTH = "what an estimate is held against is the truth, as finite elements have 
 
 @dataclass(frozen=True, eq=False)
 class Theatre:
-    """An anatomy, its T1 scan if there is one, and models by name, learnt from one data set.
+    """An anatomy, its T1 scan if there is one, models by name, learnt from one data set, and uncertainties by scene.
 
     `locator_file` is where the locator of its tumour is, for scenes with a sight.
     """
@@ -48,6 +49,7 @@ class Theatre:
     models: Mapping[str, Learned]
     device: str = "auto"
     locator_file: Path | None = None
+    uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict)
 
     @cached_property
     def site(self) -> Site:
@@ -155,7 +157,12 @@ class Theatre:
         InputError
             As `deformer`; an anatomy without open cortex.
         """
-        return Player(self.stage(scene), self.deformer(name, scene))
+        return Player(self.stage(scene), self.deformer(name, scene), uncertainty=self.uncertainty(scene))
+
+    def uncertainty(self, scene: Scene) -> Uncertainty | None:
+        """How far the tumour may be off in a scene; None where no ensemble was solved of just this one."""
+        found = self.uncertainties.get(scene.name)
+        return found if found and found.mark == mark_of(scene, self.site, self.element_of(scene)) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +188,7 @@ def model_path(anatomy: Path) -> Path:
 
 
 def open_theatre(anatomy: Path | None = None, model: Path | None = None, device: str = "auto") -> Theatre:
-    """Read an anatomy (default: the template that ships) with the scan and the models that lie beside it.
+    """Read an anatomy (default: the template that ships) with what lies beside it: scan, models, uncertainties.
 
     Raises
     ------
@@ -195,4 +202,6 @@ def open_theatre(anatomy: Path | None = None, model: Path | None = None, device:
     scan = sidecar(path)
     learnt = model_path(path) if model is None else Path(model)
     models = load(learnt, body) if model is not None or learnt.is_file() else {}
-    return Theatre(body, read_intensity(scan) if scan.is_file() else None, models, device, locator_path(path))
+    intensity = read_intensity(scan) if scan.is_file() else None
+    uncertainties = read_uncertainties(uncertainty_path(path))
+    return Theatre(body, intensity, models, device, locator_path(path), uncertainties)

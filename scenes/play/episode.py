@@ -43,7 +43,8 @@ MEANINGS = {
     "pictures/segmentation": "PNG bytes, 8 bit: the id of what is seen, see the root's `segmentation`",
     "pictures/tumour_mask": "PNG bytes, 8 bit: 1 where the predicted tumour would be seen were nothing in front of it",
     "K": "pinhole camera matrix (3, 3) [pixel]",
-    "bound": "(frames, 2): the largest error of a tumour vertex, in 95 and in 99 of 100 loads; NaN: none is stated",
+    "bound": "(frames, 2): the model's largest error of a tumour vertex against its finite elements, in 95 and "
+    "in 99 of 100 loads; NaN: none is stated",
     "tumour_nodes": "mesh vertices of the rows of tumour_*", "tumour_left": "which of them are not cut out",
     "outcome_predicted": "how the deformer's answer came about", "outcome_fem": "the same of the finite elements",
     "tumour_predicted": "positions, by the deformer, or by what is seen where the scene has a sight",
@@ -58,11 +59,17 @@ MEANINGS = {
     "contact": "where the tool pushes, on the cortex of the scan",
     "tip": "the tool's lowest point, against the open cortex's mean outward normal",
     "distance": "from the tool's tip to the predicted tumour, as the picture says it (a model may correct it)",
-    "distance_error": "what `distance` may be off by, exceeded in 5 of 100 loads; NaN where it is not known",
+    "distance_error": "what the model's `distance` is off by against its finite elements, exceeded in 5 of 100 loads; "
+    "NaN where it is not known",
+    "model_error": "no tumour vertex is farther from where the model's finite elements have it, in 95 of 100 loads; "
+    "NaN of finite elements themselves, and where it is not known",
+    "tumour_error": "95 of 100 times no point of the tumour's surface is farther from where it is in the patient. NaN "
+    "where it is not known",
+    "tumour_error_unobserved": "the same had nothing been observed",
 }  # fmt: skip
 UNITS = {
     "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
-    "distance": "m", "distance_error": "m",
+    "distance": "m", "distance_error": "m", "model_error": "m", "tumour_error": "m", "tumour_error_unobserved": "m",
     "direction": "1", "csf_level": "m", "share": "1", "done": "1",
     "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "bound": "m", "seconds": "s",
     "reaction_fem": "N, N m", "K": "pixel", "pose": "m", "displacement": "m", "tumour_nodes": "1", "tumour_left": "1",
@@ -138,6 +145,9 @@ def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
         "tumour_left": ~player.stage.at(frame.loads).anatomy.orphaned[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],
+        "model_error": number(frame.model_error),
+        "tumour_error": number(frame.tumour_error.bound),
+        "tumour_error_unobserved": number(frame.tumour_error.prior),
         "seconds": np.array([frame.seconds[stage] for stage in STAGES]),
     }
 
@@ -147,9 +157,14 @@ def held(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, np.ndarra
     return {
         "T_world_tool": pose,
         "tip": tip,
-        "distance": np.nan if frame.distance is None else frame.distance,
-        "distance_error": np.nan if frame.distance_error is None else frame.distance_error,
+        "distance": number(frame.distance),
+        "distance_error": number(frame.distance_error),
     }
+
+
+def number(value: float | None) -> float:
+    """NaN in place of None."""
+    return np.nan if value is None else value
 
 
 def caused(loads: Loads) -> dict[str, np.ndarray]:

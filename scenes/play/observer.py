@@ -75,6 +75,14 @@ class Estimate:
         return float(np.linalg.norm(self.motion))
 
     @property
+    def worst(self) -> float | None:
+        """With a probability of 95 % its least known vertex is no farther off [m]; None where all is refused."""
+        if self.location is None:
+            return None
+        largest = np.linalg.eigvalsh(self.location.covariance(self.anatomy.tumour_nodes))[:, -1].max()
+        return float(np.sqrt(chi2.ppf(LEVEL, 3) * largest))
+
+    @property
     def off(self) -> float:
         """How far the tumour's middle is from where it is believed to be [m]."""
         return float(np.linalg.norm(self.motion - self.true))

@@ -67,7 +67,8 @@ class Cast:
                 deformer = solved.deformer
             else:
                 deformer = self.theatre.deformer(name, stage.scene)
-            self.players[name, off] = Player(stage, deformer)
+            uncertainty = self.theatre.uncertainty(stage.scene)
+            self.players[name, off] = Player(stage, deformer, uncertainty=uncertainty)
         return self.players[name, off]
 
     def predicted(self, name: str, question: Question) -> Truth:

@@ -15,7 +15,9 @@ from sim.material import Material, Tissue
 from ..script.scene import Scene
 from ..script.site import Site
 from ..script.tool_paths import Touch
+from ..script.uncertainty import TumourError
 from .deformers import Theatre
+from .error_text import length
 from .load_text import acting
 from .observer import Estimate
 from .page_tally import Row
@@ -68,7 +70,7 @@ def legend(scene: Scene) -> str:
     scan = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
     keys = [
         ('stroke="#4cf28c" stroke-width="3"', "tumour now (predicted)"),
-        ('stroke="#4cf28c" stroke-width="1.5" stroke-dasharray="4 3"', "bound of its error"),
+        ('stroke="#4cf28c" stroke-width="1.5" stroke-dasharray="4 3"', "where it is, 95 of 100 times"),
         scan,
         ('stroke="#f259bf" stroke-width="1.5"', "finite elements (3-D view)"),
     ]
@@ -164,8 +166,23 @@ def trust(answer: Deformation, name: str) -> str:
     bound = float(answer.bound[0, 0])
     if not np.isfinite(bound):
         return f"<p>{who}: {how}.</p>"
-    most = f"{hud.rounded_up(1e3 * bound, 2):.2f} mm"
-    return f"<p>{who}: {how}. In 95 of 100 loads no point of the tumour is off by more than {most}.</p>"
+    return (
+        f"<p>{who}: {how}. Error of the model: in 95 of 100 loads no point of the tumour is more than "
+        f"{length(bound, 2)} from where its finite elements have it.</p>"
+    )
+
+
+def tumour_trust(error: TumourError) -> str:
+    """How far the tumour may be from where it is in the patient: no matter of the model alone."""
+    if error.bound is None:
+        return (
+            "<p>Error of the tumour: not known. It is known of scripted scenes alone, after "
+            "<code>sulcus uncertainty SCENE</code>.</p>"
+        )
+    said = f"Error of the tumour: 95 of 100 times no point of it is more than {length(error.bound, 1)} from where it is"
+    if error.observed is None:
+        return f"<p>{said}; most of that is {escape(error.largest)}.</p>"
+    return f"<p>{said}{'' if error.prior is None else f'; without observation {length(error.prior, 1)}'}.</p>"
 
 
 def report(
@@ -176,9 +193,11 @@ def report(
     acts = acting(frame.loads, frame.deformation, nodes) if frame.loads.causes else ""
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([acts] if acts else [])]
     facts += [f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"]
-    parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {read(frame)}</p>']
+    if frame.distance_error is not None and frame.distance_error < np.inf:
+        facts += [f"tip to tumour within {length(frame.distance_error, 1)} of the model's finite elements (95 %)"]
+    parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {hud.millimetres(frame.distance)}</p>']
     parts += [] if frame.estimate is None else estimated(frame.estimate)
-    parts += [trust(frame.deformation, name), f"<p>{escape('; '.join(facts))}</p>"]
+    parts += [trust(frame.deformation, name), tumour_trust(frame.tumour_error), f"<p>{escape('; '.join(facts))}</p>"]
     if without:
         parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
     if left is not None and len(left.loose):
@@ -206,12 +225,6 @@ def estimated(found: Estimate) -> list[str]:
         f"<p><b>estimate</b> from {escape(found.source)}: {1e3 * found.off:.1f} mm off the truth, which is {held} the "
         f"ellipsoid. Causes: {causes or 'none'}.{still}{guess}</p>",
     ]
-
-
-def read(frame: Frame) -> str:
-    """The distance from tip to tumour, with what it may be off by in 5 of 100 loads where that is known."""
-    assert frame.distance is not None
-    return hud.millimetres(frame.distance, frame.distance_error).replace("+-", "\N{PLUS-MINUS SIGN}")
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,6 +25,8 @@ from ..script.scene import Scene
 from ..script.site import Site
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, lifted
+from ..script.uncertainty import NOT_KNOWN, Observing, TumourError, Uncertainty
+from .error_text import error_lines, tumour_words
 from .load_text import acting, doubt_of
 from .observer import Estimate, Observer
 from .stage import CORTEX, TOOL, Stage
@@ -39,6 +41,10 @@ IN_BONE = "the bone is where this push needs the tool: do not rely on it"
 # Tissue may carry a tool into the bone's edge by so much before it is drawn elsewhere, and before its load counts as
 # none that a tool can make [m].
 CARRIED, BLOCKED = 0.5e-3, 2e-3
+# Of the picture's width, that the lines of errors may have; in one of fewer pixels a tool is beside them.
+WIDE, SLIM, FEW = 0.62, 0.36, 480
+# They begin so far down, under the letter of a side; a panel of figures begins so far down, under them [pixel].
+HEAD, UNDER_ERRORS = 34, 74
 STAGES = ("deform", "render", "overlay")
 """What the time of a frame is spent on."""
 
@@ -68,9 +74,14 @@ class Frame:
     distance
         From the tool's tip to the tumour's predicted surface [m]; None without a tool.
     distance_error
-        How far off that may be [m], as printed; None where nobody knows.
+        How far that may be from what the finite elements say [m]; None where nobody knows.
     moved
         Mean distance of the tumour's predicted surface from where the scan has it [m]; by an estimate, its middle's.
+    model_error
+        In 95 of 100 loads no point of the tumour is farther [m] from where the model's finite elements have it. None of
+        these themselves, and where nobody knows.
+    tumour_error
+        How far the tumour may be from where it is drawn, whatever answers.
     doubt
         Why the answer may not be relied on, in the words that are in the picture; empty where it may.
     remark
@@ -95,6 +106,8 @@ class Frame:
     distance: float | None
     distance_error: float | None
     moved: float
+    model_error: float | None
+    tumour_error: TumourError
     doubt: str
     remark: str
     seconds: Mapping[str, float]
@@ -120,6 +133,7 @@ class Player:
     stage: Stage
     deformer: Deformer
     style: Style = "window"
+    uncertainty: Uncertainty | None = None
 
     @property
     def scene(self) -> Scene:
@@ -165,7 +179,6 @@ class Player:
     def drawn(self, number: int, touch: Touch, loads: Loads, deformation: Deformation, seconds: float) -> Frame:
         """The frame of an answer to loads, which took so many seconds."""
         begun = clock.perf_counter()
-        margin = self._margin(self.deformer, deformation) if isinstance(self.deformer, Learned) else 0.0
         positions = self.positions(deformation)
         held = None if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
         stage = self.stage.at(loads)
@@ -177,14 +190,21 @@ class Player:
         doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
         doubt = doubt or (REFUSED if estimate is not None and estimate.location is None else "")
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
+        promised = None if doubt else self._promised(deformation)
+        error = NOT_KNOWN if doubt else self._tumour_error(touch, loads, deformation, promised or 0.0)
+        error = replace(error, observed=estimate.worst) if estimate is not None else error
+        plain = None if gauge is None else replace(gauge, error=None)
         traces = () if estimate is None else traces_of(estimate, stage.truth(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
-        over = composite(picture, self.camera, tumour, (TOOL,), self.style, margin, gauge, rest, doubt, traces, moved)
+        band = 0.0 if estimate is not None else error.bound or 0.0
+        over = composite(picture, self.camera, tumour, (TOOL,), self.style, band, plain, rest, doubt, traces, moved)
         if estimate is not None and self.style != "none":
             draw_points(over, self.camera, estimate.observation.now, picture.segmentation == CORTEX)
         remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
-        annotate(over, number, remark)
+        lines = error_lines(isinstance(self.deformer, Learned), promised, error, doubt)
+        lines = lines if estimate is None else [tumour_words(error)]
+        annotate(over, number, remark, lines, (picture.segmentation == TOOL).astype(np.uint8))
         spent = seconds, rendered - begun, clock.perf_counter() - rendered - located
         took = dict(zip(STAGES, spent, strict=True)) | ({} if estimate is None else {"locate": located})
         return Frame(
@@ -192,7 +212,7 @@ class Player:
             None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
             None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
             float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()) if moved is None else moved[0],
-            doubt, remark, took, estimate,
+            promised, error, doubt, remark, took, estimate,
         )  # fmt: skip
 
     def _estimate(self, observer: Observer, number: int, positions: np.ndarray, held: HeldTool | None) -> Estimate:
@@ -208,11 +228,22 @@ class Player:
         read = None if held.beyond > CARRIED else reading(self.deformer, loads, answer, self.scene.tool, gauge.distance)
         return gauge if read is None else replace(gauge, read=read.distance, error=read.bound)
 
-    def _margin(self, model: Learned, answer: Deformation) -> float | np.ndarray:
-        """How far each vertex of the drawn tumour may be off [m]: what the model promises of this load, if it does."""
-        if model.bounds is None:
-            return model.bound
-        return model.margin(answer)[0][np.searchsorted(model.anatomy.tumour_nodes, self.stage.tumour_vertices)]
+    def _promised(self, answer: Deformation) -> float | None:
+        """What a model promises of an answer against its finite elements [m], of this load if it can; else None."""
+        if not isinstance(self.deformer, Learned):
+            return None
+        of_load = float(answer.bound[0, 0])
+        bound = of_load if np.isfinite(of_load) else self.deformer.bound
+        return bound if np.isfinite(bound) else None
+
+    def _tumour_error(self, touch: Touch, loads: Loads, answer: Deformation, promised: float) -> TumourError:
+        """How far the tumour may be off: known where the script has the tool, and what sees the brain knows more."""
+        time = float(loads.times[0])
+        scripted = self.uncertainty is not None and touch == self.scene.path(time)
+        error = self.uncertainty.at(time, promised) if self.uncertainty is not None and scripted else NOT_KNOWN
+        if isinstance(self.deformer, Observing):
+            error = replace(error, observed=self.deformer.tumour_error(answer))
+        return error
 
     def frames(self, every: int = 1) -> Iterator[Frame]:
         """The frames of the scene, or every so many of them."""
@@ -269,9 +300,20 @@ def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
     return Gauge(tip, closest(tip[None], hidden.vertices[hidden.triangles]).point[0])
 
 
-def annotate(over: Overlaid, number: int, remark: str) -> None:
-    """Write a remark at the left of a composite picture's foot, and a frame's number at its right, in place."""
+def annotate(
+    over: Overlaid, number: int, remark: str, errors: Sequence[str] = (), sights: np.ndarray | None = None
+) -> None:
+    """Write into a composite picture, in place: errors at its head, a remark at its foot, and a frame's number.
+
+    sights (H, W) uint8: above 0 where tools are, which the errors leave in sight if they can.
+    """
     height, width = over.taken.shape
+    lines = [part for line in errors for part in folded(line, (WIDE if width >= FEW else SLIM) * width)]
+    free = over.taken.copy()
+    free[:HEAD] = free[height // 2 - HEAD // 2 : height // 2 + HEAD // 2] = 1  # letters of sides come there
+    before = free.copy()
+    lay(over.colour, free, lines, (0, HEAD), needed=True, sights=sights)
+    over.taken[free > before] = 1
     lay(over.colour, over.taken, folded(remark, NARROW * width), (0, height))
     lay(over.colour, over.taken, [f"frame {number}"], (width, height))
 
@@ -287,4 +329,4 @@ def labelled(frame: Frame, name: str) -> np.ndarray:
         lines += [f"estimate: {frame.estimate.source}", "lines: " + ", ".join(LINES.values())]
     if not frame.deformation.outcome[0].good:
         lines.append(frame.deformation.outcome[0].value)
-    return panel(frame.shown, lines)
+    return panel(frame.shown, lines, below=UNDER_ERRORS)

@@ -1,0 +1,259 @@
+"""The ensemble of a scene: bodies and tools drawn from priors, solved by finite elements, and how far they differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ar.layer import vertex_normals
+from sim.accuracy import Accuracy
+from sim.anatomy import TUMOUR_LABEL
+from sim.deformation import Deformation
+from sim.effects import SKULLS, Effect, Elasticity
+from sim.errors import InputError
+from sim.material import Material
+from sim.skulls import Bonded, SkullContact, Slide
+
+from ..play.deformers import Theatre
+from ..play.stage import Stage
+from ..script.priors import (
+    MESH,
+    OF_MESH,
+    OF_REGISTRATION,
+    OF_SEGMENTATION,
+    POISSON,
+    RATIO,
+    REGISTRATION,
+    SEGMENTATION,
+    SKULL,
+    STIFFNESS,
+    TOGETHER,
+    TOOL,
+    Draw,
+    chosen,
+    rigid,
+)  # fmt: skip
+from ..script.scene import Scene
+from ..script.tool_paths import Path, Touch
+from ..script.uncertainty import LEVEL, Uncertainty, mark_of
+
+# Thousandths of the motion, as in a locator's ensemble.
+ACCURACY = Accuracy(tolerance=3e-3)
+# Moments of a scene that are solved; a scene cannot be known where fewer draws than this share have an answer.
+MOMENTS, LEAST = 5, 0.8
+# Errors of registration and segmentation to each body.
+SHIFTS = 200
+
+
+SKULL_EFFECTS = Bonded | Slide | SkullContact
+Answer = tuple[np.ndarray, ...] | None
+"""Motions (n, 3) [m] of the tumour's surface at each moment; None where some has no equilibrium."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Motions of the tumour's surface at each moment, and how it lies.
+
+    Parameters
+    ----------
+    fields
+        Of the scene itself, at each moment (n, 3) [m]. Vertices differ where tissue was cut.
+    normals
+        Outward, at each moment (n, 3).
+    """
+
+    times: tuple[float, ...]
+    fields: tuple[np.ndarray, ...]
+    normals: tuple[np.ndarray, ...]
+
+
+def changed(scene: Scene, draw: Draw) -> Scene:
+    """The scene with another tissue, tumour, skull and place of the tool.
+
+    Raises
+    ------
+    InputError
+        A tissue that is not described by Young's modulus and Poisson's ratio.
+    """
+    tissue = _tissue(scene)
+    brain = replace(tissue, young=draw.stiffness * tissue.young, poisson=draw.poisson)
+    elasticity = Elasticity(brain, {TUMOUR_LABEL: replace(brain, young=draw.ratio * brain.young)})
+    skull = SKULLS[chosen(draw.skull, skulls_of(scene))]
+
+    def other(effect: Effect) -> Effect:
+        return elasticity if isinstance(effect, Elasticity) else skull if isinstance(effect, SKULL_EFFECTS) else effect
+
+    return replace(scene, effects=tuple(map(other, scene.effects)), path=_aside(scene.path, draw.tip))
+
+
+def skulls_of(scene: Scene) -> tuple[str, ...]:
+    """What the skull may do in a scene: where it lets go, fluid came between, and nothing is bonded any more."""
+    lets_go = any(isinstance(effect, SkullContact) for effect in scene.effects)
+    return tuple(name for name in SKULLS if not (lets_go and name == "bonded"))
+
+
+def _tissue(scene: Scene) -> Material:
+    elasticity = next((effect for effect in scene.effects if isinstance(effect, Elasticity)), None)
+    if elasticity is None or not isinstance(elasticity.default, Material) or elasticity.regions:
+        raise InputError(
+            "priors are of Young's modulus and Poisson's ratio of one tissue: give the scene such a tissue."
+        )
+    return elasticity.default
+
+
+def _aside(path: Path, tip: Sequence[float]) -> Path:
+    """A path that is off by so much (3,) [m]: right, up, inwards."""
+
+    def aside(time: float) -> Touch:
+        touch = path(time)
+        return replace(touch, x=touch.x + tip[0], y=touch.y + tip[1], depth=touch.depth + tip[2])
+
+    return aside
+
+
+def moments(scene: Scene) -> tuple[float, ...]:
+    """The times [s] of a scene that are solved."""
+    return tuple(np.linspace(0.0, scene.duration, MOMENTS).tolist())
+
+
+def nominal(theatre: Theatre, scene: Scene) -> Motions:
+    """The scene as it is.
+
+    Raises
+    ------
+    InputError
+        An anatomy without tumour; a moment without an answer.
+    """
+    if not len(theatre.anatomy.tumour_nodes):
+        raise InputError("the anatomy has no tumour to be uncertain of: make one with `sulcus anatomy`.")
+    found, normals = solved(theatre, scene), []
+    if found is None:
+        raise InputError(f"of the scene {scene.name} itself no equilibrium was found.")
+    for time in moments(scene):
+        loads = scene.loads(theatre.site, scene.path(time), time)
+        tumour = Stage(scene, theatre.site).at(loads).tumour(theatre.anatomy.mesh.nodes)
+        normals.append(vertex_normals(tumour.vertices, tumour.triangles))
+    return Motions(moments(scene), found, tuple(normals))
+
+
+def solved(theatre: Theatre, scene: Scene) -> Answer:
+    """Motions (n, 3) [m] of the tumour's surface at each moment; None where some has no equilibrium."""
+    fem, last, found, stage = theatre.fem(scene, ACCURACY, batch=1), None, [], Stage(scene, theatre.site)
+    for time in moments(scene):
+        loads = scene.loads(theatre.site, scene.path(time), time)
+        last = fem.deform(loads, start=last)
+        if not last.outcome[0].good:
+            return None
+        found.append(_surface(stage.at(loads), last))
+    return tuple(found)
+
+
+def _surface(stage: Stage, answer: Deformation) -> np.ndarray:
+    return answer.at(stage.tumour_vertices).displacement[0]
+
+
+def ensemble(theatre: Theatre, scene: Scene, draws: Sequence[Draw]) -> Iterator[Answer]:
+    """The motions of every draw."""
+    for draw in draws:
+        yield solved(theatre, changed(scene, draw))
+
+
+def uncertainty(
+    theatre: Theatre, scene: Scene, still: Motions, draws: Sequence[Draw], answers: Iterable[Answer], seed: int = 0
+) -> Uncertainty:
+    """How far the tumour may be from where the scene shows it, from the answers of an ensemble's draws.
+
+    Raises
+    ------
+    InputError
+        Too few draws have an equilibrium.
+    """
+    sound = [(draw, answer) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
+    if len(sound) < LEAST * len(draws):
+        raise InputError(f"of {len(draws)} draws of the scene {scene.name} {len(sound)} have an equilibrium: too few.")
+    kept, shifts = [draw for draw, _ in sound], rigid(SHIFTS, seed)
+    rows = []
+    for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
+        motion = np.stack([answer[moment] for _, answer in sound])
+        worst, middle = distances(off_by(motion, field, kept), normals, *shifts)
+        bounds = [float(np.quantile(one, LEVEL)) for one in (worst, middle)]
+        moved = float(np.linalg.norm(field, axis=1).mean())
+        rows.append((*bounds, moved, parts(motion, field, kept, scene)))
+    worst, middle, moved, by_name = zip(*rows, strict=True)
+    return Uncertainty(
+        scene.name, mark_of(scene, theatre.site, theatre.element_of(scene)), len(draws), len(draws) - len(sound),
+        still.times, worst, middle, moved, {name: tuple(row[name] for row in by_name) for name in by_name[0]},
+    )  # fmt: skip
+
+
+def off_by(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw]) -> np.ndarray:
+    """What a scene's field (n, 3) [m] is off by from motions (draws, n, 3) with what their meshes are off by."""
+    return (1.0 + np.array([draw.mesh for draw in draws]))[:, None, None] * motion - field
+
+
+def distances(
+    off: np.ndarray, normals: np.ndarray, shift: np.ndarray, wide: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of the worst point and of the middle (draws, shifts) [m], for every draw with every rigid error.
+
+    off (draws, n, 3): what the model is off by; normals (n, 3); shift (shifts, 3) and wide (shifts,): registration and
+    segmentation [m].
+    """
+    aside = shift[:, None] + wide[:, None, None] * normals
+    worst = np.stack([np.linalg.norm(one + aside, axis=2).max(axis=1) for one in off])
+    middle = np.stack([np.linalg.norm((one + aside).mean(axis=1), axis=1) for one in off])
+    return worst, middle
+
+
+def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: Scene) -> dict[str, float]:
+    """What each contributor does alone [m]: root mean square over the draws, at the surface's worst point of each.
+
+    A linear fit of the draws (draws, n, 3) tells the causes apart; what it leaves is of several together.
+    """
+    off, columns = motion - field, causes(draws, scene)
+    design = np.concatenate(list(columns.values()), axis=1)
+    slope = np.linalg.lstsq(design, off.reshape(len(off), -1), rcond=None)[0]
+    found, first = {}, 0
+    for name, column in columns.items():
+        last = first + column.shape[1]
+        found[name] = size((column @ slope[first:last]).reshape(off.shape))
+        first = last
+    found[TOGETHER] = size(off - (design @ slope).reshape(off.shape))
+    found[MESH] = OF_MESH.range[1] * size(motion)
+    found[REGISTRATION] = float(np.sqrt(3.0)) * OF_REGISTRATION.range[1]
+    return found | {SEGMENTATION: OF_SEGMENTATION.range[1]}
+
+
+def causes(draws: Sequence[Draw], scene: Scene) -> dict[str, np.ndarray]:
+    """By contributor, how a draw differs from the scene (draws, columns): zero where it does not."""
+    poisson = _tissue(scene).poisson
+    skull = next((effect for effect in scene.effects if isinstance(effect, SKULL_EFFECTS)), None)
+    table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in draws])
+    found = {STIFFNESS.name: table[:, :1], POISSON.name: table[:, 1:2], RATIO.name: table[:, 2:3]}
+    others = [name for name in skulls_of(scene) if type(SKULLS[name]) is not type(skull)]
+    names = [chosen(draw.skull, skulls_of(scene)) for draw in draws]
+    if skull is not None:
+        found[SKULL] = np.array([[name == other for other in others] for name in names], float)
+    return found if scene.tool is None else found | {TOOL: table[:, 3:]}
+
+
+def size(field: np.ndarray) -> float:
+    """Root mean square over draws of the largest length in each: vectors (draws, n, 3)."""
+    return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
+
+
+def coverage(still: Motions, stated: Uncertainty, draws: Sequence[Draw], answers: Iterable[Answer], seed: int) -> float:
+    """The share of twins whose worst point lies within the stated bound, over all moments but the first.
+
+    Twins are other draws, with other errors of registration and segmentation.
+    """
+    sound = [(draw, answer) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
+    kept, held = [draw for draw, _ in sound], []
+    for moment in range(1, len(still.times)):
+        motion = np.stack([answer[moment] for _, answer in sound])
+        off = off_by(motion, still.fields[moment], kept)
+        worst, _ = distances(off, still.normals[moment], *rigid(SHIFTS, seed))
+        held.append(worst <= stated.worst[moment])
+    return float(np.mean(held))

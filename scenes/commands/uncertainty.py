@@ -1,0 +1,120 @@
+"""`sulcus uncertainty`: how far the tumour of a scene may be from where it is shown, and what of that is whose."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from sim.arguments import at_least
+
+from .demo import add_bodies, scene_asked
+from .json_line import json_line
+from .tissue_options import add_element_argument, add_tissue_arguments
+
+if TYPE_CHECKING:
+    from ..play.deformers import Theatre
+    from ..script.scene import Scene
+    from ..script.uncertainty import Uncertainty
+
+FEWEST = 8
+NOTE = """
+Two errors, always apart. "model": what the answer is off by against finite elements of the same body. "tumour": the
+largest distance of its surface from where it is in the patient. It has what nobody measures: tissue, skull, the tool's
+place, registration, segmentation. What a scene says acts (force, fluid, cuts) is taken as known.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
+    add_bodies(parser)
+    add_tissue_arguments(parser)
+    add_element_argument(parser)
+    parser.add_argument(
+        "--draws", type=int, default=40, help=f"bodies to draw and solve, {FEWEST} or more (default %(default)s)"
+    )
+    parser.add_argument(
+        "--twins", type=int, default=0, help="try the result on so many other bodies (default %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.json",
+        help="where scenes are added (default: MESH.uncertainty.json beside the anatomy, where `sulcus demo` reads it)",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve an ensemble of each scene, and keep what it says."""
+    from ..bench.uncertainty import coverage, ensemble, nominal, uncertainty
+    from ..play.deformers import open_theatre
+    from ..script.priors import drawn
+    from ..script.scene import SCENES
+    from ..script.shipped_files import template_path
+    from ..script.uncertainty import read_uncertainties, uncertainty_path, write_uncertainties
+
+    at_least("--draws", args.draws, FEWEST)
+    at_least("--twins", args.twins, 0)
+    scenes = [scene_asked(args, name) for name in args.scenes or SCENES]
+    theatre = open_theatre(args.anatomy, args.model, args.device)
+    out = args.out or uncertainty_path(args.anatomy or template_path())
+    read_uncertainties(out)  # before hours are spent
+    draws, twins = drawn(args.draws, args.seed), drawn(args.twins, args.seed + 1)
+    rows, lines = [], sys.stderr if args.json else sys.stdout
+    for scene in scenes:
+        bar = partial(tqdm, unit="body", desc=scene.name, leave=False, file=sys.stderr)
+        still = nominal(theatre, scene)
+        found = uncertainty(
+            theatre, scene, still, draws, bar(ensemble(theatre, scene, draws), total=len(draws)), args.seed
+        )
+        write_uncertainties(out, [found])
+        tried = bar(ensemble(theatre, scene, twins), total=len(twins))
+        held = coverage(still, found, twins, tried, args.seed + 1) if twins else None
+        rows.append(_flat(theatre, scene, found, held))
+        print("\n".join(_lines(rows[-1])), file=lines, flush=True)
+    if args.json:
+        print(json_line({"seed": args.seed, "out": str(out), "scenes": rows}))
+    else:
+        print(f"{NOTE}\nWritten to {out}.")
+    return 0
+
+
+def _flat(theatre: Theatre, scene: Scene, found: Uncertainty, held: float | None) -> dict[str, Any]:
+    """Figures of a scene, at the moment when the tumour may be farthest off [mm]."""
+    from ..play.error_text import error_lines
+
+    model = theatre.models.get(theatre.best(scene))
+    promised = None if model is None or not np.isfinite(model.bound) else float(model.bound)
+    moment = int(np.argmax(found.worst))
+    error = found.at(found.times[moment], promised or 0.0)
+    parts = {name: 1e3 * values[moment] for name, values in found.parts.items()}
+    ranked = dict(sorted(parts.items(), key=lambda part: -part[1]))
+    return {
+        "scene": scene.name, "said": error_lines(model is not None, promised, error), "time_s": found.times[moment],
+        "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
+        "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment], "mostly": error.largest,
+        "draws": found.draws, "failed": found.failed, "held": held, "parts_mm": ranked,
+    }  # fmt: skip
+
+
+def _lines(row: dict[str, Any]) -> Sequence[str]:
+    """The same in lines."""
+    lines = [f"{row['scene']}:", *(f"  {line}" for line in row["said"])]
+    lines.append(
+        f"  at {row['time_s']:.1f} s, when it moved {row['moved_mm']:.2f} mm; its middle is within "
+        f"{row['middle_mm']:.1f} mm. Root mean square of each part [mm]:"
+    )
+    lines += [f"    {name:<20} {size:6.3f}" for name, size in row["parts_mm"].items()]
+    without = f", {row['failed']} of them without equilibrium" if row["failed"] else ""
+    lines.append(f"  {row['draws']} draws{without}")
+    if row["held"] is not None:
+        lines.append(f"  held for {row['held']:.1%} of twins")
+    return lines

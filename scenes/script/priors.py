@@ -1,0 +1,141 @@
+"""What nobody measures in theatre: how widely it may differ from what a scene takes it to be, with sources."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.special import ndtri
+
+Law = Literal["uniform", "log-uniform", "normal"]
+MESH, REGISTRATION, SEGMENTATION = "mesh", "registration", "segmentation"
+TOOL, SKULL = "tool's place", "skull"
+TOGETHER = "several together"
+"""What is more, or less, than the sum of what each contributor does alone."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A number that is not known.
+
+    Parameters
+    ----------
+    name
+        As it is printed.
+    law
+        "normal" has mean 0 here.
+    range
+        Least and greatest; of "normal" the deviation, twice.
+    what
+        What the number is, with its unit.
+    source
+        Where it is from.
+    """
+
+    name: str
+    law: Law
+    range: tuple[float, float]
+    what: str
+    source: str
+
+    def at(self, share: np.ndarray) -> np.ndarray:
+        """The values that so many shares (n,) of all draws, in (0, 1), do not exceed."""
+        low, high = self.range
+        match self.law:
+            case "uniform":
+                return low + (high - low) * share
+            case "log-uniform":
+                return low * (high / low) ** share
+            case _:
+                return high * ndtri(share)
+
+
+STIFFNESS = Prior(
+    "E", "log-uniform", (0.5, 2.0), "Young's modulus over the scene's",
+    "the laws of `sulcus` have 2.0 to 3.3 kPa; persons and methods scatter more: review of Budday, Ovaert, Holzapfel, "
+    "Steinmann, Kuhl 2019, Arch. Comput. Methods Eng., 10.1007/s11831-019-09352-w",
+)  # fmt: skip
+POISSON = Prior(
+    "nu", "uniform", (0.45, 0.4945), "Poisson's ratio",
+    "0.45 where fluid has left: Miga, Paulsen et al. 1999, IEEE Trans. Med. Imaging 18:866-874; 0.4945 at once: "
+    "Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47",
+)  # fmt: skip
+RATIO = Prior(
+    "tumour's stiffness", "log-uniform", (0.4, 2.5), "Young's modulus of the tumour over the brain's",
+    "22 glioblastomas of 1.32 kPa beside 1.54 in healthy tissue, five of them stiffer, all of soft and stiff parts: "
+    "Streitberger et al. 2014, PLoS ONE 9:e110588",
+)  # fmt: skip
+TIP = Prior(
+    TOOL, "normal", (1.06e-3, 1.06e-3), "place of the tool's tip, along each axis [m]",
+    "tracked probe off by 1.69 mm in the mean: Perwoeg et al. 2018, Int. J. Comput. Assist. Radiol. Surg. 13",
+)  # fmt: skip
+SKULL_HOLDS = Prior(
+    SKULL, "uniform", (0.0, 1.0), "bonded, sliding or letting go, each as probable",
+    "contested: Ji, Roberts, Hartov, Paulsen 2009, Med. Image Anal. 13:659; its bond tears at some kPa, "
+    "arXiv 2512.08425",
+)  # fmt: skip
+OF_MESH = Prior(
+    MESH, "normal", (0.05, 0.05), "share of the tumour's motion",
+    "smoothed elements are 5.2 % off quadratic ones: docs/surrogate.md",
+)  # fmt: skip
+OF_REGISTRATION = Prior(
+    REGISTRATION, "normal", (1.56e-3, 1.56e-3), "shift of the whole scan, along each axis [m]",
+    "2.49 mm in the mean by point pairs in 11 patients: Mongen, Willems 2019, Acta Neurochir. 161",
+)  # fmt: skip
+OF_SEGMENTATION = Prior(
+    SEGMENTATION, "normal", (1e-3, 1e-3), "how far the tumour's outline is too wide, all round [m]",
+    "raters agree with a Dice score of 74 - 85 %, which is 1.3 - 2.3 mm between two of them on 7 ml: Menze et al. "
+    "2015, IEEE Trans. Med. Imaging 34:1993-2024",
+)  # fmt: skip
+PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, OF_MESH, OF_REGISTRATION, OF_SEGMENTATION)
+"""All of them; what a trained model is off by is added where one answers."""
+
+
+@dataclass(frozen=True)
+class Draw:
+    """A body and a tool as they may be.
+
+    Parameters
+    ----------
+    stiffness, poisson, ratio
+        Young's modulus over the scene's; Poisson's ratio; the tumour's Young's modulus over the brain's.
+    skull
+        In [0, 1): which of the skulls that a scene may have.
+    tip
+        How far off the tool is (3,) [m]: to the right, up, and inwards.
+    mesh
+        The motion is longer by this share of it.
+    """
+
+    stiffness: float
+    poisson: float
+    ratio: float
+    skull: float
+    tip: tuple[float, ...]
+    mesh: float
+
+
+def drawn(count: int, seed: int = 0) -> list[Draw]:
+    """So many draws that cover each prior evenly (a Latin hypercube: McKay, Beckman, Conover 1979)."""
+    random = np.random.default_rng(seed)
+
+    def values(prior: Prior) -> list[float]:
+        return prior.at((random.permutation(count) + random.uniform(size=count)) / count).tolist()
+
+    columns = [values(prior) for prior in (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, TIP, TIP, OF_MESH)]
+    rows = zip(*columns, strict=True)
+    return [Draw(young, nu, ratio, skull, tuple(tip), mesh) for young, nu, ratio, skull, *tip, mesh in rows]
+
+
+def rigid(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of registration (count, 3) and of segmentation (count,) [m]."""
+    random = np.random.default_rng([seed, 1])
+    shift = OF_REGISTRATION.range[1] * random.standard_normal((count, 3))
+    return shift, OF_SEGMENTATION.range[1] * random.standard_normal(count)
+
+
+def chosen(share: float, names: Sequence[str]) -> str:
+    """The name that a share in [0, 1) chooses, each as probable."""
+    return names[min(int(share * len(names)), len(names) - 1)]

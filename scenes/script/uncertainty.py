@@ -1,0 +1,177 @@
+"""How far a tumour may be from where a scene shows it: what an ensemble found, stored beside the anatomy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from sim.deformation import Deformation
+from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import read_as
+
+from .priors import PRIORS
+from .scene import Scene
+from .site import Site
+
+FORMAT = "sulcus uncertainty 1"
+LEVEL = 0.95
+"""Of every bound that is printed."""
+SUFFIX = ".uncertainty.json"
+SURROGATE = "surrogate"
+# A bound at 95 % is so many deviations of a Gaussian.
+DEVIATIONS = 1.96
+
+
+@dataclass(frozen=True)
+class TumourError:
+    """How far a tumour may be from where a frame shows it.
+
+    Parameters
+    ----------
+    prior
+        With a probability of 95 % no point of its surface is farther off [m], when nothing is observed; None: not
+        known.
+    largest
+        The name of the largest contributor to that.
+    observed
+        The same with what is observed of the brain [m]; None where nothing is.
+    """
+
+    prior: float | None
+    largest: str = ""
+    observed: float | None = None
+
+    @property
+    def bound(self) -> float | None:
+        """What holds: with the observation where there is one [m]."""
+        return self.prior if self.observed is None else self.observed
+
+
+NOT_KNOWN = TumourError(None)
+
+
+@runtime_checkable
+class Observing(Protocol):
+    """A deformer that sees something of the brain, and knows by that how far the tumour may be off."""
+
+    def tumour_error(self, answer: Deformation) -> float:
+        """With a probability of 95 % no point of the tumour's surface is farther [m] from where an answer has it."""
+        ...
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What an ensemble found of one scene on one anatomy; lists go along `times`.
+
+    Parameters
+    ----------
+    scene, mark
+        Its name, and what tells it from others of that name, see `mark_of`.
+    draws, failed
+        Bodies that were solved, and those of which no equilibrium was found: these are left out.
+    times
+        [s].
+    worst, middle
+        What 95 % of all errors do not exceed [m]: of the tumour's worst surface point, and of its middle.
+    moved
+        Mean motion of the tumour's surface [m].
+    parts
+        Root mean square over draws, at the surface's worst point of each [m], by contributor.
+    """
+
+    scene: str
+    mark: str
+    draws: int
+    failed: int
+    times: tuple[float, ...]
+    worst: tuple[float, ...]
+    middle: tuple[float, ...]
+    moved: tuple[float, ...]
+    parts: Mapping[str, tuple[float, ...]]
+
+    def at(self, time: float, surrogate: float = 0.0) -> TumourError:
+        """The error at a time [s], where a trained model adds its own bound [m]."""
+        parts = {name: self.read(values, time) for name, values in self.parts.items()}
+        parts[SURROGATE] = surrogate / DEVIATIONS
+        worst = float(np.hypot(self.read(self.worst, time), surrogate))
+        return TumourError(worst, max(parts, key=lambda name: parts[name]))
+
+    def read(self, values: tuple[float, ...], time: float) -> float:
+        """One of the lists at a time [s], between its entries in proportion."""
+        return float(np.interp(time, self.times, values))
+
+
+def mark_of(scene: Scene, site: Site, element: str) -> str:
+    """What an uncertainty is of: sixteen digits of all that acts in a scene, and of the priors."""
+    times = np.linspace(0.0, scene.duration, 25).tolist()
+    # Rounded, for sines differ from machine to machine in the last digit.
+    acts = [np.round(_numbers(scene, time), 6).tolist() for time in times]
+    priors = [(prior.law, prior.range) for prior in PRIORS]
+    whole = (scene.effects, scene.surgery, scene.tool, scene.duration, element, acts, priors, site.anatomy.digest)
+    return sha256(repr(whole).encode()).hexdigest()[:16]
+
+
+def _numbers(scene: Scene, time: float) -> list[float]:
+    """What hand and head do at a time [s]."""
+    touch, lying = scene.path(time), scene.lying(time)
+    return [touch.x, touch.y, touch.force, *touch.tilt, touch.depth, *lying.direction, lying.fluid]
+
+
+def uncertainty_path(anatomy: Path) -> Path:
+    """Where the uncertainties of an anatomy file are looked for: MESH.uncertainty.json beside MESH.vtu."""
+    return anatomy.with_suffix(SUFFIX)
+
+
+def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
+    """Those of a file, by scene; none where there is no file.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read as such.
+    """
+    if not path.is_file():
+        return {}
+    with read_as(path, "uncertainties", "Delete it, and make it anew by `sulcus uncertainty`."):
+        stored = json.loads(path.read_text())
+        if stored.get("format") != FORMAT:
+            raise InputError(f"its format is not {FORMAT!r}: delete it, and make it anew by `sulcus uncertainty`.")
+        return {name: _read(row) for name, row in stored["scenes"].items()}
+
+
+def _read(row: dict) -> Uncertainty:
+    """One scene's; every list is as long as the times, and of finite numbers."""
+    lists = {name: tuple(map(float, row[name])) for name in ("times", "worst", "middle", "moved")}
+    parts = {str(name): tuple(map(float, values)) for name, values in row["parts"].items()}
+    for name, values in (lists | parts).items():
+        if len(values) != len(lists["times"]) or not np.isfinite(values).all():
+            raise InputError(f"{name} are not {len(lists['times'])} finite numbers.")
+    return Uncertainty(str(row["scene"]), str(row["mark"]), int(row["draws"]), int(row["failed"]), **lists, parts=parts)
+
+
+def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
+    """Add scenes to a file, in place of those of the same name."""
+    scenes = read_uncertainties(path) | {one.scene: one for one in found}
+    stored = {"format": FORMAT, "level": LEVEL, "scenes": {name: asdict(scenes[name]) for name in sorted(scenes)}}
+    with written_whole(path, ".json") as unfinished:
+        unfinished.write_text(json.dumps(_rounded(stored), indent=1) + "\n")
+
+
+def _rounded(value: object) -> object:
+    """Numbers to a micrometre: more digits promise more than an ensemble knows."""
+    match value:
+        case dict():
+            return {name: _rounded(one) for name, one in value.items()}
+        case list() | tuple():
+            return [_rounded(one) for one in value]
+        case float():
+            return round(value, 6)
+        case _:
+            return value

@@ -1,0 +1,320 @@
+"""Two errors, of the model and of the tumour: priors, the ensemble, what is stored, and what the picture says."""
+
+import json
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from theatres import put, short, small, theatre_of
+
+from ar.hud import FINE
+from ar.refind import stands
+from scenes.bench.uncertainty import (
+    Motions,
+    causes,
+    changed,
+    coverage,
+    distances,
+    nominal,
+    parts,
+    skulls_of,
+    solved,
+    uncertainty,
+)
+from scenes.cli import main
+from scenes.play.error_text import NOT_KNOWN_WORDS, error_lines, worst
+from scenes.play.player import Player
+from scenes.script.priors import POISSON, PRIORS, SKULL, STIFFNESS, TOOL, Draw, drawn
+from scenes.script.scene import SCENES, find_scene
+from scenes.script.tool_paths import Touch
+from scenes.script.uncertainty import (
+    NOT_KNOWN,
+    TumourError,
+    Uncertainty,
+    mark_of,
+    read_uncertainties,
+    uncertainty_path,
+    write_uncertainties,
+)
+from sim.anatomy import TUMOUR_LABEL
+from sim.effects import SKULLS, Elasticity
+from sim.errors import InputError
+from sim.material import BRAIN
+from surrogate.model.learned import Learned
+
+SAME = Draw(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
+"""As the scene has it."""
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
+    """An uncertainty that grows from the first frame to the last."""
+    mark = mark_of(scene, theatre.site, theatre.element_of(scene))
+    flat = (1e-3, 1e-3)
+    lists = {"times": (0.0, scene.duration), "worst": worst, "middle": flat, "moved": flat}
+    return Uncertainty(
+        scene.name, mark, 8, 0, **(lists | values), parts={"E": (0.0, 3e-3), "registration": (2e-3, 2e-3)}
+    )
+
+
+class TestPriors:
+    def test_each_says_what_it_is_and_where_it_is_from(self):
+        assert len({prior.name for prior in PRIORS}) == len(PRIORS)
+        assert all(prior.what and prior.source for prior in PRIORS)
+
+    def test_draws_cover_each_prior_evenly(self):
+        """One draw in each of so many parts of equal probability."""
+        found = drawn(20, 3)
+        stiffness = np.sort([one.stiffness for one in found])
+        edges = STIFFNESS.at(np.arange(21) / 20.0)
+        assert (stiffness > edges[:-1]).all() and (stiffness < edges[1:]).all()
+        poisson = np.sort([one.poisson for one in found])
+        assert np.diff(POISSON.range)[0] > np.ptp(poisson) > 0.9 * np.diff(POISSON.range)[0]
+        assert np.std([one.tip for one in found]) == pytest.approx(1.06e-3, rel=0.15)
+        assert found == drawn(20, 3) != drawn(20, 4)
+
+    def test_each_skull_is_as_probable(self):
+        names = [changed(short(), one).effects[2] for one in drawn(30, 0)]
+        assert [names.count(skull) for skull in SKULLS.values()] == [10, 10, 10]
+
+    def test_from_a_skull_that_lets_go_nothing_is_bonded(self):
+        assert skulls_of(find_scene("brain_shift")) == ("slide", "contact")
+
+
+class TestEnsemble:
+    def test_a_drawn_scene_has_what_was_drawn(self):
+        scene = find_scene("palpate")
+        found = changed(scene, Draw(2.0, 0.47, 0.5, 0.5, (1e-3, 2e-3, 3e-3), 0.1))
+        elasticity, _, skull, _ = found.effects
+        assert isinstance(elasticity, Elasticity) and skull == SKULLS["slide"]
+        brain = replace(BRAIN, young=2.0 * BRAIN.young, poisson=0.47)
+        assert elasticity == Elasticity(brain, {TUMOUR_LABEL: replace(brain, young=BRAIN.young)})
+        asked, given = scene.path(1.3), found.path(1.3)
+        assert (given.x - asked.x, given.y - asked.y, given.depth - asked.depth) == pytest.approx((1e-3, 2e-3, 3e-3))
+
+    def test_stiffness_matters_under_known_force_alone(self, theatre):
+        """Under a known pose it cancels."""
+        stiff = replace(SAME, stiffness=2.0)
+        for scene, times in ((short(), 0.5), (small("palpate"), 1.0)):
+            ours, theirs = (solved(theatre, changed(scene, one))[2] for one in (SAME, stiff))
+            lengths = [np.linalg.norm(field, axis=1).mean() for field in (theirs, ours)]
+            assert lengths[1] > 1e-5 and lengths[0] / lengths[1] == pytest.approx(times, rel=0.12)
+
+    def test_registration_and_segmentation_add_to_what_the_model_is_off_by(self):
+        off = np.array([[[3.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+        normals = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        shift, wide = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.array([0.5, 0.0])
+        worst_point, middle = distances(off, normals, shift, wide)
+        np.testing.assert_allclose(worst_point, [[4.5, np.hypot(3.0, 2.0)]])
+        np.testing.assert_allclose(middle, [[np.hypot(2.75, 0.25), 2.5]])
+
+    def test_parts_are_found_each_by_itself(self):
+        """Fields that depend on stiffness and tool, each by itself, are found as such; of nothing else is anything."""
+        scene, draws = short(), drawn(40, 5)
+        random = np.random.default_rng(0)
+        field, of_stiffness, of_tool = random.normal(size=(3, 6, 3))
+        motion = field + np.array([np.log(one.stiffness) * of_stiffness + one.tip[0] * of_tool for one in draws])
+        found = parts(motion, field, draws, scene)
+        largest = np.linalg.norm(of_stiffness, axis=1).max()
+        assert found["E"] == pytest.approx(largest * np.sqrt(np.mean([np.log(one.stiffness) ** 2 for one in draws])))
+        assert found[TOOL] > 0.0 and max(found[name] for name in ("nu", SKULL, "several together")) < 1e-12
+        assert TOOL not in causes(draws, find_scene("brain_shift"))
+
+    def test_a_bound_holds_for_other_draws(self, theatre):
+        """Twins of a body whose motion is in inverse proportion to its stiffness: 95 in 100 lie within the bound."""
+        scene = short()
+        random = np.random.default_rng(1)
+        normals = random.normal(size=(9, 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        field = 3e-3 * random.normal(size=(9, 3))
+        still = Motions((0.0, 1.0), (0.0 * field, field), (normals, normals))
+
+        def answers(draws):
+            return [(0.0 * field, field / one.stiffness) for one in draws]
+
+        draws, twins = drawn(300, 0), drawn(300, 1)
+        found = uncertainty(theatre, scene, still, draws, answers(draws))
+        assert 0.93 < coverage(still, found, twins, answers(twins), 1) < 0.97
+        tight = replace(found, worst=tuple(0.7 * one for one in found.worst))
+        assert coverage(still, tight, twins, answers(twins), 1) < 0.85
+
+    def test_draws_without_equilibrium_are_counted_and_too_many_refused(self, theatre):
+        field = np.ones((9, 3))
+        still, draws = Motions((0.0,), (field,), (field,)), drawn(10, 0)
+        answers = [(field,)] * 9
+        assert uncertainty(theatre, short(), still, draws, [*answers, None]).failed == 1
+        with pytest.raises(InputError, match="too few"):
+            uncertainty(theatre, short(), still, draws, [*answers[:7], None, None, None])
+
+    def test_the_moments_of_a_scene_end_where_it_does(self, theatre):
+        still = nominal(theatre, short())
+        assert still.times[0] == 0.0 and still.times[-1] == pytest.approx(0.2)
+        assert [np.linalg.norm(one, axis=1).mean() > 1e-4 for one in still.fields] == [False, True, True, True, False]
+        np.testing.assert_allclose(np.linalg.norm(still.normals[0], axis=1), 1.0)
+
+
+class TestStored:
+    def test_a_file_is_read_as_it_was_written_and_scenes_are_added(self, theatre, tmp_path):
+        path = tmp_path / "box.uncertainty.json"
+        one = stated(short(), theatre)
+        write_uncertainties(path, [one])
+        write_uncertainties(path, [replace(one, scene="other")])
+        assert read_uncertainties(path) == {"other": replace(one, scene="other"), one.scene: one}
+        assert read_uncertainties(tmp_path / "none.json") == {}
+
+    @pytest.mark.parametrize("harm", ["{", '{"format": "else", "scenes": {}}', None])
+    def test_a_torn_file_is_a_sentence(self, theatre, tmp_path, harm):
+        path = tmp_path / "box.uncertainty.json"
+        write_uncertainties(path, [replace(stated(short(), theatre), worst=(1e-3, np.nan))])
+        if harm:
+            path.write_text(harm)
+        with pytest.raises(InputError, match=r"box\.uncertainty\.json"):
+            read_uncertainties(path)
+
+    def test_it_is_of_this_scene_tissue_element_and_brain_alone(self, theatre):
+        scene = short()
+        knowing = replace(theatre, uncertainties={scene.name: stated(scene, theatre)})
+        assert knowing.uncertainty(scene) is not None
+        others = (
+            scene.made_of(replace(BRAIN, young=4000.0), None), scene.made_of(None, "p1"), replace(scene, name="else"),
+            replace(scene, path=lambda time: Touch(force=0.1)), replace(scene, effects=scene.effects[:-1]),
+        )  # fmt: skip
+        assert [knowing.uncertainty(other) for other in others] == [None] * 5
+
+    def test_between_moments_it_goes_in_proportion_and_a_model_adds_its_own(self, theatre):
+        found = stated(short(), theatre)
+        assert found.at(0.0) == TumourError(2e-3, "registration")
+        assert found.at(0.15) == TumourError(pytest.approx(3.5e-3), "E")
+        assert found.at(0.0, 1.5e-3).prior == pytest.approx(2.5e-3)
+        assert found.at(0.0, 9e-3).largest == "surrogate"
+
+    def test_the_template_ships_with_that_of_its_scenes(self):
+        from scenes.play.deformers import open_theatre
+
+        template = open_theatre(device="cpu")
+        known = [name for name in SCENES if template.uncertainty(find_scene(name))]
+        assert known == sorted(template.uncertainties, key=SCENES.index) and len(known) >= 5
+
+
+@dataclass(frozen=True, eq=False)
+class Seeing:
+    """A deformer that sees the brain."""
+
+    deformer: Learned
+
+    @property
+    def anatomy(self):
+        return self.deformer.anatomy
+
+    def deform(self, loads, start=None, at=None):
+        return self.deformer.deform(loads)
+
+    def tumour_error(self, answer):
+        return 1.1e-3
+
+
+class TestSaid:
+    @pytest.mark.parametrize(
+        ("trained", "promised", "error", "said"),
+        [
+            (
+                True, 2.21e-4, TumourError(4.11e-3, "E"),
+                [
+                    "model: within 0.23 mm of its finite elements (95 %)",
+                    "tumour: within 4.2 mm of where it is (95 %), mostly E",
+                ],
+            ),
+            (False, None, NOT_KNOWN, ["model: finite elements themselves", NOT_KNOWN_WORDS]),
+            (
+                True, None, TumourError(4.11e-3, "E", 1e-3),
+                [
+                    "model: error against its finite elements not known",
+                    "tumour: within 1.0 mm of where it is (95 %); without observation 4.2 mm",
+                ],
+            ),
+        ],
+    )  # fmt: skip
+    def test_both_are_said_apart(self, trained, promised, error, said):
+        assert error_lines(trained, promised, error) == said
+        assert error_lines(trained, promised, error, "doubt") == said[1:]
+
+    def test_the_worst_of_frames_is_known_where_all_are(self):
+        errors = [TumourError(1e-3, "E"), TumourError(3e-3, "nu"), TumourError(2e-3, "E")]
+        assert worst(errors) == errors[1] and worst([*errors, NOT_KNOWN]) == worst([]) == NOT_KNOWN
+
+    def test_a_picture_has_both_and_its_band_is_that_of_the_tumour(self, theatre, monkeypatch):
+        scene = short()
+        wide = replace(scene, viewpoint=replace(scene.viewpoint, width=640, height=480))
+        knowing = replace(theatre, uncertainties={scene.name: stated(scene, theatre)})
+        player = knowing.player("linear", wide)
+        drawn_with = []
+        from scenes.play.player import composite
+
+        monkeypatch.setattr(
+            "scenes.play.player.composite", lambda *given: drawn_with.append(given) or composite(*given)
+        )
+        frame = player.draw(3, 0.1, scene.path(0.1))
+        assert frame.tumour_error.prior == pytest.approx(np.hypot(3e-3, frame.model_error))
+        assert frame.model_error == frame.deformation.bound[0, 0]
+        margin, gauge = drawn_with[0][5:7]
+        assert margin == frame.tumour_error.prior and gauge.error is None
+        for line in error_lines(True, frame.model_error, frame.tumour_error):
+            assert stands(frame.shown, line, FINE)
+
+    def test_in_a_hand_and_of_a_doubtful_answer_it_is_not_known(self, theatre):
+        scene = short()
+        player = replace(theatre, uncertainties={scene.name: stated(scene, theatre)}).player("linear", scene)
+        held, doubtful = (player.draw(3, 0.1, Touch(force=force)) for force in (0.2, 0.6))
+        assert held.tumour_error == doubtful.tumour_error == NOT_KNOWN
+        assert held.model_error is not None and doubtful.model_error is None and doubtful.doubt
+
+    def test_what_is_observed_holds_in_place_of_the_prior(self, theatre):
+        scene = short()
+        seeing = Player(theatre.stage(scene), Seeing(theatre.models["linear"]), uncertainty=stated(scene, theatre))
+        error = seeing.draw(3, 0.1, scene.path(0.1)).tumour_error
+        assert error.bound == error.observed == 1.1e-3 and error.prior == pytest.approx(3e-3)
+        assert replace(seeing, uncertainty=None).draw(3, 0.1, scene.path(0.1)).tumour_error == TumourError(
+            None, "", 1.1e-3
+        )
+
+
+def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, capsys):
+    import h5py
+
+    body = put(theatre, tmp_path / "box.vtu")
+    own = tmp_path / "brief.py"
+    own.write_text(
+        "from scenes import Scene, press\n"
+        "SCENE = Scene('brief', 'A short press.', press(0.25, rise=0.1, hold=0.0), duration=0.2)\n"
+    )
+    words = [str(own), "--anatomy", str(body), "--device", "cpu"]
+    assert main(["uncertainty", *words, "--draws", "8", "--twins", "2", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["scenes"]
+    assert row["scene"] == "brief" and row["draws"] == 8 and 0.0 <= row["held"] <= 1.0
+    assert row["tumour_mm"] > 4.0 > row["model_mm"] and row["mostly"] == "registration"
+    stored = read_uncertainties(uncertainty_path(body))["brief"]
+    assert main(["check", *words, "--deformer", "fem", "--every", "3", "--json"]) == 0
+    (checked,) = json.loads(capsys.readouterr().out)["scenes"]
+    assert checked["model_error_mm"] is None
+    assert checked["tumour_error_mm"] == pytest.approx(1e3 * max(stored.at(0.1 * one).prior for one in range(3)))
+    assert main(["check", *words, "--deformer", "linear", "--every", "3"]) == 0
+    said = capsys.readouterr().out
+    assert "model: within " in said and "tumour: within " in said
+    assert main(["collect", *words, "--deformer", "linear", "--out", str(tmp_path / "one.h5")]) == 0
+    with h5py.File(tmp_path / "one.h5") as file:
+        assert np.isfinite(file["tumour_error"][:]).all() and file["tumour_error"][0] > file["model_error"][0] >= 0.0
+        assert np.array_equal(file["tumour_error"][:], file["tumour_error_unobserved"][:])
+    assert main(["uncertainty", *words, "--draws", "2"]) == 2
+    assert "--draws" in capsys.readouterr().err
+
+
+def test_other_tissues_are_refused(theatre):
+    from sim.material import MATERIALS
+
+    scene = short().made_of(MATERIALS["minutes"].tissue, None)
+    with pytest.raises(InputError, match="Young's modulus"):
+        changed(scene, SAME)
