@@ -242,5 +242,5 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     known = TumourError(4.61e-3, "E"), TumourError(4.61e-3, "E", 1.11e-3)
     prior, seen = (report(replace(frame, tumour_error=one), player.stage, "linear", "", (), 7) for one in known)
     where = "95 of 100 times no point of it is more than"
-    assert f"<p>Error of the tumour: {where} 4.7 mm from where it is; most of that is E.</p>" in prior
+    assert f"<p>Error of the tumour: {where} 4.7 mm from where it is; the largest part is E.</p>" in prior
     assert f"<p>Error of the tumour: {where} 1.2 mm from where it is; without observation 4.7 mm.</p>" in seen

@@ -174,18 +174,19 @@ def uncertainty(
     if len(sound) < LEAST * len(draws):
         raise InputError(f"of {len(draws)} draws of the scene {scene.name} {len(sound)} have an equilibrium: too few.")
     kept, shifts = [draw for draw, _ in sound], rigid(SHIFTS, seed)
-    rows = []
+    rows, held = [], []
     for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
         motion = np.stack([answer[moment] for _, answer in sound])
         worst, middle = distances(off_by(motion, field, kept), normals, *shifts)
+        held.append(left_out(worst))
         bounds = [float(np.quantile(one, LEVEL)) for one in (worst, middle)]
         moved = float(np.linalg.norm(field, axis=1).mean())
         rows.append((*bounds, moved, parts(motion, field, kept, scene)))
     worst, middle, moved, by_name = zip(*rows, strict=True)
-    return Uncertainty(
-        scene.name, mark_of(scene, theatre.site, theatre.element_of(scene)), len(draws), len(draws) - len(sound),
-        still.times, worst, middle, moved, {name: tuple(row[name] for row in by_name) for name in by_name[0]},
-    )  # fmt: skip
+    mark, failed = mark_of(scene, theatre.site, theatre.element_of(scene)), len(draws) - len(sound)
+    named = {name: tuple(row[name] for row in by_name) for name in by_name[0]}
+    share = float(np.mean(held[1:] or held))
+    return Uncertainty(scene.name, mark, len(draws), failed, share, still.times, worst, middle, moved, named)
 
 
 def off_by(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw]) -> np.ndarray:
@@ -205,6 +206,12 @@ def distances(
     worst = np.stack([np.linalg.norm(one + aside, axis=2).max(axis=1) for one in off])
     middle = np.stack([np.linalg.norm((one + aside).mean(axis=1), axis=1) for one in off])
     return worst, middle
+
+
+def left_out(worst: np.ndarray) -> float:
+    """Share of distances (draws, shifts) of each draw that are within the bound that all other draws give."""
+    bounds = [np.quantile(np.delete(worst, row, axis=0), LEVEL) for row in range(len(worst))]
+    return float((worst <= np.array(bounds)[:, None]).mean())
 
 
 def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: Scene) -> dict[str, float]:

@@ -68,7 +68,11 @@ def run(args: argparse.Namespace) -> int:
         played = {"scene": scene.name, "deformer": name, "solver": theatre.described(name, scene)}
         promised, error = _errors(frames)
         rows.append({**played, "frames": len(frames), **figures.row(), "broken": broken})
-        rows[-1] |= {"model_error_mm": _mm(promised), "tumour_error_mm": _mm(error.bound), "mostly": error.largest}
+        rows[-1] |= {
+            "model_error_mm": _mm(promised),
+            "tumour_error_mm": _mm(error.bound),
+            "largest_part": error.largest,
+        }
         rows[-1] |= {"tumour_error_unobserved_mm": _mm(error.prior)}
         print(
             f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}: the tumour is off by {figures.error_mm:.3f} "

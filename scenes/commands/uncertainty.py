@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _flat(theatre: Theatre, scene: Scene, found: Uncertainty, held: float | None) -> dict[str, Any]:
+def _flat(theatre: Theatre, scene: Scene, found: Uncertainty, twins: float | None) -> dict[str, Any]:
     """Figures of a scene, at the moment when the tumour may be farthest off [mm]."""
     from ..play.error_text import error_lines
 
@@ -100,8 +100,9 @@ def _flat(theatre: Theatre, scene: Scene, found: Uncertainty, held: float | None
     return {
         "scene": scene.name, "said": error_lines(model is not None, promised, error), "time_s": found.times[moment],
         "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
-        "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment], "mostly": error.largest,
-        "draws": found.draws, "failed": found.failed, "held": held, "parts_mm": ranked,
+        "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment], "largest_part": error.largest,
+        "draws": found.draws, "failed": found.failed, "held": found.held, "held_twins": twins,
+        "parts_mm": ranked,
     }  # fmt: skip
 
 
@@ -114,7 +115,7 @@ def _lines(row: dict[str, Any]) -> Sequence[str]:
     )
     lines += [f"    {name:<20} {size:6.3f}" for name, size in row["parts_mm"].items()]
     without = f", {row['failed']} of them without equilibrium" if row["failed"] else ""
-    lines.append(f"  {row['draws']} draws{without}")
-    if row["held"] is not None:
-        lines.append(f"  held for {row['held']:.1%} of twins")
-    return lines
+    lines.append(
+        f"  {row['draws']} draws{without}. The bound held for {row['held']:.1%} of draws that it was not made of"
+    )
+    return lines if row["held_twins"] is None else [*lines, f"  and for {row['held_twins']:.1%} of twins"]

@@ -39,13 +39,13 @@ def tumour_words(error: TumourError) -> str:
         return NOT_KNOWN_WORDS
     said = f"tumour: within {length(error.bound, 1)} of where it is (95 %)"
     if error.observed is None:
-        return f"{said}, mostly {error.largest}"
+        return f"{said}, above all {error.largest}"
     return said if error.prior is None else f"{said}; without observation {length(error.prior, 1)}"
 
 
 def length(metres: float, digits: int) -> str:
-    """A bound in millimetres, rounded up."""
-    return f"{rounded_up(1e3 * metres, digits):.{digits}f} mm"
+    """A bound in millimetres, rounded up: nothing is known to be without error."""
+    return f"{max(rounded_up(1e3 * metres, digits), 10.0**-digits):.{digits}f} mm"
 
 
 def worst(errors: Sequence[TumourError]) -> TumourError:

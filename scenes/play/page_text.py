@@ -181,7 +181,7 @@ def tumour_trust(error: TumourError) -> str:
         )
     said = f"Error of the tumour: 95 of 100 times no point of it is more than {length(error.bound, 1)} from where it is"
     if error.observed is None:
-        return f"<p>{said}; most of that is {escape(error.largest)}.</p>"
+        return f"<p>{said}; the largest part is {escape(error.largest)}.</p>"
     return f"<p>{said}{'' if error.prior is None else f'; without observation {length(error.prior, 1)}'}.</p>"
 
 

@@ -53,12 +53,12 @@ class Prior:
 
 
 STIFFNESS = Prior(
-    "E", "log-uniform", (0.5, 2.0), "Young's modulus over the scene's",
+    "brain's stiffness", "log-uniform", (0.5, 2.0), "Young's modulus over the scene's",
     "the laws of `sulcus` have 2.0 to 3.3 kPa; persons and methods scatter more: review of Budday, Ovaert, Holzapfel, "
     "Steinmann, Kuhl 2019, Arch. Comput. Methods Eng., 10.1007/s11831-019-09352-w",
 )  # fmt: skip
 POISSON = Prior(
-    "nu", "uniform", (0.45, 0.4945), "Poisson's ratio",
+    "Poisson's ratio", "uniform", (0.45, 0.4945), "of brain and tumour",
     "0.45 where fluid has left: Miga, Paulsen et al. 1999, IEEE Trans. Med. Imaging 18:866-874; 0.4945 at once: "
     "Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47",
 )  # fmt: skip

@@ -76,6 +76,8 @@ class Uncertainty:
         Its name, and what tells it from others of that name, see `mark_of`.
     draws, failed
         Bodies that were solved, and those of which no equilibrium was found: these are left out.
+    held
+        Share of draws, each with many errors of registration and segmentation, that lie within what all others say.
     times
         [s].
     worst, middle
@@ -90,6 +92,7 @@ class Uncertainty:
     mark: str
     draws: int
     failed: int
+    held: float
     times: tuple[float, ...]
     worst: tuple[float, ...]
     middle: tuple[float, ...]
@@ -153,7 +156,8 @@ def _read(row: dict) -> Uncertainty:
     for name, values in (lists | parts).items():
         if len(values) != len(lists["times"]) or not np.isfinite(values).all():
             raise InputError(f"{name} are not {len(lists['times'])} finite numbers.")
-    return Uncertainty(str(row["scene"]), str(row["mark"]), int(row["draws"]), int(row["failed"]), **lists, parts=parts)
+    counts = int(row["draws"]), int(row["failed"]), float(row["held"])
+    return Uncertainty(str(row["scene"]), str(row["mark"]), *counts, **lists, parts=parts)
 
 
 def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
