@@ -125,6 +125,7 @@ class TestEnsemble:
         )
         assert found[TOOL] > 0.0 and max(found[name] for name in (POISSON.name, SKULL, "several together")) < 1e-12
         assert TOOL not in causes(draws, find_scene("brain_shift"))
+        assert not any(column.any() for column in causes([SAME], scene).values())
 
     def test_a_bound_holds_for_other_draws(self, theatre):
         """Twins of a body whose motion is in inverse proportion to its stiffness: 95 in 100 lie within the bound."""
