@@ -1,4 +1,4 @@
-"""A tool presses with a force that nobody measures; where the tumour is, is told from its pose and the cortex alone."""
+"""A tool presses with a force that nobody measures; where the tumour is, is found from its pose and the cortex alone."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from ..script.scene import Bounds, Scene, Viewpoint
 from ..script.sight import Sight
 from ..script.tool_paths import press
 
-# Softer than usual, with a stiffer tumour: the estimate is told neither.
+# Softer than usual, with a stiffer tumour: the estimate is given neither.
 BRAIN = Material("linear", young=1800.0, poisson=0.49)
 TUMOUR = Material("linear", young=3200.0, poisson=0.49)
 

@@ -1,4 +1,4 @@
-"""Fluid drains and the brain sinks; where the tumour is now is told from a hundred points of the cortex alone."""
+"""Fluid drains and the brain sinks; where the tumour is now is found from a hundred points of the cortex alone."""
 
 from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity, Gravity, Held, Slide
@@ -8,7 +8,7 @@ from ..script.head_posture import drained
 from ..script.scene import Bounds, Scene, Viewpoint
 from ..script.sight import Sight
 
-# Softer than usual, with a stiffer tumour: the estimate is told neither.
+# Softer than usual, with a stiffer tumour: the estimate is given neither.
 BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)
 TUMOUR = Material("neo-hookean", young=3200.0, poisson=0.45)
 

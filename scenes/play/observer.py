@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -23,6 +22,7 @@ from surrogate.locating.prior import middle_of
 
 from ..script.sight import Sight
 from ..script.site import HOLE, Site
+from ..script.tool import sphere
 
 LEVEL = 0.95
 """Probability with which the tumour's middle is said to lie in its ellipsoid."""
@@ -33,7 +33,7 @@ CORNERS = 32
 ELLIPSOID_COLOUR = (0.34, 0.71, 0.97)
 ELLIPSOID = 5
 """Segmentation id of the ellipsoid's layer, which no picture holds."""
-BALL = trimesh.creation.icosphere(subdivisions=2)
+BALL, BALL_FACES = sphere()
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class Estimate:
 
     @property
     def source(self) -> str:
-        """What it was told, in words; or why it was refused."""
+        """What it was given, in words; or why it was refused."""
         if self.location is None:
             return f"refused, {self.refusal}"
         tip = ", and where the tool touches" if len(self.observation.tips) else ""
@@ -130,8 +130,8 @@ class Estimate:
         if self.location is None:
             return None
         root = np.linalg.cholesky(self.location.centroid_covariance)
-        at = np.sqrt(chi2.ppf(LEVEL, 3)) * np.asarray(BALL.vertices) @ root.T
-        return Layer("ellipsoid", ELLIPSOID, self.middle + self.motion + at, BALL.faces, ELLIPSOID_COLOUR)
+        at = np.sqrt(chi2.ppf(LEVEL, 3)) * BALL @ root.T
+        return Layer("ellipsoid", ELLIPSOID, self.middle + self.motion + at, BALL_FACES, ELLIPSOID_COLOUR)
 
 
 @dataclass(frozen=True, eq=False)

@@ -208,11 +208,11 @@ def report(
 
 
 def estimated(found: Estimate) -> list[str]:
-    """What an estimate says, how far it is from the truth, and what it was told; or why it was refused."""
+    """What an estimate says, how far it is from the truth, and what it was given; or why it was refused."""
     truth = f"truly {hud.millimetres(float(np.linalg.norm(found.true)))}"
     if found.location is None:
         return [
-            f'<p class="number">where the tumour is was not told ({truth})</p>',
+            f'<p class="number">where the tumour is, is not known ({truth})</p>',
             f'<p class="warn">What is seen was refused: {escape(found.refusal)}</p>',
         ]
     moved = hud.millimetres(found.moved, found.location.p95).replace("+-", "\N{PLUS-MINUS SIGN}")

@@ -7,7 +7,7 @@ import numpy as np
 from ar.page_parts import Body, Sign, Viewpoint
 
 from ..script.site import Site
-from .observer import BALL, ELLIPSOID_COLOUR
+from .observer import BALL, BALL_FACES, ELLIPSOID_COLOUR
 from .stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 
 FEM_COLOUR = TRUTH_COLOUR
@@ -32,8 +32,7 @@ def bodies_of(stage: Stage) -> list[Body]:
     ]
     if stage.observer is not None:
         middle = tumour.vertices.mean(axis=0)
-        at = middle + SMALL * np.asarray(BALL.vertices)
-        bodies.append(Body("ellipsoid", at, BALL.faces, ELLIPSOID_COLOUR, wireframe=True))
+        bodies.append(Body("ellipsoid", middle + SMALL * BALL, BALL_FACES, ELLIPSOID_COLOUR, wireframe=True))
     if tool is not None:
         pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
         at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]

@@ -35,7 +35,7 @@ from .tip_reading import reading
 REFUSED = "what is seen was refused, and the scan is shown: do not rely on it"
 # Strokes and gaps of the outlines of the truth and of the ellipsoid [pixel].
 TRUE_STROKES, ELLIPSOID_STROKES = (12, 4), (8, 5)
-LINES = {"estimate": "green, the estimate", "truth": "pink, the truth", "ellipsoid": "blue, its middle at 95 %"}
+LINES = "green estimate, pink truth, blue 95 % of its middle"
 """What lines beside an estimate are."""
 IN_BONE = "the bone is where this push needs the tool: do not rely on it"
 # Tissue may carry a tool into the bone's edge by so much before it is drawn elsewhere, and before its load counts as
@@ -326,7 +326,7 @@ def labelled(frame: Frame, name: str) -> np.ndarray:
     lines += [*([acts] if acts else []), f"ms: {stages}"]
     if frame.estimate is not None:
         lines[0] = f"truth: {lines[0]}"
-        lines += [f"estimate: {frame.estimate.source}", "lines: " + ", ".join(LINES.values())]
+        lines += [f"estimate: {frame.estimate.source}", f"lines: {LINES}"]
     if not frame.deformation.outcome[0].good:
         lines.append(frame.deformation.outcome[0].value)
     return panel(frame.shown, lines, below=UNDER_ERRORS)

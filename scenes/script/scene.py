@@ -82,8 +82,8 @@ class Bounds:
         How far the outline in the picture may be from where the finite elements have it [pixel]. In a scene with a
         sight, the estimate's from where the estimate has it.
     covered, removed
-        In a scene with a sight: least share of frames whose ellipsoid holds the tumour's true middle, and least share
-        of the tumour's motion, over all frames, that the estimate removes.
+        In a scene with a sight: least share of frames whose ellipsoid holds the tumour's true middle. Least share of
+        the tumour's motion, over all frames, that the estimate removes.
     """
 
     overlap: float = 0.95

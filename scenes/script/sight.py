@@ -1,4 +1,4 @@
-"""What is seen of the open cortex, and how far off it is: all that an estimate of the tumour's place is told."""
+"""What is seen of the open cortex, and how far off it is: all that an estimate of the tumour's place is given."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Sight:
-    """Points of the open cortex that are seen to move, with errors. Neither force nor tissue is among what is told.
+    """Points of the open cortex that are seen to move, with errors. Neither force nor tissue is known.
 
     What the tool hides is not seen. Where its tip touches the cortex, that place is seen too.
 

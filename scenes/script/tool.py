@@ -12,6 +12,12 @@ import trimesh
 from sim.tools import Ball, Spatula, Tool, core_of
 
 
+def sphere(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """A sphere of radius 1: vertices (n, 3), and triangles (m, 3), which point outwards."""
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return np.asarray(ball.vertices), np.asarray(ball.faces)
+
+
 class Instrument(Protocol):
     """What a scene's hand may hold: `Probe`, `Blade`, or an instrument of your own as a frozen dataclass.
 
