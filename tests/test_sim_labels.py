@@ -1,14 +1,18 @@
 """Label volumes of many kinds become meshes in their own frame, or are refused in a sentence."""
 
-from pathlib import Path
+import re
+import warnings
+from dataclasses import replace
 
 import nibabel
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from sim.anatomy import TUMOUR_LABEL
+from sim.bodies import mesher
 from sim.bodies.label_volume import volume_subject
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.errors import InputError
@@ -288,10 +292,54 @@ def test_intensities_are_read_where_their_own_affine_says(tmp_path):
     np.testing.assert_allclose(255.0 * subject.intensity.at(beside), [100.0, 20.0, 20.0, 20.0], rtol=1e-3)
 
 
-def test_a_tumour_as_rough_as_its_voxels_is_meshed():
-    """12 ml with a rough surface, 2 mm under the cortex of a folded brain, on few nodes: nothing is refused or lost."""
-    subject = volume_subject(Path(__file__).parent / "data" / "rough.nii.gz", (1,), (2,))
-    mesh = make_anatomy(subject, MeshPlan(nodes=5300)).mesh
-    tumour = mesh.volumes[mesh.region == TUMOUR_LABEL].sum()
-    assert tumour == pytest.approx(subject.tumour_volume, rel=0.01)
-    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 15.0
+def roughness(shape, amount, width, seed):
+    """Random field of that standard deviation, smooth over `width` voxels."""
+    noise = gaussian_filter(np.random.default_rng(seed).standard_normal(shape), width)
+    return amount * noise / noise.std()
+
+
+def rough_tumour(amount, width, seed=1):
+    return lambda points: ball(points, radius=RADIUS * (1.2 + roughness(points.shape[:-1], amount, width, seed)))
+
+
+def test_a_rough_cortex_is_meshed(tmp_path, monkeypatch):
+    """Fitted as it is, its mesh folds, so that nodes stay where that happens."""
+    affine, places = grid(AFFINES["straight"])
+    rough = np.linalg.norm((places - MIDDLE) / AXES, axis=-1) < 0.9 + roughness(places.shape[:-1], 0.15, 2.0, 1)
+    labels = np.where(ball(places), 3, rough)
+    subject = volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mesh = make_anatomy(subject, MeshPlan(nodes=2000)).mesh
+    assert dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
+    assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx(subject.tumour_volume, rel=0.02)
+    monkeypatch.setattr(mesher, "unfolded", lambda nodes, moved, tets: moved)
+    with pytest.raises(InputError, match="too intricate for 2000 nodes"):
+        make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(more=())))
+
+
+def test_what_is_fitted_without_folds_is_left_as_it_is(tmp_path, monkeypatch):
+    path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"])
+    monkeypatch.delattr(mesher, "unfolded")
+    assert len(make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)).mesh.nodes)
+
+
+def test_a_mesh_that_misses_much_of_the_tumour_is_refused_with_how_many_nodes_would_do(tmp_path):
+    path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(0.6, 2.0))
+    subject, plan = volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)
+    with pytest.raises(InputError, match="too intricate for 2000 nodes: ask for") as caught:
+        make_anatomy(subject, plan)
+    enough = int(re.search(r"ask for (\d+)", str(caught.value))[1])
+
+    def missed(nodes, most):
+        mesh = make_anatomy(subject, replace(plan, nodes=nodes, meshing=mesher.Meshing(largest_error=most))).mesh
+        return 1.0 - mesh.volumes[mesh.region == TUMOUR_LABEL].sum() / subject.tumour_volume
+
+    assert missed(2000, 1.0) > 0.1 > abs(missed(enough, 0.1))
+
+
+def test_labels_as_rough_as_their_voxels_are_to_be_smoothed(tmp_path):
+    path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(1.5, 1.2))
+    plan = MeshPlan(nodes=2000, meshing=mesher.Meshing(more=(1.25,)))
+    with pytest.raises(InputError, match="too intricate for 2000 nodes: smooth the labels"):
+        make_anatomy(volume_subject(path, (1, 2), (3, 4)), plan)

@@ -1,4 +1,4 @@
-"""A tool presses with a force that nobody measures; where the tumour is, is found from its pose and the cortex alone."""
+"""A tool presses with a force that nobody measures; where the tumour is, its pose and the cortex alone tell."""
 
 import numpy as np
 

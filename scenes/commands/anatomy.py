@@ -43,6 +43,8 @@ PRESETS = {
     # Tonutti et al. 2017: forces from 20 mm off the centre of a tumour of 12 mm radius, 98 cm2 of cortex left free.
     "seed": {"cover": 8.0, "craniotomy": 110.0},
 }
+NOTED = 3.0
+"""Per cent of the tumour's volume: a mesh that misses more of it is noted."""
 PLACED = ("radius", "cover", "tumour_shape", "site", "tumour_at")
 
 
@@ -111,6 +113,13 @@ def run(args: argparse.Namespace) -> int:
         else:
             write_intensity(beside, intensity)
     figures = _figures(args, anatomy, subject)
+    missed = figures["tumour_volume_error_percent"]
+    if abs(missed) > NOTED:
+        print(
+            f"{args.out}: holds {abs(missed):.1f} % {'less' if missed < 0.0 else 'more'} tumour than "
+            f"{args.labels or 'the template'}: where that matters, ask for more nodes.",
+            file=sys.stderr,
+        )
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
     summary = {**files, **figures, "seconds": round(time.perf_counter() - began, 2)}
     print(json.dumps(summary) if args.json else _sentences(summary))
