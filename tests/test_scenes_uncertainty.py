@@ -245,6 +245,8 @@ class TestSaid:
     def test_both_are_said_apart(self, trained, promised, error, said):
         assert error_lines(trained, promised, error) == said
         assert error_lines(trained, promised, error, "doubt") == said[1:]
+        located = replace(error, observed=1e-3)
+        assert error_lines(False, None, located) == error_lines(True, None, located)[1:]
 
     def test_the_worst_of_frames_is_known_where_all_are(self):
         errors = [TumourError(1e-3, "E"), TumourError(3e-3, "nu"), TumourError(2e-3, "E")]

@@ -70,7 +70,7 @@ class Theatre:
             beside = "" if path is None else f" at {path}"
             raise InputError(
                 f"the tumour cannot be located: this anatomy has no locator{beside}. `sulcus locator ANATOMY.vtu` "
-                "makes it, in 6 to 8 minutes on two cores."
+                "makes it, in up to 13 minutes on two cores."
             )
         return load_locator(path, self.anatomy)
 

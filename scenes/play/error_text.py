@@ -12,7 +12,9 @@ NOT_KNOWN_WORDS = "error of the tumour: not known"
 
 
 def error_lines(trained: bool, promised: float | None, error: TumourError, doubt: str = "") -> list[str]:
-    """Lines for a picture: what the model is off by, and what the tumour is off by; of a doubtful answer the latter.
+    """Lines for a picture: what the model is off by, and what the tumour is off by.
+
+    The latter alone of a doubtful answer, and of one that is found from what is observed.
 
     Parameters
     ----------
@@ -21,7 +23,8 @@ def error_lines(trained: bool, promised: float | None, error: TumourError, doubt
     promised
         What the model promises [m]; None where nothing is.
     """
-    return [*([] if doubt else [model_words(trained, promised)]), tumour_words(error)]
+    modelled = trained or error.observed is None
+    return [*([model_words(trained, promised)] if modelled and not doubt else []), tumour_words(error)]
 
 
 def model_words(trained: bool, promised: float | None) -> str:

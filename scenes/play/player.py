@@ -26,7 +26,7 @@ from ..script.site import Site
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, lifted
 from ..script.uncertainty import NOT_KNOWN, Observing, TumourError, Uncertainty
-from .error_text import error_lines, tumour_words
+from .error_text import error_lines
 from .load_text import acting, doubt_of
 from .observer import Estimate, Observer
 from .stage import CORTEX, TOOL, Stage
@@ -203,7 +203,6 @@ class Player:
         remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         lines = error_lines(isinstance(self.deformer, Learned), promised, error, doubt)
-        lines = lines if estimate is None else [tumour_words(error)]
         annotate(over, number, remark, lines, (picture.segmentation == TOOL).astype(np.uint8))
         spent = seconds, rendered - begun, clock.perf_counter() - rendered - located
         took = dict(zip(STAGES, spent, strict=True)) | ({} if estimate is None else {"locate": located})
