@@ -30,7 +30,7 @@ class Outside(NamedTuple):
     """Where loads lie to the training range, (B,) each.
 
     `away` is the distance from the nearest training load [m]. `beyond` says how far a load leaves the range otherwise.
-    It is the largest of some numbers: millimetres over the rim, radians beyond the angle, and the shares by which
+    That is the largest of millimetres over the rim, radians beyond the angle, and three shares. They are those by which
     force, radius and force over radius are too large or too small. `excess` counts millimetres beyond the reach too,
     and is zero inside.
     """
