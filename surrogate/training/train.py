@@ -44,7 +44,7 @@ class Trained:
     `motion` is the mean displacement [m] of the tumour over the held-out loads. `calibrated` counts the loads that
     calibrated the models' bounds, and the field after it counts the training loads. `left_out` gives by learner how
     often bounds held on the discs left out. These are bounds of the scored model, from loads outside the discs. By how
-    much they grow with the distance from training loads is told by the other discs. `distance_left_out` gives the same
+    much they grow with the distance from training loads, the other discs tell. `distance_left_out` gives the same
     for the distance from tip to tumour.
     """
 
