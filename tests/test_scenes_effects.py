@@ -177,7 +177,7 @@ class TestWithoutATool:
             assert not (frame.picture.segmentation == TOOL).any()
             assert (frame.shown != frame.picture.colour).any()
         lines = []
-        monkeypatch.setattr("scenes.play.player.panel", lambda colour, text: lines.extend(text) or colour)
+        monkeypatch.setattr("scenes.play.player.panel", lambda colour, text, below: lines.extend(text) or colour)
         labelled(frames[-1], "fem")
         assert any("gravity pulls to the left (0.87) and the back (0.50)" in line for line in lines)
         assert not any("0.00 N" in line for line in lines)

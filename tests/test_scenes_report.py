@@ -182,7 +182,7 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     assert None not in reported
     row = measured(replace(study), Learner("series"), tmp_path / "series.png")
     assert row.state == "measured" and row.solving > 0.1 * series_seconds(study, "series") > 0.0
-    assert row.series > 19 and row.inside == 0
+    assert row.series > 19 and row.inside > 0  # unit responses
     assert series_seconds(study, "linear") == 0.0
     assert row.own_fem["discs"].mm.mean < 0.5 * measured(study, SPECS[2], tmp_path / "l.png").own_fem["discs"].mm.mean
     assert {spec.name for spec in learners()} > set(EXPANDED)

@@ -22,5 +22,5 @@ SCENE = Scene(
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Bonded(), ToolForce()),
     sight=Sight(),
     viewpoint=Viewpoint(fov=np.radians(13.0), width=800, height=600),
-    bounds=Bounds(overlap=0.75, error=2e-3, removed=0.4),
+    bounds=Bounds(overlap=0.75, error=2e-3, removed=0.3),
 )
