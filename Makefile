@@ -33,7 +33,7 @@ template: $(STAMP)
 	$(VENV)/bin/sulcus train build/template.h5 --learners linear,ann,svr,series,series-gp --most 2000 --out scenes/data/template.model.npz
 	$(MAKE) locator
 
-# What locates the template's tumour in scenes: 6 minutes on one core.
+# What locates the template's tumour in scenes: up to 13 minutes on two cores.
 locator: $(STAMP)
 	$(VENV)/bin/sulcus locator scenes/data/template.vtu --small
 

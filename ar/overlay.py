@@ -135,7 +135,7 @@ def composite(
     traces
         Outlines of other surfaces, drawn under the hidden one's.
     moved
-        Length and error [m] to be written in place of the mean motion and the largest margin.
+        Length and error [m] to be written in place of the mean motion, which has none.
 
     Raises
     ------

@@ -103,7 +103,7 @@ class OwnCause(Protocol):
 
 BuiltIn = Pushed | Displaced | Nodal | Prescribed | Posture | Resected | Touching | Retracted
 Cause = BuiltIn | OwnCause
-C = TypeVar("C")
+C = TypeVar("C", bound=Cause)
 # The array of each cause that grows with the load; the others say where it acts. Tools move on `Cases.share`.
 MAGNITUDE = {
     Pushed: "force",
@@ -201,11 +201,7 @@ class Loads:
 
     def rows(self, index: slice | np.ndarray) -> Loads:
         """Some of the load cases, as loads."""
-        causes = tuple(
-            replace(cause, **{item.name: getattr(cause, item.name)[index] for item in fields(cause)})
-            for cause in self.causes
-        )
-        return Loads(causes, self.times[index])
+        return Loads(tuple(rows_of(cause, index) for cause in self.causes), self.times[index])
 
     def scaled(self, fraction: float | np.ndarray) -> Loads:
         """The same causes with every magnitude that they have times `fraction` (scalar or (B,))."""
@@ -219,6 +215,11 @@ class Loads:
             return replace(cause, **{name: factor * array})
 
         return Loads(tuple(grown(cause) for cause in self.causes), self.times)
+
+
+def rows_of(cause: C, index: slice | np.ndarray) -> C:
+    """A cause of some of the load cases, by number, a slice, or (B,) bool."""
+    return replace(cause, **{item.name: getattr(cause, item.name)[index] for item in fields(cause)})
 
 
 def stacked(parts: Sequence[Loads]) -> Loads:

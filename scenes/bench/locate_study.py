@@ -8,12 +8,12 @@ from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.threads import one_thread
-from surrogate.locating.calibration import seen_patch
+from surrogate.locating.calibration import RADIUS_SQUARED, seen_patch
+from surrogate.locating.evidence import smooth_root
 from surrogate.locating.locator import Locator
 from surrogate.locating.observation import Observation
 from surrogate.locating.prior import middle_of
@@ -24,7 +24,6 @@ from .stopwatch import timed
 
 OURS, ORACLE = "sulcus locate", "best sum of its shapes"
 """The locator, and what no estimator by its shapes can beat: it knows the truth."""
-LEVEL = 0.95
 # What is stated of points without error [m], as a locator must be given some.
 EXACT = 5e-5
 # Errors of points: white and smooth [m], the smooth one's length [m], and the angle of the rigid one [rad].
@@ -119,10 +118,8 @@ def spoilt(rest: np.ndarray, now: np.ndarray, translation: float, random: np.ran
     middle = rest.mean(axis=0)
     axis, way = random.standard_normal((2, 3))
     turn = Rotation.from_rotvec(TURN * axis / np.linalg.norm(axis))
-    square = ((rest[:, None] - rest) ** 2).sum(axis=2)
-    value, vector = np.linalg.eigh(np.exp(-0.5 * square / LENGTH**2))
-    root = vector * np.sqrt(np.maximum(value, 0.0))
-    off = WHITE * random.standard_normal(rest.shape) + SMOOTH * root @ random.standard_normal(rest.shape)
+    smooth = SMOOTH * smooth_root(rest, LENGTH)
+    off = WHITE * random.standard_normal(rest.shape) + smooth @ random.standard_normal(rest.shape)
     return middle + turn.apply(now - middle) + translation * way / np.linalg.norm(way) + off
 
 
@@ -171,7 +168,7 @@ def row(sight: Sight, name: str, estimates: Sequence[Estimate]) -> Row:
     """What became of an estimator's estimates."""
     error, motion = (np.concatenate([getattr(each, key) for each in estimates]) for key in ("error", "motion"))
     squares = [each.square for each in estimates if each.square is not None]
-    held = 100.0 * float(np.mean(np.array(squares) < chi2.ppf(LEVEL, 3))) if squares else None
+    held = 100.0 * float(np.mean(np.array(squares) < RADIUS_SQUARED)) if squares else None
     seconds = [each.seconds for each in estimates if each.seconds is not None]
     return Row(
         sight.points, sight.cover, sight.noise, name,

@@ -72,8 +72,8 @@ def run(args: argparse.Namespace) -> int:
             "model_error_mm": _mm(promised),
             "tumour_error_mm": _mm(error.bound),
             "largest_part": error.largest,
+            "tumour_error_unobserved_mm": _mm(error.prior),
         }
-        rows[-1] |= {"tumour_error_unobserved_mm": _mm(error.prior)}
         print(
             f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}: the tumour is off by {figures.error_mm:.3f} "
             f"mm of the {figures.motion_mm:.2f} mm that it moves. Its outline is off by {figures.drawn:.1f} px, "

@@ -136,12 +136,11 @@ def _numbers(found: Location, points: int, out: Path) -> dict[str, object]:
 
 def _sentences(found: Location, out: Path) -> str:
     x, y, z = 1e3 * found.centroid
-    causes = ", ".join(f"{name} {share:.0%}" for name, share in found.causes.items() if share > 0.005) or "none"
     sure = "With a probability of 95 %" if found.calibrated else "At a guess"
     lines = [
         f"The middle of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",
         f"{sure} it is within {1e3 * found.p95:.1f} mm of there.",
-        f"The motion explains {found.explained:.0%} of what was seen. Causes: {causes}.",
+        f"The motion explains {found.explained:.0%} of what was seen. Causes: {found.named_causes}.",
         f"The observation as a whole seems off by {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
     ]
     if not found.calibrated:

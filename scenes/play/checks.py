@@ -142,12 +142,14 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
 
 def _covered(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
     """Share of frames whose ellipsoid, as it is drawn, holds the tumour's middle by the finite elements."""
+    if not any(frame.estimate for frame in frames):
+        return np.nan
     anatomy, held = player.site.anatomy, []
     for row, frame in enumerate(frames):
         ellipsoid = None if frame.estimate is None else frame.estimate.ellipsoid()
         middle = middle_of(anatomy, player.positions(truth, row)[None])[0]
         held.append(ellipsoid is not None and within(ellipsoid, middle))
-    return float(np.mean(held)) if any(frame.estimate for frame in frames) else np.nan
+    return float(np.mean(held))
 
 
 def within(closed: Layer, point: np.ndarray) -> bool:

@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from ar.layer import Layer
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.geometry.closest_point import closest
-from surrogate.locating.evidence import LENGTH
+from surrogate.locating.calibration import RADIUS_SQUARED
+from surrogate.locating.evidence import smooth_root
 from surrogate.locating.locator import Location, Locator
 from surrogate.locating.observation import Observation
 from surrogate.locating.prior import middle_of
@@ -24,8 +24,6 @@ from ..script.sight import Sight
 from ..script.site import HOLE, Site
 from ..script.tool import sphere
 
-LEVEL = 0.95
-"""Probability with which the tumour's middle is said to lie in its ellipsoid."""
 # A tool so near to the cortex touches it; it hides points that are so near to it [m].
 TOUCHES, HIDES = 1e-3, 4e-3
 # Of a tool's corners so many that are nearest to those of the cortex are looked at, for where it touches.
@@ -80,7 +78,7 @@ class Estimate:
         if self.location is None:
             return None
         largest = np.linalg.eigvalsh(self.location.covariance(self.anatomy.tumour_nodes))[:, -1].max()
-        return float(np.sqrt(chi2.ppf(LEVEL, 3) * largest))
+        return float(np.sqrt(RADIUS_SQUARED * largest))
 
     @property
     def off(self) -> float:
@@ -98,7 +96,7 @@ class Estimate:
         if self.location is None:
             return False
         away = self.true - self.motion
-        return bool(away @ np.linalg.solve(self.location.centroid_covariance, away) <= chi2.ppf(LEVEL, 3))
+        return bool(away @ np.linalg.solve(self.location.centroid_covariance, away) <= RADIUS_SQUARED)
 
     @property
     def words(self) -> str:
@@ -130,7 +128,7 @@ class Estimate:
         if self.location is None:
             return None
         root = np.linalg.cholesky(self.location.centroid_covariance)
-        at = np.sqrt(chi2.ppf(LEVEL, 3)) * BALL @ root.T
+        at = np.sqrt(RADIUS_SQUARED) * BALL @ root.T
         return Layer("ellipsoid", ELLIPSOID, self.middle + self.motion + at, BALL_FACES, ELLIPSOID_COLOUR)
 
 
@@ -207,9 +205,7 @@ class Observer:
     def _smooth(self) -> np.ndarray:
         """(n, 3) [m]: the error that neighbours share."""
         at, random = self._at(self._rest), np.random.default_rng([self.sight.seed, 0, 1])
-        square = ((at[:, None] - at) ** 2).sum(axis=2)
-        value, vector = np.linalg.eigh(np.exp(-0.5 * square / LENGTH**2))
-        return self.sight.smooth * (vector * np.sqrt(value.clip(0.0))) @ random.standard_normal(at.shape)
+        return self.sight.smooth * smooth_root(at) @ random.standard_normal(at.shape)
 
     @cached_property
     def _rigid(self) -> tuple[np.ndarray, np.ndarray]:

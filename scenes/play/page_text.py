@@ -34,8 +34,6 @@ ESTIMATED = (
 )
 RESEARCH = "Research only. Not a medical device."
 MIDLINE = 5e-3
-# A cause of a smaller share is not named.
-LEAST_CAUSE = 0.005
 ELEMENTS = {"p1": "linear tetrahedra", "p2": "quadratic tetrahedra", "smoothed": "smoothed linear tetrahedra"}
 EFFECTS = {
     "ToolForce": "push of the tool",
@@ -217,13 +215,12 @@ def estimated(found: Estimate) -> list[str]:
         ]
     moved = hud.millimetres(found.moved, found.location.p95).replace("+-", "\N{PLUS-MINUS SIGN}")
     held = "inside" if found.held else "outside of"
-    causes = ", ".join(f"{cause} {share:.0%}" for cause, share in found.location.causes.items() if share > LEAST_CAUSE)
     guess = "" if found.location.calibrated else " It is a guess: such observations were not tried."
     still = "" if found.noticed else " No motion is seen beyond its error."
     return [
         f'<p class="number">tumour moved {moved} by the estimate ({truth})</p>',
         f"<p><b>estimate</b> from {escape(found.source)}: {1e3 * found.off:.1f} mm off the truth, which is {held} the "
-        f"ellipsoid. Causes: {causes or 'none'}.{still}{guess}</p>",
+        f"ellipsoid. Causes: {found.location.named_causes}.{still}{guess}</p>",
     ]
 
 

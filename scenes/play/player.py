@@ -191,8 +191,7 @@ class Player:
         doubt = doubt or (REFUSED if estimate is not None and estimate.location is None else "")
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
         promised = None if doubt else self._promised(deformation)
-        error = NOT_KNOWN if doubt else self._tumour_error(touch, loads, deformation, promised or 0.0)
-        error = replace(error, observed=estimate.worst) if estimate is not None else error
+        error = NOT_KNOWN if doubt else self._tumour_error(touch, loads, deformation, promised or 0.0, estimate)
         plain = None if gauge is None else replace(gauge, error=None)
         traces = () if estimate is None else traces_of(estimate, stage.truth(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
@@ -235,11 +234,15 @@ class Player:
         bound = of_load if np.isfinite(of_load) else self.deformer.bound
         return bound if np.isfinite(bound) else None
 
-    def _tumour_error(self, touch: Touch, loads: Loads, answer: Deformation, promised: float) -> TumourError:
+    def _tumour_error(
+        self, touch: Touch, loads: Loads, answer: Deformation, promised: float, estimate: Estimate | None
+    ) -> TumourError:
         """How far the tumour may be off: known where the script has the tool, and what sees the brain knows more."""
         time = float(loads.times[0])
         scripted = self.uncertainty is not None and touch == self.scene.path(time)
         error = self.uncertainty.at(time, promised) if self.uncertainty is not None and scripted else NOT_KNOWN
+        if estimate is not None:
+            return replace(error, observed=estimate.worst)
         if isinstance(self.deformer, Observing):
             error = replace(error, observed=self.deformer.tumour_error(answer))
         return error

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
@@ -20,6 +20,9 @@ from .presses import Presses
 from .prior import Prior, middle_of, prior_of
 
 LEVEL = 0.95
+"""Probability with which ellipsoids are made to hold."""
+RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
+"""The squared radius of a Gaussian's ellipsoid of that probability, in deviations: of chi-squared of three numbers."""
 # Trials in all. So many of those most like an observation say how far its covariance must grow.
 TRIALS, NEAREST = 240, 80
 # What moves the brain in a trial.
@@ -76,7 +79,7 @@ def covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
     away = ((tried[:, :2] - likeness(evidence)) ** 2).sum(axis=1)
     square = np.sort(tried[np.argsort(away, kind="stable")[:NEAREST], 2])
     rank = min(int(np.ceil(LEVEL * (len(square) + 1))), len(square))
-    return float(square[rank - 1] / chi2.ppf(LEVEL, 3))
+    return float(square[rank - 1] / RADIUS_SQUARED)
 
 
 def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:

@@ -9,6 +9,8 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from sim.geometry.locate import Located
 
+from ..array_functions import squared_distances
+
 # How the share of an error that is not rigid is made: white, and smooth over the surface.
 WHITE, SMOOTH = 0.3e-3, 0.5e-3
 SIGMA = float(np.hypot(WHITE, SMOOTH))
@@ -80,10 +82,9 @@ class Evidence:
 
     def noise(self, scale: float = 0.0) -> np.ndarray:
         """Covariance (m, m) [m^2] of errors that are not rigid, and of what shapes lack where `scale` [m] is seen."""
-        share, sigma = (WHITE / SIGMA) ** 2, self.sigma
-        square = ((self.at[:, None] - self.at) ** 2).sum(axis=2)
-        out = (1.0 - share) * np.outer(sigma, sigma) * np.exp(-0.5 * square / LENGTH**2)
-        out += (LACK_SMOOTH * scale) ** 2 * np.exp(-0.5 * square / LACK_LENGTH**2)
+        share, sigma, square = (WHITE / SIGMA) ** 2, self.sigma, squared_distances(self.at, self.at)
+        out = (1.0 - share) * np.outer(sigma, sigma) * alike(square, LENGTH)
+        out += (LACK_SMOOTH * scale) ** 2 * alike(square, LACK_LENGTH)
         out *= self.axis @ self.axis.T
         out[np.diag_indices(len(self))] += share * sigma**2 + (LACK_WHITE * scale) ** 2
         return out
@@ -126,6 +127,17 @@ class Whitening:
         point, axis = np.divmod(table, self.copies)
         alike = axis[:, :, None] == axis[:, None]
         return np.where(alike, inverse[point[:, :, None], point[:, None]], 0.0)
+
+
+def alike(square: np.ndarray, length: float) -> np.ndarray:
+    """Correlation (n, n) of smooth errors at squared distances (n, n) [m^2], which fades over a length [m]."""
+    return np.exp(-0.5 * square / length**2)
+
+
+def smooth_root(points: np.ndarray, length: float = LENGTH) -> np.ndarray:
+    """What makes (n, n) smooth errors at points (n, 3) [m] of independent ones, all of variance 1."""
+    value, vector = np.linalg.eigh(alike(squared_distances(points, points), length))
+    return vector * np.sqrt(np.maximum(value, 0.0))
 
 
 def of_motions(place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT) -> Evidence:

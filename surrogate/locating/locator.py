@@ -21,6 +21,8 @@ from .prior import Prior
 ROUNDS = 6
 # More points than this share are no outliers, and no cause of the ensemble moves what this is more surprised by.
 MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
+# A cause of a smaller share is not named.
+LEAST_NAMED = 0.005
 # Normal numbers by which a radius is found that holds 95 in 100.
 DRAWS = 4000
 
@@ -101,6 +103,12 @@ class Location:
         parts = [weight[rows] @ shape[rows] for rows in map(self.prior.kind.__eq__, range(len(KINDS)))]
         squares = np.array([part @ part for part in parts], float)
         return dict(zip(KINDS, (squares / (squares.sum() or 1.0)).tolist(), strict=True))
+
+    @property
+    def named_causes(self) -> str:
+        """The same in words, without those of less than half a per cent."""
+        named = [f"{name} {share:.0%}" for name, share in self.causes.items() if share > LEAST_NAMED]
+        return ", ".join(named) or "none"
 
 
 @dataclass(frozen=True, eq=False)

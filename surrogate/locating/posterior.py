@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from .evidence import Evidence, Whitening
 from .prior import Hypothesis, Prior
@@ -182,7 +182,7 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) ->
         sight = sight_of(prior, some, tips)
         answers = sight.answers()
         odd = _oddness(sight, max(answers, key=lambda answer: answer.share), some.point)
-        excess = odd / chi2.isf(IMPROBABLE, np.unique(some.point, return_counts=True)[1])
+        excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], IMPROBABLE)
         if excess.max() <= 1.0 or len(excess) <= FEWEST:
             break
         kept &= ~np.isin(point, np.unique(some.point)[excess >= max(1.0, 0.5 * excess.max())])

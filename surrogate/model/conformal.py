@@ -68,9 +68,8 @@ class Bound:
     def of(self, features: np.ndarray, force: np.ndarray, outside: Outside) -> np.ndarray:
         """Bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N], and where the B loads lie."""
         scale = np.exp(_monomials(_standard(features, self.mean, self.deviation)) @ self.weights)
-        scale = (
-            scale * (1.0 + self.growth * np.maximum(outside.away - self.near, 0.0)) * (1.0 + GROWTH * outside.beyond)
-        )
+        away = np.maximum(outside.away - self.near, 0.0)
+        scale = scale * (1.0 + self.growth * away) * (1.0 + GROWTH * outside.beyond)
         return taken(np.searchsorted(self.edges, force), self.quantile.T).T * scale
 
 

@@ -228,7 +228,7 @@ class Learned:
             return np.stack([np.nan * outside.excess] * len(LEVELS))
         # As the motion, so its error: in proportion to a force weaker than any of the training.
         weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
-        features = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *self.envelope.force)))
+        features = features_of(pushed, self.envelope.within(known))
         return np.where(weaker > 0.0, bound.of(features, known.magnitude, outside), 0.0) * weaker
 
     def distance(self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None) -> Distance:

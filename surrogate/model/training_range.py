@@ -87,6 +87,10 @@ class Envelope:
         asked, known, free = (set(map(tuple, place.astype(np.float32))) for place in (point, self.points, corners))
         return bool((asked & known) - free)
 
+    def within(self, known: Measured) -> Measured:
+        """Loads with the nearest force of the training."""
+        return known._replace(magnitude=np.clip(known.magnitude, *self.force))
+
     def outside(self, pushed: Pushed, known: Measured) -> Outside:
         """Where loads lie to the range."""
         magnitude, angle, overhang = known

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.loads import Pushed
+from sim.loads import Pushed, rows_of
 
 from ..data.cortex_patch import Patch
 from ..data.disc_split import Split
@@ -54,9 +54,8 @@ class Missed:
 
     def rows(self, some: np.ndarray) -> Missed:
         """Some of them, by number or (B,) bool."""
-        pushed = Pushed(self.pushed.point[some], self.pushed.force[some], self.pushed.footprint[some])
         known, outside = Measured(*(each[some] for each in self.known)), Outside(*(each[some] for each in self.outside))
-        return Missed(pushed, known, outside, self.features[some], self.error[some])
+        return Missed(rows_of(self.pushed, some), known, outside, self.features[some], self.error[some])
 
     @property
     def worst(self) -> np.ndarray:
@@ -72,8 +71,7 @@ class Missed:
 def missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> Missed:
     """Errors (B, k) [m] of a model on loads as it is asked them."""
     known, envelope = measured(patch, pushed), model.envelope
-    features = features_of(pushed, known._replace(magnitude=np.clip(known.magnitude, *envelope.force)))
-    return Missed(pushed, known, envelope.outside(pushed, known), features, error)
+    return Missed(pushed, known, envelope.outside(pushed, known), features_of(pushed, envelope.within(known)), error)
 
 
 def bound_by(near: Missed, way: Way, growth: float, seen: Missed | None = None) -> Bound:
@@ -93,25 +91,30 @@ def bound_by(near: Missed, way: Way, growth: float, seen: Missed | None = None) 
 
 def growth_by(near: Missed, far: Missed, way: Way) -> float:
     """The growth [1/m] by which a bound holds as often `far` from training loads as near them."""
-    plain, calibrating = bound_by(near, way, 0.0), near.rows(~_fits(near))
-    ratios = [
+    return fitted_growth(*_over_plain(near, far, way))
+
+
+def covered_on_discs(model: Learned, near: Missed, far: Missed, split: Split, way: Way) -> Coverage:
+    """How often bounds hold on each disc left out, of a growth that the other discs tell."""
+    known, (ratio, away) = _over_plain(near, far, way)
+    disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
+    for each in np.unique(disc):
+        here = disc == each
+        own = bound_by(near, way, fitted_growth(known, (ratio[~here], away[~here])))
+        some = far.rows(here)
+        bound[:, here] = model.promised(own, some.pushed, some.known, some.outside)
+    return covered(far.force, far.worst, bound, int((far.outside.excess > 0.0).sum()))
+
+
+def _over_plain(near: Missed, far: Missed, way: Way) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Errors over a bound that does not grow, and distances [m] from training loads: of what calibrates, of `far`."""
+    plain = bound_by(near, way, 0.0)
+    return [
         (each.worst / plain.of(each.features, each.force, each.outside.here)[0], each.outside.away)
-        for each in (calibrating, far)
+        for each in (near.rows(~_fits(near)), far)
     ]
-    return fitted_growth(*ratios)
 
 
 def _fits(near: Missed) -> np.ndarray:
     """Which of the loads fit the scale: (B,) bool."""
     return np.arange(len(near.error)) % SCALE == 0
-
-
-def covered_on_discs(model: Learned, near: Missed, far: Missed, split: Split, way: Way) -> Coverage:
-    """How often bounds hold on each disc left out, of a growth that the other discs tell."""
-    disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
-    for each in np.unique(disc):
-        here, others = disc == each, far.rows(disc != each)
-        own = bound_by(near, way, growth_by(near, others, way))
-        some = far.rows(here)
-        bound[:, here] = model.promised(own, some.pushed, some.known, some.outside)
-    return covered(far.force, far.worst, bound, int((far.outside.excess > 0.0).sum()))

@@ -141,15 +141,15 @@ class Expansion:
         """
         triangles = with_middles(self.patch)[0]
         inside = self.patch.rim_distance(self.places)[:, None] > self.radii
-        found = []
-        for table, linear, wide, basis in zip(self._series, self.tables, self.tabulated.bases, bases, strict=True):
+        found, known = [], self.tabulated
+        for table, linear, wide, basis in zip(known.tables, self.tables, known.bases, bases, strict=True):
             added = table.copy()
             first = linear.regressor.predict(self._unit_shares) @ (linear.basis.modes @ wide.modes.T)
             # Footprints over the rim press on nodes beyond the open cortex. Of others nothing is left.
             added[:, :, SPANS[0]] -= first.reshape(added[:, :, SPANS[0]].shape)
-            known = filled(self.places, added @ (wide.modes @ basis.modes.T), left_out)
-            known[inside, SPANS[0]] = 0.0
-            exact = Series(self.patch.points, triangles, self.radii, known)
+            every = filled(self.places, added @ (wide.modes @ basis.modes.T), left_out)
+            every[inside, SPANS[0]] = 0.0
+            exact = Series(self.patch.points, triangles, self.radii, every)
             found.append(Series.restored(exact.state()))  # what is used is what can be stored
         return found
 
@@ -159,12 +159,6 @@ class Expansion:
         point = np.repeat(self.places, 3 * len(self.radii), axis=0)
         radius = np.tile(np.repeat(self.radii, 3), len(self.places))
         return nodal_shares(self.patch, Pushed(point, np.tile(np.eye(3), (len(point) // 3, 1)), radius))
-
-    @property
-    def _series(self) -> list[np.ndarray]:
-        """The part of the table of the series that each of its bases has."""
-        cuts = np.cumsum([len(basis.modes) for basis in self.tabulated.bases])[:-1]
-        return np.split(self.tabulated.table, cuts, axis=-1)
 
     @cached_property
     def contact(self) -> tuple[Contact, list[Basis], float]:
@@ -281,6 +275,11 @@ class Tabulated:
     bases: list[Basis]
     table: np.ndarray
     seconds: float
+
+    @property
+    def tables(self) -> list[np.ndarray]:
+        """The part of each basis."""
+        return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,11 @@ def with_correction(model: Learned, patch: Patch, known: Measured) -> Learned:
     return replace(model, tip=TipModel(fitted_correction(patch, model.asked(some.loads), off)))
 
 
-def corrected_if_better(model: Learned, patch: Patch, trained: Measured, held_out: Measured) -> Learned:
-    """The model with a correction, if that brings held-out distances nearer on average."""
+def corrected_if_better(
+    model: Learned, patch: Patch, trained: Measured, held_out: Measured
+) -> tuple[Learned, np.ndarray]:
+    """The model with a correction, if that brings held-out distances nearer on average; and their errors (B,) [m]."""
     candidates = [replace(model, tip=TipModel()), with_correction(model, patch, trained)]
-    plain, corrected = (distance_errors(each, held_out).mean() for each in candidates)
-    return candidates[int(corrected < plain)]
+    error = [distance_errors(each, held_out) for each in candidates]
+    best = int(error[1].mean() < error[0].mean())
+    return candidates[best], error[best]

@@ -9,7 +9,7 @@ import numpy as np
 
 from sim.bodies.tip_distance import tip_gauge
 from sim.errors import InputError
-from sim.loads import Loads, Pushed
+from sim.loads import Loads, Pushed, rows_of
 from sim.runtime.timing import stage
 
 from ..data.cortex_patch import Patch
@@ -149,11 +149,11 @@ def train(
         distances = Measured(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.ball))
 
     def examples(rows: np.ndarray) -> Examples:
-        return Examples(_rows(pushed, rows), truth[rows], cortex[rows])
+        return Examples(rows_of(pushed, rows), truth[rows], cortex[rows])
 
     def unseen(model: Learned, rows: np.ndarray) -> tuple[Missed, Missed]:
         """How far a model is off at the tumour, and in its distance, on the chosen rows (B,) bool."""
-        some, asked, known = np.flatnonzero(rows), _rows(pushed, rows), distances.rows(rows)
+        some, asked, known = np.flatnonzero(rows), rows_of(pushed, rows), distances.rows(rows)
         of_tumour = errors(model, loads.rows(some), truth[rows], nodes)
         of_tip = distance_errors(model, known)[:, None]
         return missed(model, patch, asked, of_tumour), missed(model, patch, asked, of_tip)
@@ -177,8 +177,10 @@ def train(
         with stage("score"):
             solves = inputs[0].solve_counts(name, example_sets[0])
             scores.append(score(name, model, test, truth[split.test], nodes, solves))
-            model = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
-            far = unseen(model, split.test)
+            error = errors(model, test, truth[split.test], nodes)
+            model, off = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
+            tested = rows_of(pushed, split.test)
+            far = missed(model, patch, tested, error), missed(model, patch, tested, off[:, None])
         models[name] = replace(model, bound=min(conformal(far[0].worst, LEVELS[0]), float(far[0].worst.max())))
         growth = [USUAL_GROWTH, USUAL_GROWTH]
         if beside.sum() >= 2 * FEWEST_APART and len(test) >= TENTHS:
@@ -236,8 +238,3 @@ def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
             "poses."
         )
     return only_pushed(loads)
-
-
-def _rows(pushed: Pushed, rows: np.ndarray) -> Pushed:
-    """Those of the chosen rows, (B,) bool or by number."""
-    return Pushed(pushed.point[rows], pushed.force[rows], pushed.footprint[rows])
