@@ -1,4 +1,4 @@
-"""Two array functions that NumPy lacks. A type of array registers its own version, as graphs do for export."""
+"""Array functions that NumPy lacks. A type of array registers its own version, as graphs do for export."""
 
 from __future__ import annotations
 
@@ -19,3 +19,15 @@ def squared_distances(points: np.ndarray, sites: np.ndarray) -> np.ndarray:
 def taken(index: np.ndarray, table: np.ndarray) -> np.ndarray:
     """Rows of a table (n, ...) at whole numbers of any shape: `table[index]`."""
     return table[index]
+
+
+@singledispatch
+def product_of(rows: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """rows (B, n) @ table (n, r)."""
+    return rows @ table
+
+
+@singledispatch
+def columns_in_use(rows: np.ndarray) -> np.ndarray:
+    """The columns of rows (B, n) that are not all zero, ascending."""
+    return np.flatnonzero(rows.any(axis=0))

@@ -34,9 +34,9 @@ from surrogate.data.direction_split import leave_sectors_out
 from surrogate.data.encode import directions, reduce, tool_features
 from surrogate.model.training_range import envelope_of
 from surrogate.regressors.svr import Svr
+from surrogate.training.expansion import COARSE, EXPANDED
 from surrogate.training.learners import SVR
 from surrogate.training.published_models import from_angles, published_nodes, sites_of, thirteen, to_angles
-from surrogate.training.shared_inputs import COARSE, EXPANDED
 from surrogate.training.train import train
 from surrogate.training.tuning import Tuned
 
@@ -177,7 +177,7 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     reported = []
     tabulate_series(study, lambda done, total: reported.append((done, total)))
     assert reported and reported[-1][0] == reported[-1][1]
-    monkeypatch.setattr("surrogate.training.shared_inputs.Expansion.fem", None)
+    monkeypatch.setattr("surrogate.training.expansion.Expansion.fem", None)
     tabulate_series(study, lambda done, total: reported.append(None))
     assert None not in reported
     row = measured(replace(study), Learner("series"), tmp_path / "series.png")

@@ -10,7 +10,7 @@ from studies import study_of
 
 from scenes.report.learner import Learner, measure_learner
 from sim.runtime.threads import one_thread
-from surrogate.training.shared_inputs import Expansion
+from surrogate.training.expansion import Expansion
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from sim.tearing import Tearing
 from surrogate.data.dataset import read_dataset
 from surrogate.data.tool_loads import draw
 from surrogate.model.applicability import trained_skull
-from surrogate.training.shared_inputs import Expansion
+from surrogate.training.expansion import Expansion
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from surrogate.evaluation.score import errors
 from surrogate.model.store import load, save
 from surrogate.regressors.ball_contact import THICKER, Contact, nearest_shares
 from surrogate.training.condense_contact import condensed, unit_responses
-from surrogate.training.shared_inputs import TOUCHED
+from surrogate.training.expansion import TOUCHED
 from surrogate.training.train import Trained, learners_for, train
 
 BALL = ball_of("palpation")

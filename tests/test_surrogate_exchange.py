@@ -31,7 +31,7 @@ from surrogate.onnx_export.export import onnx_model
 from surrogate.regressors.ann import Ann
 from surrogate.regressors.bayesian import Bayesian
 from surrogate.regressors.force_series import Series
-from surrogate.training.shared_inputs import EXPANDED, Expansion
+from surrogate.training.expansion import EXPANDED, Expansion
 from surrogate.training.train import LEARNERS, train
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)

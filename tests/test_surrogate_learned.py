@@ -24,7 +24,7 @@ from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
 from surrogate.model.training_range import envelope_of
 from surrogate.training.bounds import TUMOUR, bound_by, growth_by, missed
-from surrogate.training.shared_inputs import EXPANDED
+from surrogate.training.expansion import EXPANDED
 from surrogate.training.train import LEARNERS, train
 
 

@@ -16,12 +16,13 @@ from sim.material import Material, tissue_to_json
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.disc_split import Split
-from surrogate.data.encode import directions, tool_features
+from surrogate.data.encode import ENCODERS, directions, tool_features
 from surrogate.data.simulate import simulate
 from surrogate.model.store import load, save
 from surrogate.regressors.force_series import ORDERS, SPANS, Series, forms
 from surrogate.regressors.left_out_tables import filled
-from surrogate.training.shared_inputs import ADDED, COARSE, EXPANDED, Examples, Expansion
+from surrogate.training.examples import Examples
+from surrogate.training.expansion import ADDED, COARSE, EXPANDED, Expansion
 from surrogate.training.tabulate_series import radii_between, tabulated, with_middles
 from surrogate.training.train import learners_for, train
 
@@ -138,11 +139,35 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, box, patch):
     point = np.repeat(with_middles(patch)[1][places], 3, axis=0)
     units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
     predicted = expansion.on(bases, np.zeros(len(expansion.places), bool))
-    for at, basis, found in zip(nodes, bases, predicted, strict=True):
+    for at, basis, found, exact in zip(nodes, bases, predicted, expansion.exact, strict=True):
         wanted = fem.series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
-        for terms in SPANS[1:]:
+        for terms in SPANS[len(exact) :]:
             miss = np.linalg.norm((found.table[places, 0] - wanted)[:, terms])
             assert miss < 1e-3 * np.linalg.norm(wanted[:, terms])  # half precision has eleven bits
+
+
+def test_two_orders_of_the_tumour_are_exact_wherever_a_tool_presses(data, box):
+    """Of loads inside the rim nothing is left of them; over it the table holds what is missing."""
+    expansion = Expansion(data, "cpu")
+    fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
+    loads = pushes(expansion.patch, 40, 8, (7e-3, 7e-3))
+    inside = expansion.patch.rim_distance(loads.point) > loads.footprint
+    assert 10 < inside.sum() < 40
+    exact = fem.series(Loads((loads,)), 2, every_motion(fem, expansion.tumour))
+    size = directions(loads)[0][:, None, None]
+    found = [size * part.response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
+    for order, (motion, limit) in enumerate(zip(found, (1e-3, 5e-3), strict=True)):
+        off = np.linalg.norm(motion.reshape(40, -1) - exact[:, order], axis=1) / np.linalg.norm(exact[:, order], axis=1)
+        assert off[inside].max() < limit
+    many = [part.response(ENCODERS[part.encoder](expansion.patch, replaced(loads, 3))) for part in expansion.exact[0]]
+    some = [part.response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
+    for few, more in zip(some, many, strict=True):  # more than are answered at once
+        np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)
+
+
+def replaced(loads, times):
+    """The same loads, so many times."""
+    return Pushed(*(np.concatenate([each] * times) for each in (loads.point, loads.force, loads.footprint)))
 
 
 def test_a_series_beats_the_table_of_first_order(trained):

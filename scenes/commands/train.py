@@ -19,7 +19,7 @@ from surrogate.data.disc_split import APART
 from surrogate.data.tool_loads import refused_share, refused_words
 from surrogate.evaluation.score import table, winner
 from surrogate.model.store import save
-from surrogate.training.shared_inputs import EXPANDED, Expansion
+from surrogate.training.expansion import EXPANDED, Expansion
 from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, learners_for, train
 
 from .devices_option import add_devices

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sim.runtime.atomic_files import written_whole
-from surrogate.training.shared_inputs import EXPANDED
+from surrogate.training.expansion import EXPANDED
 
 from .study import Study
 

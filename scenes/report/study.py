@@ -19,7 +19,7 @@ from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.disc_split import Split, leave_discs_out
 from surrogate.data.encode import directions
-from surrogate.training.shared_inputs import Expansion
+from surrogate.training.expansion import Expansion
 
 from ..script.shipped_files import template_path
 from .extrapolated_loads import loads_beyond

@@ -12,6 +12,7 @@ import warp as wp
 
 from ..errors import InputError
 from ..loads import Loads
+from .element import Elements
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +190,13 @@ class Strained(Term, Protocol):
     @property
     def bounded(self) -> bool:
         """Whether it is infinite where its elements are inside out."""
+        ...
+
+    def second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
+        """Its elements (T,), half the second derivative (k, 9, 9, 9) [Pa] of each tissue's stress at rest, and whose.
+
+        Of stress component a by gradient components b and c, row by row; the last (T,) says which tissue.
+        """
         ...
 
     def elements_on(self, nodes: np.ndarray) -> np.ndarray:

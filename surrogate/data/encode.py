@@ -27,6 +27,16 @@ def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
     return shared_out(weights.toarray(), pushed)
 
 
+def rooted_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
+    """`nodal_shares` times the root of the force: products of two are those of forces, for one newton."""
+    return rooted(nodal_shares(patch, pushed), pushed)
+
+
+def rooted(shares: np.ndarray, pushed: Pushed) -> np.ndarray:
+    """Shares (B, 3 m) for one newton, times the root of each load's force."""
+    return np.sqrt(directions(pushed)[0])[:, None] * shares
+
+
 def shared_out(weights: np.ndarray, pushed: Pushed) -> np.ndarray:
     """Forces (B, 3 m) at m nodes, for one newton, of which each bears its weight (B, m)."""
     return np.einsum("bm,bi->bmi", weights, directions(pushed)[1]).reshape(-1, 3 * weights.shape[1])
@@ -42,7 +52,7 @@ def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     return np.column_stack([pushed.point, direction, magnitude, pushed.footprint])
 
 
-ENCODERS: dict[str, Encoder] = {"nodal": nodal_shares, "tool": tool_features}
+ENCODERS: dict[str, Encoder] = {"nodal": nodal_shares, "rooted": rooted_shares, "tool": tool_features}
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from ..regressors.ann import Ann
 from ..regressors.ball_contact import Contact
 from ..regressors.bayesian import Bayesian
 from ..regressors.compliance_table import Linear
+from ..regressors.force_pairs import Pairs
 from ..regressors.force_series import Series
 from ..regressors.gp import Gp
 from ..regressors.pcr import Pcr
@@ -46,7 +47,13 @@ REGRESSORS: dict[str, type[Regressor]] = {
     "bayesian": Bayesian,
 }
 # These know the tool's features, and their meaning.
-FITTED: dict[str, type[Fitted]] = {**REGRESSORS, "series": Series, "remainder": Remainder, "contact": Contact}
+FITTED: dict[str, type[Fitted]] = {
+    **REGRESSORS,
+    "pairs": Pairs,
+    "series": Series,
+    "remainder": Remainder,
+    "contact": Contact,
+}
 
 
 def save(path: str | Path, models: Mapping[str, Learned]) -> None:

@@ -87,7 +87,7 @@ def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
 
 def _probe(encoder: str, model: Learned) -> np.ndarray:
     """Features of a training load, made without a tool's footprint integral."""
-    if encoder == "nodal":
+    if encoder in ("nodal", "rooted"):
         return np.ones((1, 3 * len(open_patch(model.anatomy).nodes)))
     envelope = model.envelope
     _check_envelope(envelope)

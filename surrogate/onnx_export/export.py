@@ -5,6 +5,7 @@ The graph is what the model's own formulas do with wires in place of arrays: no 
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,13 +16,14 @@ from sim.errors import InputError
 from sim.loads import Pushed
 from sim.runtime.atomic_files import written_whole
 
-from ..data.cortex_patch import Patch, open_patch
-from ..data.encode import shared_out, tool_features
+from ..data.cortex_patch import open_patch
+from ..data.encode import rooted, shared_out, tool_features
 from ..model.conformal import LEVELS
 from ..model.learned import Learned
 from ..model.training_range import measured
 from ..regressors.ann import Ann
 from ..regressors.compliance_table import Linear
+from ..regressors.force_pairs import Pairs
 from ..regressors.force_series import Series
 from ..regressors.gp import Gp
 from ..regressors.pcr import Pcr
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 # Regressors whose formulas use nothing but what a wire knows.
-TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, Remainder, Series)
+TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, Remainder, Series, Pairs)
 # Of names, shapes and meaning of inputs, outputs and metadata.
 FORMAT = "sulcus onnx 1"
 TEXT = (
@@ -74,14 +76,19 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
         sheet.input("footprint", np.full(2, envelope.footprint[1]), "radius of the disc that it presses [m]"),
     )
 
-    def nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
-        """`surrogate.data.encode.nodal_shares`, whose integral over the footprint is given."""
+    @cache
+    def weight() -> Any:
+        """The integral over the footprint, which is given, once for all that ask."""
         sample = np.full((2, len(patch.nodes)), 1.0 / len(patch.nodes))
-        weight = sheet.input("weight", sample, "share of the force on each of the nodes `pressed`")
         sheet.output(sheet.constant(patch.nodes), Port("pressed", np.int64, patch.nodes.shape, "of the mesh"))
-        return shared_out(weight, pushed)
+        return sheet.input("weight", sample, "share of the force on each of the nodes `pressed`")
 
-    displacement: Any = model.motion(pushed, nodes, {"tool": tool_features, "nodal": nodal_shares})
+    encoders = {
+        "tool": tool_features,
+        "nodal": lambda _, pushed: shared_out(weight(), pushed),
+        "rooted": lambda _, pushed: rooted(shared_out(weight(), pushed), pushed),
+    }
+    displacement: Any = model.motion(pushed, nodes, encoders)
     known = measured(patch, pushed)
     outside = envelope.outside(pushed, known)
     excess: Any = outside.excess

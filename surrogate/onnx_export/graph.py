@@ -10,7 +10,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from sim.errors import InputError
 
-from ..array_functions import squared_distances, taken
+from ..array_functions import columns_in_use, product_of, squared_distances, taken
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -293,11 +293,33 @@ def _(points: Wire, sites: np.ndarray) -> Any:
 @taken.register
 def _(index: Wire, table: np.ndarray) -> Any:
     """A table that half precision holds without loss, as a series on disk, is stored so, in units of its columns."""
-    found = table[index.sample]
-    if table.dtype == np.float32 and table.ndim == 2:
-        unit = np.maximum(np.abs(table).max(axis=0), np.finfo(np.float32).tiny)
-        share = (table / unit).astype(np.float16)
-        if np.array_equal(share.astype(np.float32) * unit, table):
-            half = index.sheet.put("Gather", share[index.sample], share, index, axis=0)
-            return half.astype(np.float32) * unit
-    return index.sheet.put("Gather", found, table, index, axis=0)
+    found, halved = table[index.sample], _halved(table)
+    if halved is None:
+        return index.sheet.put("Gather", found, table, index, axis=0)
+    share, unit = halved
+    return index.sheet.put("Gather", share[index.sample], share, index, axis=0).astype(np.float32) * unit
+
+
+@product_of.register
+def _(rows: Wire, table: np.ndarray) -> Any:
+    """As `taken` stores tables."""
+    halved = _halved(table)
+    if halved is None:
+        return rows @ table
+    share, unit = halved
+    return (rows @ rows.sheet.constant(share).astype(np.float32)) * unit
+
+
+@columns_in_use.register
+def _(rows: Wire) -> np.ndarray:
+    """All: which are zero, a graph does not know before it runs."""
+    return np.arange(rows.shape[1])
+
+
+def _halved(table: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Shares (n, r) float16 and units (r,) of a table that is their product exactly; None if it is not."""
+    if table.dtype != np.float32 or table.ndim != 2:
+        return None
+    unit = np.maximum(np.abs(table).max(axis=0, initial=0.0), np.finfo(np.float32).tiny)
+    share = (table / unit).astype(np.float16)
+    return (share, unit) if np.array_equal(share.astype(np.float32) * unit, table) else None

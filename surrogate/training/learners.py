@@ -21,7 +21,9 @@ from ..regressors.protocol import Fitted, Teachable
 from ..regressors.series_residual import Remainder
 from ..regressors.svr import Svr
 from .condense_contact import side_by_side
-from .shared_inputs import COARSE, EXPANDED, TOUCHED, Examples, Expansion, SharedInputs
+from .examples import Examples, left_by
+from .expansion import COARSE, EXPANDED, TOUCHED, Expansion
+from .shared_inputs import SharedInputs
 from .tuning import Tuned
 
 # Settings to choose from, the usual ones first: units in a layer and weight decay; C and epsilon in quartile ranges.
@@ -45,11 +47,12 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part,
     trained = partial(_trained, known.patch, examples.loads)
     if name in EXPANDED:
         added = inputs.series
+        exact = [part for parts in known.exact for part in parts]
         if name == "series":
-            return (*known.tables, *added)
-        both = zip(known.tables, added, (examples.tumour, examples.cortex), strict=False)
-        left = [trained(("tool", Remainder), parts, parts[1].basis, truth) for *parts, truth in both]
-        return (*known.tables, *added, *left)
+            return (*exact, *added)
+        both = zip(known.exact, added, (examples.tumour, examples.cortex), strict=False)
+        left = [trained(("tool", Remainder), (*parts, more), more.basis, truth) for parts, more, truth in both]
+        return (*exact, *added, *left)
     if name == "linear":
         return known.tables
     if name in TOUCHED:
@@ -96,9 +99,7 @@ def _trained(
     truth: np.ndarray,
 ) -> Part:
     """A part for what those `before` leave of `truth` (B, n, 3) [m]: `on` a basis, or on vertices (n,)."""
-    response = truth / directions(loads)[0][:, None, None]
-    for part in before:
-        response = response - part.response(ENCODERS[part.encoder](patch, loads))
+    response = left_by(before, patch, loads, truth)
     basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE)
     encoder, make = kind
     X, Y = ENCODERS[encoder](patch, loads), basis.encode(response)

@@ -10,6 +10,7 @@ from sim.fem import Fem
 from sim.loads import Loads, Pushed
 from sim.minimisers.power_series import Reading
 
+from ..array_functions import squared_distances
 from ..data.cortex_patch import Patch
 from ..regressors.force_series import FACTORS, ORDERS, STENCIL, TERMS
 
@@ -46,6 +47,14 @@ def tabulated(
         table[first : first + some] = fem.series(loads, ORDERS, reading, 3).reshape(len(here), *table.shape[1:])
         progress(first + len(here), len(places))
     return table
+
+
+def in_one_disc(patch: Patch, radius: float) -> np.ndarray:
+    """Which nodes (m, m) bool a disc of a radius [m] may press at once.
+
+    Triangles reach into it from nodes that are farther apart, but of the tumour's motion these do 1 in 100,000.
+    """
+    return squared_distances(patch.points, patch.points) <= (2.0 * radius) ** 2
 
 
 def with_middles(patch: Patch) -> tuple[np.ndarray, np.ndarray]:

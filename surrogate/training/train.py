@@ -24,8 +24,10 @@ from ..model.own_learners import OWN, find_own
 from ..model.tip_distance import TipModel
 from ..model.training_range import envelope_of
 from .bounds import TIP, TUMOUR, Missed, bound_by, covered_on_discs, growth_by, missed
+from .examples import Examples
+from .expansion import EXPANDED, TOUCHED, Expansion
 from .learners import LEARNT, POSED, parts_of
-from .shared_inputs import EXPANDED, TOUCHED, Examples, Expansion, SharedInputs
+from .shared_inputs import SharedInputs
 from .tip_distance import Measured, corrected_if_better, distance_errors, with_correction
 
 # Of pushes, and of poses.

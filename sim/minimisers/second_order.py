@@ -1,0 +1,114 @@
+"""The second order of a body's answer to nodal forces, for every pair of them: exact, without differences.
+
+With internal forces f(u) = K u + Q(u, u) + ..., Q(u, v) = integral of B^T P2(Bu, Bv), forces F move the body by
+K^-1 F - K^-1 Q(K^-1 F, K^-1 F) + ... P2 is half the second derivative of the stress at rest. Here the second term is
+had for pairs of unit forces, element by element. It is what `power_series` has of the second order for one load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..discretisation.element import Elements
+from ..discretisation.problem import Problem
+from ..discretisation.term import Strained
+from ..runtime.threads import cores, together
+from ..runtime.views import in_order, on_host, placed
+
+# Elements that are worked on together: what they need of a pair stays in a core's cache, or fills a card.
+FEW, MANY = 256, 4096
+
+
+@dataclass(frozen=True, eq=False)
+class _Some:
+    """Elements of one tissue: all of them, which (k,), and P2 (9, 81) float32 from a strain to a stiffness."""
+
+    elements: Elements
+    chosen: np.ndarray
+    tensor: np.ndarray
+
+
+def second_order(
+    problem: Problem,
+    moved: np.ndarray,
+    answers: np.ndarray,
+    near: np.ndarray,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (P, 2) of force components, the first not above the second, and what each does (P, r) float32 [1/N^2].
+
+    Under forces F (3m,) the second order is the sum over pairs of F_p F_q times their row.
+
+    Parameters
+    ----------
+    problem
+        Whose elasticity counts.
+    moved
+        (3m, 3N) [m/N]: motions under unit forces on m nodes, at rest.
+    answers
+        (r, 3N): as `Reading.answers`, of what is asked for.
+    near
+        (m, m) bool, symmetric: nodes whose pairs are wanted.
+    progress
+        Hears how many groups of elements are done, and of how many.
+    """
+    device = problem.device
+    first, second = np.nonzero(np.triu(np.repeat(np.repeat(near, 3, axis=0), 3, axis=1)))
+    start = np.searchsorted(first, np.arange(len(moved) + 1))
+    terms = [term for term in problem.terms if isinstance(term, Strained)]
+    work = [one for term in terms for one in _some(*term.second_order(), MANY if device.on_cuda else FEW)]
+    others, done = placed(device, second), count(1)
+    tasks = 1 if device.on_cuda else cores(sum(len(each.chosen) for each in work))
+    tables = [placed(device, np.zeros((len(first), len(answers)), np.float32)) for _ in range(tasks)]
+
+    def add_all(table: Any, those: list[_Some]) -> None:
+        for some in those:
+            add(table, some)
+            progress(next(done), len(work))
+
+    def add(table: Any, some: _Some) -> None:
+        gradient = _gradients(some.elements, some.chosen)
+        weight = np.repeat(some.elements.weight[some.chosen].ravel(), 9)[:, None]
+        strain = placed(device, (gradient @ moved.T).astype(np.float32).reshape(-1, 9, len(moved)))
+        lever = placed(device, (weight * (gradient @ answers.T)).astype(np.float32))
+        tensor = placed(device, some.tensor)
+        for component in np.flatnonzero(np.diff(start)).tolist():
+            rows = slice(int(start[component]), int(start[component + 1]))
+            stiffening = (strain[:, :, component] @ tensor).reshape(-1, 9, 9)
+            stress = stiffening @ strain[:, :, others[rows]]
+            table[rows] -= stress.reshape(len(lever), -1).T @ lever
+
+    with in_order(device):
+        together([partial(add_all, table, work[k::tasks]) for k, table in enumerate(tables)])
+        table = on_host(sum(tables[1:], tables[0]))
+    twice = np.where(first == second, 1.0, 2.0).astype(np.float32)
+    return np.column_stack([first, second]), table * twice[:, None]
+
+
+def _some(elements: Elements, tensors: np.ndarray, kind: np.ndarray, most: int) -> list[_Some]:
+    """All of a term's elements, at most so many at a time."""
+    found = []
+    for each, tensor in enumerate(tensors):
+        chosen = np.flatnonzero(kind == each)
+        flat = tensor.transpose(1, 0, 2).reshape(9, 81).astype(np.float32)
+        found += [_Some(elements, chosen[k : k + most], flat) for k in range(0, len(chosen), most)]
+    return found
+
+
+def _gradients(elements: Elements, chosen: np.ndarray) -> sp.csr_array:
+    """From motions (3N,) to displacement gradients (9 k q,) of some elements (k,), row by row."""
+    table, slope = elements.table[chosen], elements.gradient[chosen]
+    count, points, most = slope.shape[:3]
+    row = np.arange(9 * count * points).reshape(count, points, 1, 3, 3)
+    column = 3 * table[:, None, :, None, None] + np.arange(3)[:, None]
+    shape = count, points, most, 3, 3
+    value = np.broadcast_to(slope[:, :, :, None, :], shape).ravel()
+    place = np.broadcast_to(row, shape).ravel(), np.broadcast_to(column, shape).ravel()
+    return sp.csr_array(sp.coo_array((value, place), shape=(9 * count * points, 3 * elements.nodes)))

@@ -1,0 +1,61 @@
+"""The second order in the nodal forces, a row for each pair of them: what needs neither learning nor interpolation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from ..array_functions import columns_in_use, product_of
+
+# Loads that are answered together: bounds the memory that their products take.
+CHUNK = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """A regressor that predicts what the second order adds to the response, from `rooted_shares`.
+
+    Parameters
+    ----------
+    pairs
+        (P, 2): two force components, of the nodes of the open cortex.
+    table
+        (P, r) float32: coefficients of the basis's modes for each pair's product [1/N^2].
+    """
+
+    pairs: np.ndarray
+    table: np.ndarray
+
+    def predict(self, X: np.ndarray) -> np.ndarray:
+        """Coefficients (B, r) float32 of `rooted_shares` (B, 3 m)."""
+        if len(X) <= CHUNK:
+            return self._predicted(X)
+        return np.concatenate([self._predicted(X[first : first + CHUNK]) for first in range(0, len(X), CHUNK)])
+
+    def _predicted(self, X: np.ndarray) -> np.ndarray:
+        used = columns_in_use(X)
+        row = self._rows[used[:, None], used]
+        row = row[row >= 0]
+        first, second = self.pairs[row].T
+        return product_of((X[:, first] * X[:, second]).astype(np.float32), self.table[row])
+
+    @cached_property
+    def _rows(self) -> np.ndarray:
+        """The row (n, n) int32 of each pair of components, or -1."""
+        out = np.full((self.pairs.max(initial=-1) + 1,) * 2, -1, np.int32)
+        out[self.pairs[:, 0], self.pairs[:, 1]] = np.arange(len(self.pairs))
+        return out
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Pairs, and the table in half precision, in units of its largest number for each mode."""
+        unit = np.abs(self.table).max(axis=0, initial=0.0) + np.finfo(np.float32).tiny
+        return {"pairs": self.pairs.astype(np.int32), "unit": unit, "share": (self.table / unit).astype(np.float16)}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """From `state`: the table is what half precision kept of it, to 1 in 2,000."""
+        return cls(state["pairs"], state["share"].astype(np.float32) * state["unit"])

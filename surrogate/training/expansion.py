@@ -1,0 +1,325 @@
+"""What a data set's finite elements give without learning: compliance, power series, contact."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import REFERENCE
+from sim.effects import pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Pushed
+from sim.material import tissue_from_json
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import read_as
+
+from ..data.cortex_patch import Patch, open_patch
+from ..data.dataset import Dataset
+from ..data.encode import Basis, nodal_shares, reduce
+from ..data.tool_loads import spread
+from ..model.applicability import trained_skull
+from ..model.learned import Part, only_pushed
+from ..regressors.ball_contact import Contact
+from ..regressors.compliance_table import Linear
+from ..regressors.force_pairs import Pairs
+from ..regressors.force_series import FACTORS, SPANS, Series
+from ..regressors.left_out_tables import filled
+from .condense_contact import condensed, side_by_side
+from .examples import Examples, left_by
+from .tabulate_series import in_one_disc, radii_between, tabulated, with_middles
+
+# Share of the responses that a learner's basis may lose, and its most modes; the same of what the series adds to the
+# exact orders, a fiftieth of the motion, and of compliance.
+COARSE = (1e-3, 60)
+ADDED = (5e-3, 120)
+TABLE_TOLERANCE = 1e-4
+# What the modes of the second order may leave of it: of the motion, one in 1,000.
+SECOND = 2e-2
+# The same of the bases that series are tabulated in, made of what is had at so many places far from each other.
+WIDE, FEW = (1e-5, 192), 40
+# Learners that ask the finite elements how linear tissue gives; the second learns what that leaves.
+TOUCHED = ("contact", "contact-gp")
+# Those that ask the finite elements for their series, of which the second learns what it leaves.
+EXPANDED = ("series", "series-gp")
+# Components of motion that are read at once there: bounds the memory that it takes.
+STRIP = 1536
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """What a data set's finite elements give without learning: compliance, power series, contact; made when asked for.
+
+    It does not depend on answers to the data's loads. The series is tabulated in wide bases, of its own values at a
+    few places, so that a table grows neither with the tumour nor with the cortex.
+
+    Parameters
+    ----------
+    data
+        Its anatomy, tissue and element; its loads give the widths of tools.
+    device
+        Where the finite elements work.
+    progress
+        Hears which place is done, and of how many.
+    kept
+        Where the series' table is read from, and written to where there is none: of these data, as the caller knows.
+    """
+
+    data: Dataset
+    device: str = "auto"
+    progress: Callable[[int, int], object] = lambda done, total: None
+    kept: Path | None = None
+
+    @cached_property
+    def patch(self) -> Patch:
+        """The open cortex."""
+        return open_patch(self.data.anatomy)
+
+    @cached_property
+    def tumour(self) -> np.ndarray:
+        """Vertices of the tumour."""
+        return self.data.anatomy.tumour_nodes
+
+    @cached_property
+    def cortex(self) -> np.ndarray:
+        """Vertices of the open cortex beside the tumour's."""
+        return np.setdiff1d(self.patch.nodes, self.tumour)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Where the series is tabulated (P, 3) [m]: nodes of the open cortex, and middles of its edges."""
+        return with_middles(self.patch)[1]
+
+    @cached_property
+    def tables(self) -> tuple[Part, ...]:
+        """The tumour's compliance, and the cortex's, if there is more: exact at every node of the open cortex.
+
+        In as many modes as the unit responses need.
+        """
+        return tuple(self._compliance(nodes) for nodes in self._known)
+
+    @cached_property
+    def pairs(self) -> Part:
+        """The second order of the tumour: exact for forces on the nodes of the open cortex, wherever they are.
+
+        Raises
+        ------
+        InputError
+            Data that do not state what tissue they are of.
+        """
+        known = self.tabulated
+        return Part("rooted", Pairs.restored(known.pairs.state()), known.pair_basis)
+
+    @cached_property
+    def exact(self) -> list[tuple[Part, ...]]:
+        """What needs neither learning nor interpolation: two orders of the tumour, and the first of the cortex."""
+        return [(table, self.pairs) if k == 0 else (table,) for k, table in enumerate(self.tables)]
+
+    def bases(self, examples: Examples, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
+        """What a set of examples does to the tumour, and to the cortex, if there is more, beyond what is exact.
+
+        A dent as small as its tool is no sum of a few modes, but what nonlinearity adds to it is. `tumour` and `cortex`
+        are what may be left of it, as a share, and the most modes.
+        """
+        both = zip(self.exact, (examples.tumour, examples.cortex), (tumour, cortex), strict=False)
+        return [
+            reduce(parts[0].basis.nodes, left_by(parts, self.patch, examples.loads, moved), *limits)
+            for parts, moved, limits in both
+        ]
+
+    def on(self, bases: list[Basis], left_out: np.ndarray) -> list[Series]:
+        """What the series adds to what is exact, as coefficients of the `bases` of examples, without some places (P,).
+
+        Raises
+        ------
+        InputError
+            Data that do not state what tissue they are of.
+        """
+        triangles = with_middles(self.patch)[0]
+        inside = self.patch.rim_distance(self.places)[:, None] > self.radii
+        found, known = [], self.tabulated
+        for table, parts, wide, basis in zip(known.tables, self.exact, known.bases, bases, strict=True):
+            added = table.copy()
+            # Footprints over the rim press on nodes beyond the open cortex. Of others nothing is left.
+            for part, order, forms_of in zip(parts, SPANS, (_linear_form, _square_form), strict=False):
+                met = forms_of(part, self._unit_shares) @ (part.basis.modes @ wide.modes.T)
+                added[:, :, order] -= met.reshape(added[:, :, order].shape)
+            every = filled(self.places, added @ (wide.modes @ basis.modes.T), left_out)
+            for order in SPANS[: len(parts)]:
+                every[inside, order] = 0.0
+            exact = Series(self.patch.points, triangles, self.radii, every)
+            found.append(Series.restored(exact.state()))  # what is used is what can be stored
+        return found
+
+    @cached_property
+    def _unit_shares(self) -> np.ndarray:
+        """Forces (P R, 3, 3 m) at the patch's nodes of one newton along each axis, at each place and radius."""
+        point = np.repeat(self.places, 3 * len(self.radii), axis=0)
+        radius = np.tile(np.repeat(self.radii, 3), len(self.places))
+        shares = nodal_shares(self.patch, Pushed(point, np.tile(np.eye(3), (len(point) // 3, 1)), radius))
+        return shares.reshape(len(point) // 3, 3, -1)
+
+    @cached_property
+    def contact(self) -> tuple[Contact, list[Basis], float]:
+        """The ball on linear tissue, the bases of tumour and cortex whose coefficients it answers with, and seconds.
+
+        Raises
+        ------
+        InputError
+            Data that do not state what tissue they are of.
+        """
+        begun = time.perf_counter()
+        contact, bases = condensed(self.fem(), self._known)
+        return contact, bases, time.perf_counter() - begun
+
+    def _compliance(self, nodes: np.ndarray) -> Part:
+        response = self.data.unit_response(nodes)
+        basis = reduce(nodes, response, TABLE_TOLERANCE, len(response))
+        return Part("nodal", Linear().fit(np.eye(len(response)), basis.encode(response)), basis)
+
+    @cached_property
+    def tabulated(self) -> Tabulated:
+        """The series at every place.
+
+        Raises
+        ------
+        InputError
+            Data that do not state what tissue they are of.
+        """
+        if self.kept is not None and self.kept.exists():
+            with (
+                read_as(self.kept, "a table of the series", "Delete it: it is made anew."),
+                self.kept.open("rb") as raw,
+                np.load(raw) as file,
+            ):
+                bases = [Basis(nodes, file[f"modes{k}"]) for k, nodes in enumerate(self._known)]
+                pairs = Pairs(file["pairs"], file["second"])
+                pair_basis = Basis(self.tumour, file["second_modes"])
+                return Tabulated(bases, file["table"], pairs, pair_basis, float(file["seconds"]))
+        begun = time.perf_counter()
+        fem = self.fem()
+        bases, table = self._tabulate(fem)
+        pairs, pair_basis = self._paired(fem, bases[0])
+        found = Tabulated(bases, table, pairs, pair_basis, time.perf_counter() - begun)
+        if self.kept is not None:
+            arrays = {f"modes{k}": basis.modes for k, basis in enumerate(bases)}
+            arrays |= {"table": table, "pairs": pairs.pairs, "second": pairs.table, "second_modes": pair_basis.modes}
+            with written_whole(self.kept, ".npz") as partial:
+                np.savez(partial, seconds=np.array(found.seconds), **arrays)  # pyright: ignore[reportArgumentType]
+        return found
+
+    def _paired(self, fem: Fem, basis: Basis) -> tuple[Pairs, Basis]:
+        """The tumour's second order for pairs that one footprint may press, and the modes of a basis that it needs."""
+        reading = fem.reading(basis.nodes, basis.modes.reshape(len(basis.modes), -1, 3))
+        near = in_one_disc(self.patch, float(self.radii[-1]))
+        pairs, table = fem.second_order(self.patch.nodes, near, reading)
+        turn = reduce(basis.nodes, table, SECOND, len(basis.modes)).modes
+        return Pairs(pairs, table @ turn.T), Basis(basis.nodes, turn @ basis.modes)
+
+    def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray]:
+        """Every motion at a few places, the bases that these span, and what is at all places as their coefficients."""
+        count = len(self.places)
+        few = np.sort(spread(self.places, FEW))
+        every, motions = np.concatenate(self._known), []
+        for first in range(0, 3 * len(every), STRIP):
+            components = np.eye(3 * len(every))[first : first + STRIP].reshape(-1, len(every), 3)
+            reading = fem.reading(every, components)
+            motions.append(tabulated(fem, self.places[few], self.radii, reading, lambda n, _: self.progress(n, count)))
+        cuts = 3 * np.cumsum([len(nodes) for nodes in self._known])[:-1]
+        parts = np.split(np.concatenate(motions, axis=-1), cuts, axis=-1)
+        # The cortex's first order is in its compliance.
+        orders = (SPANS, SPANS[1:])
+        bases = [_spanned(*each) for each in zip(self._known, parts, orders, strict=False)]
+        whole = side_by_side(bases)
+        reading = fem.reading(whole.nodes, whole.modes.reshape(len(whole.modes), -1, 3))
+        table = np.empty((count, *parts[0].shape[1:3], reading.count), np.float32)
+        others = np.setdiff1d(np.arange(count), few)
+        table[few] = np.concatenate([part @ basis.modes.T for part, basis in zip(parts, bases, strict=True)], axis=-1)
+        if len(others):
+            table[others] = tabulated(
+                fem, self.places[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count)
+            )
+        return bases, table
+
+    @cached_property
+    def _known(self) -> list[np.ndarray]:
+        """Vertices of the tumour, and of the cortex, if there is more."""
+        return [nodes for nodes in (self.tumour, self.cortex) if len(nodes)]
+
+    @cached_property
+    def radii(self) -> np.ndarray:
+        """At which the series is tabulated (R,) [m]: from the narrowest tool of the data to the widest."""
+        footprint = only_pushed(self.data.loads).footprint
+        return radii_between(float(footprint.min()), float(footprint.max()))
+
+    def fem(self) -> Fem:
+        """Make the data's finite elements, in double precision.
+
+        Raises
+        ------
+        InputError
+            Data that do not state what tissue they are of.
+        """
+        stated = self.data.provenance
+        if "tissue" not in stated:
+            raise InputError(
+                f"{self.data.path}: does not state its tissue, so no series or contact can be had of it: "
+                "choose other learners, or simulate anew."
+            )
+        effects = pushed_effects(self.data.anatomy, tissue_from_json(stated["tissue"]), trained_skull(stated))
+        return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=stated.get("element"))
+
+
+@dataclass(frozen=True, eq=False)
+class Tabulated:
+    """A table of the series: bases of tumour and cortex, what all places have of both, and the seconds it took.
+
+    Parameters
+    ----------
+    bases
+        One, or two.
+    table
+        (P, R, 19, r) float32: coefficients of the bases' modes, one after the other.
+    pairs, pair_basis
+        The tumour's second order, for pairs of nodal forces.
+    seconds
+        [s].
+    """
+
+    bases: list[Basis]
+    table: np.ndarray
+    pairs: Pairs
+    pair_basis: Basis
+    seconds: float
+
+    @property
+    def tables(self) -> list[np.ndarray]:
+        """The part of each basis."""
+        return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
+
+
+def _linear_form(part: Part, shares: np.ndarray) -> np.ndarray:
+    """Coefficients (n, 3, r) of unit forces with shares (n, 3, 3 m)."""
+    return part.regressor.predict(shares.reshape(-1, shares.shape[2])).reshape(*shares.shape[:2], -1)
+
+
+def _square_form(part: Part, shares: np.ndarray) -> np.ndarray:
+    """Coefficients (n, 6, r) of the products in `FACTORS` of a direction's components, for shares (n, 3, 3 m)."""
+    own = [part.regressor.predict(shares[:, axis]) for axis in range(3)]
+    both = [
+        own[a] if a == b else part.regressor.predict(shares[:, a] + shares[:, b]) - own[a] - own[b]
+        for a, b in FACTORS[1].T
+    ]
+    return np.stack(both, axis=1)
+
+
+def _spanned(nodes: np.ndarray, motions: np.ndarray, orders: Sequence[slice]) -> Basis:
+    """The wide basis of motions (F, R, 19, 3 n) of vertices (n,): of some of the orders, which count alike."""
+    rows = [motions[:, :, order].reshape(-1, len(nodes), 3) for order in orders]
+    tiny = np.finfo(np.float32).tiny
+    return reduce(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *WIDE)
