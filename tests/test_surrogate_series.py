@@ -156,7 +156,7 @@ def test_two_orders_of_the_tumour_are_exact_wherever_a_tool_presses(data, box):
     exact = fem.series(Loads((loads,)), 2, every_motion(fem, expansion.tumour))
     size = directions(loads)[0][:, None, None]
     found = [size * part.response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
-    for order, (motion, limit) in enumerate(zip(found, (1e-3, 5e-3), strict=True)):
+    for order, (motion, limit) in enumerate(zip(found, (1e-3, 3e-2), strict=True)):
         off = np.linalg.norm(motion.reshape(40, -1) - exact[:, order], axis=1) / np.linalg.norm(exact[:, order], axis=1)
         assert off[inside].max() < limit
     many = [part.response(ENCODERS[part.encoder](expansion.patch, replaced(loads, 3))) for part in expansion.exact[0]]

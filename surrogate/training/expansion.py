@@ -40,7 +40,7 @@ COARSE = (1e-3, 60)
 ADDED = (5e-3, 120)
 TABLE_TOLERANCE = 1e-4
 # What the modes of the second order may leave of it: of the motion, one in 1,000.
-SECOND = 2e-2
+SECOND = 1e-2
 # The same of the bases that series are tabulated in, made of what is had at so many places far from each other.
 WIDE, FEW = (1e-5, 192), 40
 # Learners that ask the finite elements how linear tissue gives; the second learns what that leaves.

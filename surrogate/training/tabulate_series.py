@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sim.fem import Fem
+from sim.geometry.surface import edge_lengths
 from sim.loads import Loads, Pushed
 from sim.minimisers.power_series import Reading
 
@@ -50,11 +51,12 @@ def tabulated(
 
 
 def in_one_disc(patch: Patch, radius: float) -> np.ndarray:
-    """Which nodes (m, m) bool a disc of a radius [m] may press at once.
+    """Which nodes (m, m) bool a disc of a radius [m], or a triangle and its neighbours, may bear at once.
 
-    Triangles reach into it from nodes that are farther apart, but of the tumour's motion these do 1 in 100,000.
+    Triangles reach into a disc from nodes that are farther apart, but of the tumour's motion these do 1 in 100,000.
     """
-    return squared_distances(patch.points, patch.points) <= (2.0 * radius) ** 2
+    longest = edge_lengths(patch.points[patch.triangles]).max()
+    return squared_distances(patch.points, patch.points) <= (2.0 * max(radius, longest)) ** 2
 
 
 def with_middles(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
