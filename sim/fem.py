@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from threading import RLock
@@ -32,7 +32,6 @@ from .loads import Displaced, Loads, Nodal, Pushed
 from .minimisers.lbfgs import CARRIED
 from .minimisers.power_series import Reading, factors, taylor, terms_of
 from .minimisers.residual import shortfall
-from .minimisers.second_order import second_order
 from .runtime.columns import unstacked
 from .runtime.device import find_device
 from .runtime.exclusive import alone
@@ -289,7 +288,8 @@ class Fem:
             A solver in float32, whose round-off would be taken for the higher orders.
         """
         check_causes(self.effects, loads)
-        self._check_plain()
+        if not self.problem.plain:
+            raise InputError("a series is had of elastic bodies under forces alone: leave the other effects out.")
         if self.problem.device.precision != "float64":
             raise InputError("a series of differences needs float64: ask for an Accuracy of that precision.")
         for cause in loads.causes:
@@ -312,29 +312,6 @@ class Fem:
                 read = [reading.of(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
                 found[first : first + groups] = np.concatenate(read, axis=1)
         return found
-
-    @alone
-    def second_order(
-        self,
-        nodes: np.ndarray,
-        near: np.ndarray,
-        reading: Reading,
-        progress: Callable[[int, int], object] = lambda done, total: None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The second order of what is read, for pairs of forces at vertices `nodes` (m,): see `second_order`.
-
-        Raises
-        ------
-        InputError
-            As `reading`; bodies of more than elastic tissue.
-        """
-        self._check_plain()
-        units = self.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
-        return second_order(self.problem, units.answers, reading.answers, near, progress)
-
-    def _check_plain(self) -> None:
-        if not self.problem.plain:
-            raise InputError("a series is had of elastic bodies under forces alone: leave the other effects out.")
 
     def guess(self, loads: Loads, start: Deformation) -> np.ndarray:
         """Somebody's answers as columns (3N, B) [m] over the nodes of the element."""

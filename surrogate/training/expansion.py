@@ -16,6 +16,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Pushed
 from sim.material import tissue_from_json
+from sim.minimisers.second_order import second_order
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
 
@@ -37,10 +38,10 @@ from .tabulate_series import in_one_disc, radii_between, tabulated, with_middles
 # Share of the responses that a learner's basis may lose, and its most modes; the same of what the series adds to the
 # exact orders, a fiftieth of the motion, and of compliance.
 COARSE = (1e-3, 60)
-ADDED = (5e-3, 120)
+ADDED = (5e-3, 160)
 TABLE_TOLERANCE = 1e-4
 # What the modes of the second order may leave of it: of the motion, one in 1,000.
-SECOND = 1e-2
+SECOND = 3e-3
 # The same of the bases that series are tabulated in, made of what is had at so many places far from each other.
 WIDE, FEW = (1e-5, 192), 40
 # Learners that ask the finite elements how linear tissue gives; the second learns what that leaves.
@@ -216,8 +217,10 @@ class Expansion:
     def _paired(self, fem: Fem, basis: Basis) -> tuple[Pairs, Basis]:
         """The tumour's second order for pairs that one footprint may press, and the modes of a basis that it needs."""
         reading = fem.reading(basis.nodes, basis.modes.reshape(len(basis.modes), -1, 3))
+        nodes = self.patch.nodes
+        units = fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
         near = in_one_disc(self.patch, float(self.radii[-1]))
-        pairs, table = fem.second_order(self.patch.nodes, near, reading)
+        pairs, table = second_order(fem.problem, units.answers, reading.answers, near)
         turn = reduce(basis.nodes, table, SECOND, len(basis.modes)).modes
         return Pairs(pairs, table @ turn.T), Basis(basis.nodes, turn @ basis.modes)
 
