@@ -17,6 +17,8 @@ WHITE = (244, 244, 240)
 # Scale of the lines at the foot of a picture, from one's baseline to the next [pixel], and the share of the picture's
 # width that they may have.
 FINE, ROW, NARROW = 0.45, 18, 0.25
+# Lines at the head begin so far down, under the letter of a side [pixel].
+HEAD = 34
 # Scale of the letters of the patient's sides.
 SIGN = 0.6
 # The patient's sides along the axes of RAS, and against them.
@@ -124,7 +126,7 @@ def panel(
 ) -> np.ndarray:
     """The picture (H, W, 3) uint8 with lines of ASCII text on a dark translucent ground in one corner; a copy.
 
-    One at the top begins `below` so many rows.
+    One at the top begins `below` so many rows. Lines for which the picture is too low are left out.
 
     Raises ValueError for an unknown corner.
     """
@@ -136,7 +138,8 @@ def panel(
     lines = [part for line in lines for part in folded(line, out.shape[1] - 4 * PAD, scale)]
     sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in lines]
     step = max(height for _, height in sizes) + PAD
-    height, width = step * len(lines) + PAD, max(width for width, _ in sizes) + 2 * PAD
+    lines = lines[: max((out.shape[0] - below - 3 * PAD) // step, 1)]
+    height, width = step * len(lines) + PAD, max(width for width, _ in sizes[: len(lines)]) + 2 * PAD
     top = PAD + below if "top" in corner else max(out.shape[0] - height - PAD, 0)
     left = PAD if "left" in corner else max(out.shape[1] - width - PAD, 0)
     ground = out[top : top + height, left : left + width]

@@ -12,12 +12,12 @@ import numpy as np
 
 from . import place, rasteriser, shade, window
 from .camera import Camera
-from .hud import FINE, NARROW, folded, lay, millimetres
+from .hud import FINE, HEAD, NARROW, folded, lay, millimetres
 from .layer import Layer, vertex_normals
 from .parallel import load
 from .rasteriser import seen
 from .renderer import Picture
-from .window import DARK, SURROUND, Lines, covering, overlaid
+from .window import DARK, NEAR_EDGE, SURROUND, Lines, covering, overlaid
 
 Style = Literal["window", "contour", "fill", "none"]
 # What may not be relied on is drawn in amber, and broken, with words in a paler one, so that pixels of the outline are
@@ -107,6 +107,7 @@ def composite(
     doubt: str = "",
     traces: Sequence[Trace] = (),
     moved: tuple[float, float] | None = None,
+    head: Sequence[str] = (),
 ) -> Overlaid:
     """The picture with a hidden surface drawn into it. On a card, no depth comes back from it.
 
@@ -136,6 +137,8 @@ def composite(
         Outlines of other surfaces, drawn under the hidden one's.
     moved
         Length and error [m] to be written in place of the mean motion, which has none.
+    head
+        Lines that are written at the picture's head, whatever the style and whatever lies there.
 
     Raises
     ------
@@ -150,6 +153,7 @@ def composite(
     taken = np.zeros(shape, np.uint8)
     if style == "none":
         plain = Overlaid(picture.colour.copy(), taken)
+        write_head(plain, head)
         write_doubt(plain, doubt)
         return plain
     if doubt:
@@ -185,7 +189,8 @@ def composite(
         lines = Lines(ink, not doubt, under, above)
         out, taken[around] = overlaid(picture.drawn, around, part, hidden, found, occluders, style, lines)
     drawn = Overlaid(out, taken)
-    # The corner first, so that its words never move; then by importance, for where there is no room some are left out.
+    # Head and corner first, so that their words seldom move; then by importance, for some are left out without room.
+    write_head(drawn, head)
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
         said = millimetres(motion) if moved is None else millimetres(*moved)
@@ -277,13 +282,21 @@ def dash(
 ) -> None:
     """Draw strokes of outlines, each (n, 1, 2), with gaps, both of so many pixels as `pattern` says, in place.
 
-    A line of more than one pixel has a dark rim.
+    A line of more than one pixel has a dark rim. Nothing is drawn along the sheet's edge, where an outline is cut off.
     """
     stroke, gap = pattern
+    lines = [piece for line in lines for piece in inner(line, out.shape[1], out.shape[0])]
     strokes = [line[start : start + stroke] for line in lines for start in range(0, len(line), stroke + gap)]
     if width > 1:
         cv2.polylines(out, strokes, False, (*DARK, OPAQUE), width + 2, cv2.LINE_AA)
     cv2.polylines(out, strokes, False, (*ink, OPAQUE), width, cv2.LINE_AA)
+
+
+def inner(line: np.ndarray, width: int, height: int) -> list[np.ndarray]:
+    """The pieces of an outline (n, 1, 2) that lie inside a sheet, away from its edge."""
+    inside = ((line >= NEAR_EDGE) & (line < (width - NEAR_EDGE, height - NEAR_EDGE))).all(axis=(1, 2))
+    cuts = np.flatnonzero(np.diff(inside)) + 1
+    return [piece for piece, kept in zip(np.split(line, cuts), np.split(inside, cuts), strict=True) if kept[0]]
 
 
 def draw_trace(sheet: np.ndarray, camera: Camera, trace: Trace) -> None:
@@ -329,6 +342,15 @@ def write_gauge(drawn: Overlaid, camera: Camera, gauge: Gauge, covered: np.ndarr
     if depth > 0.0:
         column, row = np.clip(end, -1e4, 1e4).round().astype(int).tolist()
         lay(drawn.colour, drawn.taken, [str(gauge)], (column + BESIDE, row), GAUGE, sights=covered)
+
+
+def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:
+    """Write lines at the left of the head, under the letter of a side, in place, even over other lines."""
+    free, middle = drawn.taken.copy(), len(drawn.taken) // 2
+    free[:HEAD] = free[middle - HEAD // 2 : middle + HEAD // 2] = 1  # letters of sides come there
+    before = free.copy()
+    lay(drawn.colour, free, lines, (0, HEAD), needed=True)
+    drawn.taken[free > before] = 1
 
 
 def write_doubt(drawn: Overlaid, doubt: str) -> None:

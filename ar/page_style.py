@@ -35,7 +35,7 @@ RULES = """
 #SAID td, #SAID th { padding: 0 0.9rem 0 0; text-align: left; font-weight: inherit }
 .NOTE { font-size: 0.8rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
 .NOTE ul { margin: 0; padding-left: 1.1rem }
-#STATUS { position: fixed; top: 0.6rem; left: 0.6rem; z-index: 7; pointer-events: none }
+#STATUS { position: fixed; top: 0.6rem; right: calc(100vw - var(--w) + 0.6rem); z-index: 7; pointer-events: none }
 #STATUS span { background: #e8590c; color: #fff; border-radius: 0.3rem; padding: 0.2rem 0.6rem; font-size: 0.9rem }
 PANEL #PICTURE { position: fixed; left: 0; top: 0; width: var(--w); aspect-ratio: var(--aspect); background: #181818;
   z-index: 6 }
@@ -70,6 +70,7 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   PANEL div[style*="20em"] { width: 100% !important }
   VIEW { position: absolute !important; inset: auto 0 0 0 !important; height: var(--low) !important }
   #PAGE { font-size: 0.78rem }
+  #STATUS span { font-size: 0.75rem }
   #SAID { font-size: 0.82rem; max-height: 11.4rem; overflow-y: auto }
   NOTES { left: 0.5rem !important }
 }

@@ -257,6 +257,12 @@ def test_the_line_over_the_picture_comes_and_goes(page):
     assert wait_for(lambda: page.line.content == "")
 
 
+def test_the_line_over_the_picture_leaves_the_words_at_its_head_in_sight():
+    """They stand at the left."""
+    (rule,) = re.findall(rf"#{STATUS} {{ position: fixed; (.*?) }}", style(4 / 3))
+    assert "right: calc(100vw - var(--w)" in rule and "left:" not in rule
+
+
 def test_a_note_is_there_while_it_has_words(page):
     page.fill([], Playback(30, print, print), [Note("how"), Note("why", "<p>known</p>")])
     folder, text = page.notes["how"]

@@ -47,6 +47,14 @@ def test_letters_stand_at_the_edges():
     assert not changed[40:200, 40:280].any() and (plain == 90).all()
 
 
+def test_a_panel_leaves_out_lines_that_the_picture_is_too_low_for():
+    plain = np.full((100, 320, 3), 90, np.uint8)
+    lines = ["first", "second", "third", "fourth", "fifth"]
+    few = panel(plain, lines, below=30)
+    kept = next(count for count in range(1, 6) if np.array_equal(few, panel(plain, lines[:count], below=30)))
+    assert 1 < kept < 4 and (few[:30] == 90).all() and (few[-PAD:] == 90).all()
+
+
 @pytest.mark.parametrize(
     ("length", "error", "text"),
     [

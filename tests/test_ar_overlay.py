@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ar.camera import look_at
-from ar.hud import FINE, panel, write
+from ar.hud import FINE, HEAD, ROW, panel, write
 from ar.layer import Layer, Solid, vertex_normals
 from ar.overlay import BEFORE, DOUBTFUL, GAUGE, WARNING, Gauge, composite, doubt_lines, ink_of, iou, silhouette
 from ar.refind import outline_gap, stands
@@ -200,6 +200,28 @@ def test_the_margin_runs_outside_the_contour():
     middle, depth = here.project(np.array([0.0, 0.0, -0.02]))
     radius = np.hypot(columns - middle[0], rows - middle[1]) / here.K[0, 0] * depth
     assert radius.mean() == pytest.approx(0.016, abs=0.001)
+
+
+@pytest.mark.parametrize("side", [(0.06, 0.0), (-0.06, 0.0), (0.0, 0.04), (0.0, -0.04)])
+def test_no_line_runs_along_the_edge_that_cuts_a_margin_off(side):
+    """Strokes end near the edge."""
+    here, centre = camera(), (*side, -0.02)
+    picture = render(here, [cortex()], LAMP)
+    plain, wide = (composite(picture, here, tumour(centre), style="contour", margin=each) for each in (0.0, 0.02))
+    changed = (plain.colour != wide.colour).any(axis=2)
+    edge = np.ones_like(changed)
+    edge[3:-3, 3:-3] = False
+    assert changed.sum() > 40 and not (changed & edge).any()
+
+
+def test_lines_at_the_head_stand_there_whatever_the_style():
+    here = camera(320, 240)
+    picture = render(here, [cortex()], LAMP)
+    for style in ("window", "none"):
+        said = composite(picture, here, tumour(), style=style, before=tumour((0.01, 0.0, -0.02)), head=["one", "two"])
+        assert stands(said.colour[HEAD : HEAD + 2 * ROW], "one", FINE)
+        assert stands(said.colour[HEAD + ROW - 4 : HEAD + 3 * ROW], "two", FINE)
+        assert said.taken[HEAD + ROW, 8:20].all()
 
 
 def test_a_deeper_tumour_shines_less():

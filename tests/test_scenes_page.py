@@ -114,6 +114,10 @@ class TestWords:
             "smoothed linear tetrahedra, corotational tissue of Young's modulus 5 kPa and Poisson's ratio 0.4"
         )
         assert fem_words(plain, find_scene("retract")).endswith("relaxes under a held load")
+        assert fem_words(plain, find_scene("sag")).endswith(
+            "Young's modulus 1.8 kPa and Poisson's ratio 0.45; the tumour of neo-hookean tissue of Young's modulus "
+            "3.2 kPa and Poisson's ratio 0.45"
+        )
         assert "brain.vtu, opened" in about(theatre, short(), "brain.vtu")
 
     def test_a_plan_is_a_list_and_only_finite_elements_have_one(self, theatre):

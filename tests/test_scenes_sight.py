@@ -22,6 +22,7 @@ from scenes.script.scene import Bounds, find_scene
 from scenes.script.shipped_files import template_path
 from scenes.script.sight import Sight
 from scenes.script.tool_paths import press
+from scenes.script.uncertainty import TumourError, Uncertainty
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 from surrogate.locating.locator_files import locator_path, save_locator
@@ -205,6 +206,24 @@ def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     labelled(frame, "fem")
     assert any(line == f"estimate: refused, {found.refusal}" for line in said)
     assert "What is seen was refused" in report(frame, play.stage, "fem", "", (), 100)
+
+
+def test_a_visitor_reads_number_and_errors_before_what_explains_them(play, frames):
+    words = report(frames[1], play.stage, "fem", "", (), 100)
+    order = "by the estimate (truly", "solved to its tolerance", "Error of the tumour", "<b>estimate</b> from", "frame "
+    places = [words.index(each) for each in order]
+    assert places == sorted(places)
+
+
+def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
+    frame = frames[1]
+    assert frame.tumour_error == TumourError(None, "", frame.estimate.worst)
+    times = tuple(float(time) for time in play.scene.times[[0, -1]])
+    flat = {"times": times, "worst": (3e-3, 3e-3), "middle": (2e-3, 2e-3), "moved": (1e-3, 1e-3)}
+    known = Uncertainty("it", "", 9, 0, 0.95, **flat, parts={"E": (1e-3, 1e-3)})
+    knowing = replace(play, uncertainty=known)
+    both = knowing.drawn(frame.number, frame.touch, frame.loads, frame.deformation, 0.1).tumour_error
+    assert both.prior == pytest.approx(3e-3) and both.bound == both.observed == frame.estimate.worst
 
 
 def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):

@@ -1,13 +1,13 @@
 """Two errors, of the model and of the tumour: priors, the ensemble, what is stored, and what the picture says."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from theatres import put, short, small, theatre_of
 
-from ar.hud import FINE
+from ar.hud import FINE, millimetres
 from ar.refind import stands
 from scenes.bench.uncertainty import (
     Motions,
@@ -23,7 +23,7 @@ from scenes.bench.uncertainty import (
 )
 from scenes.cli import main
 from scenes.play.error_text import NOT_KNOWN_WORDS, error_lines, worst
-from scenes.play.player import Player
+from scenes.play.player import labelled
 from scenes.script.priors import POISSON, PRIORS, SKULL, STIFFNESS, TOOL, Draw, drawn
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.tool_paths import Touch
@@ -40,7 +40,6 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import SKULLS, Elasticity
 from sim.errors import InputError
 from sim.material import BRAIN
-from surrogate.model.learned import Learned
 
 SAME = Draw(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
 """As the scene has it."""
@@ -204,23 +203,6 @@ class TestStored:
         assert known == sorted(template.uncertainties, key=SCENES.index) and len(known) >= 5
 
 
-@dataclass(frozen=True, eq=False)
-class Seeing:
-    """A deformer that sees the brain."""
-
-    deformer: Learned
-
-    @property
-    def anatomy(self):
-        return self.deformer.anatomy
-
-    def deform(self, loads, start=None, at=None):
-        return self.deformer.deform(loads)
-
-    def tumour_error(self, answer):
-        return 1.1e-3
-
-
 class TestSaid:
     @pytest.mark.parametrize(
         ("trained", "promised", "error", "said"),
@@ -234,19 +216,33 @@ class TestSaid:
             ),
             (False, None, NOT_KNOWN, ["model: finite elements themselves", NOT_KNOWN_WORDS]),
             (
-                True, None, TumourError(4.11e-3, "E", 1e-3),
+                True, None, TumourError(4.11e-3, "E"),
                 [
                     "model: error against its finite elements not known",
-                    "tumour: within 1.0 mm of where it is (95 %); without observation 4.2 mm",
+                    "tumour: within 4.2 mm of where it is (95 %), above all E",
                 ],
+            ),
+            (
+                False, None, TumourError(4.11e-3, "E", 1e-3),
+                ["tumour: within 1.0 mm of where it is (95 %); without observation 4.2 mm"],
             ),
         ],
     )  # fmt: skip
     def test_both_are_said_apart(self, trained, promised, error, said):
-        assert error_lines(trained, promised, error) == said
-        assert error_lines(trained, promised, error, "doubt") == said[1:]
-        located = replace(error, observed=1e-3)
-        assert error_lines(False, None, located) == error_lines(True, None, located)[1:]
+        assert error_lines(promised, error, trained) == said
+        assert error_lines(promised, error, trained, "doubt") == said[-1:]
+
+    @pytest.mark.parametrize(
+        ("trained", "promised", "error", "said"),
+        [
+            (True, 2.21e-4, TumourError(4.11e-3, "E"), ["model: within 0.23 mm", "tumour: within 4.2 mm"]),
+            (True, None, NOT_KNOWN, ["model: not known", "tumour: not known"]),
+            (False, None, TumourError(4.11e-3, "E"), ["model: FEM itself", "tumour: within 4.2 mm"]),
+            (False, None, TumourError(4.11e-3, "E", 1e-3), ["tumour: within 1.0 mm"]),
+        ],
+    )
+    def test_small_pictures_say_them_in_few_words(self, trained, promised, error, said):
+        assert error_lines(promised, error, trained, brief=True) == said
 
     def test_the_worst_of_frames_is_known_where_all_are(self):
         errors = [TumourError(1e-3, "E"), TumourError(3e-3, "nu"), TumourError(2e-3, "E")]
@@ -268,8 +264,15 @@ class TestSaid:
         assert frame.model_error == frame.deformation.bound[0, 0]
         margin, gauge = drawn_with[0][5:7]
         assert margin == frame.tumour_error.prior and gauge.error is None
-        for line in error_lines(True, frame.model_error, frame.tumour_error):
-            assert stands(frame.shown, line, FINE)
+        assert list(frame.head) == error_lines(frame.model_error, frame.tumour_error, True)
+        assert all(stands(frame.shown, line, FINE) for line in frame.head)
+        # The panel of figures begins under them.
+        assert all(stands(labelled(frame, "linear"), line, FINE) for line in frame.head)
+        narrow = knowing.player("linear", scene).draw(3, 0.1, scene.path(0.1))
+        assert narrow.shown.shape == (240, 320, 3)
+        assert list(narrow.head) == error_lines(narrow.model_error, narrow.tumour_error, True, brief=True)
+        for line in (*narrow.head, f"moved {millimetres(narrow.moved)}", "frame 3"):
+            assert stands(narrow.shown, line, FINE)
 
     def test_in_a_hand_and_of_a_doubtful_answer_it_is_not_known(self, theatre):
         scene = short()
@@ -277,15 +280,6 @@ class TestSaid:
         held, doubtful = (player.draw(3, 0.1, Touch(force=force)) for force in (0.2, 0.6))
         assert held.tumour_error == doubtful.tumour_error == NOT_KNOWN
         assert held.model_error is not None and doubtful.model_error is None and doubtful.doubt
-
-    def test_what_is_observed_holds_in_place_of_the_prior(self, theatre):
-        scene = short()
-        seeing = Player(theatre.stage(scene), Seeing(theatre.models["linear"]), uncertainty=stated(scene, theatre))
-        error = seeing.draw(3, 0.1, scene.path(0.1)).tumour_error
-        assert error.bound == error.observed == 1.1e-3 and error.prior == pytest.approx(3e-3)
-        assert replace(seeing, uncertainty=None).draw(3, 0.1, scene.path(0.1)).tumour_error == TumourError(
-            None, "", 1.1e-3
-        )
 
 
 def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, capsys):

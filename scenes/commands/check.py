@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
             f"skull{_bond(figures.bond)}{_estimates(figures)}",
             file=table,
         )
-        for sentence in error_lines(name != "fem", promised, error):
+        for sentence in error_lines(promised, error, name != "fem"):
             print(f"{'':11s} {sentence}", file=table)
         if args.certify:
             rows[-1]["certificates"] = _certificates(theatre, scene, frames, truth, table)

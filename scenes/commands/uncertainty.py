@@ -98,7 +98,7 @@ def _flat(theatre: Theatre, scene: Scene, found: Uncertainty, twins: float | Non
     parts = {name: 1e3 * values[moment] for name, values in found.parts.items()}
     ranked = dict(sorted(parts.items(), key=lambda part: -part[1]))
     return {
-        "scene": scene.name, "said": error_lines(model is not None, promised, error), "time_s": found.times[moment],
+        "scene": scene.name, "said": error_lines(promised, error, model is not None), "time_s": found.times[moment],
         "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
         "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment], "largest_part": error.largest,
         "draws": found.draws, "failed": found.failed, "held": found.held, "held_twins": twins,

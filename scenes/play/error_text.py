@@ -11,36 +11,44 @@ from ..script.uncertainty import TumourError
 NOT_KNOWN_WORDS = "error of the tumour: not known"
 
 
-def error_lines(trained: bool, promised: float | None, error: TumourError, doubt: str = "") -> list[str]:
+def error_lines(
+    promised: float | None, error: TumourError, trained: bool, doubt: str = "", brief: bool = False
+) -> list[str]:
     """Lines for a picture: what the model is off by, and what the tumour is off by.
 
     The latter alone of a doubtful answer, and of one that is found from what is observed.
 
     Parameters
     ----------
-    trained
-        Whether a trained model answers, and not the finite elements.
     promised
         What the model promises [m]; None where nothing is.
+    trained
+        Whether a trained model answers, and not the finite elements.
+    brief
+        Whether in few words, for a small picture.
     """
-    modelled = trained or error.observed is None
-    return [*([model_words(trained, promised)] if modelled and not doubt else []), tumour_words(error)]
+    modelled = error.observed is None and not doubt
+    return [*([model_words(promised, trained, brief)] if modelled else []), tumour_words(error, brief)]
 
 
-def model_words(trained: bool, promised: float | None) -> str:
+def model_words(promised: float | None, trained: bool, brief: bool = False) -> str:
     """What the model is off by, against its finite elements."""
     if not trained:
-        return "model: finite elements themselves"
+        return "model: FEM itself" if brief else "model: finite elements themselves"
     if promised is None:
-        return "model: error against its finite elements not known"
-    return f"model: within {length(promised, 2)} of its finite elements (95 %)"
+        return "model: not known" if brief else "model: error against its finite elements not known"
+    within = f"model: within {length(promised, 2)}"
+    return within if brief else f"{within} of its finite elements (95 %)"
 
 
-def tumour_words(error: TumourError) -> str:
+def tumour_words(error: TumourError, brief: bool = False) -> str:
     """What the tumour is off by, against where it is in the patient."""
     if error.bound is None:
-        return NOT_KNOWN_WORDS
-    said = f"tumour: within {length(error.bound, 1)} of where it is (95 %)"
+        return "tumour: not known" if brief else NOT_KNOWN_WORDS
+    within = f"tumour: within {length(error.bound, 1)}"
+    if brief:
+        return within
+    said = f"{within} of where it is (95 %)"
     if error.observed is None:
         return f"{said}, above all {error.largest}"
     return said if error.prior is None else f"{said}; without observation {length(error.prior, 1)}"

@@ -8,6 +8,7 @@ from html import escape
 import numpy as np
 
 from ar import hud
+from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import Deformation, Outcome
 from sim.effects import Elasticity
 from sim.material import Material, Tissue
@@ -106,9 +107,10 @@ def side(site: Site) -> str:
 
 def fem_words(theatre: Theatre, scene: Scene) -> str:
     """Element and tissue that the theatre's finite elements have in a scene."""
-    tissue = next((effect.default for effect in scene.effects if isinstance(effect, Elasticity)), None)
-    element = theatre.element_of(scene)
-    return f"{ELEMENTS.get(element, element)}, {tissue_words(tissue)}"
+    elasticity = next((effect for effect in scene.effects if isinstance(effect, Elasticity)), Elasticity(None))
+    element, tumour = theatre.element_of(scene), elasticity.regions.get(TUMOUR_LABEL)
+    own = "" if tumour is None else f"; the tumour of {tissue_words(tumour)}"
+    return f"{ELEMENTS.get(element, element)}, {tissue_words(elasticity.default)}{own}"
 
 
 def tissue_words(tissue: Tissue | None) -> str:
@@ -194,8 +196,10 @@ def report(
     if frame.distance_error is not None and frame.distance_error < np.inf:
         facts += [f"tip to tumour within {length(frame.distance_error, 1)} of the model's finite elements (95 %)"]
     parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {hud.millimetres(frame.distance)}</p>']
-    parts += [] if frame.estimate is None else estimated(frame.estimate)
-    parts += [trust(frame.deformation, name), tumour_trust(frame.tumour_error), f"<p>{escape('; '.join(facts))}</p>"]
+    number, *found = [""] if frame.estimate is None else estimated(frame.estimate)
+    # A narrow window shows the first lines alone: both errors are among them.
+    parts += [number, trust(frame.deformation, name), tumour_trust(frame.tumour_error), *found]
+    parts.append(f"<p>{escape('; '.join(facts))}</p>")
     if without:
         parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
     if left is not None and len(left.loose):
@@ -207,13 +211,13 @@ def report(
 
 def estimated(found: Estimate) -> list[str]:
     """What an estimate says, how far it is from the truth, and what it was given; or why it was refused."""
-    truth = f"truly {hud.millimetres(float(np.linalg.norm(found.true)))}"
+    truth = f"truly {_unbroken(float(np.linalg.norm(found.true)))}"
     if found.location is None:
         return [
             f'<p class="number">where the tumour is, is not known ({truth})</p>',
             f'<p class="warn">What is seen was refused: {escape(found.refusal)}</p>',
         ]
-    moved = hud.millimetres(found.moved, found.location.p95).replace("+-", "\N{PLUS-MINUS SIGN}")
+    moved = _unbroken(found.moved, found.location.p95)
     held = "inside" if found.held else "outside of"
     guess = "" if found.location.calibrated else " It is a guess: such observations were not tried."
     still = "" if found.noticed else " No motion is seen beyond its error."
@@ -222,6 +226,12 @@ def estimated(found: Estimate) -> list[str]:
         f"<p><b>estimate</b> from {escape(found.source)}: {1e3 * found.off:.1f} mm off the truth, which is {held} the "
         f"ellipsoid. Causes: {found.location.named_causes}.{still}{guess}</p>",
     ]
+
+
+def _unbroken(length: float, error: float | None = None) -> str:
+    """A length and its error [m] in millimetres, whose unit no new line parts from them."""
+    said = hud.millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
+    return said.replace(" mm", "&nbsp;mm")
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from ar.camera import Camera
-from ar.hud import NARROW, folded, lay, panel
+from ar.hud import HEAD, NARROW, ROW, folded, lay, panel
 from ar.layer import Layer
 from ar.overlay import Gauge, Overlaid, Style, Trace, composite, draw_points
 from ar.renderer import Picture
@@ -25,7 +25,7 @@ from ..script.scene import Scene
 from ..script.site import Site
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, lifted
-from ..script.uncertainty import NOT_KNOWN, Observing, TumourError, Uncertainty
+from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
 from .error_text import error_lines
 from .load_text import acting, doubt_of
 from .observer import Estimate, Observer
@@ -41,10 +41,8 @@ IN_BONE = "the bone is where this push needs the tool: do not rely on it"
 # Tissue may carry a tool into the bone's edge by so much before it is drawn elsewhere, and before its load counts as
 # none that a tool can make [m].
 CARRIED, BLOCKED = 0.5e-3, 2e-3
-# Of the picture's width, that the lines of errors may have; in one of fewer pixels a tool is beside them.
-WIDE, SLIM, FEW = 0.62, 0.36, 480
-# They begin so far down, under the letter of a side; a panel of figures begins so far down, under them [pixel].
-HEAD, UNDER_ERRORS = 34, 74
+# Of the picture's width, that the lines of errors may have; a picture of fewer pixels has them in few words.
+WIDE, FEW = 0.62, 480
 STAGES = ("deform", "render", "overlay")
 """What the time of a frame is spent on."""
 
@@ -84,6 +82,8 @@ class Frame:
         How far the tumour may be from where it is drawn, whatever answers.
     doubt
         Why the answer may not be relied on, in the words that are in the picture; empty where it may.
+    head
+        The lines at the picture's head: the errors of model and tumour.
     remark
         What else is said in the picture, as of a tool that the bone stops; mostly empty.
     seconds
@@ -109,6 +109,7 @@ class Frame:
     model_error: float | None
     tumour_error: TumourError
     doubt: str
+    head: tuple[str, ...]
     remark: str
     seconds: Mapping[str, float]
     estimate: Estimate | None = None
@@ -191,18 +192,21 @@ class Player:
         doubt = doubt or (REFUSED if estimate is not None and estimate.location is None else "")
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
         promised = None if doubt else self._promised(deformation)
-        error = NOT_KNOWN if doubt else self._tumour_error(touch, loads, deformation, promised or 0.0, estimate)
+        error = NOT_KNOWN if doubt else self._tumour_error(touch, loads, promised or 0.0, estimate)
         plain = None if gauge is None else replace(gauge, error=None)
         traces = () if estimate is None else traces_of(estimate, stage.truth(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
         band = 0.0 if estimate is not None else error.bound or 0.0
-        over = composite(picture, self.camera, tumour, (TOOL,), self.style, band, plain, rest, doubt, traces, moved)
+        lines = error_lines(promised, error, isinstance(self.deformer, Learned), doubt, self.camera.width < FEW)
+        head = [part for line in lines for part in folded(line, WIDE * self.camera.width)]
+        over = composite(
+            picture, self.camera, tumour, (TOOL,), self.style, band, plain, rest, doubt, traces, moved, head
+        )  # fmt: skip
         if estimate is not None and self.style != "none":
             draw_points(over, self.camera, estimate.observation.now, picture.segmentation == CORTEX)
         remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
-        lines = error_lines(isinstance(self.deformer, Learned), promised, error, doubt)
-        annotate(over, number, remark, lines, (picture.segmentation == TOOL).astype(np.uint8))
+        annotate(over, number, remark)
         spent = seconds, rendered - begun, clock.perf_counter() - rendered - located
         took = dict(zip(STAGES, spent, strict=True)) | ({} if estimate is None else {"locate": located})
         return Frame(
@@ -210,7 +214,7 @@ class Player:
             None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
             None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
             float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()) if moved is None else moved[0],
-            promised, error, doubt, remark, took, estimate,
+            promised, error, doubt, tuple(head), remark, took, estimate,
         )  # fmt: skip
 
     def _estimate(self, observer: Observer, number: int, positions: np.ndarray, held: HeldTool | None) -> Estimate:
@@ -234,18 +238,12 @@ class Player:
         bound = of_load if np.isfinite(of_load) else self.deformer.bound
         return bound if np.isfinite(bound) else None
 
-    def _tumour_error(
-        self, touch: Touch, loads: Loads, answer: Deformation, promised: float, estimate: Estimate | None
-    ) -> TumourError:
+    def _tumour_error(self, touch: Touch, loads: Loads, promised: float, estimate: Estimate | None) -> TumourError:
         """How far the tumour may be off: known where the script has the tool, and what sees the brain knows more."""
         time = float(loads.times[0])
         scripted = self.uncertainty is not None and touch == self.scene.path(time)
         error = self.uncertainty.at(time, promised) if self.uncertainty is not None and scripted else NOT_KNOWN
-        if estimate is not None:
-            return replace(error, observed=estimate.worst)
-        if isinstance(self.deformer, Observing):
-            error = replace(error, observed=self.deformer.tumour_error(answer))
-        return error
+        return error if estimate is None else replace(error, observed=estimate.worst)
 
     def frames(self, every: int = 1) -> Iterator[Frame]:
         """The frames of the scene, or every so many of them."""
@@ -302,20 +300,9 @@ def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
     return Gauge(tip, closest(tip[None], hidden.vertices[hidden.triangles]).point[0])
 
 
-def annotate(
-    over: Overlaid, number: int, remark: str, errors: Sequence[str] = (), sights: np.ndarray | None = None
-) -> None:
-    """Write into a composite picture, in place: errors at its head, a remark at its foot, and a frame's number.
-
-    sights (H, W) uint8: above 0 where tools are, which the errors leave in sight if they can.
-    """
+def annotate(over: Overlaid, number: int, remark: str) -> None:
+    """Write into a composite picture, in place: a remark at its foot, and a frame's number."""
     height, width = over.taken.shape
-    lines = [part for line in errors for part in folded(line, (WIDE if width >= FEW else SLIM) * width)]
-    free = over.taken.copy()
-    free[:HEAD] = free[height // 2 - HEAD // 2 : height // 2 + HEAD // 2] = 1  # letters of sides come there
-    before = free.copy()
-    lay(over.colour, free, lines, (0, HEAD), needed=True, sights=sights)
-    over.taken[free > before] = 1
     lay(over.colour, over.taken, folded(remark, NARROW * width), (0, height))
     lay(over.colour, over.taken, [f"frame {number}"], (width, height))
 
@@ -331,4 +318,4 @@ def labelled(frame: Frame, name: str) -> np.ndarray:
         lines += [f"estimate: {frame.estimate.source}", f"lines: {LINES}"]
     if not frame.deformation.outcome[0].good:
         lines.append(frame.deformation.outcome[0].value)
-    return panel(frame.shown, lines, below=UNDER_ERRORS)
+    return panel(frame.shown, lines, below=HEAD + ROW * len(frame.head))

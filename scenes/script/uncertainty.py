@@ -7,11 +7,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
@@ -55,15 +53,6 @@ class TumourError:
 
 
 NOT_KNOWN = TumourError(None)
-
-
-@runtime_checkable
-class Observing(Protocol):
-    """A deformer that sees something of the brain, and knows by that how far the tumour may be off."""
-
-    def tumour_error(self, answer: Deformation) -> float:
-        """With a probability of 95 % no point of the tumour's surface is farther [m] from where an answer has it."""
-        ...
 
 
 @dataclass(frozen=True)
