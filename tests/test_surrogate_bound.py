@@ -13,30 +13,30 @@ def lying(count, away=0.0, beyond=0.0):
 
 
 def drawn(count, seed):
-    """Features, forces and errors at five vertices, which grow steeply with force and with the third feature."""
+    """Features, forces and largest errors, which grow steeply with force and with the third feature."""
     random = np.random.default_rng(seed)
     features = random.normal(size=(count, 4))
     force = np.exp(0.6 * features[:, 0] - 2.0)
     size = 1e-4 * np.exp(2.0 * features[:, 0] + 0.7 * features[:, 2] ** 2) * random.gamma(2.0, size=count)
-    return features, force, size[:, None] * np.array([1.0, 0.8, 0.5, 0.3, 0.1]) * random.uniform(0.5, 1.0, (count, 5))
+    return features, force, size * random.uniform(0.5, 1.0, count)
 
 
 @pytest.fixture(scope="module")
 def bound():
     features, _, error = drawn(600, 0)
-    return fitted_bound((features, error.max(axis=1)), *drawn(2000, 1))
+    return fitted_bound((features, error), *drawn(2000, 1))
 
 
 def test_fresh_loads_are_covered_in_every_class(bound):
     features, force, error = drawn(20000, 2)
     stated = bound.of(features, force, lying(len(force)))
-    covered = error.max(axis=1) <= stated
+    covered = error <= stated
     for level, row in zip(LEVELS, covered, strict=True):
         assert abs(row.mean() - level) < 0.01
     decile = np.searchsorted(np.quantile(force, np.arange(1, 10) / 10), force)
     assert all(abs(covered[0][decile == k].mean() - 0.95) < 0.045 for k in range(10))
     # Bounds that know nothing of the load would be an error's 95th percentile: five times its median and more.
-    assert np.median(stated[0] / error.max(axis=1)) < 4.0
+    assert np.median(stated[0] / error) < 4.0
     assert (stated[1] >= stated[0]).all()
 
 
@@ -69,18 +69,13 @@ def test_too_few_far_loads_tell_no_growth_and_none_is_beyond_all_bounds():
 def test_bounds_that_grow_with_the_distance_hold_near_and_far():
     features, force, error = drawn(3000, 5)
     away = np.random.default_rng(6).uniform(0.0, 6e-3, 3000)
-    error = error * (1.0 + 800.0 * away)[:, None]
+    error = error * (1.0 + 800.0 * away)
     near = np.flatnonzero(away < 2e-3)
     known = features[near], force[near], error[near]
-    bound = fitted_bound((features, error.max(axis=1)), *known, away=away[near], growth=800.0)
+    bound = fitted_bound((features, error), *known, away=away[near], growth=800.0)
     stated = bound.of(features, force, Outside(away, 0.0 * away, 0.0 * away))[0]
-    held = error.max(axis=1) <= stated
+    held = error <= stated
     assert abs(held[near].mean() - 0.95) < 0.02 and abs(held[away > 4e-3].mean() - 0.95) < 0.03
-
-
-def test_weak_vertices_have_a_small_share(bound):
-    assert bound.profile.shape == (5,) and (np.diff(bound.profile[1:]) < 0).all()
-    assert bound.profile[0] == pytest.approx(1.0) and bound.profile[4] < 0.2
 
 
 def test_conformal_takes_the_rank_that_covers_one_more():
@@ -91,10 +86,10 @@ def test_conformal_takes_the_rank_that_covers_one_more():
 
 def test_loads_of_one_force_are_one_class():
     features, _, error = drawn(500, 4)
-    bound = fitted_bound((features, error.max(axis=1)), features, np.full(500, 0.2), error)
+    bound = fitted_bound((features, error), features, np.full(500, 0.2), error)
     assert not len(bound.edges) and bound.quantile.shape == (2, 1)
     stated = bound.of(features, np.full(500, 0.2), lying(500))
-    assert np.mean(error.max(axis=1) <= stated[0]) >= 0.95
+    assert np.mean(error <= stated[0]) >= 0.95
 
 
 def placed(count, seed, discs=None):
@@ -104,17 +99,17 @@ def placed(count, seed, discs=None):
     if discs is not None:
         place = discs[random.integers(len(discs), size=count)] + random.normal(size=(count, 3))
     size = 1e-4 * np.exp(1.2 * load[:, 0] - 0.8 * load[:, 1]) * random.exponential(size=count)
-    return np.hstack([load, place]), np.exp(0.6 * load[:, 0] - 2.0), size[:, None]
+    return np.hstack([load, place]), np.exp(0.6 * load[:, 0] - 2.0), size
 
 
 @pytest.mark.parametrize("curved", [True, False])
 def test_a_scale_seen_in_few_discs_does_not_run_away_between_them(curved):
     discs = np.array([[-12.0, -9.0, 5.0], [2.0, 11.0, -8.0], [13.0, -4.0, 9.0]])
     features, _, error = placed(400, 5, discs)
-    bound = fitted_bound((features, error[:, 0]), *placed(1000, 6), curved=curved)
+    bound = fitted_bound((features, error), *placed(1000, 6), curved=curved)
     features, force, error = placed(5000, 7)
     stated = bound.of(features, force, lying(len(force)))
-    assert abs(np.mean(error[:, 0] <= stated[0]) - 0.95) < 0.02
+    assert abs(np.mean(error <= stated[0]) - 0.95) < 0.02
     # The 95th percentile of an exponential distribution is three times its mean.
     ideal = 3e-4 * np.exp(1.2 * features[:, 0] - 0.8 * features[:, 1])
     assert np.quantile(stated[0] / ideal, 0.99) < 4.0
@@ -123,7 +118,7 @@ def test_a_scale_seen_in_few_discs_does_not_run_away_between_them(curved):
 @pytest.mark.parametrize("curved", [True, False])
 def test_a_scale_is_of_the_load_and_the_same_everywhere(curved):
     features, _, error = placed(400, 5)
-    bound = fitted_bound((features, error[:, 0]), *placed(1000, 6), curved=curved)
+    bound = fitted_bound((features, error), *placed(1000, 6), curved=curved)
     elsewhere = features + [0.0, 0.0, 0.0, 0.0, 9.0, -9.0, 30.0]
     at = [bound.of(some, np.full(400, 0.2), lying(400)) for some in (features, elsewhere)]
     np.testing.assert_array_equal(*at)

@@ -50,8 +50,6 @@ class Bound:
         (k - 1,) forces [N] between the k classes.
     quantile
         (2, k): of error over scale, for `LEVELS` and each class.
-    profile
-        (n,) at most one: each vertex's share of the bound, in the order of `Anatomy.tumour_nodes`.
     growth, near
         () [1/m], with the distance from the nearest training load, of which the first part () [m] does not count.
     """
@@ -61,7 +59,6 @@ class Bound:
     weights: np.ndarray
     edges: np.ndarray
     quantile: np.ndarray
-    profile: np.ndarray
     growth: np.ndarray
     near: np.ndarray
 
@@ -94,7 +91,7 @@ def fitted_bound(
     seen
         Features (m, f) and largest errors (m,) [m] of loads that are not of the model's training.
     features, force, error
-        (n, f), (n,) [N] and errors (n, k) [m] at each vertex, of the calibration loads.
+        (n, f), (n,) [N] and largest errors (n,) [m], of the calibration loads.
     each
         Calibration loads of a class of force, at least: fewer than 99 promise nothing at 0.99.
     curved
@@ -110,16 +107,14 @@ def fitted_bound(
     penalty[0, 0] = 0.0  # the constant is free
     weights = np.zeros(len(used))
     weights[used] = np.linalg.solve(design.T @ design + penalty, design.T @ wanted)
-    worst = error.max(axis=1)
     scale = np.exp(_monomials(_standard(features, mean, deviation)) @ weights)
-    ratio = worst / (scale * (1.0 + growth * away))
+    ratio = error / (scale * (1.0 + growth * away))
     count = int(np.clip(len(ratio) // each, 1, CLASSES))
     edges = np.unique(np.quantile(force, np.arange(1, count) / count))
     edges = edges[edges < force.max()]  # equal forces are of one class
     count, member = len(edges) + 1, np.searchsorted(edges, force)
     quantile = np.array([[conformal(ratio[member == k], level) for k in range(count)] for level in LEVELS])
-    share = np.quantile(error / np.maximum(worst, np.finfo(float).tiny)[:, None], LEVELS[0], axis=0)
-    return Bound(mean, deviation, weights, edges, quantile, share, np.array(growth), np.zeros(()))
+    return Bound(mean, deviation, weights, edges, quantile, np.array(growth), np.zeros(()))
 
 
 def fitted_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.ndarray]) -> float:

@@ -268,20 +268,6 @@ class Learned:
         """
         return only_pushed(loads) if self.ball is None else indented(loads, self.ball, self._patch)
 
-    def margin(self, answer: Deformation) -> np.ndarray:
-        """A field (B, n) [m] over `anatomy.tumour_nodes`, scaled from an answer's bound at 0.95: where it is needed.
-
-        The bound itself is promised, for the largest error; how it is shared out is what calibration loads had.
-
-        Raises
-        ------
-        InputError
-            A model without calibrated bounds.
-        """
-        if self.bounds is None:
-            raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
-        return answer.bound[0][:, None] * self.bounds.profile
-
 
 def predicted(
     displacement: np.ndarray,

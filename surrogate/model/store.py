@@ -192,11 +192,11 @@ def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
 
 
 def _rebuilt_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray], reach: float) -> Bound | None:
-    """A bound; those of older files grow beyond the reach of the training loads alone."""
+    """A bound; those of older files grow beyond the reach of the training loads alone, and hold each vertex's share."""
     if names is None:
         return None
     older = {"growth": np.array(1e3 * GROWTH), "near": np.array(reach)}
-    return Bound(**(older | {name: arrays[key] for name, key in names.items()}))
+    return Bound(**(older | {name: arrays[key] for name, key in names.items() if name != "profile"}))
 
 
 def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:

@@ -37,9 +37,9 @@ def demand_sound(name: str, model: Learned) -> None:
         texts = (*model.training, *model.training.values())
         _demand(all(isinstance(text, str) for text in texts), "what it states of its training is no text")
         if model.bounds is not None:
-            _check_bounds(model.bounds, len(model.anatomy.tumour_nodes))
+            _check_bounds(model.bounds)
         if model.tip is not None and model.tip.bound is not None:
-            _check_bounds(model.tip.bound, 1)  # of one distance
+            _check_bounds(model.tip.bound)
     except InputError as error:
         raise InputError(f"the model {name!r} cannot be: {error}. Make one with `sulcus train`.") from error
 
@@ -110,7 +110,7 @@ def _check_envelope(envelope: Envelope) -> None:
     _demand(bool(np.isfinite(envelope.overhang)) and _positive(envelope.line_force), "its range of loads is none")
 
 
-def _check_bounds(bounds: Bound, count: int) -> None:
+def _check_bounds(bounds: Bound) -> None:
     for name, array in vars(bounds).items():
         _demand(array.dtype.kind == "f" and not np.isnan(array).any(), f"{name!r} of its bounds are no numbers")
     terms = 1 + FEATURES + FEATURES * (FEATURES + 1) // 2
@@ -119,7 +119,6 @@ def _check_bounds(bounds: Bound, count: int) -> None:
         "deviation": (FEATURES,),
         "weights": (terms,),
         "quantile": (len(LEVELS), len(bounds.edges) + 1),
-        "profile": (count,),
         "growth": (),
         "near": (),
     }
@@ -131,7 +130,6 @@ def _check_bounds(bounds: Bound, count: int) -> None:
     _demand(bool((bounds.quantile >= 0.0).all()), "its bounds are negative")
     _demand(0.0 <= float(bounds.growth) < np.inf and 0.0 <= float(bounds.near) < np.inf, "its bounds do not grow")
     _demand(bool((bounds.quantile[1] >= bounds.quantile[0]).all()), "its bounds shrink with their probability")
-    _demand(bool(((bounds.profile >= 0.0) & (bounds.profile <= 1.0)).all()), "a vertex's share of its bounds is none")
 
 
 def _positive(value: float) -> bool:

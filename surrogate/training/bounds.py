@@ -43,7 +43,7 @@ class Missed:
     features
         (B, f), of the scale of its bounds.
     error
-        (B, k) [m]: at k vertices, or of one distance.
+        (B,) [m]: the largest at the tumour's vertices, or of the distance.
     """
 
     pushed: Pushed
@@ -58,18 +58,13 @@ class Missed:
         return Missed(rows_of(self.pushed, some), known, outside, self.features[some], self.error[some])
 
     @property
-    def worst(self) -> np.ndarray:
-        """(B,) [m]."""
-        return self.error.max(axis=1)
-
-    @property
     def force(self) -> np.ndarray:
         """(B,) [N]."""
         return self.known.magnitude
 
 
 def missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> Missed:
-    """Errors (B, k) [m] of a model on loads as it is asked them."""
+    """Errors (B,) [m] of a model on loads as it is asked them."""
     known, envelope = measured(patch, pushed), model.envelope
     return Missed(pushed, known, envelope.outside(pushed, known), features_of(pushed, envelope.within(known)), error)
 
@@ -85,7 +80,7 @@ def bound_by(near: Missed, way: Way, growth: float, seen: Missed | None = None) 
         seen, near = near.rows(fits), near.rows(~fits)
     known = near.features, near.force, near.error
     return fitted_bound(
-        (seen.features, seen.worst), *known, way.each, curved=way.curved, away=near.outside.away, growth=growth
+        (seen.features, seen.error), *known, way.each, curved=way.curved, away=near.outside.away, growth=growth
     )
 
 
@@ -103,14 +98,14 @@ def covered_on_discs(model: Learned, near: Missed, far: Missed, split: Split, wa
         own = bound_by(near, way, fitted_growth(known, (ratio[~here], away[~here])))
         some = far.rows(here)
         bound[:, here] = model.promised(own, some.pushed, some.known, some.outside)
-    return covered(far.force, far.worst, bound, int((far.outside.excess > 0.0).sum()))
+    return covered(far.force, far.error, bound, int((far.outside.excess > 0.0).sum()))
 
 
 def _over_plain(near: Missed, far: Missed, way: Way) -> list[tuple[np.ndarray, np.ndarray]]:
     """Errors over a bound that does not grow, and distances [m] from training loads: of what calibrates, of `far`."""
     plain = bound_by(near, way, 0.0)
     return [
-        (each.worst / plain.of(each.features, each.force, each.outside.here)[0], each.outside.away)
+        (each.error / plain.of(each.features, each.force, each.outside.here)[0], each.outside.away)
         for each in (near.rows(~_fits(near)), far)
     ]
 

@@ -156,8 +156,8 @@ def train(
     def unseen(model: Learned, rows: np.ndarray) -> tuple[Missed, Missed]:
         """How far a model is off at the tumour, and in its distance, on the chosen rows (B,) bool."""
         some, asked, known = np.flatnonzero(rows), rows_of(pushed, rows), distances.rows(rows)
-        of_tumour = errors(model, loads.rows(some), truth[rows], nodes)
-        of_tip = distance_errors(model, known)[:, None]
+        of_tumour = errors(model, loads.rows(some), truth[rows], nodes).max(axis=1)
+        of_tip = distance_errors(model, known)
         return missed(model, patch, asked, of_tumour), missed(model, patch, asked, of_tip)
 
     chosen = [_first(split.train, most), *([_first(~apart, most)] if apart.any() else [])]
@@ -179,11 +179,11 @@ def train(
         with stage("score"):
             solves = inputs[0].solve_counts(name, example_sets[0])
             scores.append(score(name, model, test, truth[split.test], nodes, solves))
-            error = errors(model, test, truth[split.test], nodes)
+            error = errors(model, test, truth[split.test], nodes).max(axis=1)
             model, off = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
             tested = rows_of(pushed, split.test)
-            far = missed(model, patch, tested, error), missed(model, patch, tested, off[:, None])
-        models[name] = replace(model, bound=min(conformal(far[0].worst, LEVELS[0]), float(far[0].worst.max())))
+            far = missed(model, patch, tested, error), missed(model, patch, tested, off)
+        models[name] = replace(model, bound=min(conformal(far[0].error, LEVELS[0]), float(far[0].error.max())))
         growth = [USUAL_GROWTH, USUAL_GROWTH]
         if beside.sum() >= 2 * FEWEST_APART and len(test) >= TENTHS:
             with stage("calibrate"):
