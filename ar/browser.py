@@ -29,7 +29,7 @@ PANEL = 676.0
 EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")
 
 
-Sight = tuple[int, np.ndarray, str, int]
+Shown = tuple[int, np.ndarray, str, int]
 """A frame's number, its picture (H, W, 3) uint8, the words, HTML, beside it, and where the playback slider is."""
 
 
@@ -80,8 +80,8 @@ class Browser:
         self.line = gui.add_html("")
         self.text = gui.add_html(held(SAID, ""))
         # What is shown, newest first asked for: frame, picture and words; the picture as it is sent, and how many were.
-        self.shown: Sight = (0, blank, "", 0)
-        self.wanted: Sight = self.shown
+        self.shown: Shown = (0, blank, "", 0)
+        self.wanted: Shown = self.shown
         self.coded, self.sent = coded(blank), 0
         self.sight = gui.add_html(sight(0, self.coded, ""))
         # What the newest message did, as the `changed` that it calls may ask.

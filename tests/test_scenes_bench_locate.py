@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scenes.bench import locate_twins
 from scenes.bench.kelvinlets import kelvinlets
 from scenes.bench.locate_rivals import kelvin_forces, oracle, rigid, springs, thin_plates
-from scenes.bench.locate_study import OURS, Estimate, Sight, estimate, observed, ours, row, rows, sights_of, spoilt
+from scenes.bench.locate_study import OURS, Estimate, PointsSeen, estimate, observed, ours, row, rows, sights_of, spoilt
 from scenes.bench.locate_twins import CAUSES, Twin, drawn, effects_of, loads_of, solved, twins
 from scenes.cli import main
 from sim.accuracy import REFERENCE
@@ -113,7 +113,7 @@ def test_forces_at_the_points_are_found_again(tumour):
 
 def test_a_body_on_soft_springs_goes_along_and_one_on_stiff_springs_stays(body):
     motion = np.cross([0.02, 0.01, -0.03], body.mesh.nodes - body.mesh.nodes.mean(axis=0)) + [1e-3, 2e-3, -3e-3]
-    seen, true = observed(body, motion, Sight(40, 60, 0), (0,)), motion[body.tumour_nodes]
+    seen, true = observed(body, motion, PointsSeen(40, 60, 0), (0,)), motion[body.tumour_nodes]
     found = springs(body, skull=1.0, point=100.0)(seen.rest, seen.now - seen.rest)
     assert found == pytest.approx(true, abs=1e-5)
     held = springs(body, skull=1e9, point=100.0)(seen.rest, seen.now - seen.rest)
@@ -147,22 +147,22 @@ def test_figures_of_a_row_are_those_by_hand():
     half = estimate(true - [0.0, 1e-3, 0.0], true, 7.9, 0.030)
     refused = estimate(zeros, true, None, None, refused=True)
     assert half.error == pytest.approx(np.full(3, 1e-3)) and half.motion == pytest.approx([5e-3, 2e-3, 3e-3])
-    found = row(Sight(30, 20, 1), "it", [exact, half])
+    found = row(PointsSeen(30, 20, 1), "it", [exact, half])
     assert (found.points, found.cover, found.noise, found.estimator) == (30, 20, 1, "it")
     assert found.removed == pytest.approx(100.0 * (1.0 - 3.0 / 20.0)) and found.mean == pytest.approx(0.5)
     assert (found.held, found.milliseconds) == (50.0, pytest.approx(20.0)) and (found.twins, found.refused) == (2, 0)
-    with_refused = row(Sight(30, 20, 1), "it", [exact, half, refused])
+    with_refused = row(PointsSeen(30, 20, 1), "it", [exact, half, refused])
     assert with_refused.removed == pytest.approx(100.0 * (1.0 - 13.0 / 30.0)) and with_refused.held == 50.0
     assert with_refused.refused == 1 and with_refused.milliseconds == pytest.approx(20.0)
-    alone = row(Sight(30, 20, 1), "it", [refused])
+    alone = row(PointsSeen(30, 20, 1), "it", [refused])
     assert (alone.held, alone.milliseconds, alone.removed) == (None, None, pytest.approx(0.0))
     hundred = Estimate(1e-3 * np.arange(101.0), np.ones(101), None, 0.0)
-    assert row(Sight(30, 20, 1), "it", [hundred]).p95 == pytest.approx(95.0)
+    assert row(PointsSeen(30, 20, 1), "it", [hundred]).p95 == pytest.approx(95.0)
 
 
 def test_squares_are_by_the_stated_covariance_of_the_centroid(locator, body):
     motion = some_motion(locator, 0)
-    seen = observed(body, motion, Sight(60, 60, 1), (0, 0))
+    seen = observed(body, motion, PointsSeen(60, 60, 1), (0, 0))
     found, answer = ours(locator, motion, seen), locator.locate(seen)
     off = answer.centroid - middle_of(body, motion[None])[0]
     assert found.square == pytest.approx(off @ np.linalg.inv(answer.centroid_covariance) @ off)
@@ -173,18 +173,18 @@ def test_squares_are_by_the_stated_covariance_of_the_centroid(locator, body):
 
 def test_what_is_seen_lies_on_the_same_points_at_every_level_of_noise(locator, body):
     motion = some_motion(locator, 2)
-    exact, low, high = (observed(body, motion, Sight(50, 36, noise), (3, 1)) for noise in (0, 1, 2))
+    exact, low, high = (observed(body, motion, PointsSeen(50, 36, noise), (3, 1)) for noise in (0, 1, 2))
     assert np.array_equal(exact.rest, low.rest) and np.array_equal(exact.rest, high.rest)
     assert exact.sigma == pytest.approx(np.full(50, 0.05e-3)) and low.sigma is None and high.sigma is None
     assert np.sqrt(3.0) * np.array([each.rigid for each in (exact, low, high)]) == pytest.approx([0.0, 1e-3, 2e-3])
     at = np.linalg.norm(body.mesh.nodes[:, None] - exact.rest, axis=2)
     on_vertex = at.argmin(axis=0)
     assert np.linalg.norm(exact.now - exact.rest - motion[on_vertex], axis=1).max() < 1e-3
-    again = observed(body, motion, Sight(50, 36, 1), (3, 1))
+    again = observed(body, motion, PointsSeen(50, 36, 1), (3, 1))
     assert np.array_equal(again.now, low.now)
-    others = [observed(body, motion, Sight(50, 36, 1), seed).rest for seed in ((3, 2), (4, 1))]
+    others = [observed(body, motion, PointsSeen(50, 36, 1), seed).rest for seed in ((3, 2), (4, 1))]
     assert not any(np.array_equal(low.rest, other) for other in others)
-    wide = observed(body, motion, Sight(50, 100, 0), (3, 1))
+    wide = observed(body, motion, PointsSeen(50, 100, 0), (3, 1))
     assert np.ptp(exact.rest[:, :2], axis=0).max() < 0.8 * np.ptp(wide.rest[:, :2], axis=0).max()
 
 
@@ -192,7 +192,7 @@ def test_levels_of_noise_have_their_translations(locator, body):
     """Mean squares over many observations: those of white and smooth errors are the same at both levels."""
     still, square = np.zeros_like(body.mesh.nodes), []
     for noise in (1, 2):
-        seen = [observed(body, still, Sight(60, 60, noise), (0, number)) for number in range(60)]
+        seen = [observed(body, still, PointsSeen(60, 60, noise), (0, number)) for number in range(60)]
         square.append(np.mean([1e6 * ((one.now - one.rest).mean(axis=0) ** 2).sum() for one in seen]))
     assert 1.0 < square[0] < 1.5 and square[1] - square[0] == pytest.approx(3.0, abs=0.6)
 

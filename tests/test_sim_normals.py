@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from boxes import blurred_faces
 
-from sim.geometry.surface import Sight, blurred_normals, unit, vertex_normals
+from sim.geometry.surface import BlurRange, blurred_normals, unit, vertex_normals
 
 BALL = trimesh.creation.icosphere(subdivisions=5, radius=0.07)  # edges of 2.5 mm
 ARM = unit(BALL.vertices)
@@ -76,5 +76,5 @@ def test_a_mesh_far_coarser_than_the_blur_faces_outward_too():
 
 def test_more_points_than_are_summed_at_once():
     whole = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3)
-    parts = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3, Sight(together=7))
+    parts = blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3, BlurRange(together=7))
     np.testing.assert_array_equal(parts, whole)

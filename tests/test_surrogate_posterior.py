@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from sim.geometry.locate import Located
 from surrogate.locating.causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
 from surrogate.locating.evidence import SHIFT, SIGMA, TURN, of_motions
-from surrogate.locating.posterior import COARSENED, MIXED, Sight, conditioned, sight_of
+from surrogate.locating.posterior import COARSENED, MIXED, SeenPrior, conditioned, seen_prior
 from surrogate.locating.prior import NOWHERE, SETS, WITH_PLACE, Prior
 
 POINTS = 30
@@ -83,7 +83,7 @@ def test_hypotheses_are_sets_of_causes_in_one_skull_with_and_without_a_tool(prio
 def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_covariance(prior):
     """Bayes' formula by precisions instead of covariances, and the density of what is seen, with a place or without."""
     _, evidence = drawn(prior, np.random.default_rng(1), 2)
-    sight = sight_of(prior, evidence)
+    sight = seen_prior(prior, evidence)
     noise = evidence.noise(np.sqrt((evidence.value**2).sum() / POINTS))
     unknown = seen_unknowns(prior, evidence).T
     logs, density = [], []
@@ -128,11 +128,11 @@ def test_ellipsoids_hold_what_is_drawn(prior):
     random, hypothesis, square = np.random.default_rng(3), prior.hypotheses[2], []
     for _ in range(200):
         truth, evidence = drawn(prior, random, 2)
-        sight = sight_of(prior, evidence)
+        sight = seen_prior(prior, evidence)
         # What shapes lack is no part of these draws, and their size is known.
         exact = evidence.whitening(0.0)
         unknown = seen_unknowns(prior, evidence)
-        sight = Sight(prior, 3.0, exact, exact.white(unknown), exact.white(evidence.value), np.zeros(3))
+        sight = SeenPrior(prior, 3.0, exact, exact.white(unknown), exact.white(evidence.value), np.zeros(3))
         answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
         scale = np.append(np.ones(len(prior.kind)), RIGID)
         off = answer.mean - (truth / scale)[answer.rows]
@@ -146,7 +146,7 @@ def test_a_mixture_lies_between_its_hypotheses(prior):
     found = conditioned(prior, evidence)
     assert not len(found.outliers) and 0.2 < found.surprise < 1.6
     assert np.linalg.eigvalsh(found.spread).min() > -1e-12 and np.linalg.eigvalsh(found.rigid_spread).min() > 0.0
-    answers = sight_of(prior, evidence).answers()
+    answers = seen_prior(prior, evidence).answers()
     assert len(answers) == MIXED and sum(answer.share for answer in answers) == pytest.approx(1.0)
     means = np.zeros((len(answers), len(prior.kind) + 6))
     for row, answer in zip(means, answers, strict=True):
@@ -186,8 +186,8 @@ def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
     """The odds of a place fall with its distance from the nearest tip; without tips all are alike."""
     _, evidence = drawn(prior, np.random.default_rng(8))
     without, near = (
-        sight_of(prior, evidence),
-        sight_of(prior, evidence, np.array([[0.02, 0.004, 0.0], [1.0, 1.0, 1.0]])),
+        seen_prior(prior, evidence),
+        seen_prior(prior, evidence, np.array([[0.02, 0.004, 0.0], [1.0, 1.0, 1.0]])),
     )
     assert not without.odds.any()
     assert near.odds == pytest.approx([np.log(0.05), -0.5 * (0.02**2 + 0.004**2) / 0.004**2, -0.5])
@@ -200,10 +200,10 @@ def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
 def test_what_is_seen_may_be_little_because_a_motion_and_a_rigid_error_cancel(prior):
     """Motions may then be as large as a rigid error: its prior's translation has a length of 1.4 mm."""
     little, much = (seen(prior, np.full_like(prior.anatomy.mesh.nodes, each)) for each in (1e-5, 3e-3))
-    assert sight_of(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
-    assert sight_of(prior, much).scale == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
+    assert seen_prior(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
+    assert seen_prior(prior, much).scale == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
     exact = replace(much, shift=0.0)
-    assert sight_of(prior, exact).scale == pytest.approx(np.sqrt(3.0) * 3.0, rel=1e-3)
+    assert seen_prior(prior, exact).scale == pytest.approx(np.sqrt(3.0) * 3.0, rel=1e-3)
 
 
 def test_a_rigid_error_is_believed_to_be_as_large_as_is_stated(prior):

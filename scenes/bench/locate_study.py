@@ -33,7 +33,7 @@ TRANSLATIONS = (0.0, 1e-3, 2e-3)
 
 
 @dataclass(frozen=True)
-class Sight:
+class PointsSeen:
     """What is seen: so many points, on a round share `cover` [%] of the open cortex, at a level of noise."""
 
     points: int
@@ -95,7 +95,7 @@ class Row:
     refused: int
 
 
-def observed(body: Anatomy, motion: np.ndarray, sight: Sight, seed: tuple[int, ...]) -> Observation:
+def observed(body: Anatomy, motion: np.ndarray, sight: PointsSeen, seed: tuple[int, ...]) -> Observation:
     """What is seen of a motion (V, 3) [m], with how far a tracker like this is off.
 
     Where the points lie is the same at every level of noise.
@@ -125,7 +125,7 @@ def spoilt(rest: np.ndarray, now: np.ndarray, translation: float, random: np.ran
 
 def rows(
     twins: Sequence[Twin],
-    sights: Sequence[Sight],
+    sights: Sequence[PointsSeen],
     rivals: dict[str, Rival],
     locator: Locator,
     seed: int = 0,
@@ -159,12 +159,12 @@ def rows(
             yield row(sight, name, estimates)
 
 
-def sights_of(points: Sequence[int], covers: Sequence[int], noises: Sequence[int]) -> tuple[Sight, ...]:
+def sights_of(points: Sequence[int], covers: Sequence[int], noises: Sequence[int]) -> tuple[PointsSeen, ...]:
     """Every combination."""
-    return tuple(Sight(*each) for each in product(points, covers, noises))
+    return tuple(PointsSeen(*each) for each in product(points, covers, noises))
 
 
-def row(sight: Sight, name: str, estimates: Sequence[Estimate]) -> Row:
+def row(sight: PointsSeen, name: str, estimates: Sequence[Estimate]) -> Row:
     """What became of an estimator's estimates."""
     error, motion = (np.concatenate([getattr(each, key) for each in estimates]) for key in ("error", "motion"))
     squares = [each.square for each in estimates if each.square is not None]

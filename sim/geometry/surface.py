@@ -8,8 +8,8 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Sight:
-    """How much of a surface a point sees through a blur.
+class BlurRange:
+    """How far a blur of a surface reaches, and how narrow it may be.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class Sight:
 
 
 def blurred_normals(
-    nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, blur: float, sight: Sight = Sight()
+    nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, blur: float, limits: BlurRange = BlurRange()
 ) -> np.ndarray:
     """Unit normals (n, 3) at points (n, 3) [m] of the body within outward triangles (S, 3), seen through a blur.
 
@@ -41,12 +41,14 @@ def blurred_normals(
 
     a, b, c = np.moveaxis(nodes[triangles], 1, 0)
     longest = np.linalg.norm([b - a, c - b, a - c], axis=2).max()
-    blur = max(blur, sight.narrowest * longest)
+    blur = max(blur, limits.narrowest * longest)
     twice, middle = np.cross(b - a, c - a), KDTree((a + b + c) / 3.0)
     out = np.zeros_like(points)
-    for first in range(0, len(points), sight.together):
-        some = slice(first, first + sight.together)
-        near = KDTree(points[some]).sparse_distance_matrix(middle, sight.reach * blur, output_type="coo_matrix").tocsr()
+    for first in range(0, len(points), limits.together):
+        some = slice(first, first + limits.together)
+        near = (
+            KDTree(points[some]).sparse_distance_matrix(middle, limits.reach * blur, output_type="coo_matrix").tocsr()
+        )
         near.data = np.exp(-0.5 * (near.data / blur) ** 2)
         out[some] = near @ twice
     return unit(out)

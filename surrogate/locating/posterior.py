@@ -78,7 +78,7 @@ class Answer:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class SeenPrior:
     """A prior as it is seen at some points, whitened by their errors.
 
     Parameters
@@ -164,14 +164,16 @@ class Sight:
         return np.append(hypothesis.rows, rigid), size
 
 
-def sight_of(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> Sight:
+def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> SeenPrior:
     """How a prior is seen by some evidence, where tips of tools (k, 3) [m] touch the cortex."""
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
     whitening = evidence.whitening(seen)
     unknown = np.concatenate([prior.seen(evidence.place, evidence.axis), evidence.rigid * evidence.rigid_scale], axis=1)
     # A motion and a rigid error may cancel, so that little is seen of either.
     scale = 1e3 * float(np.hypot(seen, np.sqrt(3.0) * evidence.shift))
-    return Sight(prior, scale, whitening, whitening.white(unknown), whitening.white(evidence.value), prior.odds(tips))
+    return SeenPrior(
+        prior, scale, whitening, whitening.white(unknown), whitening.white(evidence.value), prior.odds(tips)
+    )
 
 
 def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> Posterior:
@@ -179,14 +181,14 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) ->
     kept, point = np.ones(len(evidence), bool), evidence.point
     while True:
         some = evidence.rows(kept)
-        sight = sight_of(prior, some, tips)
-        answers = sight.answers()
-        odd = _oddness(sight, max(answers, key=lambda answer: answer.share), some.point)
+        seen = seen_prior(prior, some, tips)
+        answers = seen.answers()
+        odd = _oddness(seen, max(answers, key=lambda answer: answer.share), some.point)
         excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], IMPROBABLE)
         if excess.max() <= 1.0 or len(excess) <= FEWEST:
             break
         kept &= ~np.isin(point, np.unique(some.point)[excess >= max(1.0, 0.5 * excess.max())])
-    means, share = np.zeros((len(answers), len(sight.pull))), np.array([answer.share for answer in answers])
+    means, share = np.zeros((len(answers), len(seen.pull))), np.array([answer.share for answer in answers])
     for row, answer in zip(means, answers, strict=True):
         row[answer.rows] = answer.mean
     mean = share @ means
@@ -200,17 +202,17 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) ->
     )  # fmt: skip
 
 
-def _oddness(sight: Sight, answer: Answer, point: np.ndarray) -> np.ndarray:
+def _oddness(seen: SeenPrior, answer: Answer, point: np.ndarray) -> np.ndarray:
     """Square Mahalanobis distance of each point (n,) from what all others predict of it, by one hypothesis."""
-    root = sight.unknown[:, answer.rows] @ answer.back.T
-    gain = sight.whitening.back(sight.value - root @ (root.T @ sight.value))
-    known, number = sight.whitening.back(root), np.unique(point, return_inverse=True)[1]
+    root = seen.unknown[:, answer.rows] @ answer.back.T
+    gain = seen.whitening.back(seen.value - root @ (root.T @ seen.value))
+    known, number = seen.whitening.back(root), np.unique(point, return_inverse=True)[1]
     order, count = np.argsort(number, kind="stable"), np.bincount(number)
     found, first = np.empty(len(count)), np.cumsum(count) - count
     for size in np.unique(count):
         some = np.flatnonzero(count == size)
         table = order[first[some][:, None] + np.arange(size)]
-        inverse = sight.whitening.precision(table) - known[table] @ known[table].transpose(0, 2, 1)
+        inverse = seen.whitening.precision(table) - known[table] @ known[table].transpose(0, 2, 1)
         own = gain[table]
         found[some] = np.einsum("ni,ni->n", own, np.linalg.solve(inverse, own[..., None])[..., 0])
     return found

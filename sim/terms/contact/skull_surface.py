@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from ...anatomy import Anatomy
 from ...discretisation.space import Discretisation
 from ...errors import InputError
-from ...geometry.surface import Sight, areas, blurred_normals, edge_lengths, unit
+from ...geometry.surface import BlurRange, areas, blurred_normals, edge_lengths, unit
 
 # What was under bone stays so far [m] from where it ends, and is barred wherever it goes.
 UNDER_BONE = -1.0
@@ -183,7 +183,7 @@ def inside_opening(
     triangles = mesh.surface[about_opening(anatomy)]
     a, b, c = np.moveaxis(mesh.nodes[triangles], 1, 0)
     twice, middle, bare = np.cross(b - a, c - a), (a + b + c) / 3.0, opened[triangles].mean(axis=1)
-    seen = KDTree(points).sparse_distance_matrix(KDTree(middle), Sight.reach * blur, output_type="coo_matrix")
+    seen = KDTree(points).sparse_distance_matrix(KDTree(middle), BlurRange.reach * blur, output_type="coo_matrix")
     # The other side of a thin body is not seen.
     facing = np.einsum("ki,ki->k", normal[seen.row], twice[seen.col]).clip(0.0)
     seen.data = facing * np.exp(-0.5 * (seen.data / blur) ** 2)
