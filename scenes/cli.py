@@ -16,6 +16,7 @@ from sim.runtime.user_script import run_script
 
 from .commands.bench import BENCHES
 from .commands.guidance import guidance
+from .commands.interrupt import INTERRUPTED
 
 # A command's module is imported only when it is asked for: `sulcus solve` does not wait for torch.
 COMMANDS = {
@@ -74,6 +75,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"sulcus {args.command}: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print(f"sulcus {args.command}: stopped", file=sys.stderr)
+        return INTERRUPTED
 
 
 def limit_threads() -> None:

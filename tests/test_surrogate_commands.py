@@ -172,3 +172,20 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, box, capsy
     assert "difference of two bodies" in capsys.readouterr().err
     assert main(["judge", model, data]) == 2
     assert "was trained: simulate others" in capsys.readouterr().err
+
+
+def test_what_is_said_at_ctrl_c_stands_on_its_own_line(folder, tmp_path, monkeypatch, capsys):
+    """A bar of progress ends before; of a command that goes on nowhere it is said that it stopped."""
+
+    def stopped(path, deformer, loads, provenance, batch, progress):
+        progress(3, 40)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("scenes.commands.simulate.simulate", stopped)
+    words = ["simulate", str(folder / "box.vtu"), "--out", str(tmp_path / "a.h5"), "--count", "40", "--device", "cpu"]
+    assert main(words) == 130
+    *before, last = capsys.readouterr().err.splitlines()
+    assert last == f"stopped; the same command goes on from {tmp_path / 'a.h5'}.partial" and "3/40" in before[-1]
+    monkeypatch.setattr("scenes.commands.train.train", lambda *given, **more: stopped(*5 * given[:1], lambda *done: None))
+    assert main(["train", str(folder / "data.h5"), "--out", str(tmp_path / "model.npz")]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "sulcus train: stopped"

@@ -121,6 +121,7 @@ def run(args: argparse.Namespace) -> int:
         try:
             solved = simulate(out, solver.deformer, loads, provenance, solver.batch, progress)
         except KeyboardInterrupt:
+            bar.close()  # its line ends
             print(f"stopped; the same command goes on from {unfinished_path(out)}", file=sys.stderr)
             return INTERRUPTED
     _report(args, solver.description, len(loads), solved)
