@@ -1,5 +1,6 @@
 """Label volumes of many kinds become meshes in their own frame, or are refused in a sentence."""
 
+import json
 import re
 import warnings
 from dataclasses import replace
@@ -11,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from scenes.cli import main
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies import mesher
 from sim.bodies.label_volume import volume_subject
@@ -336,6 +338,37 @@ def test_a_mesh_that_misses_much_of_the_tumour_is_refused_with_how_many_nodes_wo
         return 1.0 - mesh.volumes[mesh.region == TUMOUR_LABEL].sum() / subject.tumour_volume
 
     assert missed(2000, 1.0) > 0.1 > abs(missed(enough, 0.1))
+
+
+def with_plates(path, count):
+    """A tumour of 8 mm, and round it `count` plates of 8 mm, a voxel thick, that it does not touch."""
+    affine, places = grid(AFFINES["straight"])
+    labels = np.where(ball(places, radius=0.008), 3, ellipsoid(places))
+    for turn in np.linspace(0.0, 2.0 * np.pi, count, endpoint=False):
+        middle = MIDDLE + 0.026 * np.array([np.cos(turn), np.sin(turn), -0.3])
+        labels[ball(places, middle, 0.004) & (np.abs(places - middle)[..., 2] <= 0.0006)] = 3
+    return save(path, labels, affine)
+
+
+def test_pieces_that_vanish_are_named_and_the_others_keep_their_volume(tmp_path, capsys):
+    path = with_plates(tmp_path / "l.nii", 1)
+    words = ["anatomy", "--labels", str(path), "--brain", "1", "--tumour", "3", "--nodes", "3000", "--json"]
+    assert main([*words, "--craniotomy", "30", "--out", str(tmp_path / "a.vtu")]) == 0
+    said = capsys.readouterr()
+    summary = json.loads(said.out)
+    lost = [piece["ml"] for piece in summary["tumour_pieces"] if piece["lost"]]
+    assert len(lost) == 1 and not summary["tumour_pieces"][0]["lost"]
+    assert f"does not hold 1 of the tumour's 2 pieces, {sum(lost):.2g} ml in all" in said.err
+    volume = summary["tumour_pieces"][0]["ml"]
+    assert summary["tumour_ml"] == pytest.approx(volume, rel=0.01) and sum(lost) > 0.03 * volume
+
+
+def test_small_pieces_are_told_from_intricate_surfaces(tmp_path):
+    subject = volume_subject(with_plates(tmp_path / "l.nii", 12), (1,), (3,))
+    with pytest.raises(
+        InputError, match=r"12 of the tumour's 13 pieces, 1.\d ml in all, are too small for 2000 nodes: "
+    ):
+        make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(more=())))
 
 
 def test_labels_as_rough_as_their_voxels_are_to_be_smoothed(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.bodies.mesher import Meshing, too_intricate
+from sim.bodies.mesher import INTRICATE, Meshing, too_few
 from sim.bodies.placement import Placement, opening_at, opening_over, side_of, site_over
 from sim.errors import InputError
 
@@ -80,6 +80,6 @@ def test_too_few_nodes_are_refused_with_how_many_would_do():
         asked.append(count)
         return count >= 4000
 
-    message = str(too_intricate(3000, Meshing().more, would_do))
+    message = str(too_few(3000, INTRICATE, Meshing().more, would_do))
     assert "too intricate for 3000 nodes: ask for 4800, or smooth" in message and asked == [3800, 4800]
-    assert "for 1000 nodes: smooth the labels" in str(too_intricate(1000, Meshing().more, would_do))
+    assert "for 1000 nodes: smooth the labels" in str(too_few(1000, INTRICATE, Meshing().more, would_do))

@@ -14,7 +14,7 @@ import numpy as np
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.bodies.intensity import sidecar, write_intensity
 from sim.bodies.label_volume import volume_subject
-from sim.bodies.mesher import surface_errors
+from sim.bodies.mesher import lost_pieces, lost_words, surface_errors
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.placement import side_of
 from sim.bodies.subject import MeshPlan, Subject, make_anatomy
@@ -112,7 +112,12 @@ def run(args: argparse.Namespace) -> int:
             beside.unlink(missing_ok=True)  # of an earlier mesh of this name
         else:
             write_intensity(beside, intensity)
-    figures = _figures(args, anatomy, subject)
+    tumour = anatomy.mesh.tets[anatomy.mesh.region == TUMOUR_LABEL]
+    lost = lost_pieces(subject.pieces, anatomy.mesh.nodes, tumour)
+    if any(lost):
+        said = lost_words(subject.pieces, lost)
+        print(f"{args.out}: does not hold {said}: where they matter, ask for more nodes.", file=sys.stderr)
+    figures = _figures(args, anatomy, subject, lost)
     missed = figures["tumour_volume_error_percent"]
     if abs(missed) > NOTED:
         print(
@@ -157,7 +162,7 @@ def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     return volume_subject(args.labels, args.brain, args.tumour, args.t1)
 
 
-def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject) -> dict[str, Any]:
+def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost: list[bool]) -> dict[str, Any]:
     mesh = anatomy.mesh
     volume = mesh.volumes[mesh.region == TUMOUR_LABEL].sum()
     error, weight = surface_errors(mesh.nodes, mesh.surface, subject.brain)
@@ -176,7 +181,8 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject) -> di
         "surface_error_p95_mm": round(1e3 * float(np.quantile(error, 0.95, weights=weight, method="inverted_cdf")), 3),
         "opening": {"over": opened_over(args), **_place(subject, subject.site)},
         "tumour_pieces": [
-            {"ml": round(1e6 * piece.volume, 3), **_place(subject, piece.centre)} for piece in subject.pieces
+            {"ml": round(1e6 * piece.volume, 3), "lost": gone, **_place(subject, piece.centre)}
+            for piece, gone in zip(subject.pieces, lost, strict=True)
         ],
         "digest": anatomy.digest,
     }
@@ -196,7 +202,10 @@ def _said(place: dict[str, Any]) -> str:
 def _pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
     if len(pieces) == 1:
         return [f"tumour: {_said(pieces[0])}"]
-    listed = [f"  piece {number}: {piece['ml']:g} ml, {_said(piece)}" for number, piece in enumerate(pieces, start=1)]
+    listed = [
+        f"  piece {number}: {piece['ml']:g} ml, {_said(piece)}{', not in the mesh' if piece['lost'] else ''}"
+        for number, piece in enumerate(pieces, start=1)
+    ]
     return [f"tumour: {len(pieces)} pieces; the skull is opened over {over}", *listed]
 
 

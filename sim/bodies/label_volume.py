@@ -185,5 +185,6 @@ def _pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[Piece, ...]:
     pieces = []
     for number in range(1, count + 1):
         one = component == number
-        pieces.append(Piece(float(one.sum() * voxel), rim(one, affine).mean(axis=0)))
+        surface = rim(one, affine)
+        pieces.append(Piece(float(one.sum() * voxel), surface.mean(axis=0), surface))
     return tuple(sorted(pieces, key=lambda piece: -piece.volume))

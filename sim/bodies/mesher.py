@@ -16,8 +16,11 @@ from .bcc_lattice import graded_lattice
 from .isosurface_stuffing import Pieces, Stuffing, cut, whole
 from .manifold_repair import clean, ears
 from .mesh_smoothing import Projection, Smoothing, fitted, improved, smallest_sines, unfolded
+from .placement import Piece
 from .signed_distance import Field, onto_level
 
+INTRICATE = "the surfaces are too intricate", "smooth the labels"
+"""Why a mesh does not show a solid, and what helps beside more nodes."""
 TOO_COARSE = "so few nodes do not show the brain or the tumour: ask for more nodes, or check the labels."
 
 
@@ -46,6 +49,8 @@ class Meshing:
     largest_error
         Of the tumour's volume, as a share. Outlines of one glioma by several raters agree less: Dice 74 to 85 %,
         Menze et al. 2015.
+    shown
+        A piece of the tumour of which a mesh shows a lesser share is lost.
     more
         Times the nodes asked for, tried only to tell how many would do.
     stuffing, smoothing
@@ -62,6 +67,7 @@ class Meshing:
     deepest: int = 4
     slacks: tuple[float, ...] = (0.0, 3e-4, 6e-4, 1.2e-3, 2.4e-3)
     largest_error: float = 0.1
+    shown: float = 0.1
     more: tuple[float, ...] = (1.25, 1.6, 2.0, 2.5)
     stuffing: Stuffing = field(default_factory=Stuffing)
     smoothing: Smoothing = field(default_factory=Smoothing)
@@ -78,9 +84,11 @@ class Solids:
     low, high
         (3,) [m]: a box round the solid.
     tumour_volume
-        [m^3], held exactly as far as the nodes allow.
+        [m^3], held exactly as far as the nodes allow, but for pieces that a mesh does not show.
     interface, opening
         Points (n, 3) [m] on the tumour's surface and on the cortex to be opened: there the mesh is fine.
+    pieces
+        Of the tumour, where it has several.
     """
 
     brain: Field
@@ -90,6 +98,7 @@ class Solids:
     tumour_volume: float
     interface: np.ndarray
     opening: np.ndarray
+    pieces: Sequence[Piece] = ()
 
 
 def mesh_solids(solids: Solids, count: int, settings: Meshing = Meshing()) -> TetMesh:
@@ -102,28 +111,47 @@ def mesh_solids(solids: Solids, count: int, settings: Meshing = Meshing()) -> Te
         many does. A count that the search for a lattice size does not reach.
     """
     mesh = _meshed(solids, count, settings)
-    if mesh is None:
-        raise too_intricate(count, settings.more, lambda number: _would_do(solids, number, settings))
-    return mesh
+    if isinstance(mesh, TetMesh):
+        return mesh
+    raise too_few(count, mesh, settings.more, lambda number: _would_do(solids, number, settings))
 
 
-def too_intricate(count: int, more: Sequence[float], would_do: Callable[[int], bool]) -> InputError:
+def too_few(count: int, why: tuple[str, str], more: Sequence[float], would_do: Callable[[int], bool]) -> InputError:
     """What is said where `count` nodes do not show a solid: the first of `more` times as many that `would_do`."""
+    reason, remedy = why
     numbers = (int(round(count * times, -2)) for times in more)
     enough = next(filter(would_do, numbers), None)
-    remedy = "smooth the labels" if enough is None else f"ask for {enough}, or smooth the labels"
-    return InputError(f"the surfaces are too intricate for {count} nodes: {remedy}.")
+    return InputError(f"{reason} for {count} nodes: {'' if enough is None else f'ask for {enough}, or '}{remedy}.")
+
+
+def lost_pieces(
+    pieces: Sequence[Piece], nodes: np.ndarray, tets: np.ndarray, settings: Meshing = Meshing()
+) -> list[bool]:
+    """Which pieces of a tumour its tetrahedra (T, 4) do not show: each is of the piece whose surface is nearest."""
+    if len(pieces) < 2:
+        return [False for _ in pieces]
+    owner = np.repeat(np.arange(len(pieces)), [len(piece.surface) for piece in pieces])
+    surfaces, corners = KDTree(np.concatenate([piece.surface for piece in pieces])), nodes[tets]
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
+    shown = np.bincount(owner[surfaces.query(corners.mean(axis=1))[1]], volume, len(pieces))
+    return [bool(one < settings.shown * piece.volume) for one, piece in zip(shown, pieces, strict=True)]
+
+
+def lost_words(pieces: Sequence[Piece], lost: Sequence[bool]) -> str:
+    """How many pieces are lost, and their volume in all."""
+    volume = sum(piece.volume for piece, gone in zip(pieces, lost, strict=True) if gone)
+    return f"{sum(lost)} of the tumour's {len(pieces)} pieces, {1e6 * volume:.2g} ml in all"
 
 
 def _would_do(solids: Solids, count: int, settings: Meshing) -> bool:
     try:
-        return _meshed(solids, count, settings) is not None
+        return isinstance(_meshed(solids, count, settings), TetMesh)
     except InputError:
         return False
 
 
-def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | None:
-    """The mesh with `count` nodes; None where it has slivers or misses the tumour's volume. Raises as `mesh_solids`."""
+def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[str, str]:
+    """The mesh with `count` nodes, or what is amiss with it and what helps. Raises as `mesh_solids`."""
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
     for _ in range(settings.trials):
@@ -164,26 +192,34 @@ def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
     return cut(body, solids.tumour, surface, settings.stuffing)
 
 
-def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | None:
-    """The pieces fitted and improved, in a second try without what folds them. None as `_meshed`."""
+def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tuple[str, str]:
+    """The pieces fitted and improved, in a second try without what folds them; else as `_meshed`."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
+    lost = lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)
+    gone = sum(piece.volume for piece, one in zip(solids.pieces, lost, strict=True) if one)
+    if gone > settings.largest_error * solids.tumour_volume:
+        be = "is" if sum(lost) == 1 else "are"
+        return f"{lost_words(solids.pieces, lost)}, {be} too small", "leave what is small out of the labels"
     for fold in (True, False):
-        found = _improved(solids, _fitted(solids, pieces, settings, fold), settings)
+        found = _improved(solids, _fitted(solids, pieces, solids.tumour_volume - gone, settings, fold), settings)
         if smallest_sines(found.nodes[found.tets]).min() >= np.sin(np.radians(SLIVER_DEGREES)):
             mesh = TetMesh(found.nodes, found.tets, np.where(found.inside, TUMOUR_LABEL, BRAIN_LABEL))
             volume = mesh.volumes[found.inside].sum()
-            return mesh if abs(volume / solids.tumour_volume - 1.0) <= settings.largest_error else None
-    return None
+            return mesh if abs(volume / solids.tumour_volume - 1.0) <= settings.largest_error else INTRICATE
+    return INTRICATE
 
 
-def _fitted(solids: Solids, pieces: Pieces, settings: Meshing, fold: bool) -> Pieces:
-    """Nodes on the surfaces, the outer one first; unless it may `fold`, they stay where a piece would be inside out."""
+def _fitted(solids: Solids, pieces: Pieces, volume: float, settings: Meshing, fold: bool) -> Pieces:
+    """Nodes on the surfaces, the outer one first, with a `volume` [m^3] of tumour.
+
+    Unless it may `fold`, they stay where a piece would be inside out.
+    """
     (surface, _), smoothing = _surfaces(pieces), settings.smoothing
     outer, inner = faces_once(pieces.tets), faces_once(pieces.tets[pieces.inside])
     nodes = fitted(pieces.nodes, outer, solids.brain, surface, settings=smoothing)
     nodes = nodes if fold else unfolded(pieces.nodes, nodes, pieces.tets)
-    moved = fitted(nodes, inner, solids.tumour, ~surface, solids.tumour_volume, smoothing)
+    moved = fitted(nodes, inner, solids.tumour, ~surface, volume, smoothing)
     return replace(pieces, nodes=moved if fold else unfolded(nodes, moved, pieces.tets))
 
 

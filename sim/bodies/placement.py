@@ -47,10 +47,11 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One connected piece of a tumour: volume [m^3], centre (3,) [m]."""
+    """One connected piece of a tumour: volume [m^3], centre (3,) [m], points (n, 3) [m] on its surface."""
 
     volume: float
     centre: np.ndarray
+    surface: np.ndarray
 
 
 def side_of(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings: Placement = Placement()) -> str:

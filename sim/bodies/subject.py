@@ -99,7 +99,9 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     """
     opening = subject.cortex[np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * plan.craniotomy]
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
-    solids = Solids(subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening)
+    solids = Solids(
+        subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
+    )
     mesh = mesh_solids(solids, plan.nodes, plan.meshing)
     return bounded(mesh, subject.site, plan.craniotomy, plan.placement)
 

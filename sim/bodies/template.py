@@ -179,9 +179,8 @@ def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
             "choose a smaller radius, or another place."
         )
     volume = 4.0 / 3.0 * np.pi * tumour.radius**3
-    return Subject(
-        brain, shape, cortex, interface, volume, site, Intensity(grey, affine), pieces=(Piece(volume, shape.middle),)
-    )
+    pieces = (Piece(volume, shape.middle, interface),)
+    return Subject(brain, shape, cortex, interface, volume, site, Intensity(grey, affine), pieces=pieces)
 
 
 def _scaled_template(head: Head) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
