@@ -13,7 +13,7 @@ from theatres import PUSHING, put, short, sinking, theatre_of
 
 from ar.screen import shrunk
 from scenes.cli import main
-from scenes.play.contact_sheet import sheet
+from scenes.play.contact_sheet import sheet, thumbnail
 from scenes.play.effect_ablation import ALL, device_arrays, rows, run, without
 from scenes.script.scene import SCENES, find_scene
 from sim.effects import Gravity, Held, ToolForce
@@ -140,8 +140,15 @@ class TestScenes:
         assert "ms a frame by linear; the tumour moves" in capsys.readouterr().out
         assert sorted(path.name for path in out.iterdir()) == ["brain_shift.png", "press.png", "sheet.png"]
         whole, one = (cv2.imread(str(out / name)) for name in ("sheet.png", "press.png"))
-        assert one.shape == (240, 320, 3) and whole.shape == (240, 960, 3)
-        assert np.array_equal(whole[:, :320], one) and (whole[:, 640:] == 12).all()
+        assert one.shape == (360, 480, 3) and whole.shape == (360, 1440, 3)
+        assert np.array_equal(whole[:, :480], one) and (whole[:, 960:] == 12).all()
+
+    def test_a_scene_s_name_covers_no_words_at_the_foot(self, theatre):
+        scene = short()
+        wide = replace(scene, viewpoint=replace(scene.viewpoint, width=480, height=360))
+        player = theatre.player("linear", wide)
+        foot = thumbnail(player, "linear").colour[-40:]
+        assert any(np.array_equal(foot, frame.shown[-40:]) for frame in player.frames())
 
     def test_a_file_is_no_folder(self, anatomy, tmp_path, capsys):
         (tmp_path / "file").touch()

@@ -14,7 +14,7 @@ from .player import Frame, Player, labelled
 # Frames that are drawn of each scene, evenly spaced; the first loads kernels and is not timed.
 DRAWN = 8
 # Width and height of a picture of the sheet [pixel].
-SIZE = (320, 240)
+SIZE = (480, 360)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ def thumbnail(player: Player, name: str) -> Thumbnail:
     every = max(1, (len(player.scene.times) - 1) // (DRAWN - 1))
     frames = list(player.frames(every))
     best = max(frames, key=lambda frame: (_cuts(player, frame), frame.moved))
-    picture = panel(labelled(best, name), [player.scene.name], "bottom left", 0.9)
+    picture = panel(labelled(best, name), [player.scene.name], "top right", 0.9)
     return Thumbnail(shrunk(picture, *SIZE), _medians(frames[1:] or frames), 1e3 * max(frame.moved for frame in frames))
 
 
