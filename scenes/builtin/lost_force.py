@@ -22,5 +22,6 @@ SCENE = Scene(
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Bonded(), ToolForce()),
     sight=Sight(),
     viewpoint=Viewpoint(fov=np.radians(13.0), width=800, height=600),
+    # The tumour moves little more than the rigid error: 46 % are removed, 36 of four frames, by other seeds 11 to 76.
     bounds=Bounds(overlap=0.75, error=2e-3, removed=0.3),
 )
