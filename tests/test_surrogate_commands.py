@@ -186,6 +186,10 @@ def test_what_is_said_at_ctrl_c_stands_on_its_own_line(folder, tmp_path, monkeyp
     assert main(words) == 130
     *before, last = capsys.readouterr().err.splitlines()
     assert last == f"stopped; the same command goes on from {tmp_path / 'a.h5'}.partial" and "3/40" in before[-1]
-    monkeypatch.setattr("scenes.commands.train.train", lambda *given, **more: stopped(*5 * given[:1], lambda *done: None))
+
+    def stopped_too(*given, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("scenes.commands.train.train", stopped_too)
     assert main(["train", str(folder / "data.h5"), "--out", str(tmp_path / "model.npz")]) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "sulcus train: stopped"
