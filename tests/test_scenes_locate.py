@@ -78,6 +78,18 @@ def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
     assert bias[0] == 0.0 < bias[1] < bias[2]
 
 
+def test_motions_in_metres_are_remarked_on_and_no_zero_has_a_sign(files, tmp_path, capsys):
+    folder, _ = files
+    table = np.loadtxt(folder / "plain.csv", delimiter=",", skiprows=1)
+    table[:, 3:] *= 1e-3
+    np.savetxt(tmp_path / "metres.csv", table, delimiter=",", header="x,y,z,dx,dy,dz", comments="")
+    for name, remarked in ((folder / "plain.csv", False), (tmp_path / "metres.csv", True)):
+        assert main(["locate", str(folder / "box.vtu"), str(name), "--out", str(tmp_path / "out.vtu")]) == 0
+        said = capsys.readouterr()
+        assert ("half of the points move by less than 0.01 mm. Give millimetres." in said.err) is remarked
+        assert "-0.0" not in said.out and ("by 0.0, 0.0, 0.0 mm" in said.out) is remarked
+
+
 @pytest.mark.parametrize("words", [["plain.csv"], ["cloud.csv"], ["cloud.csv", "--tool", "tips.csv"]])
 def test_people_read_sentences(files, capsys, words):
     folder, _ = files

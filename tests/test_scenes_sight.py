@@ -244,7 +244,9 @@ def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
     write_anatomy(tmp_path / "box.vtu", box)
     words = ["--anatomy", str(tmp_path / "box.vtu"), "--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["render", "sag", *words]) == 2
-    assert "has no locator at" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    said = capsys.readouterr().err
+    assert "has no locator at" in said and not (tmp_path / "out").exists()
+    assert "sulcus train" not in said and "is the truth, as finite elements have it" in said
 
 
 def test_no_trained_model_is_the_truth(scene):

@@ -312,6 +312,9 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
         assert np.array_equal(file["tumour_error"][:], file["tumour_error_unobserved"][:])
     assert main(["uncertainty", *words, "--draws", "2"]) == 2
     assert "--draws" in capsys.readouterr().err
+    # Before anything is solved.
+    assert main(["uncertainty", *words, "--out", str(tmp_path / "found.csv")]) == 2
+    assert "written as .json" in capsys.readouterr().err
 
 
 def test_other_tissues_are_refused(theatre):

@@ -363,7 +363,7 @@ def test_pieces_that_vanish_are_named_and_the_others_keep_their_volume(tmp_path,
     assert summary["tumour_ml"] == pytest.approx(volume, rel=0.01) and sum(lost) > 0.03 * volume
 
 
-def test_small_pieces_are_told_from_intricate_surfaces(tmp_path):
+def test_small_pieces_are_another_reason_than_intricate_surfaces(tmp_path):
     subject = volume_subject(with_plates(tmp_path / "l.nii", 12), (1,), (3,))
     with pytest.raises(
         InputError, match=r"12 of the tumour's 13 pieces, 1.\d ml in all, are too small for 2000 nodes: "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,9 @@ from sim.errors import InputError
 from .json_line import json_line
 from .locator import KIND, forget_parts, made
 from .outputs import add_force, claimed
+
+# Nobody sees so small a motion [m].
+UNSEEN = 1e-5
 
 if TYPE_CHECKING:
     from sim.anatomy import Anatomy
@@ -85,6 +89,10 @@ def run(args: argparse.Namespace) -> int:
         "covariance": covariance[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
     }
     write_mesh(out, anatomy.mesh, fields)
+    if observation.rest is not None:
+        motions = np.linalg.norm(observation.now - observation.rest, axis=1)
+        if 0.0 < np.median(motions) < UNSEEN:
+            print(f"{args.observed}: half of the points move by less than 0.01 mm. Give millimetres.", file=sys.stderr)
     print(json_line(_numbers(found, len(observation.now), out)) if args.json else _sentences(found, out))
     return 0
 
@@ -135,7 +143,7 @@ def _numbers(found: Location, points: int, out: Path) -> dict[str, object]:
 
 
 def _sentences(found: Location, out: Path) -> str:
-    x, y, z = 1e3 * found.centroid
+    x, y, z = (round(value, 1) + 0.0 for value in 1e3 * found.centroid)  # a zero has no sign
     sure = "With a probability of 95 %" if found.calibrated else "At a guess"
     lines = [
         f"The middle of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",

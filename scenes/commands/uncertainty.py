@@ -16,6 +16,7 @@ from sim.arguments import at_least
 
 from .demo import add_bodies, scene_asked
 from .json_line import json_line
+from .outputs import claimed
 from .tissue_options import add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:
@@ -66,7 +67,9 @@ def run(args: argparse.Namespace) -> int:
     scenes = [scene_asked(args, name) for name in args.scenes or SCENES]
     theatre = open_theatre(args.anatomy, args.model, args.device)
     out = args.out or uncertainty_path(args.anatomy or template_path())
-    read_uncertainties(out)  # before hours are spent
+    # Before hours are spent; a file that is there is read, and scenes are added to it.
+    claimed(out, ".json", "uncertainties", force=True)
+    read_uncertainties(out)
     draws, twins = drawn(args.draws, args.seed), drawn(args.twins, args.seed + 1)
     rows, lines = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
