@@ -85,13 +85,13 @@ def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> s
     InputError
         A deformer and a budget, or a budget that none here meets.
     """
-    from ..play.deformers import TRUTH
-
     budget = args.within_mm, args.within_ms
     if args.deformer != "auto" and budget == (None, None):
-        none = "none lies beside this anatomy; `sulcus train` makes them" if scene.sight is None else TRUTH
-        why = next(iter(theatre.refusals(scene).values()), none)
         if args.deformer is None and not theatre.knowing(scene):
+            from ..play.deformers import TRUTH
+
+            none = "none lies beside this anatomy; `sulcus train` makes them" if scene.sight is None else TRUTH
+            why = next(iter(theatre.refusals(scene).values()), none)
             print(f"sulcus {args.command}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
         return args.deformer or theatre.best(scene)
     if args.deformer not in (None, "auto"):
