@@ -165,6 +165,15 @@ def test_two_orders_of_the_tumour_are_exact_wherever_a_tool_presses(data, box):
         np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)
 
 
+def test_of_too_many_pairs_the_second_order_is_interpolated(data, trained):
+    known = Expansion(data, "cpu", most_pairs=100)
+    assert [len(parts) for parts in known.exact] == [1, 1]
+    again = train(data, ["series"], expansion=known)
+    kinds = [type(part.regressor).__name__ for part in again.models["series"].parts]
+    assert kinds == ["Linear", "Linear", "Series", "Series"]
+    assert again.scores[0].mean_mm < 0.2 * trained.scores[0].mean_mm
+
+
 def replaced(loads, times):
     """The same loads, so many times."""
     return Pushed(*(np.concatenate([each] * times) for each in (loads.point, loads.force, loads.footprint)))

@@ -69,12 +69,15 @@ class Expansion:
         Hears which place is done, and of how many.
     kept
         Where the series' table is read from, and written to where there is none: of these data, as the caller knows.
+    most_pairs
+        Of force components, for which the second order is had: so many take minutes, and 60 MB of a model.
     """
 
     data: Dataset
     device: str = "auto"
     progress: Callable[[int, int], object] = lambda done, total: None
     kept: Path | None = None
+    most_pairs: int = 150_000
 
     @cached_property
     def patch(self) -> Patch:
@@ -118,8 +121,12 @@ class Expansion:
 
     @cached_property
     def exact(self) -> list[tuple[Part, ...]]:
-        """What needs neither learning nor interpolation: two orders of the tumour, and the first of the cortex."""
-        return [(table, self.pairs) if k == 0 else (table,) for k, table in enumerate(self.tables)]
+        """What needs neither learning nor interpolation: two orders of the tumour, and the first of the cortex.
+
+        Where pairs of nodes are too many, the tumour's second order is in the table.
+        """
+        paired = (self.pairs,) if len(self.tabulated.pairs.pairs) else ()
+        return [(table, *paired) if k == 0 else (table,) for k, table in enumerate(self.tables)]
 
     def bases(self, examples: Examples, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
         """What a set of examples does to the tumour, and to the cortex, if there is more, beyond what is exact.
@@ -216,10 +223,12 @@ class Expansion:
 
     def _paired(self, fem: Fem, basis: Basis) -> tuple[Pairs, Basis]:
         """The tumour's second order for pairs that one footprint may press, and the modes of a basis that it needs."""
+        near = in_one_disc(self.patch, float(self.radii[-1]))
+        if 4.5 * near.sum() > self.most_pairs:
+            return Pairs(np.zeros((0, 2), int), np.zeros((0, 0), np.float32)), Basis(basis.nodes, basis.modes[:0])
         reading = fem.reading(basis.nodes, basis.modes.reshape(len(basis.modes), -1, 3))
         nodes = self.patch.nodes
         units = fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
-        near = in_one_disc(self.patch, float(self.radii[-1]))
         pairs, table = second_order(fem.problem, units.answers, reading.answers, near)
         turn = reduce(basis.nodes, table, SECOND, len(basis.modes)).modes
         return Pairs(pairs, table @ turn.T), Basis(basis.nodes, turn @ basis.modes)
