@@ -100,18 +100,19 @@ def drawn(seed: int, number: int) -> Draw:
 
 def effects_of(draw: Draw) -> tuple[Effect, ...]:
     """What a twin's finite elements are made of."""
+    tumour = {TUMOUR_LABEL: ogden(draw.stiffness * draw.ratio)}
+    swells = Pulsation(Wave(0.25, abs(draw.swelling)), Wave(0.25, 0.0))
+    skull = SKULLS[draw.skull]
+    return Elasticity(ogden(draw.stiffness), tumour), Held(), skull, ToolForce(), Gravity(), swells
+
+
+def ogden(share: float, poisson: float = POISSON) -> Ogden:
+    """Tissue of one exponent, so many times as stiff as that of minutes."""
     minutes = MATERIALS["minutes"].tissue
     assert isinstance(minutes, Ogden)
     (c, m), *_ = minutes.terms
-
-    def tissue(share: float) -> Ogden:
-        bulk = share * c * (1.0 + POISSON) / (3.0 * (1.0 - 2.0 * POISSON))
-        return Ogden(((share * c, m),), bulk)
-
-    tumour = {TUMOUR_LABEL: tissue(draw.stiffness * draw.ratio)}
-    swells = Pulsation(Wave(0.25, abs(draw.swelling)), Wave(0.25, 0.0))
-    skull = SKULLS[draw.skull]
-    return Elasticity(tissue(draw.stiffness), tumour), Held(), skull, ToolForce(), Gravity(), swells
+    bulk = share * c * (1.0 + poisson) / (3.0 * (1.0 - 2.0 * poisson))
+    return Ogden(((share * c, m),), bulk)
 
 
 def loads_of(anatomy: Anatomy, draw: Draw) -> Loads:
