@@ -29,6 +29,7 @@ COMMANDS = {
     "patient": "make all that the scenes need from a label volume: anatomy, data set, models",
     "locate": "tell where the tumour is from what is seen of the open cortex, and how surely",
     "locator": "make what `locate`, and scenes in which a tumour is located, need of an anatomy",
+    "fit": "find a patient's tissue and skull from what is seen of the open cortex in several frames",
     "scenes": "list the built-in scenes: effects, who can play them, pictures and cost",
     "effects": "measure what each effect of a scene costs, and what it changes",
     "demo": "play a scene on a page in the browser",

@@ -7,6 +7,11 @@ from .data.tool_poses import draw_poses
 from .evaluation.certificate import Certificate, certify
 from .evaluation.coverage import Coverage, coverage
 from .evaluation.score import Score, score
+from .fitting.fit import fit_tissue
+from .fitting.frame import Frame, Tool
+from .fitting.tissue import FittedTissue
+from .fitting.tissue_files import load_tissue, save_tissue
+from .fitting.tool_table import read_tools
 from .locating.locator import Location, Locator
 from .locating.locator_files import load_locator, save_locator
 from .locating.observation import Observation
@@ -23,26 +28,33 @@ __all__ = [
     "Certificate",
     "Coverage",
     "Dataset",
+    "FittedTissue",
+    "Frame",
     "Learned",
     "Location",
     "Locator",
     "Observation",
     "Regressor",
     "Score",
+    "Tool",
     "Trained",
     "certify",
     "coverage",
     "draw",
     "draw_poses",
+    "fit_tissue",
     "learner",
     "load",
     "load_locator",
+    "load_tissue",
     "make_locator",
     "onnx_model",
     "read_dataset",
     "read_observation",
+    "read_tools",
     "save",
     "save_locator",
+    "save_tissue",
     "score",
     "simulate",
     "train",

@@ -32,6 +32,7 @@ ORDER = (
     {"surrogate.data", "surrogate.regressors"},
     {"surrogate.model"},
     {"surrogate.evaluation", "surrogate.locating", "surrogate.onnx_export"},
+    {"surrogate.fitting"},
     {"surrogate.training"},
     {"scenes.script"},
     {"scenes.builtin", "scenes.play"},

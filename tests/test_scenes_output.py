@@ -18,6 +18,8 @@ from sim.bodies.intensity import Intensity, sidecar, write_intensity
 from sim.bodies.meshfile import read_mesh, write_anatomy, write_mesh
 from sim.errors import InputError
 from sim.runtime.atomic_files import check_output
+from surrogate.fitting.tissue import FittedTissue
+from surrogate.fitting.tissue_files import save_tissue
 
 # None of what they read is there: whoever looks at it first says so, and not that nothing can be written.
 WRITING = {
@@ -96,6 +98,7 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
     np.savez(tmp_path / "model.npz", header=np.array(json.dumps({"format": "sulcus model 2"})))
     np.savez(tmp_path / "arrays.npz", mine=np.zeros(3))
     (tmp_path / "graph.onnx").write_bytes(b"\x08\x08 sulcus onnx 1")
+    save_tissue(tmp_path / "box.tissue.json", FittedTissue("0", 1, np.full((3, 13, 33), 1 / 1287), np.zeros(0)))
     (tmp_path / "table.csv").write_text("what,default,now,force mean_mm\n")
     (tmp_path / "factorial.csv").write_text("opening [mm],depth [mm],skull,nu\n")
     (tmp_path / "index.html").write_text("<!doctype html><title>What accuracy costs in time</title>")
@@ -110,6 +113,7 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         "a result of `sulcus solve`": "solution.vtu",
         "a result of `sulcus locate`": "located.vtu",
         "a locator of `sulcus locate`": "locator.npz",
+        "fitted tissue of `sulcus fit`": "box.tissue.json",
         "a data set of `sulcus simulate`": "data.h5",
         "an episode of `sulcus collect`": "episode.h5",
         "a model of `sulcus train`": "model.npz",

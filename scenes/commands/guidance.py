@@ -40,6 +40,10 @@ next: open located.vtu in ParaView; `displacement` and `deviation` are in metres
   sulcus locator patient.vtu
   sulcus locator patient.vtu --small
 next: sulcus demo sag --anatomy patient.vtu, which finds patient.locator.npz beside the mesh""",
+    "fit": """examples:
+  sulcus fit patient.vtu drained1.csv drained2.csv pressed.csv --tool tools.csv
+  sulcus fit patient.vtu drained1.csv drained2.csv --rigid 0.3 --json
+next: sulcus uncertainty press --anatomy patient.vtu, which draws its bodies from patient.tissue.json""",
     "scenes": """examples:
   sulcus scenes
   sulcus scenes --out pictures

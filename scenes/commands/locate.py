@@ -11,18 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.arguments import at_least
-from sim.errors import InputError
 
 from .json_line import json_line
-from .locator import KIND, forget_parts, made
+from .locator import located_by
 from .outputs import add_force, claimed
 
 # Nobody sees so small a motion [m].
 UNSEEN = 1e-5
 
 if TYPE_CHECKING:
-    from sim.anatomy import Anatomy
-    from surrogate.locating.locator import Location, Locator
+    from surrogate.locating.locator import Location
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -80,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     anatomy = read_anatomy(args.anatomy)
     observation = replace(read_observation(args.observed, args.tool), rigid=1e-3 * args.rigid)
     placed(anatomy, observation)  # what cannot be placed need not wait for a locator
-    found = _locator(args, anatomy).locate(observation)
+    found = located_by(args, anatomy).locate(observation)
     every = np.arange(len(anatomy.mesh.nodes))
     covariance = found.covariance(every)
     fields = {
@@ -95,32 +93,6 @@ def run(args: argparse.Namespace) -> int:
             print(f"{args.observed}: half of the points move by less than 0.01 mm. Give millimetres.", file=sys.stderr)
     print(json_line(_numbers(found, len(observation.now), out)) if args.json else _sentences(found, out))
     return 0
-
-
-def _locator(args: argparse.Namespace, anatomy: Anatomy) -> Locator:
-    """The locator that lies beside the anatomy, or a new one; it knows every vertex.
-
-    Raises
-    ------
-    InputError
-        As `load_locator`; a small one.
-    """
-    from surrogate.locating.locator_files import load_locator, locator_path, save_locator
-
-    path = args.locator or locator_path(args.anatomy)
-    if path.is_file():
-        locator = load_locator(path, anatomy)
-        if locator.prior.nodes is not None:
-            raise InputError(
-                f"{path}: is small, and knows nothing of most vertices that a result has. Name another file by "
-                "--locator: a whole one is made there."
-            )
-        return locator
-    path = claimed(path, ".npz", KIND, args.force)
-    locator = made(path, anatomy, args.seed, args.device)
-    save_locator(path, locator)
-    forget_parts(path)
-    return locator
 
 
 def _numbers(found: Location, points: int, out: Path) -> dict[str, object]:

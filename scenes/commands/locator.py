@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim.arguments import at_least
+from sim.errors import InputError
 
 from .outputs import add_force, claimed
 
@@ -70,6 +71,32 @@ def made(path: Path, anatomy: Anatomy, seed: int, device: str) -> Locator:
             bar.set_description(stage)
 
         return make_locator(anatomy, seed, device, folder=_parts(path), progress=progress)
+
+
+def located_by(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
+    """The locator that lies beside the anatomy, or a new one; it knows every vertex, unless it may be `small`.
+
+    Raises
+    ------
+    InputError
+        As `load_locator`; a small one.
+    """
+    from surrogate.locating.locator_files import load_locator, locator_path, save_locator
+
+    path = args.locator or locator_path(args.anatomy)
+    if path.is_file():
+        locator = load_locator(path, anatomy)
+        if locator.prior.nodes is not None and not small:
+            raise InputError(
+                f"{path}: is small, and knows nothing of most vertices that a result has. Name another file by "
+                "--locator: a whole one is made there."
+            )
+        return locator
+    path = claimed(path, ".npz", KIND, args.force)
+    locator = made(path, anatomy, args.seed, args.device)
+    save_locator(path, locator)
+    forget_parts(path)
+    return locator
 
 
 def forget_parts(path: Path) -> None:

@@ -186,6 +186,7 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "a result of `sulcus solve`": _is_solution,
     "a result of `sulcus locate`": _is_located,
     "a locator of `sulcus locate`": lambda path: str(model_header(path)["format"]).startswith("sulcus locator"),
+    "fitted tissue of `sulcus fit`": _begins(b'"format": "sulcus tissue'),
     "a data set of `sulcus simulate`": _hdf5("sulcus data"),
     "an episode of `sulcus collect`": _hdf5("sulcus episode"),
     "a model of `sulcus train`": lambda path: str(model_header(path)["format"]).startswith("sulcus model"),

@@ -144,7 +144,7 @@ def swellings(anatomy: Anatomy, shares: tuple[float, ...]) -> Loads:
 def drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Loads, ...]:
     """Fluid that leaves, level by level, under heads that lie in some ways."""
     random = np.random.default_rng([seed, group.number, 1])
-    down = _directions(random, open_cortex(anatomy).axis, causes)
+    down = directions(random, open_cortex(anatomy).axis, causes)
     idle = _idle(anatomy, len(down))
     return tuple(Loads((idle, _posture(anatomy, down, left)), np.zeros(len(down))) for left in causes.levels)
 
@@ -160,7 +160,7 @@ def _posture(anatomy: Anatomy, down: np.ndarray, left: float) -> Posture:
     return Posture(down, level, np.ones(len(down)))
 
 
-def _directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
+def directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
     """Ways that gravity pulls (n, 3): evenly by solid angle within a cone round the inward axis."""
     cosine = random.uniform(np.cos(causes.cone), 1.0, causes.drainages)
     angle = random.uniform(0.0, 2.0 * np.pi, causes.drainages)

@@ -12,7 +12,7 @@ from sim.runtime.outside_files import path_of, read_as
 
 from .observation import Observation
 
-PLACE, MOTION, SIGMA, RADIUS = ("x", "y", "z"), ("dx", "dy", "dz"), "sigma", "radius"
+PLACE, MOTION, SIGMA = ("x", "y", "z"), ("dx", "dy", "dz"), "sigma"
 # Rows and characters of a line, beyond which a file is no list of points.
 MOST_ROWS, LONGEST_LINE = 1_000_000, 1000
 
@@ -28,8 +28,8 @@ def read_observation(path: str | Path, tips: str | Path | None = None) -> Observ
         A file that is missing or no such table, columns that are missing, unknown or named twice, cells that are no
         finite numbers.
     """
-    columns = _columns(path, {(*PLACE, *MOTION), (*PLACE, *MOTION, SIGMA), PLACE, (*PLACE, SIGMA)})
-    touched = np.zeros((0, 3)) if tips is None else _points(_columns(tips, {PLACE}), PLACE)
+    columns = read_columns(path, {(*PLACE, *MOTION), (*PLACE, *MOTION, SIGMA), PLACE, (*PLACE, SIGMA)})
+    touched = np.zeros((0, 3)) if tips is None else _points(read_columns(tips, {PLACE}), PLACE)
     at = _points(columns, PLACE)
     sigma = 1e-3 * columns[SIGMA] if SIGMA in columns else None
     if "dx" in columns:
@@ -42,7 +42,14 @@ def _points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarra
     return 1e-3 * np.column_stack([columns[name] for name in names])
 
 
-def _columns(path: str | Path, allowed: set[tuple[str, ...]]) -> dict[str, np.ndarray]:
+def read_columns(path: str | Path, allowed: set[tuple[str, ...]], empty: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+    """Columns of a table by name, whose header is one of those allowed; in some columns cells may be `empty`: NaN.
+
+    Raises
+    ------
+    InputError
+        As `read_observation`.
+    """
     path = path_of(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file.")
@@ -63,11 +70,14 @@ def _columns(path: str | Path, allowed: set[tuple[str, ...]]) -> dict[str, np.nd
     values = np.empty((len(rows) - 1, len(header)))
     for number, row in enumerate(rows[1:], start=2):
         try:
-            values[number - 2] = [float(cell) for cell in row]
+            values[number - 2] = [
+                float(cell) if cell.strip() or name not in empty else np.nan
+                for name, cell in zip(header, row, strict=True)
+            ]
         except ValueError as error:
             raise InputError(
                 f"{path}: row {number} is {','.join(row)[:80]!r}, not {len(header)} numbers: mend or remove it."
             ) from error
-        if not np.isfinite(values[number - 2]).all():
+        if not np.isfinite(values[number - 2][[bool(cell.strip()) for cell in row]]).all():
             raise InputError(f"{path}: row {number} has a number that is not finite: remove it.")
     return dict(zip(header, values.T, strict=True))

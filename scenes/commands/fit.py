@@ -1,0 +1,138 @@
+"""`sulcus fit`: what tissue a patient has, from what is seen of the open cortex in several frames."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim.errors import InputError
+
+from .json_line import json_line
+from .locator import located_by
+from .outputs import add_force, claimed
+
+if TYPE_CHECKING:
+    from surrogate.fitting.frame import Frame
+    from surrogate.fitting.tissue import FittedTissue
+
+KIND = "fitted tissue of `sulcus fit`"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("anatomy", metavar="ANATOMY.vtu", help="made by `sulcus anatomy` or `sulcus patient`")
+    parser.add_argument(
+        "frames", metavar="FRAME.csv", nargs="+",
+        help="what was seen in each frame, in millimetres, RAS: `x,y,z,dx,dy,dz[,sigma]`, as `sulcus locate` reads it. "
+        "In a frame without tool some fluid has drained",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tool", metavar="TOOLS.csv",
+        help="`frame,x,y,z[,radius][,force[,sigma]]`: tools that press in some frames, which count from 1. The tip and "
+        "the radius of the pressed disc [mm] (default 6); the force that was read and its error [N], or empty cells",
+    )  # fmt: skip
+    parser.add_argument(
+        "--rigid", type=float, default=0.8, metavar="MM",
+        help="how far all points of a frame may be off together: a standard deviation along each axis "
+        "(default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.json",
+        help="the fitted tissue (default: ANATOMY.tissue.json, where `sulcus uncertainty` reads it)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--locator", metavar="FILE.npz", type=Path,
+        help="as of `sulcus locate`; made where there is none, which takes minutes (default: beside the anatomy)",
+    )  # fmt: skip
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of a locator that is made (default %(default)s)")
+    add_force(parser)
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit the tissue. 0: done."""
+    from tqdm import tqdm
+
+    from sim.bodies.meshfile import read_anatomy
+    from sim.runtime.device import find_device
+    from surrogate.fitting.fit import fit_tissue
+    from surrogate.fitting.frame import check_frames
+    from surrogate.fitting.tissue_files import save_tissue, tissue_path
+
+    out = claimed(args.out or tissue_path(args.anatomy), ".json", KIND, args.force, [args.anatomy, *args.frames])
+    find_device(args.device, "float32")
+    frames = _frames(args)
+    anatomy = read_anatomy(args.anatomy)
+    check_frames(anatomy, frames)  # bad frames need not wait for a locator
+    locator = located_by(args, anatomy, small=True)
+    with tqdm(file=sys.stderr) as bar:
+
+        def progress(stage: str, done: int, total: int) -> None:
+            bar.total, bar.n = total, done
+            bar.set_description(stage)
+
+        tissue = fit_tissue(locator, frames, args.device, Path(args.anatomy).with_suffix(".fit.parts"), progress)
+    save_tissue(out, tissue)
+    print(json_line(_numbers(tissue, out)) if args.json else "\n".join(sentences(tissue, out)))
+    return 0
+
+
+def _frames(args: argparse.Namespace) -> list[Frame]:
+    from surrogate.fitting.frame import Frame
+    from surrogate.fitting.tool_table import read_tools
+    from surrogate.locating.observed_files import read_observation
+
+    tools = ((),) * len(args.frames) if args.tool is None else read_tools(args.tool, len(args.frames))
+    seen = [replace(read_observation(path), rigid=1e-3 * args.rigid) for path in args.frames]
+    return [Frame(*each) for each in zip(seen, tools, strict=True)]
+
+
+def _numbers(tissue: FittedTissue, out: Path) -> dict[str, object]:
+    names = ("low", "median", "high")
+    young = tissue.stiffness
+    return {
+        "ratio": dict(zip(names, tissue.ratio, strict=True)),
+        "skull": tissue.skulls,
+        "poisson": {**dict(zip(names, tissue.poisson, strict=True)), **tissue.classes},
+        "young_pa": None if young is None else dict(zip(names, young, strict=True)),
+        "not_known": tissue.not_known,
+        "frames": tissue.frames,
+        "of": "the patient's tissue: medians, and intervals that hold 95 % of the probability",
+        "out": str(out),
+    }
+
+
+def sentences(tissue: FittedTissue, out: Path) -> list[str]:
+    """What was found, and what was not."""
+    low, middle, high = tissue.ratio
+    lines = [
+        f"The tumour is {middle:.2g} times as stiff as the brain (95 %: {low:.2g} to {high:.2g}).",
+        "Skull: " + ", ".join(f"{name} {share:.0%}" for name, share in tissue.skulls.items()) + ".",
+        "Poisson's ratio: {1:.3f} (95 %: {0:.3f} to {2:.3f}); ".format(*tissue.poisson)
+        + ", ".join(f"{name} {share:.0%}" for name, share in tissue.classes.items()) + ".",
+    ]  # fmt: skip
+    if tissue.stiffness is not None:
+        low, middle, high = (1e-3 * each for each in tissue.stiffness)
+        lines.append(f"Young's modulus of the brain is {middle:.2g} kPa (95 %: {low:.2g} to {high:.2g}).")
+    lines += [f"Of {name} the frames say little: it is about as unknown as before." for name in tissue.not_known]
+    return [*lines, f"written: {out}"]
+
+
+def fitted_beside(path: Path | None, anatomy: Path, digest: str) -> FittedTissue | None:
+    """The tissue that was asked for by its `path`, or that lies beside an anatomy; None: there is none.
+
+    Raises
+    ------
+    InputError
+        As `load_tissue`; a file that was asked for and is missing.
+    """
+    from surrogate.fitting.tissue_files import load_tissue, tissue_path
+
+    if path is not None and not path.is_file():
+        raise InputError(f"{path}: no such file: make it by `sulcus fit`, or leave --tissue out.")
+    where = path or tissue_path(anatomy)
+    return load_tissue(where, digest) if where.is_file() else None

@@ -1,0 +1,106 @@
+"""What is seen in one frame: the open cortex, and where a tool presses on it, how hard if that is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.errors import InputError
+from sim.bodies.open_cortex import open_cortex
+from sim.geometry.closest_point import closest
+
+from ..locating.observation import FARTHEST_TIP, Observation, placed
+
+RADIUS = 6e-3
+"""Of the disc on which a tool presses, if nothing else is known [m]."""
+# Radii of tools [m], and forces [N] beyond which no tool presses on a brain.
+RADII, HARDEST = (0.5e-3, 30e-3), 10.0
+FORCE_SIGMA = 0.1
+"""Standard deviation of a force that is read, as a share of it, if nothing else is known."""
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A tool that presses on the open cortex.
+
+    Parameters
+    ----------
+    tip
+        (3,) [m], RAS: where it touches.
+    radius
+        [m] of the disc on which it presses.
+    force, sigma
+        How hard it presses [N], and that reading's standard deviation; None: nobody read it.
+    """
+
+    tip: tuple[float, float, float]
+    radius: float = RADIUS
+    force: float | None = None
+    sigma: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What was seen, and the tools that pressed meanwhile; without any, fluid has drained."""
+
+    observation: Observation
+    tools: tuple[Tool, ...] = ()
+
+
+def check_frames(anatomy: Anatomy, frames: Sequence[Frame]) -> None:
+    """Refuse frames that say nothing of a body.
+
+    Raises
+    ------
+    InputError
+        No frames; the same frame twice; what `placed` refuses; clouds; tools that are off the open cortex, too wide,
+        or whose force is none.
+    """
+    if not frames:
+        raise InputError("there is no frame to fit tissue to: give what was seen of the open cortex, a file a frame.")
+    for number, frame in enumerate(frames, start=1):
+        try:
+            if frame.observation.rest is None:
+                raise InputError("is a cloud, whose points have no names: give points and how they moved.")
+            placed(anatomy, frame.observation)
+            for tool in frame.tools:
+                _check(anatomy, tool)
+            if len(frame.tools) > 1 and any(tool.force is not None for tool in frame.tools):
+                raise InputError("a force is read while several tools press: read it while one presses alone.")
+        except InputError as error:
+            raise InputError(f"frame {number}: {error}") from error
+    order = sorted(range(len(frames)), key=lambda number: frames[number].observation.now.tobytes())
+    for one, other in pairwise(order):
+        if np.array_equal(frames[one].observation.now, frames[other].observation.now):
+            first, second = sorted((one + 1, other + 1))
+            raise InputError(f"frames {first} and {second} are the same, which would count twice: leave one out.")
+
+
+def foot(anatomy: Anatomy, tool: Tool) -> np.ndarray:
+    """The point (3,) [m] of the open cortex at rest that is nearest to a tool's tip."""
+    return closest(np.array([tool.tip]), open_cortex(anatomy).corners).point[0]
+
+
+def _check(anatomy: Anatomy, tool: Tool) -> None:
+    numbers = [*tool.tip, tool.radius, tool.force or 0.0, tool.sigma or 0.0]
+    if not np.isfinite(numbers).all():
+        raise InputError("a tool has a number that is not finite: leave it out.")
+    away = float(np.linalg.norm(foot(anatomy, tool) - tool.tip))
+    if away > FARTHEST_TIP:
+        raise InputError(
+            f"a tool lies {1e3 * away:.0f} mm off the open cortex, so that it cannot press on it: give millimetres, "
+            "RAS, or leave it out."
+        )
+    if not RADII[0] <= tool.radius <= RADII[1]:
+        raise InputError(
+            f"a tool of radius {1e3 * tool.radius:g} mm presses on no disc of a brain: give "
+            f"{1e3 * RADII[0]:g} to {1e3 * RADII[1]:g} mm."
+        )
+    if tool.force is not None and not 0.0 < tool.force <= HARDEST:
+        raise InputError(f"a force of {tool.force:g} N is none of a tool on a brain: give newtons, up to {HARDEST:g}.")
+    if tool.sigma is not None and (tool.force is None or not tool.sigma > 0.0):
+        raise InputError("a force's sigma needs a force, and is positive: give both in newtons, or neither.")

@@ -1,0 +1,120 @@
+"""How linear tissue moves under drained fluid and under forces, tissue by tissue: what frames are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from sim.accuracy import Accuracy
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.bodies.fluid_level import fluid_level
+from sim.bodies.open_cortex import open_cortex
+from sim.effects import SKULLS, Elasticity, Gravity, Held, ToolForce
+from sim.fem import Fem
+from sim.geometry.tetmesh import digest_of
+from sim.loads import Loads, Posture, Pushed
+from sim.material import Material
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import read_as
+
+from ..locating.causes import SPREAD, SUPINE, USUAL, YOUNG, directions
+from ..locating.locator import telling_nodes
+from ..model.npz_archive import Archive
+
+RATIOS = np.geomspace(0.4, 3.2, 4)
+"""Stiffness of the tumour over the brain's, in the tissues that are solved."""
+POISSONS = np.array([0.45, 0.47, 0.4945])
+"""Poisson's ratio of brain and tumour in them."""
+LINEAR = ("bonded", "slide")
+"""Skulls in which they are solved; one that lets go holds what tools press against it as one that lets it slide."""
+FORCE = 0.01
+"""Of a tool, along each axis [N]."""
+# Ways that the head lies, and shares of the fluid that are left in each.
+POSTURES, LEVELS, SEED = 6, (0.7, 0.4, 0.15), 5
+ACCURACY = Accuracy(tolerance=1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Motions of some vertices by loads of one kind.
+
+    Parameters
+    ----------
+    nodes
+        (n,) sorted mesh vertices.
+    motion
+        By skull: (poissons, ratios, loads, n, 3) [m], of tissue of Young's modulus `YOUNG`.
+    """
+
+    nodes: np.ndarray
+    motion: dict[str, np.ndarray]
+
+
+def drained_loads(anatomy: Anatomy) -> Loads:
+    """Fluid that drains while the head lies in some ways."""
+    down = directions(np.random.default_rng(SEED), open_cortex(anatomy).axis, replace(USUAL, drainages=POSTURES))
+    every = [(way, fluid_level(anatomy.mesh.nodes, way, left)) for left in LEVELS for way in down]
+    way, level = (np.array(each) for each in zip(*every, strict=True))
+    middle = np.tile(open_cortex(anatomy).origin, (len(way), 1))
+    idle = Pushed(middle, np.zeros_like(middle), np.full(len(way), SPREAD))
+    return Loads((idle, Posture(way, level, np.ones(len(way)))))
+
+
+def force_loads(anatomy: Anatomy, point: np.ndarray, radius: np.ndarray, force: np.ndarray | None = None) -> Loads:
+    """Forces (n, 3) [N] on discs round points (k, 3) of some radii (k,) [m]; None: along each axis of each point."""
+    some = FORCE * np.tile(np.eye(3), (len(point), 1)) if force is None else force
+    each, count = len(some) // len(point), len(some)
+    pushed = Pushed(np.repeat(point, each, axis=0), some, np.repeat(radius, each))
+    level = fluid_level(anatomy.mesh.nodes, SUPINE, 1.0)
+    posture = Posture(np.tile(SUPINE, (count, 1)), np.full(count, level), np.ones(count))
+    return Loads((pushed, posture), np.zeros(count))
+
+
+def responses(
+    anatomy: Anatomy,
+    loads: Loads,
+    device: str = "auto",
+    folder: Path | None = None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Responses:
+    """Solve each tissue. Those that a `folder` keeps, of the same loads, are read.
+
+    `progress` hears how many tissues are done, and of how many.
+    """
+    nodes, found = telling_nodes(anatomy), []
+    every = list(product(LINEAR, POISSONS, RATIOS))
+    progress(0, len(every))
+    for done, (skull, poisson, ratio) in enumerate(every, start=1):
+        found.append(_kept(anatomy, nodes, loads, (skull, float(poisson), float(ratio)), device, folder))
+        progress(done, len(every))
+    whole = np.array(found).reshape(len(LINEAR), len(POISSONS), len(RATIOS), *found[0].shape)
+    return Responses(nodes, dict(zip(LINEAR, whole, strict=True)))
+
+
+def _kept(
+    anatomy: Anatomy,
+    nodes: np.ndarray,
+    loads: Loads,
+    tissue: tuple[str, float, float],
+    device: str,
+    folder: Path | None,
+) -> np.ndarray:
+    """Motions (loads, n, 3) [m] of one tissue, from the folder if they are there."""
+    numbers = [array.tobytes() for cause in loads.causes for array in vars(cause).values()]
+    stated = digest_of(np.frombuffer(b"".join([repr((anatomy.digest, tissue, ACCURACY)).encode(), *numbers]), np.uint8))
+    path = None if folder is None else folder / f"{stated}.npz"
+    if path is not None and path.exists():
+        with read_as(path, "motions of one tissue", "Delete it: it is made anew."), path.open("rb") as raw:
+            return Archive(raw).arrays(["motion"])["motion"]
+    skull, poisson, ratio = tissue
+    brain, tumour = (Material("linear", YOUNG * times, poisson) for times in (1.0, ratio))
+    effects = (Elasticity(brain, {TUMOUR_LABEL: tumour}), Held(), SKULLS[skull], ToolForce(), Gravity())
+    motion = Fem(anatomy, effects, ACCURACY, device).deform(loads).displacement[:, nodes].astype(np.float32)
+    if path is not None:
+        with written_whole(path, ".npz") as unfinished:
+            np.savez(unfinished, motion=motion)
+    return motion

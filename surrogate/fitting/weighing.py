@@ -1,0 +1,96 @@
+"""How probable one frame is in each tissue: a Gaussian of unknown sizes of the tissue's own motions, and of errors."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.special import logsumexp
+
+from sim.effects import SKULLS
+
+from ..array_functions import squared_distances
+from ..locating.causes import DRAINAGE
+from ..locating.evidence import Evidence, alike
+from ..locating.prior import Prior
+from .responses import LINEAR, Responses
+
+LACK, LACK_LENGTH = 0.05, 10e-3
+"""What linear tissue is off by where a point moves, as a share of that, white and smooth, and the latter's length [m]."""
+# A point that hardly moves is off by that share of so much of the mean motion.
+LEAST = 0.1
+# Sizes that motions may have, as shares of what is seen.
+SIZES = (0.3, 1.0, 3.0)
+# Evidence counts as one part in so many: of drained fluid, and of tools, whose dents are far from linear.
+COARSENED, COARSENED_TOOLS = 2.0, 8.0
+
+
+def of_drained(drained: Responses, prior: Prior, evidence: Evidence) -> np.ndarray:
+    """Logarithms (skulls, poissons, ratios) of how probable a frame is in which fluid has drained."""
+    lower, seen = errors(evidence)
+    rows = {name: seen_of(drained, name, evidence) for name in LINEAR}
+    own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
+    lets_go = prior.seen(evidence.place, evidence.axis)[:, own].T
+    size = np.mean([_size(each) for each in rows.values()])
+    found = {name: _weighed(each / size, evidence, lower, seen) for name, each in rows.items()}
+    found["contact"] = _weighed((lets_go / _size(lets_go))[None, None], evidence, lower, seen)
+    shape = found[LINEAR[0]].shape
+    return np.stack([np.broadcast_to(found[name], shape) for name in SKULLS]) / COARSENED
+
+
+def of_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
+    """Logarithms (skulls, 1, 1) of how probable a frame is in which tools press: its `columns` (k,) of the responses.
+
+    Dents of tools say which skull there is. What they seem to say of the rest is mostly how they stiffen tissue.
+    """
+    lower, seen = errors(evidence)
+    rows = {name: seen_of(pressed, name, evidence)[:, :, columns] for name in LINEAR}
+    size = np.mean([_size(each) for each in rows.values()])
+    found = {name: _weighed(each / size, evidence, lower, seen) for name, each in rows.items()}
+    found = {name: logsumexp(each) - np.log(each.size) for name, each in found.items()}
+    found["contact"] = found["slide"]
+    return np.array([found[name] for name in SKULLS])[:, None, None] / COARSENED_TOOLS
+
+
+def seen_of(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
+    """What is seen (poissons, ratios, loads, m) [m] of responses."""
+    column = np.searchsorted(responses.nodes, evidence.place.vertices)
+    return np.einsum(
+        "prlmki,mk,mi->prlm",
+        responses.motion[skull][..., column, :],
+        evidence.place.weights,
+        evidence.axis,
+        optimize=True,
+    )
+
+
+def _size(rows: np.ndarray) -> float:
+    return float(np.sqrt((rows**2).sum(axis=-2).mean()))
+
+
+def errors(evidence: Evidence) -> tuple[np.ndarray, float]:
+    """Cholesky factor (m, m) of the covariance of all errors, and the root mean square that is seen [m]."""
+    value = evidence.value
+    length = np.sqrt(np.bincount(evidence.point, value**2))[evidence.point]
+    seen = float(np.sqrt((value**2).mean()))
+    off = LACK * np.maximum(length, LEAST * np.sqrt(3.0) * seen)
+    axes = evidence.axis @ evidence.axis.T
+    noise = (
+        evidence.noise() + np.outer(off, off) * alike(squared_distances(evidence.at, evidence.at), LACK_LENGTH) * axes
+    )
+    noise[np.diag_indices(len(noise))] += off**2
+    rigid = evidence.rigid * evidence.rigid_scale
+    return cholesky(noise + rigid @ rigid.T, lower=True), max(seen, 1e-6)
+
+
+def _weighed(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
+    """Logarithms (poissons, ratios) of evidence for motions (poissons, ratios, loads, m) of size 1 together."""
+    value = solve_triangular(lower, evidence.value, lower=True, check_finite=False)
+    flat = solve_triangular(lower, rows.reshape(-1, rows.shape[-1]).T, lower=True, check_finite=False)
+    white = seen * flat.T.reshape(rows.shape)
+    gram, pull = white @ white.transpose(0, 1, 3, 2), white @ value
+    logs = []
+    for times in SIZES:
+        root = np.linalg.cholesky(np.eye(gram.shape[-1]) + times**2 * gram)
+        half = np.linalg.solve(root, times * pull[..., None])[..., 0]
+        logs.append(0.5 * (half**2).sum(axis=-1) - np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1))
+    return logsumexp(logs, axis=0) - np.log(len(SIZES))
