@@ -77,7 +77,7 @@ def changed(scene: Scene, draw: Draw) -> Scene:
     InputError
         A tissue that is not described by Young's modulus and Poisson's ratio.
     """
-    tissue = _tissue(scene)
+    tissue = tissue_of(scene)
     brain = replace(tissue, young=draw.stiffness * tissue.young, poisson=draw.poisson)
     elasticity = Elasticity(brain, {TUMOUR_LABEL: replace(brain, young=draw.ratio * brain.young)})
     skull = SKULLS[chosen(draw.skull, skulls_of(scene))]
@@ -94,7 +94,14 @@ def skulls_of(scene: Scene) -> tuple[str, ...]:
     return tuple(name for name in SKULLS if not (lets_go and name == "bonded"))
 
 
-def _tissue(scene: Scene) -> Material:
+def tissue_of(scene: Scene) -> Material:
+    """The one tissue of a scene.
+
+    Raises
+    ------
+    InputError
+        Another than of Young's modulus and Poisson's ratio, or several.
+    """
     elasticity = next((effect for effect in scene.effects if isinstance(effect, Elasticity)), None)
     if elasticity is None or not isinstance(elasticity.default, Material) or elasticity.regions:
         raise InputError(
@@ -235,7 +242,7 @@ def parts(motion: np.ndarray, field: np.ndarray, draws: Sequence[Draw], scene: S
 
 def causes(draws: Sequence[Draw], scene: Scene) -> dict[str, np.ndarray]:
     """By contributor, how a draw differs from the scene (draws, columns): zero where it does not."""
-    poisson = _tissue(scene).poisson
+    poisson = tissue_of(scene).poisson
     skull = next((effect for effect in scene.effects if isinstance(effect, SKULL_EFFECTS)), None)
     table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in draws])
     found = {STIFFNESS.name: table[:, :1], POISSON.name: table[:, 1:2], RATIO.name: table[:, 2:3]}

@@ -73,18 +73,18 @@ def run(args: argparse.Namespace) -> int:
 
     _check(args)
     body = read_anatomy(args.anatomy or template_path())
-    finer = _finer(args)
-    with _bar("twins") as heard:
+    finer = finer_of(args)
+    with bar("twins") as heard:
         found = list(twins(body, finer, args.twins, args.seed, args.device, args.element, args.folder, heard))
     failed = [number for number, twin in enumerate(found) if twin is None]
     some = [twin for twin in found if twin is not None]
-    locator = _locator(args, body)
+    locator = locator_of(args, body)
     table = sys.stderr if args.json else sys.stdout
     where = f"{machine(args.device)}; truths of {len(finer.mesh.nodes)} nodes, {args.element}"
     print(f"{where}\n\n{len(some)} twins\n\n| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
     sights = sights_of(args.points, args.cover, args.noise)
     made = []
-    with _bar("observations") as heard:
+    with bar("observations") as heard:
         for row in rows(some, sights, rivals(body), locator, args.seed, heard):
             made.append(row)
             print(f"| {' | '.join(_cells(row))} |", file=table, flush=True)
@@ -110,11 +110,16 @@ def _check(args: argparse.Namespace) -> None:
     for cover in args.cover:
         if not 1 <= cover <= 100:
             raise InputError(f"--cover {cover}: give a share of the open cortex, from 1 to 100 [%].")
+    check_finer(args)
+
+
+def check_finer(args: argparse.Namespace) -> None:
+    """Raise InputError for a brain of one's own without its finer mesh."""
     if args.anatomy is not None and args.finer is None:
         raise InputError("--anatomy needs --finer: a finer mesh of the same brain, by `sulcus anatomy --nodes`.")
 
 
-def _finer(args: argparse.Namespace) -> Anatomy:
+def finer_of(args: argparse.Namespace) -> Anatomy:
     """The mesh that the truths are solved on."""
     from sim.bodies.meshfile import read_anatomy, write_anatomy
     from sim.bodies.subject import MeshPlan, make_anatomy
@@ -131,7 +136,7 @@ def _finer(args: argparse.Namespace) -> Anatomy:
     return anatomy
 
 
-def _locator(args: argparse.Namespace, body: Anatomy) -> Locator:
+def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
     """The locator that the folder keeps, or a new one."""
     from surrogate.locating.locator_files import load_locator, save_locator
     from surrogate.locating.setup import make_locator
@@ -140,7 +145,7 @@ def _locator(args: argparse.Namespace, body: Anatomy) -> Locator:
     if path is not None and path.is_file():
         return load_locator(path, body)
     parts = None if path is None else path.with_suffix(".parts")
-    with _bar("locator") as heard:
+    with bar("locator") as heard:
         locator = make_locator(
             body, device=args.device, folder=parts, progress=lambda stage, done, total: heard(done, total, stage)
         )
@@ -150,7 +155,7 @@ def _locator(args: argparse.Namespace, body: Anatomy) -> Locator:
 
 
 @contextmanager
-def _bar(name: str) -> Iterator[Callable[..., None]]:
+def bar(name: str) -> Iterator[Callable[..., None]]:
     """A progress bar on the error stream, and what sets it: how many are done, of how many, and of what."""
     from tqdm import tqdm
 

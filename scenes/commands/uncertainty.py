@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,12 +16,14 @@ from tqdm import tqdm
 from sim.arguments import at_least
 
 from .demo import add_bodies, scene_asked
+from .fit import fitted_beside
 from .json_line import json_line
 from .outputs import claimed
 from .tissue_options import add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
+    from ..script.priors import Draw
     from ..script.scene import Scene
     from ..script.uncertainty import Uncertainty
 
@@ -44,6 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--twins", type=int, default=0, help="try the result on so many other bodies (default %(default)s)"
     )
+    parser.add_argument(
+        "--tissue", type=Path, metavar="FILE.json",
+        help="tissue fitted by `sulcus fit`, from which bodies are drawn in place of priors (default: "
+        "MESH.tissue.json beside the anatomy, where there is one)",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
     parser.add_argument(
@@ -55,9 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve an ensemble of each scene, and keep what it says."""
-    from ..bench.uncertainty import coverage, ensemble, nominal, uncertainty
+    from ..bench.uncertainty import coverage, ensemble, nominal, skulls_of, tissue_of, uncertainty
     from ..play.deformers import open_theatre
-    from ..script.priors import drawn
+    from ..script.priors import drawn, drawn_from
     from ..script.scene import SCENES
     from ..script.shipped_files import template_path
     from ..script.uncertainty import read_uncertainties, uncertainty_path, write_uncertainties
@@ -70,14 +78,22 @@ def run(args: argparse.Namespace) -> int:
     # Before hours are spent; a file that is there is read, and scenes are added to it.
     claimed(out, ".json", "uncertainties", force=True)
     read_uncertainties(out)
-    draws, twins = drawn(args.draws, args.seed), drawn(args.twins, args.seed + 1)
+    fitted = fitted_beside(args.tissue, args.anatomy or template_path(), theatre.anatomy.digest)
+
+    def draws_of(scene: Scene, count: int, seed: int) -> list[Draw]:
+        if fitted is None:
+            return drawn(count, seed)
+        return drawn_from(fitted, tissue_of(scene).young, skulls_of(scene), count, seed)
+
     rows, lines = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
         bar = partial(tqdm, unit="body", desc=scene.name, leave=False, file=sys.stderr)
+        draws, twins = (draws_of(scene, *each) for each in ((args.draws, args.seed), (args.twins, args.seed + 1)))
         still = nominal(theatre, scene)
         found = uncertainty(
             theatre, scene, still, draws, bar(ensemble(theatre, scene, draws), total=len(draws)), args.seed
         )
+        found = replace(found, frames=0 if fitted is None else fitted.frames)
         write_uncertainties(out, [found])
         tried = bar(ensemble(theatre, scene, twins), total=len(twins))
         held = coverage(still, found, twins, tried, args.seed + 1) if twins else None
@@ -104,7 +120,7 @@ def _flat(theatre: Theatre, scene: Scene, found: Uncertainty, twins: float | Non
         "scene": scene.name, "said": error_lines(promised, error, model is not None), "time_s": found.times[moment],
         "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
         "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment], "largest_part": error.largest,
-        "draws": found.draws, "failed": found.failed, "held": found.held, "held_twins": twins,
+        "draws": found.draws, "failed": found.failed, "frames": found.frames, "held": found.held, "held_twins": twins,
         "parts_mm": ranked,
     }  # fmt: skip
 
@@ -117,6 +133,8 @@ def _lines(row: dict[str, Any]) -> Sequence[str]:
         f"{row['middle_mm']:.1f} mm. Root mean square of each part [mm]:"
     )
     lines += [f"    {name:<20} {size:6.3f}" for name, size in row["parts_mm"].items()]
+    if row["frames"]:
+        lines.append(f"  bodies are of tissue that was fitted to {row['frames']} frames, and not of priors alone")
     without = f", {row['failed']} of them without equilibrium" if row["failed"] else ""
     lines.append(
         f"  {row['draws']} draws{without}. The bound held for {row['held']:.1%} of draws that it was not made of"

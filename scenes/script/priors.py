@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.special import ndtri
 
+from sim.errors import InputError
+
+if TYPE_CHECKING:
+    from surrogate.fitting.tissue import FittedTissue
+
 Law = Literal["uniform", "log-uniform", "normal"]
 MESH, REGISTRATION, SEGMENTATION = "mesh", "registration", "segmentation"
 TOOL, SKULL = "tool's place", "skull"
+# A scene cannot be where its skulls have less probability.
+LEAST_POSSIBLE = 0.01
 TOGETHER = "several together"
 """What is more, or less, than the sum of what each contributor does alone."""
 
@@ -127,6 +134,33 @@ def drawn(count: int, seed: int = 0) -> list[Draw]:
     columns = [values(prior) for prior in (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, TIP, TIP, OF_MESH)]
     rows = zip(*columns, strict=True)
     return [Draw(young, nu, ratio, skull, tuple(tip), mesh) for young, nu, ratio, skull, *tip, mesh in rows]
+
+
+def drawn_from(tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0) -> list[Draw]:
+    """So many draws whose tissue and skull are drawn from what was fitted; all else as in `drawn`.
+
+    `young` [Pa] is the scene's own modulus, and `skulls` are those that it may have. What was not fitted keeps its
+    prior.
+
+    Raises
+    ------
+    InputError
+        A skull was found that the scene does not allow.
+    """
+    if sum(tissue.skulls[name] for name in skulls) < LEAST_POSSIBLE:
+        raise InputError(
+            f"the fitted tissue has a skull that this scene cannot have ({' or '.join(skulls)}): choose another scene, "
+            "or another tissue by --tissue."
+        )
+    names, poisson, ratio = tissue.drawn(count, seed, tuple(skulls))
+    random, made = np.random.default_rng([seed, 3]), []
+    moduli = random.choice(tissue.young, count) if len(tissue.young) else None
+    for number, one in enumerate(drawn(count, seed)):
+        stiffness = one.stiffness if moduli is None else float(moduli[number]) / young
+        skull = (list(skulls).index(names[number]) + 0.5) / len(skulls)
+        own = {"poisson": float(poisson[number]), "ratio": float(ratio[number])}
+        made.append(replace(one, stiffness=stiffness, skull=skull, **own))
+    return made
 
 
 def rigid(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -75,6 +75,8 @@ class Uncertainty:
         Mean motion of the tumour's surface [m].
     parts
         Root mean square over draws, at the surface's worst point of each [m], by contributor.
+    frames
+        How many frames the draws' tissue was fitted to; 0: it was drawn from priors.
     """
 
     scene: str
@@ -87,6 +89,7 @@ class Uncertainty:
     middle: tuple[float, ...]
     moved: tuple[float, ...]
     parts: Mapping[str, tuple[float, ...]]
+    frames: int = 0
 
     def at(self, time: float, surrogate: float = 0.0) -> TumourError:
         """The error at a time [s], where a trained model adds its own bound [m]."""
@@ -146,7 +149,9 @@ def _read(row: dict) -> Uncertainty:
         if len(values) != len(lists["times"]) or not np.isfinite(values).all():
             raise InputError(f"{name} are not {len(lists['times'])} finite numbers.")
     counts = int(row["draws"]), int(row["failed"]), float(row["held"])
-    return Uncertainty(str(row["scene"]), str(row["mark"]), *counts, **lists, parts=parts)
+    return Uncertainty(
+        str(row["scene"]), str(row["mark"]), *counts, **lists, parts=parts, frames=int(row.get("frames", 0))
+    )
 
 
 def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:

@@ -54,7 +54,7 @@ def fit_tissue(
             lambda done, total: progress("tools", done, total),
         )
     with one_thread():  # products are small
-        probability = _probability(weighed(locator, frames, drained, pressed))
+        probability = probability_of(weighed(locator, frames, drained, pressed))
     tissue = FittedTissue(anatomy.digest, len(frames), probability, np.zeros(0))
     young = young_moduli(anatomy, frames, tissue, pressed, device, lambda done, total: progress("forces", done, total))
     return FittedTissue(anatomy.digest, len(frames), probability, young)
@@ -75,7 +75,7 @@ def weighed(
     return total
 
 
-def _probability(total: np.ndarray) -> np.ndarray:
+def probability_of(total: np.ndarray) -> np.ndarray:
     """Probabilities on the fine grid: logarithms are smooth in that of the ratio, and in how compressible it is."""
     fine = CubicSpline(np.log(RATIOS), total, axis=2)(np.log(FINE_RATIOS))
     order = np.argsort(1.0 - 2.0 * POISSONS)

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.errors import InputError
 from sim.bodies.open_cortex import open_cortex
+from sim.errors import InputError
 from sim.geometry.closest_point import closest
 
 from ..locating.observation import FARTHEST_TIP, Observation, placed

@@ -55,7 +55,7 @@ class FittedTissue:
     def classes(self) -> dict[str, float]:
         """Probability of each of `CLASSES` of Poisson's ratio."""
         share = self.probability.sum(axis=(0, 2))
-        low = float(share @ (FINE_POISSONS < CLASSES["compressible"][1]))
+        low = float(share @ (CLASSES["compressible"][1] > FINE_POISSONS))
         return dict(zip(CLASSES, (low, 1.0 - low), strict=True))
 
     @property

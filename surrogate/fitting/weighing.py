@@ -15,7 +15,7 @@ from ..locating.prior import Prior
 from .responses import LINEAR, Responses
 
 LACK, LACK_LENGTH = 0.05, 10e-3
-"""What linear tissue is off by where a point moves, as a share of that, white and smooth, and the latter's length [m]."""
+"""What linear tissue is off by where a point moves, as a share: white, and smooth over a length [m]."""
 # A point that hardly moves is off by that share of so much of the mean motion.
 LEAST = 0.1
 # Sizes that motions may have, as shares of what is seen.

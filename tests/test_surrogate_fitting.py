@@ -1,0 +1,177 @@
+"""Fitting tissue to several frames: a small body whose motions obey the tissue that is to be found, and bad input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from locators import in_a_skull, locator_of
+
+from scenes.script.priors import drawn_from
+from sim.effects import SKULLS
+from sim.errors import InputError
+from sim.fem import Fem
+from surrogate.fitting.fit import probability_of, weighed
+from surrogate.fitting.frame import Frame, Tool, check_frames, foot
+from surrogate.fitting.responses import POISSONS, RATIOS, drained_loads, force_loads, responses
+from surrogate.fitting.stiffness import young_moduli
+from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
+from surrogate.fitting.tissue_files import load_tissue, save_tissue
+from surrogate.fitting.tool_table import read_tools
+from surrogate.locating.calibration import seen_patch
+from surrogate.locating.causes import YOUNG, Group
+from surrogate.locating.observation import Observation
+
+
+@pytest.fixture(scope="module")
+def body():
+    return in_a_skull()
+
+
+@pytest.fixture(scope="module")
+def locator(body):
+    return locator_of(body)
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    return tmp_path_factory.mktemp("parts")
+
+
+@pytest.fixture(scope="module")
+def drained(body, parts):
+    return responses(body, drained_loads(body), "cpu", parts)
+
+
+def frame_of(body, motion, seed=0):
+    """What is seen of a motion (V, 3) [m] without error, on most of the open cortex."""
+    evidence = seen_patch(body, motion, np.random.default_rng(seed), 60, 0.9)
+    rest, moved = evidence.at[::3], evidence.value.reshape(-1, 3)
+    return Frame(Observation(rest + moved, rest, np.full(len(rest), 5e-5), rigid=0.0))
+
+
+def drained_frames(body, drained, skull, poisson, ratio):
+    """Drained fluid in one of the solved tissues, made so large that the cortex moves by millimetres."""
+    found = []
+    for number in (1, 8, 15):
+        motion = np.zeros_like(body.mesh.nodes)
+        motion[drained.nodes] = drained.motion[skull][poisson, ratio, number]
+        motion *= 3e-3 / np.linalg.norm(motion[np.unique(body.open_surface)], axis=1).max()
+        found.append(frame_of(body, motion, number))
+    return found
+
+
+@pytest.mark.parametrize(("skull", "poisson", "ratio"), [("bonded", 0, 0), ("slide", 2, 3), ("slide", 0, 2)])
+def test_the_tissue_that_moved_so_is_found(body, locator, drained, skull, poisson, ratio):
+    frames = drained_frames(body, drained, skull, poisson, ratio)
+    tissue = FittedTissue("", 3, probability_of(weighed(locator, frames, drained, None)), np.zeros(0))
+    assert tissue.skulls[skull] > 0.9
+    low, middle, high = tissue.ratio
+    assert low < 1.05 * RATIOS[ratio] and high > 0.95 * RATIOS[ratio]
+    assert abs(np.log(middle / RATIOS[ratio])) < np.log(1.5)
+    assert abs(tissue.poisson[1] - POISSONS[poisson]) < 0.012
+    assert high / low < 0.7 * FINE_RATIOS[-1] / FINE_RATIOS[0]
+
+
+def test_more_frames_say_more(body, locator, drained):
+    frames = drained_frames(body, drained, "slide", 1, 2)
+    entropy = []
+    for some in (frames[:1], frames):
+        share = probability_of(weighed(locator, some, drained, None))
+        entropy.append(-(share * np.log(share + 1e-300)).sum())
+    assert entropy[1] < entropy[0] - 0.1
+
+
+def test_points_that_hardly_move_leave_the_prior(body, locator, drained):
+    frame = frame_of(body, np.random.default_rng(0).normal(scale=1e-6, size=body.mesh.nodes.shape))
+    frame = replace(frame, observation=replace(frame.observation, sigma=np.full(60, 5e-3), rigid=5e-3))
+    tissue = FittedTissue("", 1, probability_of(weighed(locator, [frame], drained, None)), np.zeros(0))
+    assert "the tumour's stiffness" in tissue.not_known and "Young's modulus" in tissue.not_known
+
+
+def test_a_force_that_is_read_gives_the_modulus(body):
+    tip = foot(body, Tool(tuple(body.mesh.nodes[np.unique(body.open_surface)].mean(axis=0).tolist())))
+    loads = force_loads(body, tip[None], np.array([6e-3]), np.array([[0.0, 0.02, -0.12]]))
+    motion = Fem(body, Group(1, "slide", 0.47, 1.0, 14.0).effects((0.01,)), device="cpu").deform(loads).displacement[0]
+    tool = Tool(tuple(tip.tolist()), 6e-3, force=2.0 * float(np.hypot(0.02, 0.12)), sigma=0.005)
+    frame = replace(frame_of(body, motion), tools=(tool,))
+    pressed = responses(body, force_loads(body, tip[None], np.array([6e-3])), "cpu")
+    share = np.zeros((len(SKULLS), len(FINE_POISSONS), len(FINE_RATIOS)))
+    share[list(SKULLS).index("slide"), 6, 14] = 1.0
+    young = young_moduli(body, [frame], FittedTissue("", 1, share, np.zeros(0)), pressed, "cpu")
+    low, middle, high = np.quantile(young, [0.025, 0.5, 0.975])
+    assert low < 2.0 * YOUNG < high and abs(np.log(middle / (2.0 * YOUNG))) < np.log(1.25)
+    silent = [replace(frame, tools=(replace(tool, force=None, sigma=None),))]
+    assert not len(young_moduli(body, silent, FittedTissue("", 1, share, np.zeros(0)), pressed, "cpu"))
+
+
+def test_solved_tissues_are_read_again(body, parts, drained, monkeypatch):
+    monkeypatch.setattr("surrogate.fitting.responses.Fem", None)
+    again = responses(body, drained_loads(body), "cpu", parts)
+    assert all(np.array_equal(again.motion[name], drained.motion[name]) for name in ("bonded", "slide"))
+
+
+def test_what_is_drawn_is_what_was_fitted():
+    share = np.zeros((3, 13, 33))
+    share[0, 3, 20], share[1, 3, 20], share[1, 9, 30] = 0.25, 0.25, 0.5
+    tissue = FittedTissue("", 4, share, np.array([1500.0]))
+    names, poisson, ratio = tissue.drawn(400, 1)
+    assert names.count("bonded") == 100 and (ratio == FINE_RATIOS[30]).sum() == 200
+    assert ((poisson == FINE_POISSONS[9]) == (ratio == FINE_RATIOS[30])).all()
+    draws = drawn_from(tissue, 3000.0, ("slide", "contact"), 30, 2)
+    assert {draw.stiffness for draw in draws} == {0.5} and all(draw.skull == 0.25 for draw in draws)
+    with pytest.raises(InputError, match="cannot have"):
+        drawn_from(tissue, 3000.0, ("contact",), 8)
+
+
+def test_a_file_keeps_the_tissue_and_refuses_others(tmp_path):
+    share = np.random.default_rng(0).uniform(size=(3, 13, 33))
+    tissue = FittedTissue("abc", 4, share / share.sum(), np.array([1500.0, 2000.0]))
+    path = tmp_path / "brain.tissue.json"
+    save_tissue(path, tissue)
+    again = load_tissue(path, "abc")
+    assert again.ratio == tissue.ratio and again.stiffness == tissue.stiffness and again.frames == 4
+    with pytest.raises(InputError, match="another anatomy"):
+        load_tissue(path, "abd")
+    path.write_text(path.read_text().replace("[[[", "[[[-", 1))
+    with pytest.raises(InputError, match="no probabilities"):
+        load_tissue(path, "abc")
+
+
+def test_bad_frames_are_refused(body):
+    motion = np.zeros_like(body.mesh.nodes) + [0.0, 0.0, 1e-3]
+    good = frame_of(body, motion)
+    tip = tuple((np.array(good.observation.rest)[0]).tolist())
+    cases = {
+        "no frame": [],
+        "frames 1 and 2 are the same": [good, good],
+        "frame 1: is a cloud": [replace(good, observation=replace(good.observation, rest=None))],
+        "frame 1: half of the points lie": [
+            replace(good, observation=replace(good.observation, rest=1e3 * good.observation.rest))
+        ],
+        "mm off the open cortex": [replace(good, tools=(Tool((1e3, 0.0, 0.0)),))],
+        "not finite": [replace(good, tools=(Tool((np.nan, 0.0, 0.0)),))],
+        "give newtons": [replace(good, tools=(Tool(tip, force=50.0),))],
+        "needs a force": [replace(good, tools=(Tool(tip, sigma=0.1),))],
+        "several tools": [replace(good, tools=(Tool(tip, force=0.1), Tool(tip)))],
+        "presses on no disc": [replace(good, tools=(Tool(tip, radius=6.0),))],
+    }
+    for words, frames in cases.items():
+        with pytest.raises(InputError, match=words):
+            check_frames(body, frames)
+    check_frames(body, [good])
+
+
+def test_a_table_of_tools_is_read(tmp_path):
+    path = tmp_path / "tools.csv"
+    path.write_text("frame,x,y,z,radius,force,sigma\n2,10,20,30,,0.2,\n2,11,20,30,5,,\n")
+    first, second = read_tools(path, 2)
+    assert first == () and second[0] == Tool((0.01, 0.02, 0.03), force=0.2) and second[1].radius == 5e-3
+    for text, words in (
+        ("frame,x,y,z\n3,1,2,3\n", "there are 2"),
+        ("frame,x,y,z\n1,1,2,\n", "not 4 numbers"),
+        ("frame,x,y,z,force\n1,1,2,3,nan\n", "not finite"),
+        ("x,y,z\n1,2,3\n", "header"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=words):
+            read_tools(path, 2)
