@@ -17,8 +17,9 @@ from surrogate.fitting.stiffness import young_moduli
 from surrogate.fitting.tissue import CLASSES, FittedTissue
 from surrogate.locating.locator import Locator
 
-from .fit_twins import Patient, Seen, effects_of, places
+from .fit_twins import Patient, Seen, places
 from .locate_study import Sight, observed
+from .locate_twins import ogden
 
 NEAR, NEAR_YOUNG = 1.5, 1.2
 """Factors within which the tumour's stiffness, and Young's modulus, were wanted."""
@@ -110,15 +111,19 @@ def row(noise: int, said: Sequence[tuple[Patient, FittedTissue]]) -> Row:
     named = [max(tissue.skulls, key=lambda name: tissue.skulls[name]) == patient.skull for patient, tissue in said]
     edge = CLASSES["compressible"][1]
     classes = [(patient.poisson < edge) == (tissue.classes["compressible"] > 0.5) for patient, tissue in said]
-    moduli = _off(young, NEAR_YOUNG) if young else (None, None, None)
     share = [100.0 * float(np.mean(each)) for each in (held, named, classes)]
-    return Row(noise, len(said), *_off(ratio, NEAR), *share, *moduli, len(young))
+    factor, within, inside = _off(ratio, NEAR)
+    moduli = _off(young, NEAR_YOUNG) if young else (None, None, None)
+    return Row(
+        noise, len(said), factor, within, inside, share[0], share[1], share[2],
+        moduli[0], moduli[1], moduli[2], len(young),
+    )  # fmt: skip
 
 
 def young_of(patient: Patient) -> float:
     """Young's modulus [Pa] of a patient's brain at small strain."""
-    elasticity = effects_of(patient)[0]
-    ((c, _),) = elasticity.default.terms  # pyright: ignore[reportAttributeAccessIssue]
+    tissue = ogden(patient.stiffness, patient.poisson)
+    (c, _), *_ = tissue.terms
     return c * (1.0 + patient.poisson)
 
 

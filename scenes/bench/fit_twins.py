@@ -80,19 +80,20 @@ def places(anatomy: Anatomy, seed: int = 0) -> Pushed:
 
 
 def patient(tools: Pushed, seed: int, number: int, presses: int, drainages: int) -> Patient:
-    """The patient of a number, under so many tools and in so many postures; it depends on that, the places of tools and the seed alone."""
+    """The patient of a number, under so many tools and in so many postures; it depends on these and the seed alone."""
     random = np.random.default_rng([seed, number, 7])
     stiffness, ratio = (float(np.exp(random.uniform(*np.log(limits)))) for limits in (STIFFNESS, RATIO))
     skull, poisson = str(random.choice(list(SKULLS), p=PROBABLE)), float(random.uniform(*POISSON))
     chosen = random.permutation(PLACES)[:presses]
-    pressure = np.exp(random.uniform(*np.log(PRESSURE), presses))
+    pressure = np.exp(random.uniform(*np.log(PRESSURE), size=presses))
     # The way of some other place's force: within the tool's cone nearly everywhere.
     way = np.stack([_leaning(tools.force[place], random) for place in chosen])
     force = way * (pressure * np.pi * tools.footprint[chosen] ** 2)[:, None]
-    left, tilt = random.uniform(*LEFT, drainages), TILT * random.standard_normal((drainages, 3))
+    left, tilt = random.uniform(LEFT[0], LEFT[1], drainages), TILT * random.standard_normal((drainages, 3))
     return Patient(
         number, skull, stiffness, ratio, poisson,
-        tuple(chosen.tolist()), tuple(map(tuple, force.tolist())), tuple(left.tolist()), tuple(map(tuple, tilt.tolist())),
+        tuple(chosen.tolist()), tuple(map(tuple, force.tolist())),
+        tuple(left.tolist()), tuple(map(tuple, tilt.tolist())),
     )  # fmt: skip
 
 

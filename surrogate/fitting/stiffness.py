@@ -90,7 +90,7 @@ def _weighed(
         off = _white(lower, (evidence.value - shape).reshape(-1, len(value)).T)
         log = -0.5 * (off**2).sum(axis=0).reshape(asked.shape) / COARSENED_TOOLS
         found.append(np.where(inside, log, log.min() - 50.0))
-    return logsumexp(found, axis=(0, 1))
+    return np.asarray(logsumexp(found, axis=(0, 1)))
 
 
 def _dents(

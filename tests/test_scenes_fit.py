@@ -1,0 +1,108 @@
+"""`sulcus fit` as a user calls it, its file where an ensemble is drawn, and what its bench says of known tissue."""
+
+import json
+
+import numpy as np
+import pytest
+from locators import dent, in_a_skull, locator_of
+
+from scenes.bench.fit_study import row
+from scenes.bench.fit_twins import loads_of, patient, places
+from scenes.cli import main
+from scenes.commands.fit import fitted_beside, sentences
+from sim.bodies.meshfile import write_anatomy
+from sim.errors import InputError
+from sim.loads import Pushed
+from surrogate.fitting import fit
+from surrogate.fitting.responses import LINEAR, Responses
+from surrogate.fitting.tissue import FittedTissue
+from surrogate.fitting.tissue_files import load_tissue, save_tissue
+from surrogate.locating.locator import telling_nodes
+from surrogate.locating.locator_files import save_locator
+
+
+@pytest.fixture(scope="module")
+def body():
+    return in_a_skull()
+
+
+@pytest.fixture(scope="module")
+def folder(body, tmp_path_factory):
+    """An anatomy with its locator, and two frames."""
+    folder = tmp_path_factory.mktemp("fit")
+    write_anatomy(folder / "box.vtu", body)
+    save_locator(folder / "box.locator.npz", locator_of(body))
+    nodes = body.mesh.nodes[np.unique(body.open_surface)]
+    for number in (1, 2):
+        motion = dent(body, np.random.default_rng(number))[np.unique(body.open_surface)]
+        rows = [",".join(f"{value:.5f}" for value in each) for each in 1e3 * np.hstack([nodes, motion])]
+        (folder / f"{number}.csv").write_text("\n".join(["x,y,z,dx,dy,dz", *rows]))
+    return folder
+
+
+def by_formula(body, loads, *_):
+    """Responses that take no time: dents, other ones in each tissue."""
+    random, nodes = np.random.default_rng(0), telling_nodes(body)
+    count = len(loads.causes[0].point)
+    motion = {
+        name: np.array([[[dent(body, random)[nodes] for _ in range(count)] for _ in range(4)] for _ in range(3)])
+        for name in LINEAR
+    }
+    return Responses(nodes, motion)
+
+
+def test_the_command_writes_what_it_says(body, folder, monkeypatch, capsys):
+    monkeypatch.setattr(fit, "responses", by_formula)
+    words = ["fit", str(folder / "box.vtu"), str(folder / "1.csv"), str(folder / "2.csv")]
+    assert main([*words, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    tissue = load_tissue(folder / "box.tissue.json", body.digest)
+    assert said["frames"] == tissue.frames == 2 and said["ratio"]["median"] == pytest.approx(tissue.ratio[1])
+    assert sum(said["skull"].values()) == pytest.approx(1.0) and said["young_pa"] is None
+    assert "Young's modulus" in said["not_known"]
+    assert main(words) == 0  # its own file is replaced
+    assert "times as stiff as the brain" in capsys.readouterr().out
+
+
+def test_bad_input_is_one_sentence(folder, capsys):
+    body, first = str(folder / "box.vtu"), str(folder / "1.csv")
+    (folder / "tools.csv").write_text("frame,x,y,z\n2,1,2,3\n")
+    assert main(["fit", body, first, first]) == 2
+    assert "frames 1 and 2 are the same" in capsys.readouterr().err
+    assert main(["fit", body, first, "--tool", str(folder / "tools.csv")]) == 2
+    assert "is of frame 2, but there are 1" in capsys.readouterr().err
+
+
+def test_fitted_tissue_lies_beside_its_anatomy(tmp_path):
+    share = np.full((3, 13, 33), 1.0 / (3 * 13 * 33))
+    save_tissue(tmp_path / "a.tissue.json", FittedTissue("digest", 5, share, np.zeros(0)))
+    found = fitted_beside(None, tmp_path / "a.vtu", "digest")
+    assert found is not None and found.frames == 5
+    assert set(found.not_known) == {"the tumour's stiffness", "the skull", "Poisson's ratio", "Young's modulus"}
+    assert sum("about as unknown as before" in line for line in sentences(found, tmp_path)) == 4
+    assert fitted_beside(None, tmp_path / "b.vtu", "digest") is None
+    with pytest.raises(InputError, match="no such file"):
+        fitted_beside(tmp_path / "c.json", tmp_path / "a.vtu", "digest")
+
+
+def test_a_row_counts_what_was_right(body):
+    tools = places(body)
+    one = patient(tools, 0, 0, 2, 3)
+    assert one == patient(tools, 0, 0, 2, 3) != patient(tools, 0, 1, 2, 3)
+    loads = loads_of(body, tools, one)
+    pushed = loads.of(Pushed)
+    assert pushed is not None and (np.linalg.norm(pushed.force, axis=1) > 0.0).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
+    sure = np.zeros((3, 13, 33))
+    held = one.skull == "bonded"
+    sure[0 if held else 1, 0 if one.poisson < 0.4725 else 12, :] = 1.0 / 33.0
+    right = row(1, [(one, FittedTissue("", 5, sure, np.array([1.0, 2.0])))])
+    assert right.sliding == right.poisson == right.held == 100.0 and right.young_within == 0.0 and right.forces == 1
+    other = sure[[1, 0, 2]][:, ::-1]
+    wrong = row(1, [(one, FittedTissue("", 5, other, np.zeros(0)))])
+    assert wrong.poisson == wrong.sliding == 0.0 and wrong.young is None
