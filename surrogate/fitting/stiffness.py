@@ -22,7 +22,7 @@ from ..locating.observation import placed
 from .frame import FORCE_SIGMA, Frame, Tool, foot
 from .responses import FORCE, POISSONS, RATIOS, Responses, force_loads
 from .tissue import FittedTissue
-from .weighing import COARSENED_TOOLS, errors, seen_of
+from .weighing import errors, seen_of
 
 EXPONENTS = (9.5, 19.0)
 """-m of Ogden's law, as probable each: tissue stiffens as it is dented, so that a dent alone tells no modulus."""
@@ -88,7 +88,7 @@ def _weighed(
         inside = (asked >= np.log(sizes[0])) & (asked <= np.log(sizes[-1]))
         shape = CubicSpline(np.log(sizes), rows)(np.clip(asked, *np.log(sizes[[0, -1]])))
         off = _white(lower, (evidence.value - shape).reshape(-1, len(value)).T)
-        log = -0.5 * (off**2).sum(axis=0).reshape(asked.shape) / COARSENED_TOOLS
+        log = -0.5 * (off**2).sum(axis=0).reshape(asked.shape)
         found.append(np.where(inside, log, log.min() - 50.0))
     return np.asarray(logsumexp(found, axis=(0, 1)))
 
