@@ -139,7 +139,7 @@ def test_all_names_of_what_comes_with_sulcus_are_reserved():
     [
         ("svr", "tool", "a learner is called 'svr' already"),
         ("series-gp", "tool", "a learner is called 'series-gp' already"),
-        ("mine", "smell", "no encoder is called 'smell': choose one of nodal, tool"),
+        ("mine", "smell", "no encoder is called 'smell': choose one of nodal, rooted, tool"),
     ],
 )
 def test_names_that_cannot_be_are_sentences(name, encoder, words, clean):

@@ -18,7 +18,7 @@ from surrogate.fitting.tissue import CLASSES, FittedTissue
 from surrogate.locating.locator import Locator
 
 from .fit_twins import Patient, Seen, places
-from .locate_study import Sight, observed
+from .locate_study import PointsSeen, observed
 from .locate_twins import ogden
 
 NEAR, NEAR_YOUNG = 1.5, 1.2
@@ -80,7 +80,7 @@ def library_of(locator: Locator, device: str, folder: Path | None, progress: Cal
 
 
 def fitted(
-    locator: Locator, library: Library, seen: Seen, sight: Sight, seed: int, read: bool, device: str
+    locator: Locator, library: Library, seen: Seen, sight: PointsSeen, seed: int, read: bool, device: str
 ) -> FittedTissue:
     """What is said of one patient; the first tool's force is `read`, or none."""
     patient, frames = seen.patient, []

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..bench.fit_study import fitted, library_of, row
     from ..bench.fit_twins import patients
-    from ..bench.locate_study import Sight
+    from ..bench.locate_study import PointsSeen
     from ..script.shipped_files import template_path
 
     for name, least in (("twins", 1), ("presses", 1), ("drained", 0), ("forces", 0), ("points", 6), ("cover", 1)):
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
     made = []
     for noise in args.noise:
-        sight, said = Sight(args.points, args.cover, noise), []
+        sight, said = PointsSeen(args.points, args.cover, noise), []
         with bar("fits") as heard:
             for number, seen in enumerate(found):
                 tissue = fitted(locator, library, seen, sight, args.seed, number < args.forces, args.device)

@@ -23,6 +23,7 @@ RESERVED = frozenset(
         "contact-gp",
         "gp",
         "linear",
+        "pairs",
         "pcr",
         "remainder",
         "residual",
