@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import singledispatch
 
 import numpy as np
@@ -31,3 +32,16 @@ def product_of(rows: np.ndarray, table: np.ndarray) -> np.ndarray:
 def columns_in_use(rows: np.ndarray) -> np.ndarray:
     """The columns of rows (B, n) that are not all zero, ascending."""
     return np.flatnonzero(rows.any(axis=0))
+
+
+def in_chunks(predicted: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, most: int = 64) -> np.ndarray:
+    """What is predicted of rows (B, f), at most so many at a time: bounds the memory that it takes."""
+    if len(rows) <= most:
+        return predicted(rows)
+    return np.concatenate([predicted(rows[first : first + most]) for first in range(0, len(rows), most)])
+
+
+def halved(table: np.ndarray, axes: int | tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """A table in half precision: units, its largest numbers along some axes, and shares of them (float16)."""
+    unit = np.abs(table).max(axis=axes, initial=0.0) + np.finfo(np.float32).tiny
+    return unit, (table / unit).astype(np.float16)

@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from sim.loads import Pushed
-from sim.runtime.threads import one_thread
-from surrogate.fitting.fit import probability_of, weighed
+from surrogate.fitting.fit import fitted
 from surrogate.fitting.frame import Frame, Tool
 from surrogate.fitting.responses import Responses, drained_loads, force_loads, responses
-from surrogate.fitting.stiffness import young_moduli
 from surrogate.fitting.tissue import CLASSES, FittedTissue
 from surrogate.locating.locator import Locator
 
@@ -79,7 +77,7 @@ def library_of(locator: Locator, device: str, folder: Path | None, progress: Cal
     return Library(tools, drained, pressed)
 
 
-def fitted(
+def fitted_to(
     locator: Locator, library: Library, seen: Seen, sight: PointsSeen, seed: int, read: bool, device: str
 ) -> FittedTissue:
     """What is said of one patient; the first tool's force is `read`, or none."""
@@ -88,10 +86,7 @@ def fitted(
         observation = observed(locator.anatomy, motion, sight, (seed, patient.number, number))
         frames.append(Frame(observation, _tools(library.tools, patient, number, read and not number)))
     pressed = library.pressed_on(patient.places) if patient.places else None
-    with one_thread():  # products are small
-        probability = probability_of(weighed(locator, frames, library.drained, pressed))
-    tissue = FittedTissue(locator.anatomy.digest, len(frames), probability, np.zeros(0))
-    return replace(tissue, young=young_moduli(locator.anatomy, frames, tissue, pressed, device))
+    return fitted(locator, frames, library.drained, pressed, device)
 
 
 def _tools(tools: Pushed, patient: Patient, number: int, read: bool) -> tuple[Tool, ...]:

@@ -17,10 +17,8 @@ from sim.fem import Fem
 from sim.geometry.locate import locate
 from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Posture, Pushed
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.outside_files import read_as
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.npz_archive import Archive
+from surrogate.model.npz_archive import kept_arrays
 
 from .locate_twins import LEFT, PROBABLE, RATIO, SKULLS, STIFFNESS, TILT, check_same, ogden
 
@@ -156,13 +154,10 @@ def _kept(finer: Anatomy, loads: Loads, patient: Patient, device: str, folder: P
     """Motions (frames, V, 3) [m] of a patient's own mesh, from the folder if they are there; (0, V, 3): none."""
     stated = digest_of(np.frombuffer(repr((finer.digest, patient)).encode(), np.uint8))
     path = None if folder is None else folder / f"patient-{patient.number:04d}-{stated}.npz"
-    if path is not None and path.exists():
-        with read_as(path, "a patient's motions", "Delete it: it is made anew."), path.open("rb") as raw:
-            return Archive(raw).arrays(["motion"])["motion"]
-    answer = Fem(finer, effects_of(patient), ACCURACY, device).deform(loads)
-    good = all(outcome.good for outcome in answer.outcome)
-    motion = (answer.displacement if good else answer.displacement[:0]).astype(np.float32)
-    if path is not None:
-        with written_whole(path, ".npz") as unfinished:
-            np.savez(unfinished, motion=motion)
-    return motion
+
+    def solved() -> dict[str, np.ndarray]:
+        answer = Fem(finer, effects_of(patient), ACCURACY, device).deform(loads)
+        good = all(outcome.good for outcome in answer.outcome)
+        return {"motion": (answer.displacement if good else answer.displacement[:0]).astype(np.float32)}
+
+    return kept_arrays(path, "a patient's motions", ["motion"], solved)["motion"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,10 +20,8 @@ from sim.geometry.locate import locate
 from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Posture, Pushed
 from sim.material import MATERIALS, Ogden
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.outside_files import read_as
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.npz_archive import Archive
+from surrogate.model.npz_archive import kept_arrays
 
 CAUSES = ("tool", "drainage", "swelling", "drainage and tool")
 """What moves twins, one after the other: each takes part in a quarter of them, or in half."""
@@ -192,14 +190,15 @@ def _kept(anatomy: Anatomy, draw: Draw, device: str, element: str, folder: Path 
     """The motion of a twin's own mesh, from the folder if it is there, of the same draw."""
     stated = digest_of(np.frombuffer(repr((anatomy.digest, draw, element)).encode(), np.uint8))
     path = None if folder is None else folder / f"twin-{draw.number:04d}-{stated}.npz"
-    if path is not None and path.exists():
-        with read_as(path, "a twin", "Delete it: it is made anew."), path.open("rb") as raw:
-            motion = Archive(raw).arrays(["motion"])["motion"]
-            if motion.shape not in (anatomy.mesh.nodes.shape, (0, 3)):
-                raise InputError(f"holds motions of {len(motion)} vertices: delete it, and it is made anew.")
-            return motion if len(motion) else None
-    motion = solved(anatomy, draw, device, element)
-    if path is not None:
-        with written_whole(path, ".npz") as unfinished:
-            np.savez(unfinished, motion=np.zeros((0, 3)) if motion is None else motion)
-    return motion
+
+    def made() -> dict[str, np.ndarray]:
+        found = solved(anatomy, draw, device, element)
+        return {"motion": np.zeros((0, 3)) if found is None else found}
+
+    def check(arrays: Mapping[str, np.ndarray]) -> None:
+        count, *rest = arrays["motion"].shape
+        if (count, *rest) not in (anatomy.mesh.nodes.shape, (0, 3)):
+            raise InputError(f"holds motions of {count} vertices: delete it, and it is made anew.")
+
+    motion = kept_arrays(path, "a twin", ["motion"], made, check)["motion"]
+    return motion if len(motion) else None

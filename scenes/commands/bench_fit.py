@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure; 1 if of some patient no equilibrium was found."""
     from sim.bodies.meshfile import read_anatomy
 
-    from ..bench.fit_study import fitted, library_of, row
+    from ..bench.fit_study import fitted_to, library_of, row
     from ..bench.fit_twins import patients
     from ..bench.locate_study import PointsSeen
     from ..script.shipped_files import template_path
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         sight, said = PointsSeen(args.points, args.cover, noise), []
         with bar("fits") as heard:
             for number, seen in enumerate(found):
-                tissue = fitted(locator, library, seen, sight, args.seed, number < args.forces, args.device)
+                tissue = fitted_to(locator, library, seen, sight, args.seed, number < args.forces, args.device)
                 said.append((seen.patient, tissue))
                 heard(number + 1, len(found))
         made.append(row(noise, said))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,11 +54,22 @@ def fit_tissue(
             folder,
             lambda done, total: progress("tools", done, total),
         )
+    return fitted(locator, frames, drained, pressed, device, lambda done, total: progress("forces", done, total))
+
+
+def fitted(
+    locator: Locator,
+    frames: Sequence[Frame],
+    drained: Responses | None,
+    pressed: Responses | None,
+    device: str = "auto",
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> FittedTissue:
+    """What frames say of the tissue, as `fit_tissue`, of what is solved; `progress` hears of forces that were read."""
     with one_thread():  # products are small
         probability = probability_of(weighed(locator, frames, drained, pressed))
-    tissue = FittedTissue(anatomy.digest, len(frames), probability, np.zeros(0))
-    young = young_moduli(anatomy, frames, tissue, pressed, device, lambda done, total: progress("forces", done, total))
-    return FittedTissue(anatomy.digest, len(frames), probability, young)
+    tissue = FittedTissue(locator.anatomy.digest, len(frames), probability, np.zeros(0))
+    return replace(tissue, young=young_moduli(locator.anatomy, frames, tissue, pressed, device, progress))
 
 
 def weighed(

@@ -18,12 +18,10 @@ from sim.fem import Fem
 from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Posture, Pushed
 from sim.material import Material
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.outside_files import read_as
 
 from ..locating.causes import SPREAD, SUPINE, USUAL, YOUNG, directions
 from ..locating.locator import telling_nodes
-from ..model.npz_archive import Archive
+from ..model.npz_archive import kept_arrays
 
 RATIOS = np.geomspace(0.4, 3.2, 4)
 """Stiffness of the tumour over the brain's, in the tissues that are solved."""
@@ -107,14 +105,12 @@ def _kept(
     numbers = [array.tobytes() for cause in loads.causes for array in vars(cause).values()]
     stated = digest_of(np.frombuffer(b"".join([repr((anatomy.digest, tissue, ACCURACY)).encode(), *numbers]), np.uint8))
     path = None if folder is None else folder / f"{stated}.npz"
-    if path is not None and path.exists():
-        with read_as(path, "motions of one tissue", "Delete it: it is made anew."), path.open("rb") as raw:
-            return Archive(raw).arrays(["motion"])["motion"]
     skull, poisson, ratio = tissue
     brain, tumour = (Material("linear", YOUNG * times, poisson) for times in (1.0, ratio))
     effects = (Elasticity(brain, {TUMOUR_LABEL: tumour}), Held(), SKULLS[skull], ToolForce(), Gravity())
-    motion = Fem(anatomy, effects, ACCURACY, device).deform(loads).displacement[:, nodes].astype(np.float32)
-    if path is not None:
-        with written_whole(path, ".npz") as unfinished:
-            np.savez(unfinished, motion=motion)
-    return motion
+
+    def solved() -> dict[str, np.ndarray]:
+        answer = Fem(anatomy, effects, ACCURACY, device).deform(loads)
+        return {"motion": answer.displacement[:, nodes].astype(np.float32)}
+
+    return kept_arrays(path, "motions of one tissue", ["motion"], solved)["motion"]

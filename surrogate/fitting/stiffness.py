@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.linalg import solve_triangular
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import logsumexp
 
@@ -22,7 +21,7 @@ from ..locating.observation import placed
 from .frame import FORCE_SIGMA, Frame, Tool, foot
 from .responses import FORCE, POISSONS, RATIOS, Responses, force_loads
 from .tissue import FittedTissue
-from .weighing import errors, seen_of
+from .weighing import errors, seen_of, white
 
 EXPONENTS = (9.5, 19.0)
 """-m of Ogden's law, as probable each: tissue stiffens as it is dented, so that a dent alone tells no modulus."""
@@ -75,8 +74,8 @@ def _weighed(
     skull, (_, poisson, _), (_, ratio, _) = "slide" if name == LETS_GO else name, tissue.poisson, tissue.ratio
     nearest = int(np.abs(POISSONS - poisson).argmin()), int(np.abs(np.log(RATIOS / ratio)).argmin())
     lower, _ = errors(evidence)
-    value = _white(lower, evidence.value)
-    way = np.linalg.lstsq(_white(lower, seen_of(pressed, skull, evidence)[nearest][own].T), value, rcond=None)[0]
+    value = white(lower, evidence.value)
+    way = np.linalg.lstsq(white(lower, seen_of(pressed, skull, evidence)[nearest][own].T), value, rcond=None)[0]
     force, direction = FORCE * float(np.linalg.norm(way)), way / np.linalg.norm(way)
     reading = float(tool.force or 0.0)
     sigma = FORCE_SIGMA * reading if tool.sigma is None else tool.sigma
@@ -87,7 +86,7 @@ def _weighed(
         sizes, rows = _dents(anatomy, tool, group, evidence, pressed, force * np.array(TIMES), direction, device)
         inside = (asked >= np.log(sizes[0])) & (asked <= np.log(sizes[-1]))
         shape = CubicSpline(np.log(sizes), rows)(np.clip(asked, *np.log(sizes[[0, -1]])))
-        off = _white(lower, (evidence.value - shape).reshape(-1, len(value)).T)
+        off = white(lower, (evidence.value - shape).reshape(-1, len(value)).T)
         log = -0.5 * (off**2).sum(axis=0).reshape(asked.shape)
         found.append(np.where(inside, log, log.min() - 50.0))
     return np.asarray(logsumexp(found, axis=(0, 1)))
@@ -105,7 +104,3 @@ def _dents(
         raise InputError(f"a force of {tool.force:g} N cannot be what dents this brain so: check its unit and frame.")
     motion = Responses(pressed.nodes, {group.skull: answer.displacement[good][None, None][..., pressed.nodes, :]})
     return sizes[good], seen_of(motion, group.skull, evidence)[0, 0]
-
-
-def _white(lower: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    return solve_triangular(lower, rows, lower=True, check_finite=False)

@@ -82,12 +82,15 @@ def errors(evidence: Evidence) -> tuple[np.ndarray, float]:
     return cholesky(noise + rigid @ rigid.T, lower=True), max(seen, 1e-6)
 
 
+def white(lower: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Columns (m,) or (m, k) in units of errors whose covariance has the Cholesky factor `lower` (m, m)."""
+    return solve_triangular(lower, columns, lower=True, check_finite=False)
+
+
 def _weighed(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
     """Logarithms (poissons, ratios) of evidence for motions (poissons, ratios, loads, m) of size 1 together."""
-    value = solve_triangular(lower, evidence.value, lower=True, check_finite=False)
-    flat = solve_triangular(lower, rows.reshape(-1, rows.shape[-1]).T, lower=True, check_finite=False)
-    white = seen * flat.T.reshape(rows.shape)
-    gram, pull = white @ white.transpose(0, 1, 3, 2), white @ value
+    motion = seen * white(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
+    gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ white(lower, evidence.value)
     logs = []
     for times in SIZES:
         root = np.linalg.cholesky(np.eye(gram.shape[-1]) + times**2 * gram)

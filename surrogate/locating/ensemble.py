@@ -15,10 +15,8 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.tetmesh import digest_of
-from sim.runtime.atomic_files import written_whole
-from sim.runtime.outside_files import read_as
 
-from ..model.npz_archive import Archive
+from ..model.npz_archive import kept_arrays
 from .causes import (
     DRAINAGE,
     SWELLING,
@@ -100,15 +98,14 @@ def _kept(
     """The motions and kinds of a group, from the folder if they are there, of the same draw."""
     stated = digest_of(np.frombuffer(repr((anatomy.digest, group, seed, causes, ACCURACY)).encode(), np.uint8))
     path = None if folder is None else folder / f"{group.number:03d}-{stated}.npz"
-    if path is not None and path.exists():
-        with read_as(path, "a group of an ensemble", "Delete it: it is made anew."), path.open("rb") as raw:
-            arrays = Archive(raw).arrays(["motion", "kind"])
-            return arrays["motion"], arrays["kind"]
-    motion, kind = members(anatomy, group, seed, device, causes)
-    if path is not None:
-        with written_whole(path, ".npz") as unfinished:
-            np.savez(unfinished, motion=motion, kind=kind)
-    return motion, kind
+    names = "motion", "kind"
+    arrays = kept_arrays(
+        path,
+        "a group of an ensemble",
+        names,
+        lambda: dict(zip(names, members(anatomy, group, seed, device, causes), strict=True)),
+    )
+    return arrays["motion"], arrays["kind"]
 
 
 def members(

@@ -4,17 +4,48 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import BinaryIO, cast
 
 import numpy as np
 from numpy.lib import format as npy
 
 from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
 from sim.runtime.file_limits import LARGEST_HEADER, LARGEST_MODEL
+from sim.runtime.outside_files import read_as
 
 # Of an array's own header.
 LONGEST = 10_000
+
+
+def kept_arrays(
+    path: Path | None,
+    kind: str,
+    names: Iterable[str],
+    make: Callable[[], Mapping[str, np.ndarray]],
+    check: Callable[[Mapping[str, np.ndarray]], object] = lambda arrays: None,
+) -> Mapping[str, np.ndarray]:
+    """Arrays of some names from a file, if it is there; else they are made, and kept there. No path: only made.
+
+    `kind` is what the file holds, with its article; `check` refuses arrays that were read.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, or that the check refuses.
+    """
+    if path is not None and path.exists():
+        with read_as(path, kind, "Delete it: it is made anew."), path.open("rb") as raw:
+            found = Archive(raw).arrays(names)
+            check(found)
+            return found
+    made = make()
+    if path is not None:
+        with written_whole(path, ".npz") as unfinished:
+            np.savez(unfinished, **made)  # pyright: ignore[reportArgumentType]
+    return made
 
 
 class Archive:

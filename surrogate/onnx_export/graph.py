@@ -10,7 +10,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from sim.errors import InputError
 
-from ..array_functions import columns_in_use, product_of, squared_distances, taken
+from ..array_functions import columns_in_use, halved, product_of, squared_distances, taken
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -320,6 +320,5 @@ def _halved(table: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Shares (n, r) float16 and units (r,) of a table that is their product exactly; None if it is not."""
     if table.dtype != np.float32 or table.ndim != 2:
         return None
-    unit = np.maximum(np.abs(table).max(axis=0, initial=0.0), np.finfo(np.float32).tiny)
-    share = (table / unit).astype(np.float16)
+    unit, share = halved(table, 0)
     return (share, unit) if np.array_equal(share.astype(np.float32) * unit, table) else None

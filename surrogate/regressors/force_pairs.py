@@ -9,10 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from ..array_functions import columns_in_use, product_of
-
-# Loads that are answered together: bounds the memory that their products take.
-CHUNK = 64
+from ..array_functions import columns_in_use, halved, in_chunks, product_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +29,7 @@ class Pairs:
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of `rooted_shares` (B, 3 m)."""
-        if len(X) <= CHUNK:
-            return self._predicted(X)
-        return np.concatenate([self._predicted(X[first : first + CHUNK]) for first in range(0, len(X), CHUNK)])
+        return in_chunks(self._predicted, X)
 
     def _predicted(self, X: np.ndarray) -> np.ndarray:
         used = columns_in_use(X)
@@ -52,8 +47,8 @@ class Pairs:
 
     def state(self) -> dict[str, np.ndarray]:
         """Pairs, and the table in half precision, in units of its largest number for each mode."""
-        unit = np.abs(self.table).max(axis=0, initial=0.0) + np.finfo(np.float32).tiny
-        return {"pairs": self.pairs.astype(np.int32), "unit": unit, "share": (self.table / unit).astype(np.float16)}
+        unit, share = halved(self.table, 0)
+        return {"pairs": self.pairs.astype(np.int32), "unit": unit, "share": share}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:

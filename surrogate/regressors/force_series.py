@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from ..array_functions import taken
+from ..array_functions import halved, in_chunks, taken
 
 ORDERS = 3
 # Which components of the direction are multiplied, order by order: 3, 6 and 10 products.
@@ -20,7 +20,6 @@ SPANS = (slice(0, 3), slice(3, 9), slice(9, 19))
 TERMS = SPANS[-1].stop
 # So many radii carry a parabola.
 STENCIL = 3
-CHUNK = 64
 # What a share of -1 counts for, as a height [m].
 BESIDE = 1e-2
 
@@ -62,9 +61,7 @@ class Series:
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of `tool_features` (B, 8)."""
-        if len(X) <= CHUNK:
-            return self._predicted(X)
-        return np.concatenate([self._predicted(X[first : first + CHUNK]) for first in range(0, len(X), CHUNK)])
+        return in_chunks(self._predicted, X)
 
     def _predicted(self, X: np.ndarray) -> np.ndarray:
         place, share = self._located(X[:, :3])
@@ -78,9 +75,9 @@ class Series:
 
     def state(self) -> dict[str, np.ndarray]:
         """Places, radii, and the table in half precision, in units of its largest number for each term and mode."""
-        unit = np.abs(self.table).max(axis=(0, 1)) + np.finfo(np.float32).tiny
+        unit, share = halved(self.table, (0, 1))
         known = {name: getattr(self, name) for name in ("corners", "triangles", "radii")}
-        return {**known, "unit": unit, "share": (self.table / unit).astype(np.float16)}
+        return {**known, "unit": unit, "share": share}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:

@@ -150,18 +150,26 @@ class Expansion:
         """
         triangles = with_middles(self.patch)[0]
         inside = self.patch.rim_distance(self.places)[:, None] > self.radii
-        found, known = [], self.tabulated
-        for table, parts, wide, basis in zip(known.tables, self.exact, known.bases, bases, strict=True):
-            added = table.copy()
+        found = []
+        for added, parts, wide, basis in zip(self._beyond, self.exact, self.tabulated.bases, bases, strict=True):
             # Footprints over the rim press on nodes beyond the open cortex. Of others nothing is left.
-            for part, order, forms_of in zip(parts, SPANS, (_linear_form, _square_form), strict=False):
-                met = forms_of(part, self._unit_shares) @ (part.basis.modes @ wide.modes.T)
-                added[:, :, order] -= met.reshape(added[:, :, order].shape)
             every = filled(self.places, added @ (wide.modes @ basis.modes.T), left_out)
             for order in SPANS[: len(parts)]:
                 every[inside, order] = 0.0
             exact = Series(self.patch.points, triangles, self.radii, every)
             found.append(Series.restored(exact.state()))  # what is used is what can be stored
+        return found
+
+    @cached_property
+    def _beyond(self) -> list[np.ndarray]:
+        """The tables (P, R, 19, r) less what is exact."""
+        known, found = self.tabulated, []
+        for table, parts, wide in zip(known.tables, self.exact, known.bases, strict=True):
+            added = table.copy()
+            for part, order, form_of in zip(parts, SPANS, (_linear_form, _square_form), strict=False):
+                met = form_of(part, self._unit_shares) @ (part.basis.modes @ wide.modes.T)
+                added[:, :, order] -= met.reshape(added[:, :, order].shape)
+            found.append(added)
         return found
 
     @cached_property
