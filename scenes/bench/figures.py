@@ -155,8 +155,7 @@ FIGURES = (
     ),
     *(_poses(element, count) for element in ("p1", "smoothed") for count in (64, 1024)),
     *(_growth("cpu", size, "1", "8") for size in (2000, 5300, 17_000, 50_000, 100_000, 200_000)),
-    *(_growth("cuda", size, "1", "64") for size in (2000, 5300, 17_000)),
-    _growth("cuda", 50_000, "1"),
+    *(_growth("cuda", size, "1", "64") for size in (2000, 5300, 17_000, 50_000, 100_000, 200_000)),
     *(
         _solver(
             f"solver-{threads}-cpu",
