@@ -110,7 +110,7 @@ class TestLearnt:
         assert "here is none" in (refusal(model, EFFECTS) or "") and theatre.names(
             replace(short(), effects=EFFECTS)
         ) == ("fem",)
-        assert theatre.names(short()) == ("linear", "svr", "fem") and theatre.names(sinking()) == ("fem",)
+        assert theatre.names(short()) == ("linear", "svr", "guarded", "fem") and theatre.names(sinking()) == ("fem",)
         assert theatre.best(sinking()) == "fem"
 
     def test_it_refuses_causes_that_it_does_not_know(self, theatre):

@@ -108,7 +108,7 @@ def test_models_are_judged_with_what_they_were_trained_on(box, body, tmp_path) -
     assert physics(theatre, small()) == ("smoothed", BRAIN)
     assert theatre.names(small()) == ("fem",)
     scene = small().made_of(STIFF, "smoothed")
-    assert physics(theatre, scene) == ("smoothed", STIFF) and theatre.names(scene) == (*trained, "fem")
+    assert physics(theatre, scene) == ("smoothed", STIFF) and theatre.names(scene) == (*trained, "guarded", "fem")
     loads = [scene.loads(site_of(box), scene.path(1.0), 1.0)]
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Elasticity))
     right = Fem(box, (Elasticity(STIFF), *others), TRAIN, "cpu", element="smoothed").deform(loads[0])

@@ -246,7 +246,12 @@ def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch
 def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
 
     again = open_theatre(put(theatre, tmp_path / "box.vtu"), device="cpu")
-    assert again.anatomy.digest == theatre.anatomy.digest and again.names(short()) == ("linear", "svr", "fem")
+    assert again.anatomy.digest == theatre.anatomy.digest and again.names(short()) == (
+        "linear",
+        "svr",
+        "guarded",
+        "fem",
+    )
     assert again.intensity is not None and theatre.intensity is not None
     assert np.array_equal(again.intensity.values, theatre.intensity.values)
     assert again.best(short()) == min(theatre.models, key=lambda name: theatre.models[name].bound)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sim.deformation import Deformer
 from surrogate.evaluation.choose import Offer
+from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
 
 from ..play.deformers import Theatre
@@ -24,7 +26,7 @@ def offers(theatre: Theatre, scene: Scene) -> list[Offer]:
     for name in theatre.names(scene):
         deformer = theatre.deformer(name, scene)
         learnt, seconds, last = isinstance(deformer, Learned), [], None
-        error_mm = 1e3 * deformer.bound if isinstance(deformer, Learned) else 1e3 * PROMISED
+        error_mm = 1e3 * _stated(deformer)
         if np.isnan(error_mm):
             continue
         for load in loads:
@@ -32,3 +34,10 @@ def offers(theatre: Theatre, scene: Scene) -> list[Offer]:
             seconds.append(spent)
         made.append(Offer(name, error_mm, 1e3 * float(np.median(seconds[1:]))))
     return made
+
+
+def _stated(deformer: Deformer) -> float:
+    """The error that a deformer states of itself [m]."""
+    if isinstance(deformer, Guarded):
+        return float(np.fmin(deformer.model.bound, deformer.limit))
+    return deformer.bound if isinstance(deformer, Learned) else PROMISED

@@ -33,8 +33,8 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     parser.add_argument(
         "--deformer",
-        help="who answers: a trained model (linear, ann, svr, ...), or fem. auto: chosen by --within-mm or "
-        "--within-ms. Default: the model of least error",
+        help="who answers: a trained model (linear, ann, svr, ...), fem, or guarded: the best of them, and finite "
+        "elements where it is unsure. auto: chosen by --within-mm or --within-ms. Default: the model of least error",
     )
     budget = parser.add_argument_group("a budget, in place of --deformer; errors are those that models state")
     budget.add_argument(

@@ -15,7 +15,7 @@ from ar.raycast import raycast
 from ar.refind import of_ink, outline_gap, stands
 from sim.deformation import Deformation
 from surrogate.locating.prior import middle_of
-from surrogate.model.learned import Learned
+from surrogate.model.guarded import answering
 
 from ..script.scene import Bounds
 from .player import TRUE_STROKES, Frame, Player
@@ -245,6 +245,7 @@ def _distance(player: Player, frame: Frame, tip: np.ndarray) -> float:
     positions = player.believed(frame)
     corners = positions[player.stage.at(frame.loads).anatomy.tumour_surface]
     apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", SAMPLES, corners) - tip, axis=2).min())
-    if not isinstance(player.deformer, Learned):
+    model = answering(player.deformer, frame.deformation)
+    if model is None:
         return apart
-    return float(player.deformer.distance(frame.loads, frame.deformation, np.array([apart])).value[0])
+    return float(model.distance(frame.loads, frame.deformation, np.array([apart])).value[0])

@@ -23,6 +23,7 @@ from sim.runtime.device import find_device
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_files import load_locator, locator_path
 from surrogate.model.applicability import refusal
+from surrogate.model.guarded import LIMIT, Guarded
 from surrogate.model.learned import Learned
 from surrogate.model.store import load
 
@@ -34,6 +35,8 @@ from .observer import Observer
 from .player import Player
 from .stage import Stage
 
+GUARDED = "guarded"
+"""The name of the best model with finite elements behind it."""
 TRUTH = "what an estimate is held against is the truth, as finite elements have it"
 
 
@@ -106,8 +109,9 @@ class Theatre:
         return {name: self.models[name] for name, why in self.refusals(scene).items() if why is None}
 
     def names(self, scene: Scene) -> tuple[str, ...]:
-        """Every deformer that can be asked for a scene: the learnt ones that know it, then the finite elements."""
-        return (*self.knowing(scene), "fem")
+        """Every deformer that can be asked for a scene: learnt ones that know it, the best guarded, finite elements."""
+        knowing = tuple(self.knowing(scene))
+        return (*knowing, *([GUARDED] if knowing else []), "fem")
 
     def best(self, scene: Scene) -> str:
         """The learnt model of the tightest error bound; the finite elements where none knows the scene."""
@@ -116,9 +120,10 @@ class Theatre:
 
     def described(self, name: str, scene: Scene) -> str:
         """A deformer by name, in words: what solves, or what it learned from."""
-        if name != "fem":
-            return self.models[name].source
-        return solver_named(self.element_of(scene), scene.effects)
+        solver = solver_named(self.element_of(scene), scene.effects)
+        if name == GUARDED:
+            return f"{self.models[self.best(scene)].source}; where that may be over {1e3 * LIMIT:g} mm off, {solver}"
+        return solver if name == "fem" else self.models[name].source
 
     def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
         """Finite elements for a scene's effects, tissue and element; `live` as `Fem` has it."""
@@ -130,7 +135,7 @@ class Theatre:
         return scene.element or recommended(self.anatomy.mesh)
 
     def deformer(self, name: str, scene: Scene) -> Deformer:
-        """A deformer by name; "fem" is made for the scene's accuracy.
+        """A deformer by name; finite elements are made for the scene's accuracy.
 
         Raises
         ------
@@ -140,6 +145,8 @@ class Theatre:
         if name == "fem":
             return self.fem(scene, scene.accuracy, live=True)
         allowed = ", ".join(self.names(scene))
+        if name == GUARDED and self.knowing(scene):
+            return Guarded(self.models[self.best(scene)], self.fem(scene, scene.accuracy, live=True))
         if name not in self.models:
             raise InputError(
                 f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the trained ones."

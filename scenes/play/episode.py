@@ -24,6 +24,7 @@ from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
 from sim.material import tissue_to_json
 from sim.runtime.atomic_files import demand_space, written_stream
+from surrogate.model.guarded import model_of
 from surrogate.model.learned import Learned
 
 from .deformers import Theatre
@@ -205,7 +206,7 @@ def write_motion(file: h5py.File, player: Player, rows: list[dict], truth: Defor
 
 def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str) -> None:
     """Units, frames and provenance as attributes."""
-    scene, camera, model = player.scene, player.camera, player.deformer
+    scene, camera, model = player.scene, player.camera, model_of(player.deformer)
     file.create_dataset("K", data=camera.K)
     for name, unit in UNITS.items():
         for place in (name, f"pictures/{name}"):
@@ -227,7 +228,7 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str) -
             "tissue": "none" if elasticity.default is None else tissue_to_json(elasticity.default),
             "tool": repr(scene.tool),
             "footprint_m": np.nan if scene.tool is None else scene.tool.radius,
-            "model_digest": digest_of_model(model) if isinstance(model, Learned) else "none",
+            "model_digest": "none" if model is None else digest_of_model(model),
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "anatomy": player.site.anatomy.digest,
             "world_frame": "RAS [m]",

@@ -17,7 +17,7 @@ from ..script.scene import Scene
 from ..script.site import Site
 from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
-from .deformers import Theatre
+from .deformers import GUARDED, Theatre
 from .error_text import length
 from .load_text import acting
 from .observer import Estimate
@@ -128,6 +128,8 @@ def tissue_words(tissue: Tissue | None) -> str:
 
 def deformer_words(name: str) -> str:
     """What a deformer is."""
+    if name == GUARDED:
+        return "best trained model, finite elements where it is unsure"
     return "finite elements" if name == "fem" else f"trained model {name}"
 
 

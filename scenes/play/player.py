@@ -19,6 +19,7 @@ from sim.effects import remember
 from sim.geometry.ball_at_rest import resting_tip
 from sim.geometry.closest_point import closest
 from sim.loads import Loads
+from surrogate.model.guarded import answering
 from surrogate.model.learned import Learned
 
 from ..script.scene import Scene
@@ -197,7 +198,8 @@ class Player:
         traces = () if estimate is None else traces_of(estimate, stage.truth(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
         band = 0.0 if estimate is not None else error.bound or 0.0
-        lines = error_lines(promised, error, isinstance(self.deformer, Learned), doubt, self.camera.width < FEW)
+        trained = answering(self.deformer, deformation) is not None
+        lines = error_lines(promised, error, trained, doubt, self.camera.width < FEW)
         head = [part for line in lines for part in folded(line, WIDE * self.camera.width)]
         over = composite(
             picture, self.camera, tumour, (TOOL,), self.style, band, plain, rest, doubt, traces, moved, head
@@ -232,10 +234,11 @@ class Player:
 
     def _promised(self, answer: Deformation) -> float | None:
         """What a model promises of an answer against its finite elements [m], of this load if it can; else None."""
-        if not isinstance(self.deformer, Learned):
+        model = answering(self.deformer, answer)
+        if model is None:
             return None
         of_load = float(answer.bound[0, 0])
-        bound = of_load if np.isfinite(of_load) else self.deformer.bound
+        bound = of_load if np.isfinite(of_load) else model.bound
         return bound if np.isfinite(bound) else None
 
     def _tumour_error(self, touch: Touch, loads: Loads, promised: float, estimate: Estimate | None) -> TumourError:

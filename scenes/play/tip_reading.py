@@ -11,7 +11,7 @@ from sim.anatomy import Anatomy
 from sim.bodies.tip_distance import tip_gauge
 from sim.deformation import Deformation, Deformer
 from sim.loads import Loads, Pushed, Touching
-from surrogate.model.learned import Learned
+from surrogate.model.guarded import answering
 
 from ..script.tool import Instrument, Probe
 
@@ -49,9 +49,10 @@ def reading(
     """
     if _ball(loads, tool) is None:
         return None
-    if not isinstance(deformer, Learned):
+    model = answering(deformer, answer)
+    if model is None:
         return Reading(apart, None)
-    found = deformer.distance(loads, answer, np.array([apart]))
+    found = model.distance(loads, answer, np.array([apart]))
     promised = float(found.bound[0, 0])
     kept = answer.outcome[0].good and promised < float("inf")
     return Reading(float(found.value[0]), promised if kept else None)

@@ -1,0 +1,92 @@
+"""A trained model that hands the loads of which it is not sure enough to the finite elements it learned from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim.anatomy import Anatomy
+from sim.deformation import Cost, Deformation, Deformer, Outcome, joined
+from sim.loads import Loads
+
+from .learned import Learned
+
+LIMIT = 0.2e-3
+"""How far off a tumour's vertex may be, in 95 of 100 loads, before the finite elements answer [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Guarded:
+    """A `Deformer`: the model where it promises enough, and finite elements where it does not.
+
+    Parameters
+    ----------
+    model
+        What answers first.
+    fem
+        Finite elements of the model's body, effects and element. They answer loads that the model calls extrapolated,
+        of which it promises nothing, or for which its bound is above the limit.
+    limit
+        Of the worst tumour vertex, at 95 % [m].
+    """
+
+    model: Learned
+    fem: Deformer
+    limit: float = LIMIT
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """The body that is deformed."""
+        return self.model.anatomy
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """Answer `loads` at mesh vertices `at` (n,): by default at those that the model knows.
+
+        Where the finite elements answer every load, and `at` is not given, the answer has every vertex. They start from
+        such a `start`, and else from rest. Where they find no equilibrium the model's answer stands, with its bound.
+
+        Raises
+        ------
+        InputError
+            Loads, or a start, that the model refuses.
+        """
+        told = self.model.deform(loads, start, at)
+        unsure = np.flatnonzero(self.unsure(told))
+        if not len(unsure):
+            return told
+        whole = start is not None and len(start.nodes) == len(self.anatomy.mesh.nodes)
+        solved = self.fem.deform(loads.rows(unsure), start.rows(unsure) if start is not None and whole else None)
+        good = np.array([outcome.good for outcome in solved.outcome])
+        if at is None and good.all() and len(unsure) == len(loads):
+            return solved
+        return _replaced(told, unsure[good], solved.rows(np.flatnonzero(good)))
+
+    def unsure(self, told: Deformation) -> np.ndarray:
+        """(B,) bool: which of the model's answers are not good enough."""
+        bound = np.where(np.isnan(told.bound[0]), self.model.bound, told.bound[0])
+        return ~(bound <= self.limit) | np.array([not outcome.good for outcome in told.outcome])
+
+
+def model_of(deformer: Deformer) -> Learned | None:
+    """The model that a deformer is, or asks first; None of finite elements."""
+    if isinstance(deformer, Guarded):
+        return deformer.model
+    return deformer if isinstance(deformer, Learned) else None
+
+
+def answering(deformer: Deformer, answer: Deformation) -> Learned | None:
+    """The model that gave the first answer of a deformer; None if finite elements did."""
+    return model_of(deformer) if answer.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
+
+
+def _replaced(told: Deformation, rows: np.ndarray, solved: Deformation) -> Deformation:
+    """Answers of which some `rows` (k,) are solved; the force of a push is what the load says, whoever answers."""
+    pick = np.arange(len(told))
+    pick[rows] = len(told) + np.arange(len(rows))
+    ours = replace(told, cost=Cost({"predict": told.cost.total, "solve": 0.0}))
+    theirs = replace(
+        solved.at(told.nodes), reaction=told.reaction[rows], cost=Cost({"predict": 0.0, "solve": solved.cost.total})
+    )
+    source = f"{told.source}; for {len(rows)} of {len(told)} loads {solved.source}" if len(rows) else told.source
+    return replace(joined([ours, theirs]).rows(pick), source=source)

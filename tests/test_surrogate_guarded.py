@@ -1,0 +1,111 @@
+"""A model with finite elements behind it: who answers which load, and what is said of the answer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from theatres import player, small, theatre_of
+
+from scenes.play.deformers import GUARDED, AtRest
+from scenes.script.tool_paths import Touch
+from sim.deformation import Outcome
+from sim.errors import InputError
+from surrogate.data.tool_loads import draw
+from surrogate.model.guarded import answering
+
+
+@pytest.fixture(scope="module")
+def theatre(box):
+    return theatre_of(box)
+
+
+@pytest.fixture(scope="module")
+def guarded(theatre):
+    return theatre.deformer(GUARDED, small())
+
+
+@pytest.fixture(scope="module")
+def loads(box):
+    return draw("palpation", box, 6, 3)
+
+
+@pytest.fixture(scope="module")
+def told(guarded, loads):
+    return guarded.model.deform(loads)
+
+
+@pytest.fixture(scope="module")
+def solved(guarded, loads):
+    return guarded.fem.deform(loads)
+
+
+def limited(guarded, limit):
+    """Whatever the bounds of loads are called, a limit alone decides."""
+    return replace(guarded, limit=limit, model=replace(guarded.model, bounds=None, bound=1e-3))
+
+
+def test_the_model_answers_what_it_is_sure_of(guarded, loads, told):
+    sure = limited(guarded, 2e-3).deform(loads)
+    inside = [row for row, outcome in enumerate(told.outcome) if outcome.good]
+    assert inside and np.array_equal(sure.displacement[inside], told.displacement[inside])
+    assert all(sure.outcome[row] is Outcome.PREDICTED for row in inside)
+
+
+def test_the_finite_elements_answer_the_rest(guarded, loads, solved):
+    answer = limited(guarded, 0.5e-3).deform(loads)
+    assert answer.displacement == pytest.approx(solved.displacement, abs=1e-9) and answer.outcome == solved.outcome
+    assert answer.source == solved.source and np.isnan(answer.bound).all()
+
+
+def test_loads_are_told_apart_one_by_one(guarded, loads, told, solved):
+    """Bounds of their own: half of the loads lie below the limit; asked at vertices, in the order asked for."""
+    bounds = np.linspace(1e-4, 6e-4, len(loads))
+    bounds[2] = np.nan
+    marked = replace(told, bound=np.stack([bounds, bounds]), outcome=(Outcome.PREDICTED,) * len(loads))
+    assert replace(guarded, limit=3.5e-4, model=replace(guarded.model, bound=1.0)).unsure(marked).tolist() == [
+        False, False, True, True, True, True,
+    ]  # fmt: skip
+    far = replace(marked, outcome=(Outcome.EXTRAPOLATED,) * len(loads))
+    assert replace(guarded, limit=1.0).unsure(far).all()
+    nodes, limit = guarded.model.nodes[5:2:-1], float(np.sort(told.bound[0])[2]) + 1e-9
+    some = replace(guarded, limit=limit)
+    handed = some.unsure(told)
+    assert 0 < handed.sum() < len(loads)
+    answer = some.deform(loads, at=nodes)
+    expected = np.where(handed[:, None, None], solved.at(nodes).displacement, told.at(nodes).displacement)
+    assert answer.displacement == pytest.approx(expected, abs=1e-9) and answer.nodes.tolist() == nodes.tolist()
+    assert f"for {handed.sum()} of {len(loads)} loads" in answer.source
+
+
+def test_where_no_equilibrium_is_found_the_model_stands_with_its_bound(guarded, loads, told, box):
+    answer = replace(guarded, limit=0.0, fem=AtRest(box)).deform(loads)
+    assert np.array_equal(answer.displacement, told.displacement) and answer.outcome == told.outcome
+    assert answer.bound == pytest.approx(told.bound, nan_ok=True)
+
+
+def test_frames_start_from_the_last_solved_one(guarded, loads):
+    one, strict = loads.rows(np.array([0])), replace(guarded, limit=0.0)
+    first = strict.deform(one)
+    again = strict.deform(one, start=first)
+    assert again.iterations[0] < first.iterations[0]
+    assert strict.deform(one, start=guarded.model.deform(one)).iterations[0] == first.iterations[0]
+    with pytest.raises(InputError, match="one row for each"):
+        strict.deform(one, start=guarded.fem.deform(loads))
+
+
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+def test_a_frame_says_who_answered(theatre, limit):
+    play = player(theatre, small(), GUARDED)
+    play = replace(play, deformer=replace(play.deformer, limit=limit))
+    frame = play.draw(0, 0.0, Touch(force=0.1))
+    by_model = answering(play.deformer, frame.deformation) is not None
+    assert by_model == (limit == 1.0) == (frame.model_error is not None) == (frame.distance_error is not None)
+    assert ("finite elements themselves" in " ".join(frame.head) or "FEM itself" in " ".join(frame.head)) != by_model
+    moved = player(theatre, small(), "fem" if not by_model else theatre.best(small())).draw(0, 0.0, Touch(force=0.1))
+    assert frame.moved == pytest.approx(moved.moved, abs=1e-9)
+
+
+def test_it_is_named_where_a_model_knows_the_scene_and_says_what_it_is(theatre):
+    assert GUARDED in theatre.names(small()) and "where that may be over 0.2 mm off" in theatre.described(
+        GUARDED, small()
+    )
