@@ -335,6 +335,20 @@ def test_tables_are_written_between_their_marks_and_stay_as_they_are(tmp_path, c
     assert "a machine; 2026-11-23: `live-cpu`.\n\nMeasured on a machine; 2026-11-24: `stages-cpu`.\n" in text
 
 
+def test_numbers_of_a_page_that_the_record_lacks_stay(tmp_path, capsys):
+    page, words = tmp_path / "page.md", ["bench", "all", "--tables", str(tmp_path / "page.md"), "--from"]
+    page.write_text(PAGE)
+    assert main([*words, put(tmp_path / "both.json", entry(a=1.0), entry("stages-cpu", a=2.0))]) == 0
+    both = page.read_bytes()
+    capsys.readouterr()
+    for rows in ([entry(a=3.0)], [entry(a=3.0), entry("stages-cpu", "failed")]):
+        one = put(tmp_path / "one.json", *rows)
+        assert main([*words, one]) == 2 and page.read_bytes() == both
+        assert "has numbers of stages-cpu, and the record has none" in capsys.readouterr().err
+    assert main([*words, one, "--force"]) == 0 and "| `stages-cpu` | not measured here |" in page.read_text()
+    assert main([*words, one]) == 0
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -382,7 +396,8 @@ def test_only_figures_that_there_are(capsys):
 
 def test_the_tables_of_the_page_are_marked_as_they_are_written(tmp_path):
     page = shutil.copy(HOUSE / "docs/figures.md", tmp_path)
-    assert main(["bench", "all", "--tables", page, "--from", put(tmp_path / "new.json", entry(a=1.0))]) == 0
+    words = ["--from", put(tmp_path / "new.json", entry(a=1.0)), "--force"]
+    assert main(["bench", "all", "--tables", page, *words]) == 0
     before, after = (HOUSE / "docs/figures.md").read_text(), Path(page).read_text()
     outside = [re.sub(r"(<!-- bench.*?-->).*?<!-- end -->", r"\1", text, flags=re.DOTALL) for text in (before, after)]
     assert outside[0] == outside[1] and before != after

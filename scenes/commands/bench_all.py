@@ -43,7 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--tables", nargs="+", type=Path, default=[], metavar="PAGE.md",
-        help="then write the tables between `<!-- bench: NAME ... -->` and `<!-- end -->` of these pages anew",
+        help="then write the tables between `<!-- bench: NAME ... -->` and `<!-- end -->` of these pages anew; a number that "
+        "the record lacks is lost by --force alone",
     )  # fmt: skip
     parser.add_argument(
         "--against", type=Path, metavar="OLD.json",
@@ -86,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         print(table(record.rows))
         code = int(any(entry.state in ("failed", "missed") for entry in record.rows))
     for path in args.tables:
-        print(f"{path}: {'written' if write_page(path, record) else 'these numbers stand there already'}")
+        print(f"{path}: {'written' if write_page(path, record, args.force) else 'these numbers stand there already'}")
     return max(code, _compared(old, record)) if old else code
 
 
