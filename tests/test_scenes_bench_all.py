@@ -273,7 +273,29 @@ def test_what_differs_besides_is_said(tmp_path, capsys):
     assert "robust-cuda is not compared: it broke." in capsys.readouterr().out
     apart = put(tmp_path / "apart.json", entry("stages-cpu", a=1.0))
     assert main(["bench", "all", "--from", apart, "--against", old]) == 2
-    assert "no figure in common" in capsys.readouterr().err
+    assert re.search("no figure in common.*: measure one of them anew, with the --only", capsys.readouterr().err)
+
+
+def test_what_the_new_record_lacks_is_said(tmp_path, capsys):
+    gone = replace(entry(a=1.0), name="a-figure-of-last-year")
+    old = put(tmp_path / "old.json", entry(a=1.0, b=1.0), entry("stages-cpu", a=2.0), gone)
+    words = ["bench", "all", "--against", old, "--from"]
+    assert main([*words, put(tmp_path / "fewer.json", entry(a=1.0, b=1.0))]) == 0
+    said = capsys.readouterr().out
+    for name in ("stages-cpu", "a-figure-of-last-year"):
+        assert f"{name} is not compared: the new record does not have it." in said
+    assert main([*words, str(tmp_path / "fewer.json"), "--only", "live-cpu"]) == 0
+    assert "not compared" not in capsys.readouterr().out
+    assert main([*words, put(tmp_path / "part.json", entry(a=1.0), entry("stages-cpu", a=2.0))]) == 1
+    assert "no longer measured as before: live-cpu: it has no number for b\n" in capsys.readouterr().out
+
+
+def test_a_comparison_of_small_counts_says_so(tmp_path, capsys):
+    small = replace(entry(a=1.0), command=command_of(NAMED["live-cpu"], quick=True))
+    for one, said in ((small, True), (entry(a=1.0), False)):
+        path = put(tmp_path / "one.json", one)
+        assert main(["bench", "all", "--from", path, "--against", path]) == 0
+        assert ("--quick, whose times mean nothing" in capsys.readouterr().out) is said
 
 
 def damaged(whole):

@@ -69,18 +69,31 @@ def compared(old: Record, new: Record) -> Comparison:
     both = [(before[entry.name], entry) for entry in new.rows if entry.name in before]
     same = [pair for pair in both if _alike(*pair)]
     changes = tuple(change for pair in same for change in _changes(*pair))
-    lost = tuple(f"{mine.name}: {mine.reason}" for theirs, mine in same if _lost(theirs, mine))
+    lost = tuple(f"{mine.name}: {why}" for theirs, mine in same if (why := _lost(theirs, mine)))
     if not changes and not lost:
-        raise InputError("the two records have no figure in common that one command measured on one anatomy.")
-    return Comparison(changes, lost, tuple(dict.fromkeys(note for pair in both for note in _notes(*pair))))
+        raise InputError(
+            "the two records have no figure in common that one command measured on one anatomy: "
+            "measure one of them anew, with the --only, --quick and --anatomy of the other."
+        )
+    here = {entry.name for entry in new.rows}
+    notes = [f"{name} is not compared: the new record does not have it." for name in before if name not in here]
+    notes += [note for pair in both for note in _notes(*pair)]
+    if any(mine.quick for _, mine in same):
+        notes.append("Figures were measured with --quick, whose times mean nothing.")
+    return Comparison(changes, lost, tuple(dict.fromkeys(notes)))
 
 
 def _alike(old: Entry, new: Entry) -> bool:
     return old.command == new.command and old.origin.anatomy == new.origin.anatomy
 
 
-def _lost(old: Entry, new: Entry) -> bool:
-    return new.state == "failed" or (new.state == "missed" and old.state == "measured")
+def _lost(old: Entry, new: Entry) -> str:
+    """Why a figure, or a number of it, is no longer there; empty if all are."""
+    if new.state == "failed" or (new.state == "missed" and old.state == "measured"):
+        return new.reason
+    here = {value.name for value in new.values}
+    gone = [value.name for value in old.values if value.name not in here]
+    return f"it has no number for {', '.join(gone)}" if gone and new.state != "skipped" else ""
 
 
 def _changes(old: Entry, new: Entry) -> list[Change]:

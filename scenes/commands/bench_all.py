@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -43,8 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--tables", nargs="+", type=Path, default=[], metavar="PAGE.md",
-        help="then write the tables between `<!-- bench: NAME ... -->` and `<!-- end -->` of these pages anew; a number that "
-        "the record lacks is lost by --force alone",
+        help="then write the tables between `<!-- bench: NAME ... -->` and `<!-- end -->` of these pages anew; "
+        "--force: also where numbers are lost",
     )  # fmt: skip
     parser.add_argument(
         "--against", type=Path, metavar="OLD.json",
@@ -81,14 +82,20 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on from {args.json or OUT}", file=sys.stderr)
         return INTERRUPTED
-    record = replace(record, rows=tuple(entry for entry in record.rows if entry.name in args.only))
+    record = _only(record, args.only)
     code = 0
     if not args.source:
         print(table(record.rows))
         code = int(any(entry.state in ("failed", "missed") for entry in record.rows))
     for path in args.tables:
         print(f"{path}: {'written' if write_page(path, record, args.force) else 'these numbers stand there already'}")
+    if old and set(args.only) < set(NAMED):  # else its figures that are none any more are named
+        old = _only(old, args.only)
     return max(code, _compared(old, record)) if old else code
+
+
+def _only(record: Record, names: Sequence[str]) -> Record:
+    return replace(record, rows=tuple(entry for entry in record.rows if entry.name in names))
 
 
 def _measured(args: argparse.Namespace) -> Record:
