@@ -99,12 +99,18 @@ def test_the_command_tells_every_tool(site, tmp_path, capsys, monkeypatch):
     assert all(item["frames"] == 3 and item["checked"] == 2 and item["error"] <= 0.05 for item in rides)
     monkeypatch.setattr(live, "errors", lambda frames, *rest: np.full(len(frames), 1e-3))
     assert main([*words, "--device", "cpu"]) == 1
+    capsys.readouterr()
+    assert main([*words[:-2], "--device", "cpu", "--json"]) == 1  # as many are checked as there are
+    assert [item["checked"] for item in json.loads(capsys.readouterr().out)["rides"]] == [3] * len(RIDES)
+    assert main([*words[:-2], "--device", "cpu"]) == 1
     assert "| palpation | 3 |" in capsys.readouterr().out
 
 
 def test_bad_input_is_a_sentence(tmp_path, capsys):
     assert main(["bench", "live", "--frames", "3", "--checked", "4"]) == 2
     assert "--checked 4" in capsys.readouterr().err
+    assert main(["bench", "live", "--frames", "0"]) == 2
+    assert "--frames is 0: give a whole number from 1 up" in capsys.readouterr().err
     write_anatomy(tmp_path / "small.vtu", make_box(opening=9e-3))
     assert main(["bench", "live", "--anatomy", str(tmp_path / "small.vtu")]) == 2
     assert "larger craniotomy" in capsys.readouterr().err

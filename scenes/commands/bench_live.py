@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from sim.arguments import at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.effects import pushed_effects
 from sim.elements import ELEMENTS, RECOMMENDED
@@ -23,14 +24,18 @@ from .tissue_options import add_tissue_arguments, tissue_of
 if TYPE_CHECKING:
     from ..bench.live import Tally
 
+CHECKED = 20
+"""Frames that are held against the converged solution, unless another number is given."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
     parser.add_argument("--frames", type=int, default=1000, help="frames of each tool (default %(default)s)")
     parser.add_argument(
-        "--checked", type=int, default=20, help="frames held against the converged solution (default %(default)s)"
-    )
+        "--checked", type=int,
+        help=f"frames held against the converged solution (default {CHECKED}, or all where there are fewer)",
+    )  # fmt: skip
     add_tissue_arguments(parser)
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
@@ -44,9 +49,11 @@ def run(args: argparse.Namespace) -> int:
     from ..script.scene import find_scene
     from ..script.site import site_of
 
-    if not 1 <= args.checked <= args.frames:
+    at_least("--frames", args.frames, 1)
+    checked = min(CHECKED, args.frames) if args.checked is None else args.checked
+    if not 1 <= checked <= args.frames:
         raise InputError(
-            f"--frames {args.frames} --checked {args.checked} measures nothing: give 1 <= --checked <= --frames."
+            f"--frames {args.frames} --checked {checked} measures nothing: give 1 <= --checked <= --frames."
         )
     site = site_of(read_anatomy(args.anatomy or template_path()))
     scene = replace(find_scene("press"), effects=pushed_effects(site.anatomy, tissue_of(args)))
@@ -55,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     for ride in RIDES:
         loads = loads_of(ride, scene, site, args.frames)
         frames = list(tqdm(frames_of(fem, loads), ride.name, args.frames, unit="frame", file=sys.stderr))
-        sample = frames[:: args.frames // args.checked][: args.checked]
+        sample = frames[:: args.frames // checked][:checked]
         found.append(tally(ride, frames, errors(sample, scene, site, args.element)))
     where = f"{machine(args.device)}; {len(site.anatomy.mesh.nodes)} nodes, {args.element}"
     if args.json:
