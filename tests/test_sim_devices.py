@@ -29,7 +29,8 @@ def test_a_list_names_devices_one_by_one(words, names):
     [
         ("all,cpu", "names devices beside 'all'"),
         ("cpu,", "names a device that has no name"),
-        ("", "names a device that has no name"),
+        ("", "'' names no device: choose auto, or cpu"),
+        (" , ", "names no device: choose auto, or cpu"),
         ("cpu,abacus", "no device 'abacus' here: choose auto or cpu"),
         pytest.param("all", r"'all' means every graphics card, and there is none.*or name devices", marks=NO_CARD),
         pytest.param("cpu,cuda:0", "no device 'cuda:0' here, as no NVIDIA driver", marks=NO_CARD),

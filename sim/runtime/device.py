@@ -125,6 +125,8 @@ def device_names(words: str) -> tuple[str, ...]:
     asked = [name.strip() for name in words.split(",")]
     if EVERY in asked:
         raise InputError(f"{words!r} names devices beside 'all', which means every graphics card: give it alone.")
+    if not any(asked):
+        raise InputError(f"{words!r} names no device: choose auto, or {' or '.join(_present())}.")
     if not all(asked):
         raise InputError(f"{words!r} names a device that has no name: leave the comma out, or name one.")
     names = tuple(find_device(name, "float32").name for name in asked)
