@@ -37,7 +37,7 @@ def test_what_is_measured_is_not_measured_again(folder, tmp_path, monkeypatch, c
     out = folder / "growth.png"
     asked = []
 
-    def instead(trial, sizes, batches, done):
+    def instead(trial, sizes, batches, done, said):
         asked.append([row.asked for row in done])
         yield from (replace(ROW, asked=b, batch=b) for b in batches if b not in asked[-1])
 
@@ -45,7 +45,10 @@ def test_what_is_measured_is_not_measured_again(folder, tmp_path, monkeypatch, c
     assert main([*words[:-3], "--device", "cpu", "--out", str(out)]) == 0
     assert main([*words, "--out", str(out), "--json"]) == 0
     assert asked == [[], [1]]
-    captured = json.loads(capsys.readouterr().out.splitlines()[-1])
+    said = capsys.readouterr().out
+    assert "| 12 of 12 | 0.3 |  |  |\n" in said  # without a card nothing of it is taken, nor foreseen
+    assert f"{out}: written; its rows are in {out.with_suffix('.csv')}" in said
+    captured = json.loads(said.splitlines()[-1])
     assert [row["batch"] for row in captured["rows"]] == [1, 2]
     assert read_png(out).std() > 5.0
     monkeypatch.undo()
@@ -60,8 +63,10 @@ def test_what_is_measured_is_not_measured_again(folder, tmp_path, monkeypatch, c
 
 def test_each_row_has_a_process_of_its_own(folder):
     """What it refuses comes back as it is."""
+    said = []
     with pytest.raises(InputError, match="no element"):
-        list(rows(Trial("abacus", "cpu", folder), [2000], [1], []))
+        list(rows(Trial("abacus", "cpu", folder), [2000], [1], [], said.append))
+    assert said == ["2000 nodes, the mesh", "2000 nodes, batch of 1"]
 
 
 def test_the_switch_is_marked_between_the_sizes_beside_it():

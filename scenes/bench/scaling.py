@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -124,8 +124,10 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
     )  # fmt: skip
 
 
-def rows(trial: Trial, sizes: Sequence[int], batches: Sequence[int], done: Sequence[Row]) -> Iterator[Row]:
-    """A row for each size and batch that is not `done`, each measured in a fresh process.
+def rows(
+    trial: Trial, sizes: Sequence[int], batches: Sequence[int], done: Sequence[Row], said: Callable[[str], object]
+) -> Iterator[Row]:
+    """A row for each size and batch that is not `done`, each measured in a fresh process. `said` hears what is done.
 
     Raises
     ------
@@ -137,7 +139,9 @@ def rows(trial: Trial, sizes: Sequence[int], batches: Sequence[int], done: Seque
         for batch in batches:
             if (size, batch) in known:
                 continue
+            said(f"{size} nodes, the mesh")
             template_mesh(trial.folder, size)
+            said(f"{size} nodes, batch of {batch}")
             with ProcessPoolExecutor(1, get_context("spawn")) as pool:
                 try:
                     yield pool.submit(measured, trial, size, batch).result()

@@ -60,13 +60,14 @@ def run(args: argparse.Namespace) -> int:
     table = sys.stderr if args.json else sys.stdout
     print(where, file=table)
     with tqdm(total=len(args.sizes) * len(args.batch), initial=len(found), unit="row", file=sys.stderr) as bar:
-        for row in rows(trial, args.sizes, args.batch, tuple(found)):
+        for row in rows(trial, args.sizes, args.batch, tuple(found), bar.set_description):
             append_rows(record, stated, [row])
             found.append(row)
             bar.update()
     found.sort(key=lambda row: (row.nodes, row.batch))
     write_png(out, drawn(panels(found)))
     _print(found, table)
+    print(f"\n{out}: written; its rows are in {record}, its meshes beside it", file=table)
     if args.json:
         print(json.dumps({"machine": where, "rows": [asdict(row) for row in found], "plot": str(out)}))
     return 0 if all(row.converged == row.loads for row in found) else 1
@@ -75,13 +76,13 @@ def run(args: argparse.Namespace) -> int:
 def _print(found: Sequence[Row], table) -> None:
     names = (
         "nodes", "tetrahedra", "preconditioner", "set-up [s]", "batch", "a load [s]", "outer", "converged",
-        "host [GiB]", "card [GiB]", "foreseen",
+        "host [GiB]", "card [GiB]", "card, foreseen [GiB]",
     )  # fmt: skip
     print(f"\n| {' | '.join(names)} |\n|{'---|' * len(names)}", file=table)
     for row in found:
         cells = (
             row.nodes, row.tets, row.preconditioner, f"{row.set_up:.3g}", row.batch, f"{row.load:.3g}",
-            f"{row.outer:g}", f"{row.converged} of {row.loads}", f"{row.memory:.3g}", f"{row.card:.3g}",
-            f"{row.foreseen:.3g}",
+            f"{row.outer:g}", f"{row.converged} of {row.loads}", f"{row.memory:.3g}",
+            *(f"{number:.3g}" if row.foreseen else "" for number in (row.card, row.foreseen)),  # none without a card
         )  # fmt: skip
         print(f"| {' | '.join(map(str, cells))} |", file=table)
