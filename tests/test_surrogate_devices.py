@@ -108,6 +108,15 @@ def test_a_killed_process_is_a_sentence_and_loses_no_finished_case(tmp_path, bod
     assert undated(path) == undated(whole)
 
 
+@pytest.mark.parametrize("devices", [("cpu",), ("cpu", "cpu")])
+def test_a_batch_that_no_memory_holds_begins_no_file(body, devices):
+    """A file keeps its batch, so that a smaller one would be refused beside it."""
+    asked = Asked(body, (*pushed_effects(body, BRAIN), NodalForce()), TRAIN, "p1", 10**9, 2 * 10**9)
+    refused = pytest.raises(InputError, match=r"the answers to 1000000000 loads take about .* are free: solve at most")
+    with refused, solving(asked, devices, print):
+        pytest.fail("it would begin")
+
+
 def test_batches_are_shared_evenly():
     assert [even_batch(10_000, count, 4) for count in (5, 5_000, 40_000, 50_000)] == [2, 1_250, 10_000, 6_250]
     assert even_batch(0, 7, 2) == 1 and even_batch(64, 7, 1) == 7

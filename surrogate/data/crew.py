@@ -15,6 +15,7 @@ from sim.deformation import Deformation, Deformer
 from sim.effects import Effect
 from sim.fem import Fem
 from sim.loads import Loads
+from sim.runtime.memory import check_fits
 from sim.runtime.processes import at_once, working
 from sim.strategy.memory_needed import Needed, foreseen
 
@@ -110,7 +111,10 @@ def memory_of(asked: Asked, task: None) -> Needed | None:
 
 
 def described(asked: Asked, task: None) -> tuple[str, str, int]:
-    """Their element, all of them in words, and the most loads that they solve together."""
+    """Their element, all of them in words, and the most loads that they solve together, which must fit."""
+    if asked.needed is None:  # on the CPU: before a file is begun that keeps its batch
+        fem = asked.fem
+        check_fits(fem.problem.rows, fem.batch, min(fem.batch, asked.loads), fem.problem.device, fem.strategy.held)
     return asked.fem.space.element, asked.fem.description, asked.fem.batch
 
 
