@@ -14,7 +14,7 @@ INFLATION = 1032
 # One array [bytes]: quadratic tetrahedra (10 numbers of 8 bytes) of the finest brain meshes in use, 10 million, take
 # 0.8 GB.
 LARGEST_ARRAY = 2 * 1024**3
-# All arrays of a model file, inflated [bytes]: the shipped one, of seven learners, has 0.04 GB.
+# All arrays of a model file, inflated [bytes]: the shipped one, of five learners, has 0.04 GB.
 LARGEST_MODEL = 2 * 1024**3
 # Text that heads a model file [bytes]: the shipped one has 0.02 MB.
 LARGEST_HEADER = 16 * 1024**2
