@@ -17,6 +17,7 @@ from .locating.locator_files import load_locator, save_locator
 from .locating.observation import Observation
 from .locating.observed_files import read_observation
 from .locating.setup import make_locator
+from .model.guarded import Guarded
 from .model.learned import Learned
 from .model.own_learners import learner
 from .model.store import load, save
@@ -30,6 +31,7 @@ __all__ = [
     "Dataset",
     "FittedTissue",
     "Frame",
+    "Guarded",
     "Learned",
     "Location",
     "Locator",

@@ -332,7 +332,7 @@ def test_tables_are_written_between_their_marks_and_stay_as_they_are(tmp_path, c
     assert main([*words[:-1], put(tmp_path / "two.json", entry(a=1.0), later)]) == 0
     text = page.read_text()
     assert "| `stages-cpu` | a 1 ms (it broke) |" in text
-    assert "a machine; 2026-11-23: `live-cpu`.\n\nMeasured on a machine; 2026-11-24: `stages-cpu`.\n" in text
+    assert "| a machine; 2026-11-23 | `live-cpu` |\n| a machine; 2026-11-24 | `stages-cpu` |\n" in text
 
 
 @pytest.mark.parametrize(

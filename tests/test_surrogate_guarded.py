@@ -30,7 +30,7 @@ def loads(box):
 
 
 @pytest.fixture(scope="module")
-def told(guarded, loads):
+def predicted(guarded, loads):
     return guarded.model.deform(loads)
 
 
@@ -44,10 +44,10 @@ def limited(guarded, limit):
     return replace(guarded, limit=limit, model=replace(guarded.model, bounds=None, bound=1e-3))
 
 
-def test_the_model_answers_what_it_is_sure_of(guarded, loads, told):
+def test_the_model_answers_what_it_is_sure_of(guarded, loads, predicted):
     sure = limited(guarded, 2e-3).deform(loads)
-    inside = [row for row, outcome in enumerate(told.outcome) if outcome.good]
-    assert inside and np.array_equal(sure.displacement[inside], told.displacement[inside])
+    inside = [row for row, outcome in enumerate(predicted.outcome) if outcome.good]
+    assert inside and np.array_equal(sure.displacement[inside], predicted.displacement[inside])
     assert all(sure.outcome[row] is Outcome.PREDICTED for row in inside)
 
 
@@ -57,30 +57,30 @@ def test_the_finite_elements_answer_the_rest(guarded, loads, solved):
     assert answer.source == solved.source and np.isnan(answer.bound).all()
 
 
-def test_loads_are_told_apart_one_by_one(guarded, loads, told, solved):
+def test_each_load_is_judged_by_its_own_bound(guarded, loads, predicted, solved):
     """Bounds of their own: half of the loads lie below the limit; asked at vertices, in the order asked for."""
     bounds = np.linspace(1e-4, 6e-4, len(loads))
     bounds[2] = np.nan
-    marked = replace(told, bound=np.stack([bounds, bounds]), outcome=(Outcome.PREDICTED,) * len(loads))
+    marked = replace(predicted, bound=np.stack([bounds, bounds]), outcome=(Outcome.PREDICTED,) * len(loads))
     assert replace(guarded, limit=3.5e-4, model=replace(guarded.model, bound=1.0)).unsure(marked).tolist() == [
         False, False, True, True, True, True,
     ]  # fmt: skip
     far = replace(marked, outcome=(Outcome.EXTRAPOLATED,) * len(loads))
     assert replace(guarded, limit=1.0).unsure(far).all()
-    nodes, limit = guarded.model.nodes[5:2:-1], float(np.sort(told.bound[0])[2]) + 1e-9
+    nodes, limit = guarded.model.nodes[5:2:-1], float(np.sort(predicted.bound[0])[2]) + 1e-9
     some = replace(guarded, limit=limit)
-    handed = some.unsure(told)
+    handed = some.unsure(predicted)
     assert 0 < handed.sum() < len(loads)
     answer = some.deform(loads, at=nodes)
-    expected = np.where(handed[:, None, None], solved.at(nodes).displacement, told.at(nodes).displacement)
+    expected = np.where(handed[:, None, None], solved.at(nodes).displacement, predicted.at(nodes).displacement)
     assert answer.displacement == pytest.approx(expected, abs=1e-9) and answer.nodes.tolist() == nodes.tolist()
     assert f"for {handed.sum()} of {len(loads)} loads" in answer.source
 
 
-def test_where_no_equilibrium_is_found_the_model_stands_with_its_bound(guarded, loads, told, box):
+def test_where_no_equilibrium_is_found_the_model_stands_with_its_bound(guarded, loads, predicted, box):
     answer = replace(guarded, limit=0.0, fem=AtRest(box)).deform(loads)
-    assert np.array_equal(answer.displacement, told.displacement) and answer.outcome == told.outcome
-    assert answer.bound == pytest.approx(told.bound, nan_ok=True)
+    assert np.array_equal(answer.displacement, predicted.displacement) and answer.outcome == predicted.outcome
+    assert answer.bound == pytest.approx(predicted.bound, nan_ok=True)
 
 
 def test_frames_start_from_the_last_solved_one(guarded, loads):

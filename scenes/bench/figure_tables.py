@@ -16,6 +16,7 @@ from .figures import NAMED, command_of
 BEGIN, END = "<!-- bench:", "<!-- end -->"
 MARKED = re.compile(rf"({BEGIN} ([^\n]*?) -->\n)(.*?)({END})", re.DOTALL)
 HEAD = "| figure | measured | command |\n|---|---|---|"
+PLACES = "| measured on | figures |\n|---|---|"
 NOT_HERE = "not measured here"
 
 
@@ -33,8 +34,10 @@ def table(entries: Sequence[Entry]) -> str:
 def _with_origins(lines: Sequence[str], entries: Sequence[Entry]) -> str:
     places: dict[str, list[str]] = {}
     for entry in entries:
-        places.setdefault(f"Measured on {entry.origin.machine}; {entry.origin.date}", []).append(f"`{entry.name}`")
-    said = [f"{place}." if len(places) == 1 else f"{place}: {', '.join(some)}." for place, some in places.items()]
+        places.setdefault(f"{entry.origin.machine}; {entry.origin.date}", []).append(f"`{entry.name}`")
+    said = [f"Measured on {place}." for place in places]
+    if len(places) > 1:
+        said = ["\n".join((PLACES, *(f"| {place} | {', '.join(some)} |" for place, some in places.items())))]
     return "\n\n".join(("\n".join((HEAD, *lines)), *said))
 
 

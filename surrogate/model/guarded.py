@@ -51,21 +51,21 @@ class Guarded:
         InputError
             Loads, or a start, that the model refuses.
         """
-        told = self.model.deform(loads, start, at)
-        unsure = np.flatnonzero(self.unsure(told))
+        predicted = self.model.deform(loads, start, at)
+        unsure = np.flatnonzero(self.unsure(predicted))
         if not len(unsure):
-            return told
+            return predicted
         whole = start is not None and len(start.nodes) == len(self.anatomy.mesh.nodes)
         solved = self.fem.deform(loads.rows(unsure), start.rows(unsure) if start is not None and whole else None)
         good = np.array([outcome.good for outcome in solved.outcome])
         if at is None and good.all() and len(unsure) == len(loads):
             return solved
-        return _replaced(told, unsure[good], solved.rows(np.flatnonzero(good)))
+        return _replaced(predicted, unsure[good], solved.rows(np.flatnonzero(good)))
 
-    def unsure(self, told: Deformation) -> np.ndarray:
+    def unsure(self, predicted: Deformation) -> np.ndarray:
         """(B,) bool: which of the model's answers are not good enough."""
-        bound = np.where(np.isnan(told.bound[0]), self.model.bound, told.bound[0])
-        return ~(bound <= self.limit) | np.array([not outcome.good for outcome in told.outcome])
+        bound = np.where(np.isnan(predicted.bound[0]), self.model.bound, predicted.bound[0])
+        return ~(bound <= self.limit) | np.array([not outcome.good for outcome in predicted.outcome])
 
 
 def model_of(deformer: Deformer) -> Learned | None:
@@ -80,13 +80,13 @@ def answering(deformer: Deformer, answer: Deformation) -> Learned | None:
     return model_of(deformer) if answer.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
 
 
-def _replaced(told: Deformation, rows: np.ndarray, solved: Deformation) -> Deformation:
+def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation) -> Deformation:
     """Answers of which some `rows` (k,) are solved; the force of a push is what the load says, whoever answers."""
-    pick = np.arange(len(told))
-    pick[rows] = len(told) + np.arange(len(rows))
-    ours = replace(told, cost=Cost({"predict": told.cost.total, "solve": 0.0}))
+    pick = np.arange(len(predicted))
+    pick[rows] = len(predicted) + np.arange(len(rows))
+    ours = replace(predicted, cost=Cost({"predict": predicted.cost.total, "solve": 0.0}))
     theirs = replace(
-        solved.at(told.nodes), reaction=told.reaction[rows], cost=Cost({"predict": 0.0, "solve": solved.cost.total})
+        solved.at(predicted.nodes), reaction=predicted.reaction[rows], cost=Cost({"predict": 0.0, "solve": solved.cost.total})
     )
-    source = f"{told.source}; for {len(rows)} of {len(told)} loads {solved.source}" if len(rows) else told.source
+    source = f"{predicted.source}; for {len(rows)} of {len(predicted)} loads {solved.source}" if len(rows) else predicted.source
     return replace(joined([ours, theirs]).rows(pick), source=source)
