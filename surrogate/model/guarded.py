@@ -85,8 +85,10 @@ def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation) -> 
     pick = np.arange(len(predicted))
     pick[rows] = len(predicted) + np.arange(len(rows))
     ours = replace(predicted, cost=Cost({"predict": predicted.cost.total, "solve": 0.0}))
-    theirs = replace(
-        solved.at(predicted.nodes), reaction=predicted.reaction[rows], cost=Cost({"predict": 0.0, "solve": solved.cost.total})
-    )
-    source = f"{predicted.source}; for {len(rows)} of {len(predicted)} loads {solved.source}" if len(rows) else predicted.source
+    theirs = solved.at(predicted.nodes)
+    cost = Cost({"predict": 0.0, "solve": solved.cost.total})
+    theirs = replace(theirs, reaction=predicted.reaction[rows], cost=cost)
+    source = predicted.source
+    if len(rows):
+        source += f"; for {len(rows)} of {len(predicted)} loads {solved.source}"
     return replace(joined([ours, theirs]).rows(pick), source=source)
