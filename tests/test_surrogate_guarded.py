@@ -1,5 +1,6 @@
 """A model with finite elements behind it: who answers which load, and what is said of the answer."""
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from theatres import player, small, theatre_of
 
 from scenes.play.deformers import GUARDED, AtRest
+from scenes.play.page_cast import ALL, Cast
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
 from sim.errors import InputError
@@ -103,6 +105,16 @@ def test_a_frame_says_who_answered(theatre, limit):
     assert ("finite elements themselves" in " ".join(frame.head) or "FEM itself" in " ".join(frame.head)) != by_model
     moved = player(theatre, small(), "fem" if not by_model else theatre.best(small())).draw(0, 0.0, Touch(force=0.1))
     assert frame.moved == pytest.approx(moved.moved, abs=1e-9)
+
+
+def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
+    cast = Cast(theatre, small(), GUARDED, threading.Lock())
+    play = cast.player(GUARDED)
+    cast.players[GUARDED, ALL] = replace(play, deformer=replace(play.deformer, limit=0.0))
+    question = (0, Touch(force=0.1))
+    first, again = (cast.predicted(GUARDED, question).deformation for _ in range(2))
+    assert first.iterations[0] > again.iterations[0] == 0
+    assert again.displacement == pytest.approx(first.displacement, abs=1e-6)
 
 
 def test_it_is_named_where_a_model_knows_the_scene_and_says_what_it_is(theatre):

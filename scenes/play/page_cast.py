@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import threading
 import time as clock
+from contextlib import nullcontext
 from dataclasses import replace
 
+from sim.deformation import Deformation, Deformer
+
 from ..script.scene import Scene
-from .deformers import Theatre
+from .deformers import GUARDED, Theatre
 from .effect_ablation import without
 from .page_referee import Question, Referee, Truth
 from .player import Player
@@ -35,6 +38,7 @@ class Cast:
         # Not on a card: there, what is drawn while a solver's thread records a CUDA graph would be recorded with it.
         self.stages = {ALL: replace(theatre.stage(scene), device="cpu")}
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
+        self.last: dict[str, Deformation] = {}
         self.solvers: dict[frozenset[str], Referee] = {}
         # The finite elements that are asked for what is shown next, and their question.
         self.seeking: tuple[Referee, Question] | None = None
@@ -66,16 +70,21 @@ class Cast:
                 assert solved is not None
                 deformer = solved.deformer
             else:
-                deformer = self.theatre.deformer(name, stage.scene)
+                deformer = self._trained(name, stage.scene)
             uncertainty = self.theatre.uncertainty(stage.scene)
             self.players[name, off] = Player(stage, deformer, uncertainty=uncertainty)
         return self.players[name, off]
 
+    def _trained(self, name: str, scene: Scene) -> Deformer:
+        """A trained model. Finite elements behind it are made in turn, and on the CPU, for the reason of the stages."""
+        with self.turn if name == GUARDED else nullcontext():
+            return replace(self.theatre, device="cpu").deformer(name, scene)
+
     def predicted(self, name: str, question: Question) -> Truth:
-        """A trained model's answer."""
+        """A trained model's answer; finite elements behind it start from its last one."""
         begun, player = clock.perf_counter(), self.player(name)
         loads = player.loads(*question)
-        answer = player.answer(loads)
+        answer = self.last[name] = player.answer(loads, self.last.get(name))
         return Truth(question[0], loads, answer, clock.perf_counter() - begun, question)
 
     def solved(self, off: frozenset[str], question: Question, seen: Truth | None, patience: float) -> Truth | None:
