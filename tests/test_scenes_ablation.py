@@ -131,7 +131,7 @@ class TestScenes:
         reported = {row["scene"]: row for row in json.loads(capsys.readouterr().out)["scenes"]}
         assert tuple(reported) == SCENES
         for name, row in reported.items():
-            assert row["deformers"] == (["linear", "svr", "fem"] if name in PUSHING else ["fem"])
+            assert row["deformers"] == (["linear", "svr", "guarded", "fem"] if name in PUSHING else ["fem"])
             assert ("ToolForce" in row["effects"]) == (ToolForce() in find_scene(name).effects)
         assert "Resection" in reported["resection"]["effects"] and "milliseconds" not in reported["press"]
 

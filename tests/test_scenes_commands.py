@@ -117,7 +117,7 @@ ALL = [
     (["--anatomy", "box.vtu", "--model", "text.npz"], "cannot be read as a model"),
     (["--anatomy", "box.vtu", "--device", "abacus"], "no device 'abacus'"),
 ]
-DEFORMER = (["--anatomy", "box.vtu", "--deformer", "oracle"], "'oracle' here: choose one of linear, svr, fem")
+DEFORMER = (["--anatomy", "box.vtu", "--deformer", "oracle"], "'oracle' here: choose one of linear, svr, guarded, fem")
 OWN = [
     ("render", ["--every", "0"], "--every is 0"),
     ("render", ["--every", "-3"], "--every is -3"),

@@ -8,7 +8,7 @@ import pytest
 from theatres import short, sinking, small, theatre_of
 
 from ar.page_parts import Choice, Fold, Slider
-from scenes.play.deformers import plan_of
+from scenes.play.deformers import GUARDED, plan_of
 from scenes.play.page_controls import clocked, controls
 from scenes.play.page_referee import Truth
 from scenes.play.page_requests import Wish
@@ -50,6 +50,12 @@ class TestTrust:
         """It stands in another colour, with the reason."""
         said = trust(answer(outcome), "svr")
         assert "95 of 100" not in said and 'class="warn"' in said and "Do not rely on this answer" in said
+
+    def test_a_guarded_model_says_which_of_the_two_answered(self):
+        assert trust(answer(Outcome.PREDICTED), GUARDED).startswith(
+            "<p><b>trained model (guarded)</b>: inside the range"
+        )
+        assert "as the trained model is unsure of this load</b>: solved" in trust(answer(Outcome.CONVERGED), GUARDED)
 
     def test_code_names_are_not_shown(self):
         for outcome in Outcome:

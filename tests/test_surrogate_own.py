@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
+from scenes.play.deformers import GUARDED
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import write_anatomy
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolForce
@@ -20,7 +21,7 @@ from sim.runtime.user_script import run_script
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model.own_learners import OWN, RESERVED, find_own, learner
+from surrogate.model.own_learners import OWN, PLAYERS, RESERVED, find_own, learner
 from surrogate.model.store import FITTED, load, save
 from surrogate.training.train import LEARNERS, OF_POSES, train
 
@@ -132,13 +133,15 @@ def test_ones_own_features(box, clean):
 
 def test_all_names_of_what_comes_with_sulcus_are_reserved():
     assert {*LEARNERS, *OF_POSES, *FITTED} == RESERVED
+    assert {"auto", "fem", GUARDED} == PLAYERS
 
 
 @pytest.mark.parametrize(
     ("name", "encoder", "words"),
     [
-        ("svr", "tool", "a learner is called 'svr' already"),
-        ("series-gp", "tool", "a learner is called 'series-gp' already"),
+        ("svr", "tool", "the name 'svr' is taken"),
+        ("series-gp", "tool", "the name 'series-gp' is taken"),
+        ("guarded", "tool", "the name 'guarded' is taken"),
         ("mine", "smell", "no encoder is called 'smell': choose one of nodal, rooted, tool"),
     ],
 )

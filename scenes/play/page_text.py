@@ -154,7 +154,8 @@ def plan_words(lines: Sequence[str]) -> str:
 
 def trust(answer: Deformation, name: str) -> str:
     """How an answer came about, and how far off it may be; in another colour, with the reason, where it is not good."""
-    outcome, who = answer.outcome[0], f"<b>{escape(deformer_words(name))}</b>"
+    outcome = answer.outcome[0]
+    who = f"<b>{escape(_guarded_words(outcome) if name == GUARDED else deformer_words(name))}</b>"
     if outcome is Outcome.EXTRAPOLATED:
         return (
             f'<p>{who}</p><p class="warn">Do not rely on this answer: the load lies outside the range that the model '
@@ -172,6 +173,12 @@ def trust(answer: Deformation, name: str) -> str:
         f"<p>{who}: {how}. Error of the model: in 95 of 100 loads no point of the tumour is more than "
         f"{length(bound, 2)} from where its finite elements have it.</p>"
     )
+
+
+def _guarded_words(outcome: Outcome) -> str:
+    """Which of the two answered, where a model has finite elements behind it."""
+    by_model = outcome in (Outcome.PREDICTED, Outcome.EXTRAPOLATED)
+    return "trained model (guarded)" if by_model else "finite elements, as the trained model is unsure of this load"
 
 
 def tumour_trust(error: TumourError) -> str:

@@ -33,6 +33,8 @@ RESERVED = frozenset(
     ]
 )
 """Names of what comes with sulcus."""
+PLAYERS = frozenset(["auto", "fem", "guarded"])
+"""Other names that can be asked to play a scene."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,8 @@ def learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:
         missing = [what for what in ("fit", "predict", "state", "restored") if not hasattr(kind, what)]
         if missing:
             raise InputError(f"the learner {name} has no {', '.join(missing)}: see surrogate.Regressor.")
-        if name in RESERVED or (name in OWN and _file(OWN[name].regressor) != _file(kind)):
-            raise InputError(f"a learner is called {name!r} already: choose another name.")
+        if name in RESERVED | PLAYERS or (name in OWN and _file(OWN[name].regressor) != _file(kind)):
+            raise InputError(f"the name {name!r} is taken: give the learner another.")
         OWN[name] = Own(encoder, kind)
         return kind
 
