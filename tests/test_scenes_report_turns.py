@@ -47,6 +47,22 @@ def test_learners_are_measured_side_by_side_where_there_are_cores(study, cores, 
     assert run.most[Elements] == elements and run.most[Learner] == learners
 
 
+@pytest.mark.parametrize(("cores", "learners"), [(4, 2), (16, 4)])
+def test_beside_a_card_learners_are_measured_together_with_finite_elements(study, cores, learners):
+    run = Rows()
+    found = [row.name for row in rows(study, SPECS, run, cores, on_card=True)]
+    assert found == [spec.name for spec in SPECS] and run.most == {Elements: 2, Learner: learners}
+    begun_first = {spec.name for spec in SPECS[:4]}
+    assert (set(run.begun[:4]) == begun_first) is (cores == 4)
+
+
+def test_a_stop_beside_a_card_ends_the_learners_too(study):
+    run = Rows("fem 1")
+    with pytest.raises(KeyboardInterrupt):
+        list(rows(study, SPECS, run, 16, on_card=True))
+    assert len([name for name in run.begun if name.startswith("learner")]) < 9
+
+
 def test_what_is_measured_in_this_process_is_measured_one_by_one(study, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 16)
     run = Rows()

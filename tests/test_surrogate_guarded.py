@@ -14,6 +14,8 @@ from sim.deformation import Outcome
 from sim.errors import InputError
 from surrogate.data.tool_loads import draw
 from surrogate.model.guarded import answering
+from surrogate.model.left_out import LeftOut, left_out_of
+from surrogate.model.store import load, save
 
 
 @pytest.fixture(scope="module")
@@ -121,3 +123,33 @@ def test_it_is_named_where_a_model_knows_the_scene_and_says_what_it_is(theatre):
     assert GUARDED in theatre.names(small()) and "where that may be over 0.2 mm off" in theatre.described(
         GUARDED, small()
     )
+
+
+def test_errors_on_left_out_cortex_count_what_finite_elements_answer_as_exact():
+    distance = 1e-3 * np.array([[0.1, 0.3], [0.02, 0.02], [0.4, 0.4]])
+    stated = left_out_of(distance, np.full(3, 10e-3), 1e-3 * np.array([0.5, 0.1, 0.1]), np.array([False, False, True]))
+    assert stated.mean == pytest.approx((0.02 + 0.002 + 0.04) / 3) and stated.guarded == pytest.approx(0.002 / 3)
+    assert stated.solved == pytest.approx(2 / 3) and stated.p999 is None and not stated.enough
+    assert "guarded" in str(stated) and "2.07 %" in str(stated)
+    many = left_out_of(np.full((1000, 2), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.1e-3), np.zeros(1000, bool))
+    assert many.p999 == pytest.approx(0.3e-3) and many.mean < 0.01 and not many.enough
+    assert left_out_of(distance[1:2], np.full(1, 10e-3), np.full(1, np.nan), np.zeros(1, bool)).solved == 1.0
+
+
+@pytest.mark.parametrize(("mean", "who"), [(0.009, "series-gp"), (0.011, GUARDED), (None, "series-gp")])
+def test_whoever_asks_for_nobody_gets_a_model_alone_only_where_it_may_be(theatre, mean, who):
+    (_, model), *_ = theatre.models.items()
+    stated = None if mean is None else LeftOut(mean, 0.001, None, 0.3)
+    some = replace(theatre, models={"series-gp": replace(model, left_out=stated)})
+    assert some.usual(small()) == who and some.best(small()) == "series-gp"
+
+
+def test_a_file_keeps_errors_on_left_out_cortex(theatre, tmp_path):
+    (name, model), *_ = theatre.models.items()
+    stated = LeftOut(0.02, 0.004, 0.3e-3, 0.4)
+    save(tmp_path / "a.npz", {name: replace(model, left_out=stated)})
+    assert load(tmp_path / "a.npz", model.anatomy)[name].left_out == stated
+    for bad in (replace(stated, mean=float("nan")), replace(stated, solved=1.1), replace(stated, p999="1")):
+        save(tmp_path / "b.npz", {name: replace(model, left_out=bad)})
+        with pytest.raises(InputError, match="left-out"):
+            load(tmp_path / "b.npz", model.anatomy)

@@ -20,9 +20,10 @@ from surrogate.data.disc_split import APART
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.evaluation.coverage import coverage
+from surrogate.evaluation.score import errors
+from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
-from surrogate.model.training_range import envelope_of
 from surrogate.training.bounds import TUMOUR, bound_by, growth_by, missed
 from surrogate.training.expansion import EXPANDED
 from surrogate.training.train import LEARNERS, train
@@ -91,8 +92,8 @@ def scored(trained, data):
 def test_no_load_of_a_left_out_disc_is_learnt(trained, scored, data):
     split = trained.split
     for model in scored.models.values():
-        distance = np.linalg.norm(model.envelope.points[:, None] - split.centres, axis=2)
-        assert distance.min() > split.radius * (1 - 1e-5)
+        away = np.linalg.norm(model.envelope.points[:, None] - split.centres, axis=2).min()
+        assert away > split.radius * (1 - 1e-5)
         assert len(model.envelope.points) == split.train.sum()
     assert len(split.test) == data.good.sum() < len(data.loads)  # failed cases are neither learnt nor scored
 
@@ -132,10 +133,8 @@ def test_what_is_used_was_trained_on_the_discs_too(trained, scored, data):
     held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
     truth = data.displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test]
     for name in ("ann", "svr", "gp", "residual"):
-        used, judged = (
-            np.linalg.norm(models[name].deform(held_out, at=data.anatomy.tumour_nodes).displacement - truth, axis=2)
-            for models in (trained.models, scored.models)
-        )
+        both = (trained.models[name], scored.models[name])
+        used, judged = (errors(model, held_out, truth, data.anatomy.tumour_nodes) for model in both)
         assert used.mean() < 0.9 * judged.mean()
     assert trained.calibrated == data.good.sum() // APART and scored.calibrated == 0
     assert [row.mean_mm for row in trained.scores] == [row.mean_mm for row in scored.scores]
@@ -173,11 +172,18 @@ def test_how_bounds_hold_in_the_discs_left_out_is_reported_of_a_model_that_knows
             error = np.linalg.norm(answer - truth[rows], axis=2).max(axis=1)
             return missed(model, open_patch(data.anatomy), loads.of(Pushed), error)
 
-        near, held = seen(beside), []
+        near, held, alone = seen(beside), [], []
         for disc in range(len(split.centres)):
             here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
             bounds = bound_by(near, TUMOUR, growth_by(near, seen(others), TUMOUR))
-            held.append(seen(here).error <= replace(model, bounds=bounds).deform(good.rows(here)).bound)
+            bounded, asked = replace(model, bounds=bounds), good.rows(here)
+            answer = bounded.deform(asked, at=data.anatomy.tumour_nodes)
+            held.append(seen(here).error <= answer.bound)
+            off, moved = np.linalg.norm([answer.displacement - truth[here], truth[here]], axis=3).mean(axis=2)
+            alone.append([off / moved, Guarded(bounded, bounded).unsure(answer)])
+        (share, solved), stated = np.concatenate(alone, axis=1), trained.models[name].left_out
+        assert (stated.mean, stated.solved) == pytest.approx((share.mean(), solved.mean())) and solved.any()
+        assert stated.guarded == pytest.approx((share * (1.0 - solved)).mean())
         found, held = trained.left_out[name], np.concatenate(held, axis=1)
         assert found.loads == held.shape[1] == split.test.sum() and found.held == pytest.approx(held.mean(axis=1))
     assert scored.left_out == {}
@@ -302,24 +308,8 @@ def test_threads_that_share_a_model_get_their_own_answers(trained, fresh, name):
         return [model.deform(fresh.rows(slice(k, k + 1))).displacement for k in range(thread, 60, 4)]
 
     with ThreadPoolExecutor(4) as pool:
-        answers = list(pool.map(work, range(4)))
+        answers = pool.map(work, range(4))
     assert all(np.array_equal(answer, wanted[k]) for k, answer in enumerate(sum(zip(*answers, strict=True), ())))
-
-
-def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
-    patch = open_patch(box)
-    points = [[0.0, 0.0, 0.0], [3e-3, 0.0, 0.0], [3e-3, 4e-3, 0.0]]
-    training = push(points, [[0.0, 0.0, -0.1], [0.0, 0.0, -0.2], [0.0, 0.0, -0.15]], [5e-3, 6e-3, 5e-3]).of(Pushed)
-    held = push([[13e-3, 0.0, 0.0], [0.0, 4e-3, 0.0]], [[0.3, 0.0, -0.9], [0.0, 0.0, -0.9]], [9e-3, 9e-3]).of(Pushed)
-    found = envelope_of(patch, training)
-    assert found.reach == pytest.approx(4e-3) and np.allclose(found.points, training.point)
-    alone = Pushed(training.point[:1], training.force[:1], training.footprint[:1])
-    assert envelope_of(patch, alone).reach == 0.0
-    overhang = training.footprint - patch.rim_distance(training.point)
-    assert found.overhang == pytest.approx(overhang.max()) and found.angle == pytest.approx(0.0, abs=1e-7)
-    assert (found.force, found.footprint) == ((0.1, 0.2), (5e-3, 6e-3))
-    assert found.line_force == pytest.approx(0.2 / 6e-3)
-    assert not found.holds(patch, held).any() and found.holds(patch, training).all()
 
 
 def test_fresh_loads_lie_inside_the_envelope_and_those_of_left_out_discs_outside(trained, scored, data, fresh):

@@ -55,11 +55,11 @@ def run(args: argparse.Namespace) -> int:
             bar.write(f"{name}: {scene.title}\n  acting: {', '.join(names)}", file=lines)
             bar.write(f"  can be played by: {players}\n  fem: {solver}", file=lines)
             if name in drawn:
-                best = theatre.best(scene)
-                found = thumbnail(theatre.player(best, scene), best)
+                usual = theatre.usual(scene)
+                found = thumbnail(theatre.player(usual, scene), usual)
                 pictures[name] = found.colour
-                known |= {"milliseconds": found.milliseconds, "moved_mm": found.moved_mm, "played_by": best}
-                cost = f"{found.total:.0f} ms a frame by {best}"
+                known |= {"milliseconds": found.milliseconds, "moved_mm": found.moved_mm, "played_by": usual}
+                cost = f"{found.total:.0f} ms a frame by {usual}"
                 bar.write(f"  {cost}; the tumour moves by up to {found.moved_mm:.2f} mm", file=lines)
             rows.append(known)
             bar.update()

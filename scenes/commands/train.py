@@ -18,6 +18,7 @@ from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.disc_split import APART
 from surrogate.data.tool_loads import refused_share, refused_words
 from surrogate.evaluation.score import table, winner
+from surrogate.model.learned import Learned
 from surrogate.model.store import save
 from surrogate.training.expansion import EXPANDED, Expansion
 from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, learners_for, train
@@ -102,6 +103,7 @@ def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
             "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
             table(trained.scores, 1e3 * trained.motion),
             f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}",
+            *(f"on those discs {name} is {model.left_out}" for name, model in trained.models.items() if model.left_out),
             *(f"on those discs bounds of {name} held for {found}" for name, found in trained.left_out.items()),
             *(
                 f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"
@@ -120,12 +122,18 @@ def _calibration(trained: Trained) -> str:
     return f"{trained.calibrated} others calibrated bounds"
 
 
+def _stated(model: Learned) -> dict[str, object]:
+    """What a model says of itself, beside its score."""
+    known = model.left_out
+    return {"bound_mm": 1e3 * model.bound, "discs": None if known is None else asdict(known)}
+
+
 def _for_machines(trained: Trained, out: str, failed: int, preset: str) -> str:
     split = trained.split
     return json.dumps(
         {
             "out": out,
-            "scores": [{**asdict(row), "bound_mm": 1e3 * trained.models[row.name].bound} for row in trained.scores],
+            "scores": [{**asdict(row), **_stated(trained.models[row.name])} for row in trained.scores],
             "winner": winner(trained.scores).name,
             "motion_mm": 1e3 * trained.motion,
             "discs": len(split.centres),

@@ -23,8 +23,9 @@ from sim.runtime.device import find_device
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_files import load_locator, locator_path
 from surrogate.model.applicability import refusal
-from surrogate.model.guarded import LIMIT, Guarded
+from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
+from surrogate.model.left_out import LIMIT
 from surrogate.model.store import load
 
 from ..script.scene import Scene
@@ -117,6 +118,12 @@ class Theatre:
         """The learnt model of the tightest error bound; the finite elements where none knows the scene."""
         knowing = self.knowing(scene)
         return min(knowing, key=lambda name: knowing[name].bound, default="fem")
+
+    def usual(self, scene: Scene) -> str:
+        """Who plays a scene unless somebody else is asked: the best model, guarded where it may not answer alone."""
+        name = self.best(scene)
+        stated = self.models[name].left_out if name in self.models else None
+        return name if stated is None or stated.enough else GUARDED
 
     def described(self, name: str, scene: Scene) -> str:
         """A deformer by name, in words: what solves, or what it learned from."""

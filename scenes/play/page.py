@@ -181,7 +181,7 @@ class Demo:
         try:
             scene = self.first if name == self.first.name else self.find(name)
             known = self.theatre.names(scene)
-            deformer = self.wish.deformer if self.wish.deformer in known else self.theatre.best(scene)
+            deformer = self.wish.deformer if self.wish.deformer in known else self.theatre.usual(scene)
             self._cast(scene, deformer)
             self.wish.set(style=old[-1].style)
             parts = self._parts(deformer)

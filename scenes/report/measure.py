@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,11 @@ Spec = Elements | Learner
 FAMILY = {Elements: "finite elements", Learner: "learnt"}
 
 
-def ready() -> None:
-    """Does nothing, in a process that has then imported all that rows need."""
+def ready(on_card: bool) -> None:
+    """Import all that rows need; on a card also PyTorch, which takes seconds, and what draws."""
+    if on_card:
+        for name in ("torch", "scenes.report.picture"):
+            import_module(name)
 
 
 def measured(study: Study, spec: Spec, picture: Path) -> Row:

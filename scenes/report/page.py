@@ -12,7 +12,7 @@ from typing import Any
 
 from ar.screen import write_png
 from sim.runtime.atomic_files import written_whole
-from surrogate.evaluation.score import FEWEST_FOR_P999
+from surrogate.model.left_out import FEWEST_FOR_P999
 
 from ..bench.csv_tables import write_table
 from .plots import against_solves, against_time, front, learners_against_time

@@ -11,10 +11,10 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from functools import partial
-from itertools import groupby, product
+from itertools import chain, groupby, product, takewhile
 from multiprocessing import get_context
 from pathlib import Path
-from threading import BoundedSemaphore
+from threading import BoundedSemaphore, Event
 
 import msgspec
 import numpy as np
@@ -75,7 +75,7 @@ def apart(turn: AbstractContextManager[object], study: Study, spec: Spec, pictur
     """Measured in a process of its own, which starts at once and measures in its `turn`."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         try:
-            pool.submit(ready).result()
+            pool.submit(ready, study.on_card).result()
             with turn:
                 # What the study has read already stays here.
                 return pool.submit(measured, replace(study), spec, picture).result()
@@ -83,19 +83,39 @@ def apart(turn: AbstractContextManager[object], study: Study, spec: Spec, pictur
             return Row(spec.name, FAMILY[type(spec)], state="its process was ended, for want of memory most likely")
 
 
-def rows(study: Study, specs: Sequence[Spec], run: Run | None = None, cores: int | None = None) -> Iterator[Row]:
+def rows(
+    study: Study,
+    specs: Sequence[Spec],
+    run: Run | None = None,
+    cores: int | None = None,
+    on_card: bool | None = None,
+) -> Iterator[Row]:
     """A row for each of the `specs`; those whose inputs are the same as before are read.
 
     A row is kept as soon as it is measured, unless it could not be. By default each has a process of its own. Finite
-    elements are measured one by one; of learners one for every `CORES` of the machine's cores. What `run` measures in
-    this process is measured one by one, unless `cores` say otherwise.
+    elements are measured one by one; of learners one for every `CORES` of the machine's cores. On a card, whose finite
+    elements take one of those, learners are measured beside them. What `run` measures in this process is measured one
+    by one, unless `cores` say otherwise.
     """
     cores = cores or (1 if run else os.cpu_count() or 1)
+    beside = cores >= 2 * CORES and (study.on_card if on_card is None else on_card)
+    stopped, groups = Event(), []
     for kind, alike in groupby(specs, type):
-        together = 1 if kind is Elements else max(1, cores // CORES)
+        together = 1 if kind is Elements else max(1, cores // CORES - beside)
         measuring = run or partial(apart, BoundedSemaphore(together))
         ahead = together if cores >= CORES else 0
-        yield from _ahead(partial(_row, study, measuring), list(alike), ahead)
+        groups.append(_ahead(partial(_row, study, measuring), list(alike), ahead))
+    if not beside or len(groups) < 2:
+        yield from chain.from_iterable(groups)
+        return
+    with ThreadPoolExecutor(len(groups) - 1) as threads:
+        found = [threads.submit(list, takewhile(lambda _: not stopped.is_set(), group)) for group in groups[1:]]
+        try:
+            yield from groups[0]
+            for group in found:
+                yield from group.result()
+        finally:
+            stopped.set()
 
 
 def _ahead(work: Callable[[Spec], Row], specs: Sequence[Spec], ahead: int) -> Iterator[Row]:

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.loads import Loads, Pushed
 from sim.material import BRAIN, Tissue, tissue_from_json
+from sim.runtime.device import find_device
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.disc_split import Split, leave_discs_out
@@ -51,6 +53,11 @@ class Study:
     beyond: int = 120
     timed: int = 1000
     fine: bool = False
+
+    @cached_property
+    def on_card(self) -> bool:
+        """Whether its finite elements are solved on a graphics card."""
+        return find_device(self.device, TRAIN.precision).on_cuda
 
     @cached_property
     def dataset(self) -> Dataset:

@@ -14,11 +14,10 @@ from sim.loads import Loads
 from sim.runtime.threads import one_thread
 
 from ..model.learned import Learned
+from ..model.left_out import FEWEST_FOR_P999
 from .solve_counts import SolveCounts
 
 WARM_UP, TIMED = 20, 200
-# Fewer loads do not determine the greatest of a thousand.
-FEWEST_FOR_P999 = 1000
 T = TypeVar("T")
 
 

@@ -25,6 +25,7 @@ from ..data.encode import ENCODERS, Basis, Encoder, directions
 from ..data.indentation import indented
 from ..regressors.protocol import Fitted
 from .conformal import LEVELS, Bound, features_of
+from .left_out import LeftOut
 from .tip_distance import Distance, TipModel
 from .training_range import Envelope, Measured, Outside, measured
 
@@ -83,6 +84,8 @@ class Learned:
         Radius [m] of the ball whose poses it answers; None: it answers pushes. Depth [m] then stands for force.
     tip
         What it has learned of the distance from tip to tumour, if anything.
+    left_out
+        How far it was off on cortex left out of a training; None where none was left out, or in older files.
     """
 
     anatomy: Anatomy
@@ -93,6 +96,7 @@ class Learned:
     training: Mapping[str, str] = field(default_factory=dict)
     ball: float | None = None
     tip: TipModel | None = None
+    left_out: LeftOut | None = None
 
     @cached_property
     def source(self) -> str:

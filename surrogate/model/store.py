@@ -31,6 +31,7 @@ from ..regressors.series_residual import Remainder
 from ..regressors.svr import Svr
 from .conformal import GROWTH, Bound
 from .learned import Learned, Part
+from .left_out import LeftOut
 from .npz_archive import Archive
 from .own_learners import find_own, name_of
 from .tip_distance import TipModel
@@ -168,6 +169,7 @@ def _described(model: Learned, put: Any) -> dict[str, Any]:
         "training": dict(model.training),
         "ball": model.ball,
         "tip": None if model.tip is None else _described_tip(model.tip, put),
+        "left_out": None if model.left_out is None else asdict(model.left_out),
     }
 
 
@@ -220,4 +222,5 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         # Older files do not have these.
         description.get("ball"),
         _rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
+        None if (stated := description.get("left_out")) is None else LeftOut(**stated),
     )

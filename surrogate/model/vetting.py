@@ -13,6 +13,7 @@ from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS, Basis
 from .conformal import LEVELS, Bound
 from .learned import Learned, Part
+from .left_out import LeftOut
 from .training_range import Envelope
 
 # Of tool features, and so of the features of bounds.
@@ -34,6 +35,7 @@ def demand_sound(name: str, model: Learned) -> None:
         _check_envelope(model.envelope)
         _demand(isinstance(model.bound, float) and not model.bound < 0.0, "its bound is no distance")
         _demand(model.ball is None or _positive(model.ball), "its ball has no radius")
+        _demand(model.left_out is None or _sound(model.left_out), "its errors on left-out cortex are no errors")
         texts = (*model.training, *model.training.values())
         _demand(all(isinstance(text, str) for text in texts), "what it states of its training is no text")
         if model.bounds is not None:
@@ -130,6 +132,12 @@ def _check_bounds(bounds: Bound) -> None:
     _demand(bool((bounds.quantile >= 0.0).all()), "its bounds are negative")
     _demand(0.0 <= float(bounds.growth) < np.inf and 0.0 <= float(bounds.near) < np.inf, "its bounds do not grow")
     _demand(bool((bounds.quantile[1] >= bounds.quantile[0]).all()), "its bounds shrink with their probability")
+
+
+def _sound(stated: LeftOut) -> bool:
+    """Whether errors on left-out cortex can be."""
+    sizes = (stated.mean, stated.guarded, stated.solved, *([] if stated.p999 is None else [stated.p999]))
+    return all(type(size) is float and 0.0 <= size < np.inf for size in sizes) and stated.solved <= 1.0
 
 
 def _positive(value: float) -> bool:

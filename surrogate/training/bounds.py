@@ -58,6 +58,11 @@ class Missed:
         return Missed(rows_of(self.pushed, some), known, outside, self.features[some], self.error[some])
 
     @property
+    def extrapolated(self) -> np.ndarray:
+        """Which loads (B,) bool lie outside the training range."""
+        return self.outside.excess > 0.0
+
+    @property
     def force(self) -> np.ndarray:
         """(B,) [N]."""
         return self.known.magnitude
@@ -89,8 +94,8 @@ def growth_by(near: Missed, far: Missed, way: Way) -> float:
     return fitted_growth(*_over_plain(near, far, way))
 
 
-def covered_on_discs(model: Learned, near: Missed, far: Missed, split: Split, way: Way) -> Coverage:
-    """How often bounds hold on each disc left out, of a growth that the other discs tell."""
+def bounds_on_discs(model: Learned, near: Missed, far: Missed, split: Split, way: Way) -> np.ndarray:
+    """Bounds (2, B) [m] of loads on discs left out, each of a growth that the other discs tell."""
     known, (ratio, away) = _over_plain(near, far, way)
     disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
     for each in np.unique(disc):
@@ -98,7 +103,12 @@ def covered_on_discs(model: Learned, near: Missed, far: Missed, split: Split, wa
         own = bound_by(near, way, fitted_growth(known, (ratio[~here], away[~here])))
         some = far.rows(here)
         bound[:, here] = model.promised(own, some.pushed, some.known, some.outside)
-    return covered(far.force, far.error, bound, int((far.outside.excess > 0.0).sum()))
+    return bound
+
+
+def covered_by(bound: np.ndarray, far: Missed) -> Coverage:
+    """How often bounds (2, B) [m] hold."""
+    return covered(far.force, far.error, bound, int(far.extrapolated.sum()))
 
 
 def _over_plain(near: Missed, far: Missed, way: Way) -> list[tuple[np.ndarray, np.ndarray]]:

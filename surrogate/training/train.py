@@ -20,10 +20,11 @@ from ..evaluation.coverage import TENTHS, Coverage
 from ..evaluation.score import Score, errors, score
 from ..model.conformal import LEVELS, USUAL_GROWTH, conformal
 from ..model.learned import Learned, only_pushed
+from ..model.left_out import left_out_of
 from ..model.own_learners import OWN, find_own
 from ..model.tip_distance import TipModel
 from ..model.training_range import envelope_of
-from .bounds import TIP, TUMOUR, Missed, bound_by, covered_on_discs, growth_by, missed
+from .bounds import TIP, TUMOUR, Missed, bound_by, bounds_on_discs, covered_by, growth_by, missed
 from .examples import Examples
 from .expansion import EXPANDED, TOUCHED, Expansion
 from .learners import LEARNT, POSED, parts_of
@@ -145,6 +146,7 @@ def train(
         split = _without(leave_discs_out(pushed.point[~apart], patch), apart)
     with stage("read"):
         truth = data.displacement(nodes)[data.good]
+        motion = np.linalg.norm(truth, axis=2).mean(axis=1)
         cortex = data.displacement(shared.cortex)[data.good]
         at = np.concatenate([nodes, shared.cortex])
         both = np.concatenate([truth, cortex], axis=1)
@@ -179,7 +181,8 @@ def train(
         with stage("score"):
             solves = inputs[0].solve_counts(name, example_sets[0])
             scores.append(score(name, model, test, truth[split.test], nodes, solves))
-            error = errors(model, test, truth[split.test], nodes).max(axis=1)
+            distance = errors(model, test, truth[split.test], nodes)
+            error = distance.max(axis=1)
             model, off = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
             tested = rows_of(pushed, split.test)
             far = missed(model, patch, tested, error), missed(model, patch, tested, off)
@@ -190,8 +193,10 @@ def train(
                 near = unseen(model, beside)
                 both = list(zip(near, far, WAYS, strict=True))
                 growth = [growth_by(here, there, way) for here, there, way in both]
-                held = [covered_on_discs(model, here, there, split, way) for here, there, way in both]
-                left_out[name], distance_left_out[name] = held
+                bound = [bounds_on_discs(model, here, there, split, way) for here, there, way in both]
+                left_out[name], distance_left_out[name] = map(covered_by, bound, far)
+                alone = left_out_of(distance, motion[split.test], bound[0][0], far[0].extrapolated)
+                models[name] = replace(models[name], left_out=alone)
         if apart.any():
             with stage(f"learn {name}"):
                 parts = parts_of(name, inputs[1], example_sets[1])
@@ -205,12 +210,11 @@ def train(
                 bounds, tip = (bound_by(near, way, grown, seen) for near, way, grown, seen in every)
                 models[name] = replace(used, bounds=bounds, tip=replace(used.tip or TipModel(), bound=tip))
         progress(name)
-    motion = float(np.linalg.norm(truth[split.test], axis=2).mean())
     return Trained(
         models,
         tuple(scores),
         split,
-        motion,
+        float(motion[split.test].mean()),
         int(apart.sum()),
         len(example_sets[-1].loads.point),
         left_out,

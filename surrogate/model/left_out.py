@@ -1,0 +1,66 @@
+"""How far a model is off where it was given no load, and whether it may answer alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+LIMIT = 0.2e-3
+"""How far off a tumour's vertex may be, in 95 of 100 loads, before finite elements behind a model answer [m]."""
+MEAN, WORST = 0.01, 0.2e-3
+"""What a model may be off by and still answer alone: mean share of the motion; vertices at 99.9 % [m]."""
+FEWEST_FOR_P999 = 1000
+"""Fewer loads do not determine the greatest of a thousand."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Errors on cortex left out of the training, of a model alone and with finite elements behind it.
+
+    Parameters
+    ----------
+    mean, guarded
+        Distance over the motion of its load, mean over loads and tumour vertices: alone, and as `Guarded` answers. What
+        finite elements answer counts as exact.
+    p999
+        Of the model alone, over loads and vertices [m]; None of fewer than `FEWEST_FOR_P999` loads.
+    solved
+        Share of these loads that finite elements answer.
+    """
+
+    mean: float
+    guarded: float
+    p999: float | None
+    solved: float
+
+    @property
+    def enough(self) -> bool:
+        """Whether the model may answer alone."""
+        return self.mean <= MEAN and (self.p999 is None or self.p999 <= WORST)
+
+    def __str__(self) -> str:
+        """In words."""
+        behind = f"with finite elements behind it for {100 * self.solved:.0f} % of the loads {100 * self.guarded:.2f} %"
+        verdict = "it may answer alone" if self.enough else "scenes play it guarded"
+        return f"{100 * self.mean:.2f} % of the motion off alone, {behind}: {verdict}"
+
+
+def left_out_of(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> LeftOut:
+    """Errors on B loads.
+
+    Parameters
+    ----------
+    distance
+        From the finite elements (B, n) [m], at the tumour's vertices.
+    motion
+        Mean displacement of these (B,) [m].
+    bound
+        Of the worst vertex, at 95 % (B,) [m].
+    outside
+        Which loads (B,) bool lie outside the training range.
+    """
+    share = distance.mean(axis=1) / motion
+    solved = ~(bound <= LIMIT) | outside
+    p999 = float(np.percentile(distance, 99.9)) if len(distance) >= FEWEST_FOR_P999 else None
+    return LeftOut(float(share.mean()), float(np.where(solved, 0.0, share).mean()), p999, float(solved.mean()))
