@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+# Share of a distance that two ways to find it may differ by.
+ROUNDING = 1e-9
+
 
 class Closest(NamedTuple):
     """Closest points (B, 3) [m], and where they lie: triangle (B,) and barycentric weights (B, 3)."""
@@ -19,9 +22,13 @@ def closest(points: np.ndarray, corners: np.ndarray) -> Closest:
     """Find what is closest to points (B, 3) [m] on triangles with corners (S, 3, 3), or (B, S, 3, 3) [m].
 
     It is the foot on a triangle's plane where that lies inside, else the closest point of an edge. Triangles without
-    area have edges all the same. All pairs are looked at: meant for a few hundred triangles.
+    area have edges all the same. Of triangles that all points share, each point is held against those alone that may be
+    the closest; the distance to the middle of every one is looked at.
     """
-    corners = corners if corners.ndim == 4 else corners[None]
+    if corners.ndim == 3:
+        near = _candidates(points, corners)
+        found = closest(points, corners[near])
+        return found._replace(triangle=near[np.arange(len(near)), found.triangle])
     edge = np.roll(corners, -1, axis=2) - corners
     arm = points[:, None, None] - corners
     square = np.einsum("bsei,bsei->bse", edge, edge)
@@ -48,3 +55,15 @@ def closest(points: np.ndarray, corners: np.ndarray) -> Closest:
     weights[some, (start + 1) % 3] = along
     at = corners[np.minimum(row, len(corners) - 1), triangle]
     return Closest(np.einsum("bc,bci->bi", weights, at), triangle, weights)
+
+
+def _candidates(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Numbers (B, k) of triangles among which the closest is: no middle lies nearer than their nearest corner may.
+
+    Each row begins with those that may be the closest, in rising order, so that of equal ones the first is found.
+    """
+    middle = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    away = np.linalg.norm(points[:, None] - middle, axis=2)
+    maybe = ~(away - reach > (1.0 + ROUNDING) * away.min(axis=1, keepdims=True))
+    return np.argsort(~maybe, axis=1, kind="stable")[:, : maybe.sum(axis=1).max()]
