@@ -93,6 +93,8 @@ class Deformation:
     bound
         (2, B) [m]: with probability 0.95, and 0.99, no tumour vertex is farther off what the deformer was trained on;
         NaN from one that promises nothing.
+    reaction_bound
+        (2, B) [N]: the same of the force of each tool in `reaction`.
     source
         Who answered, in words: finite elements of which kind and tissue, or what learned from them.
     """
@@ -112,11 +114,13 @@ class Deformation:
     leaked: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     bond: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     bound: np.ndarray = field(default_factory=lambda: np.array(np.nan))
+    reaction_bound: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     source: str = ""
 
     def __post_init__(self) -> None:
         count = len(self.displacement)
-        shapes = {name: (count,) for name in ("reached", "inverted", "leaked", "bond")} | {"bound": (2, count)}
+        shapes = {name: (count,) for name in ("reached", "inverted", "leaked", "bond")}
+        shapes |= {"bound": (2, count), "reaction_bound": (2, count)}
         for name, shape in shapes.items():
             given = getattr(self, name)
             if given.shape != shape:
@@ -142,6 +146,7 @@ class Deformation:
             leaked=self.leaked[index],
             bond=self.bond[index],
             bound=self.bound[:, index],
+            reaction_bound=self.reaction_bound[:, index],
             memory={name: value[index] for name, value in self.memory.items()},
             warm={name: value[index] for name, value in self.warm.items()},
         )
@@ -195,6 +200,7 @@ def joined(parts: Sequence[Deformation]) -> Deformation:
         leaked=stacked("leaked"),
         bond=stacked("bond"),
         bound=np.concatenate([part.bound for part in parts], axis=1),
+        reaction_bound=np.concatenate([part.reaction_bound for part in parts], axis=1),
         source=parts[0].source,
     )
 

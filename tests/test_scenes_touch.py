@@ -18,15 +18,18 @@ from scenes.script.site import site_of
 from scenes.script.tool_paths import AIR, Touch
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
+from sim.deformation import Outcome
 from sim.effects import Elasticity, Held, Pulsation, Slide, ToolContact
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Retracted, Touching
+from sim.loads import Retracted, Touching, stacked
 from sim.material import Material
 from sim.tools import Ball, distances_to
 from surrogate.data.cortex_patch import open_patch
 from surrogate.model.applicability import refusal
+from surrogate.model.guarded import answering
 from surrogate.model.learned import Learned, Part
+from surrogate.model.tool_force import ForceModel
 from surrogate.model.training_range import Envelope
 from surrogate.training.condense_contact import condensed, side_by_side
 
@@ -57,7 +60,8 @@ def untrained(anatomy: Anatomy, scene: Scene) -> Learned:
     contact, bases = condensed(fem, [anatomy.tumour_nodes, np.setdiff1d(patch.nodes, anatomy.tumour_nodes)])
     envelope = Envelope(patch.points, 1.0, 1.0, np.pi, (1e-6, 1.0), (ball.radius, ball.radius), np.inf)
     said = {"effects": repr(scene.effects)}
-    return Learned(anatomy, (Part("tool", contact, side_by_side(bases)),), envelope, training=said, ball=ball.radius)
+    parts = (Part("tool", replace(contact, grip=np.array([1.0, 0.0])), side_by_side(bases)),)
+    return Learned(anatomy, parts, envelope, training=said, ball=ball.radius, force=ForceModel())
 
 
 class TestPalpate:
@@ -94,6 +98,43 @@ class TestPalpate:
         """Trained on where a ball is, it answers without the force that it takes."""
         frame = palpated[6]
         assert acting(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6)))) == ""
+
+    def test_what_a_model_knows_of_the_force_is_said_with_its_bound(self, palpated):
+        frame = palpated[6]
+        reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
+        answer = replace(frame.deformation, reaction_bound=np.array([[0.012], [0.02]]), outcome=(Outcome.PREDICTED,))
+        assert acting(frame.loads, answer) == f"the tool reads {reads:.2f} N within 0.01 N"
+        far = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
+        assert acting(frame.loads, far) == f"the tool reads {reads:.2f} N"
+
+    @pytest.mark.parametrize("force", [ForceModel(), None])
+    def test_guarded_frames_are_the_model_s_or_the_finite_elements(self, theatre, palpated, force):
+        """Deeper than in training the finite elements answer: each frame, and all of them as one batch."""
+        scene, anatomy = small("palpate"), theatre.anatomy
+        plain = replace(untrained(anatomy, scene), bound=1e-4, force=force)
+        model = replace(plain, envelope=replace(plain.envelope, force=(1e-6, 2e-3)))
+        both = replace(theatre, models={"contact": model})
+        assert both.names(scene) == ("contact", "guarded", "fem")
+        play, by_model = player(both, scene, "guarded"), 0
+        frames = list(play.frames(10))
+        for frame, solved in zip(frames, palpated, strict=True):
+            trained = answering(play.deformer, frame.deformation) is not None
+            by_model += trained
+            assert trained == (model.deform(frame.loads).outcome[0] is Outcome.PREDICTED)
+            expected = model.deform(frame.loads) if trained else solved.deformation
+            nodes = anatomy.tumour_nodes
+            theirs = expected.at(nodes).displacement
+            assert frame.deformation.at(nodes).displacement == pytest.approx(theirs, abs=1e-5)
+            assert frame.deformation.reaction == pytest.approx(expected.reaction, abs=2e-3)
+        assert 2 < by_model < len(frames) - 2
+        batch = play.deformer.deform(stacked([frame.loads for frame in frames]), at=nodes)
+        for row, (frame, solved) in enumerate(zip(frames, palpated, strict=True)):
+            theirs = frame.deformation.at(nodes).displacement[0]
+            assert batch.displacement[row] == pytest.approx(theirs, abs=1e-5)
+            known = batch.outcome[row] is Outcome.PREDICTED
+            assert np.isnan(batch.reaction_bound).all() and batch.reaction.shape == (len(frames), force is not None, 6)
+            if force is not None and not known:
+                assert batch.reaction[row] == pytest.approx(solved.deformation.reaction[0], abs=2e-3)
 
     def test_linear_contact_plays_it_untrained(self, theatre, palpated):
         """Nearly as finite elements of softer tissue that stiffens do, on tumour and cortex."""

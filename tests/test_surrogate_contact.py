@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -16,14 +18,17 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Touching
 from sim.material import Material, tissue_to_json
+from surrogate.data.answer_rows import checksums, row_type
 from surrogate.data.cortex_patch import barycentric_lattice, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import Basis, tool_features
 from surrogate.data.indentation import indented
 from surrogate.data.simulate import simulate
-from surrogate.data.tool_poses import ball_of, draw_poses
+from surrogate.data.tool_poses import ball_of, draw_poses, poses_at
+from surrogate.evaluation.force_score import judged_force
 from surrogate.evaluation.score import errors
 from surrogate.model.store import load, save
+from surrogate.model.tool_force import wrench
 from surrogate.regressors.ball_contact import THICKER, Contact, nearest_shares
 from surrogate.training.condense_contact import condensed, unit_responses
 from surrogate.training.expansion import TOUCHED
@@ -33,6 +38,8 @@ BALL = ball_of("palpation")
 SOFT = Material("linear", 3000.0, 0.45)
 # What the pretender's forces do far away: at no depth, and more by so much a radius of depth.
 LINE = (0.97, 0.3)
+# The same of the force that the tool exerts.
+GRIP = (1.05, 0.5)
 
 
 def features(anatomy: Anatomy, loads: Loads) -> np.ndarray:
@@ -160,7 +167,9 @@ class Stiffening:
         split, displacement = len(self.bases[0].modes), np.zeros((len(loads), len(self.anatomy.mesh.nodes), 3))
         for basis, coefficients in zip(self.bases, (answered[:, :split], answered[:, split:]), strict=True):
             displacement[:, basis.nodes] = basis.decode(coefficients)
-        count = len(loads)
+        count, depth = len(loads), X[:, 6:7] / X[:, 7:8]
+        force = self.contact.force(X).reshape(count, -1, 3).sum(axis=1)
+        force *= (GRIP[0] + GRIP[1] * depth) * (1.0 + 0.1 * np.sin(100.0 * X[:, :1]))
         answer = Deformation(
             displacement,
             np.arange(len(self.anatomy.mesh.nodes)),
@@ -168,7 +177,7 @@ class Stiffening:
             np.zeros(count, int),
             np.zeros(count),
             loads.times,
-            np.zeros((count, 0, 6)),
+            wrench(force, loads.of(Touching), BALL.radius),
         )
         return answer if at is None else answer.at(at)
 
@@ -213,12 +222,63 @@ def test_contact_learns_how_forces_grow_and_a_process_the_rest(
     assert np.linalg.norm(both.deform(fresh, at=cortex).displacement - exact) < 0.05 * np.linalg.norm(exact)
 
 
+def test_the_tool_s_force_is_answered_with_a_bound_of_its_own(
+    data: Dataset, trained: Trained, elements: Stiffening, box: Anatomy
+) -> None:
+    contact, both = (trained.models[name] for name in TOUCHED)
+    regressor = contact.parts[0].regressor
+    assert isinstance(regressor, Contact)
+    np.testing.assert_allclose(regressor.grip, GRIP, atol=0.1)
+    fresh = draw_poses("palpation", box, 60, 77)
+    truth = elements.deform(fresh).reaction
+    found, plain = both.deform(fresh), contact.deform(fresh)
+    size = np.linalg.norm(truth[:, 0, :3], axis=1)
+    error = np.linalg.norm((found.reaction - truth)[:, 0, :3], axis=1)
+    assert (error / size).mean() < 0.02
+    assert (error / size).mean() < 0.7 * (np.linalg.norm((plain.reaction - truth)[:, 0, :3], axis=1) / size).mean()
+    # Moments about the tool's lowest point follow the force.
+    assert np.linalg.norm((found.reaction - truth)[:, 0, 3:]) < 0.05 * np.linalg.norm(truth[:, 0, 3:])
+    for answer in (found, plain):
+        off = np.linalg.norm((answer.reaction - truth)[:, 0, :3], axis=1)
+        assert (off <= answer.reaction_bound[0]).mean() > 0.75  # 40 loads calibrate
+        assert (answer.reaction_bound[0] < size).mean() > 0.9
+    judged = judged_force(both, fresh, truth[:, 0, :3])
+    assert judged.mean_percent == pytest.approx(100.0 * (error / size).mean())
+    assert judged.held is not None and judged.held[0] == pytest.approx((error <= found.reaction_bound[0]).mean())
+    assert trained.force["contact-gp"].mean_percent < trained.force["contact"].mean_percent < 9.0
+    lifted = poses_at(BALL, np.array([[0.0, 0.0, 0.1]]), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 0.0, -1e-3]]))
+    assert not both.deform(Loads((lifted,))).reaction.any()
+
+
+def test_without_reactions_the_force_is_not_answered(tmp_path: Path, data: Dataset, box: Anatomy) -> None:
+    """Files of earlier versions, whose rows end before the reaction, are read and train models all the same."""
+    older = tmp_path / "older.h5"
+    shutil.copy(data.path, older)
+    with h5py.File(older, "r+") as file:
+        rows = np.empty(len(data.loads), row_type(len(box.mesh.nodes)))
+        for name in rows.dtype.names or ():
+            rows[name] = file[f"answers/{name}"][:]
+        del file["answers/reaction"]
+        file["answers/checksum"][:] = checksums(rows)
+    read = read_dataset(older)
+    assert read.reaction() is None and data.reaction() is not None
+    np.testing.assert_array_equal(read.displacement(box.tumour_nodes), data.displacement(box.tumour_nodes))
+    found = train(read, ["contact"])
+    assert found.force == {}
+    answer = found.models["contact"].deform(draw_poses("palpation", box, 2, 1))
+    assert answer.reaction.shape == (2, 0, 6) and np.isnan(answer.reaction_bound).all()
+
+
 def test_it_is_stored_and_answers_alone_as_in_company(tmp_path: Path, trained: Trained, box: Anatomy) -> None:
     save(tmp_path / "model.npz", trained.models)
     again, fresh = load(tmp_path / "model.npz", box), draw_poses("palpation", box, 6, 1)
     for name in TOUCHED:
         together = trained.models[name].deform(fresh).displacement
         np.testing.assert_array_equal(again[name].deform(fresh).displacement, together)
+        for what in ("reaction", "reaction_bound"):
+            np.testing.assert_array_equal(
+                *(getattr(model.deform(fresh), what) for model in (again[name], trained.models[name]))
+            )
         alone = [again[name].deform(fresh.rows(slice(row, row + 1))).displacement[0] for row in range(6)]
         np.testing.assert_allclose(alone, together, atol=1e-8)
 

@@ -250,6 +250,9 @@ def test_the_command_makes_poses_that_finite_elements_answer(
     truth = fem.deform(data.loads)
     stored = data.displacement(np.arange(len(box.mesh.nodes)))
     assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
+    reaction = data.reaction()
+    assert reaction is not None
+    np.testing.assert_allclose(reaction, truth.reaction, atol=2e-3 * np.abs(truth.reaction).max())
     force = truth.reaction[:, 0, :3]
     shaft = data.loads.of(Touching).pose[:, 0, :3, 2]  # pyright: ignore[reportOptionalMemberAccess]
     assert (np.einsum("bi,bi->b", force, shaft) < 0.0).all()

@@ -30,6 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.data.dataset import read_dataset
     from surrogate.data.tool_loads import refused_share, refused_words
     from surrogate.evaluation.coverage import coverage, distance_coverage
+    from surrogate.evaluation.force_score import judged_force
     from surrogate.evaluation.score import score, table
     from surrogate.model.store import load
 
@@ -60,11 +61,18 @@ def run(args: argparse.Namespace) -> int:
         for name, model in models.items()
         if model.tip is not None and model.tip.bound is not None
     }
+    reaction = data.reaction()
+    forces = {
+        name: judged_force(model, loads, reaction[data.good, 0, :3])
+        for name, model in models.items()
+        if model.force is not None and reaction is not None
+    }
     motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())
     preset = "" if data.ball is not None else data.provenance.get("preset", "")
     if args.json:
         covered, of_tip = ({name: asdict(found) for name, found in held.items()} for held in (promised, ranged))
         figures = {"scores": [asdict(row) for row in scores], "coverage": covered, "distance_coverage": of_tip}
+        figures["force"] = {name: asdict(found) for name, found in forces.items()}
         print(json.dumps({**figures, "motion_mm": motion, "nominal_refused": refused_share(preset)}))
     else:
         print(f"{len(loads)} loads, against the finite elements that answered them:\n{table(scores, motion)}")
@@ -73,4 +81,6 @@ def run(args: argparse.Namespace) -> int:
         for name in models:
             for what, held in (("bounds", promised), ("bounds of the distance from tip to tumour", ranged)):
                 print(f"{name}: {what} held for {held[name]}" if name in held else f"{name}: states no {what}")
+            if name in forces:
+                print(f"{name}: the tool's force: {forces[name]}")
     return 0

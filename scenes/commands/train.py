@@ -109,6 +109,7 @@ def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
                 f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"
                 for name, found in trained.distance_left_out.items()
             ),
+            *(f"on those discs, the tool's force by {name}: {found}" for name, found in trained.force.items()),
             f"the models written were trained on {trained.training_loads} loads; {_calibration(trained)}",
             f"written: {out}",
         ]
@@ -144,6 +145,7 @@ def _for_machines(trained: Trained, out: str, failed: int, preset: str) -> str:
             "calibrated": trained.calibrated,
             "left_out": {name: asdict(found) for name, found in trained.left_out.items()},
             "distance_left_out": {name: asdict(found) for name, found in trained.distance_left_out.items()},
+            "force": {name: asdict(found) for name, found in trained.force.items()},
             "not_converged": failed,
             "nominal_refused": refused_share(preset),
         }

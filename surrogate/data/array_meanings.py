@@ -21,7 +21,7 @@ GROUPS = {
 CASE, VERTEX, RAS = "load case", "mesh vertex, as the rows of anatomy/nodes", "x, y, z (RAS)"
 CHECKED = (
     "zlib.crc32 of the row's bytes, little-endian and in this order: displacement, outcome (padded with zeros), "
-    "iterations, residual"
+    "iterations, residual, and reaction where there is one"
 )
 
 
@@ -74,6 +74,11 @@ MEANINGS = {
         "T_world_tool, from the tool's frame to RAS: a rotation, and in the last column the tool's origin",
     ),
     "answers/displacement": Meaning("m", f"{CASE}; {VERTEX}; {RAS}", "displacement from rest"),
+    "answers/reaction": Meaning(
+        "N, N m",
+        f"{CASE}; tool; force along {RAS}, then moment about the tool's origin",
+        "what each tool exerts on the body",
+    ),
     "unit/displacement": Meaning(
         "m/N",
         f"node and axis of the force, as in unit/node; {VERTEX}; {RAS}",

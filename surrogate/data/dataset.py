@@ -3,7 +3,8 @@
 Layout: `anatomy/` the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/`, each with `displacement`
 (n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` belongs to `loads/`. `unit/` holds
 the small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, y and z in turn.
-Data of poses have none. What each array is, is written beside it (`array_meanings`).
+Data of poses have none, but `answers/reaction` (n, tools, 6), which older files lack. What each array is, is written
+beside it (`array_meanings`).
 """
 
 from __future__ import annotations
@@ -134,6 +135,29 @@ class Dataset:
         """
         return self._rows("answers", nodes, self.good, 1.0)
 
+    def reaction(self) -> np.ndarray | None:
+        """The force [N] and moment [N m] that each tool exerts, (n, tools, 6); None where these are not known.
+
+        That is of pushes, of files of earlier versions, and of deformers that do not know them.
+
+        Raises
+        ------
+        InputError
+            Rows that were damaged.
+        """
+        with read_as(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
+            if "answers/reaction" not in file:
+                return None
+            rows = [
+                read_rows(file, "answers", len(self.anatomy.mesh.nodes), first, first + CHUNK)
+                for first in range(0, len(self.loads), CHUNK)
+            ]
+        lost = np.flatnonzero(~np.concatenate([whole for _, whole in rows]))
+        if len(lost):
+            raise InputError(_damaged(self.path, lost, "answers"))
+        found = np.concatenate([each["reaction"] for each, _ in rows])
+        return found if np.isfinite(found[self.good]).all() else None
+
     def unit_response(self, nodes: np.ndarray) -> np.ndarray:
         """Small-strain responses (3 m, k, 3) float32 [m/N] of the vertices `nodes` (k,).
 
@@ -158,16 +182,20 @@ class Dataset:
                 chosen.append(field[:, nodes])
         lost, strange = np.concatenate(damaged), np.concatenate(absurd)
         if len(lost):
-            raise InputError(
-                f"{self.path}: {numbered(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: it solves "
-                "those alone; data of an earlier version are made anew."
-            )
+            raise InputError(_damaged(self.path, lost, group))
         if len(strange):
             raise InputError(
                 f"{self.path}: {numbered(strange)} of `{group}` move by more than the body measures, {size:.3g} m"
                 f"{'' if force == 1.0 else f', under {force:g} N'}: no solver made them. Simulate anew."
             )
         return np.concatenate(chosen)
+
+
+def _damaged(path: Path, lost: np.ndarray, group: str) -> str:
+    return (
+        f"{path}: {numbered(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: it solves those alone; "
+        "data of an earlier version are made anew."
+    )
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -242,10 +270,14 @@ def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int)
     """Rows `first` to `last` (`row_type`) of answers or unit responses, and (B,) bool: whose checksums agree."""
     here = slice(first, last)
     displacement = stored(file, f"{group}/displacement", "f", (None, vertices, 3))
-    rows = np.empty(len(range(*here.indices(len(displacement)))), row_type(vertices))
+    known = f"{group}/reaction" in file
+    tools = stored(file, f"{group}/reaction", "f", (len(displacement), None, 6)).shape[1] if known else 0
+    rows = np.empty(len(range(*here.indices(len(displacement)))), row_type(vertices, tools))
     rows["displacement"] = displacement[here]
     for name, kinds in (("outcome", "S"), ("iterations", "iu"), ("residual", "f")):
         rows[name] = stored(file, f"{group}/{name}", kinds, (len(displacement),))[here]
+    if tools:
+        rows["reaction"] = stored(file, f"{group}/reaction", "f")[here]
     if file.attrs["format"] == UNCHECKED:
         return rows, np.ones(len(rows), bool)
     return rows, checksums(rows) == stored(file, f"{group}/checksum", "u", (len(displacement),))[here]

@@ -40,7 +40,7 @@ from .dataset import (
     write_provenance,
 )
 from .journal import Batch, DamageWarning, Journal, opened
-from .tasks import Crew, Task, answered
+from .tasks import Crew, Task, answered, posed_tools
 
 # Names of the file's groups where their seconds are reported.
 STAGES = {"unit": "unit responses", "answers": "loads"}
@@ -86,10 +86,9 @@ class Work:
     nodes: np.ndarray
     batch: int
 
-    @property
-    def row(self) -> np.dtype:
-        """What a row is."""
-        return row_type(len(self.anatomy.mesh.nodes))
+    def row(self, group: str) -> np.dtype:
+        """What a row of a group is."""
+        return row_type(len(self.anatomy.mesh.nodes), posed_tools(self.loads) if group == "answers" else 0)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -151,8 +150,10 @@ def simulate(
     if batch < 1:
         raise InputError(f"a batch of {batch} solves nothing: give --batch >= 1.")
     check_output(path, path.suffix)
-    nodes = open_patch(deformer.anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
+    posed = posed_tools(loads) > 0
+    nodes = np.zeros(0, int) if posed else open_patch(deformer.anatomy).nodes
     stated = {**provenance, "format": FORMAT, "anatomy": deformer.anatomy.digest, "batch": str(batch)}
+    stated |= {"reactions": "kept"} if posed else {}
     partial = unfinished_path(path)
     finished: set[Batch] = set()
     work = Work(deformer.anatomy, loads, nodes, batch)
@@ -163,7 +164,7 @@ def simulate(
         finished = _whole_batches(path, work)
         if not partial.exists() and not set(work.batches) - finished and _same_body(path, work):
             return Solved()
-    size = work.row.itemsize * sum(work.counts.values())
+    size = sum(work.row(group).itemsize * rows for group, rows in work.counts.items())
     held = partial.stat().st_size if partial.exists() else 0
     demand_space(path, max(size - held, 0) + size, size)
     run = {
@@ -245,22 +246,27 @@ def _write(path: Path, work: Work, stated: Mapping[str, str], journal: Journal) 
         write_provenance(file, {**facts, **stated})
         write_embedded(file, work.anatomy)
         write_loads(file, work.loads)
+
+        def kinds(group: str) -> list[tuple[str, np.dtype]]:
+            return [(item, work.row(group)[item]) for item in work.row(group).names or ()]
+
         arrays = {
             (name, item): group.create_dataset(item, (rows, *kind.shape), kind.base)
             for name, rows in work.counts.items()
             for group in [file.create_group(name)]
-            for item, kind in [(item, work.row[item]) for item in work.row.names or ()] + [("checksum", CHECKSUM)]
+            for item, kind in [*kinds(name), ("checksum", CHECKSUM)]
         }
         file["unit/node"] = np.repeat(work.nodes, 3)
         explain(file)
 
         def taken(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
-            rows = np.frombuffer(journal.read(batch), work.row) if batch in journal else _kept(path, work, batch)
+            kind = work.row(batch[0])
+            rows = np.frombuffer(journal.read(batch), kind) if batch in journal else _kept(path, work, batch)
             return rows, checksums(rows)
 
         for batch, (rows, sums) in _ahead(taken, work.batches):
             here = slice(batch[1], batch[1] + len(rows))
-            for item in work.row.names or ():
+            for item, _ in kinds(batch[0]):
                 arrays[batch[0], item][here] = rows[item]
             arrays[batch[0], "checksum"][here] = sums
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer
-from sim.loads import Loads, Nodal
+from sim.loads import Loads, Nodal, Touching
 from sim.runtime.processes import Child, answers
 
 from .answer_rows import rows_of
@@ -53,7 +53,13 @@ def solved(deformer: Deformer, task: Task) -> bytes:
     unit = task.loads is None
     loads = unit_loads(anatomy, task.rows) if task.loads is None else task.loads
     answer = deformer.deform(loads).at(np.arange(len(anatomy.mesh.nodes)))
-    return rows_of(answer, UNIT_FORCE if unit else 1.0).tobytes()
+    return rows_of(answer, UNIT_FORCE if unit else 1.0, 0 if unit else posed_tools(loads)).tobytes()
+
+
+def posed_tools(loads: Loads) -> int:
+    """How many tools the loads move by pose, whose reactions are kept; none of pushes."""
+    touching = loads.of(Touching)
+    return 0 if touching is None else touching.pose.shape[1]
 
 
 def unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:

@@ -58,7 +58,8 @@ class Guarded:
         good = np.array([outcome.good for outcome in solved.outcome])
         if at is None and good.all() and len(unsure) == len(loads):
             return solved
-        return _replaced(predicted, unsure[good], solved.rows(np.flatnonzero(good)))
+        pushed = self.model.ball is None
+        return _replaced(predicted, unsure[good], solved.rows(np.flatnonzero(good)), pushed)
 
     def unsure(self, predicted: Deformation) -> np.ndarray:
         """(B,) bool: which of the model's answers are not good enough."""
@@ -78,14 +79,18 @@ def answering(deformer: Deformer, answer: Deformation) -> Learned | None:
     return model_of(deformer) if answer.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
 
 
-def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation) -> Deformation:
-    """Answers of which some `rows` (k,) are solved; the force of a push is what the load says, whoever answers."""
+def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation, pushed: bool) -> Deformation:
+    """Answers of which some `rows` (k,) are solved; the force of a push is what the load says, whoever answers.
+
+    So is that of a pose unknown in all of them, if the model does not know it.
+    """
     pick = np.arange(len(predicted))
     pick[rows] = len(predicted) + np.arange(len(rows))
     ours = replace(predicted, cost=Cost({"predict": predicted.cost.total, "solve": 0.0}))
     theirs = solved.at(predicted.nodes)
     cost = Cost({"predict": 0.0, "solve": solved.cost.total})
-    theirs = replace(theirs, reaction=predicted.reaction[rows], cost=cost)
+    known = solved.reaction.shape[1] == predicted.reaction.shape[1] and not pushed
+    theirs = replace(theirs, reaction=theirs.reaction if known else predicted.reaction[rows], cost=cost)
     source = predicted.source
     if len(rows):
         source += f"; for {len(rows)} of {len(predicted)} loads {solved.source}"

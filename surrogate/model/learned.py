@@ -16,17 +16,19 @@ from sim.arguments import whole_numbers
 from sim.bodies.tip_distance import tip_gauge
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
-from sim.loads import Loads, Pushed, check_loads
+from sim.loads import Loads, Pushed, Touching, check_loads
 from sim.material import tissue_from_json
 from sim.runtime.threads import one_thread
 
 from ..data.cortex_patch import Patch, nearest, open_patch
 from ..data.encode import ENCODERS, Basis, Encoder, directions
 from ..data.indentation import indented
+from ..regressors.ball_contact import Contact
 from ..regressors.protocol import Fitted
 from .conformal import LEVELS, Bound, features_of
 from .left_out import LeftOut
 from .tip_distance import Distance, TipModel
+from .tool_force import ForceModel, wrench
 from .training_range import Envelope, Measured, Outside, measured
 
 # Times the strongest force, or the widest footprint, of the training. Of three loads so strong on the template's brain
@@ -86,6 +88,8 @@ class Learned:
         What it has learned of the distance from tip to tumour, if anything.
     left_out
         How far it was off on cortex left out of a training; None where none was left out, or in older files.
+    force
+        What it has learned of the force that its ball exerts, if anything.
     """
 
     anatomy: Anatomy
@@ -97,6 +101,7 @@ class Learned:
     ball: float | None = None
     tip: TipModel | None = None
     left_out: LeftOut | None = None
+    force: ForceModel | None = None
 
     @cached_property
     def source(self) -> str:
@@ -206,7 +211,16 @@ class Learned:
         far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED
         self._demand_answerable(pushed, np.flatnonzero(far | small))
         promised = self.promised(self.bounds, pushed, known, outside)
-        return predicted(self.motion(pushed, nodes), nodes, loads, far, begun, promised, self.source)
+        answer = predicted(self.motion(pushed, nodes), nodes, loads, far, begun, promised, self.source)
+        touching = loads.of(Touching)
+        if self.force is None or self.ball is None or touching is None:
+            return answer
+        return replace(
+            answer,
+            reaction=wrench(self.exerted(pushed), touching, self.ball),
+            reaction_bound=self.promised(self.force.bound, pushed, known, outside),
+            cost=Cost({"predict": time.perf_counter() - begun}),
+        )
 
     def motion(self, pushed: Pushed, nodes: np.ndarray, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
         """Displacements (B, n, 3) [m] of mesh vertices `nodes` (n,) by the model alone, without limits and bound.
@@ -226,8 +240,26 @@ class Learned:
         ]
         return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
 
+    def exerted(self, pushed: Pushed) -> np.ndarray:
+        """Forces (B, 3) [N] that the ball exerts at indentations; as `motion`, in proportion beyond the training.
+
+        Raises
+        ------
+        InputError
+            A model that has not learned them.
+        """
+        if self.force is None:
+            raise InputError("this model does not know its tool's force: train it anew, on newly simulated poses.")
+        magnitude, direction = directions(pushed)
+        asked = replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
+        found = np.zeros(pushed.force.shape) + self.force.added(self._patch, asked)
+        for part in self.parts:
+            if isinstance(part.regressor, Contact):
+                found += part.regressor.exerted(ENCODERS[part.encoder](self._patch, asked))
+        return magnitude[:, None] * found
+
     def promised(self, bound: Bound | None, pushed: Pushed, known: Measured, outside: Outside) -> np.ndarray:
-        """The bounds (2, B) [m] of loads; NaN where there is none."""
+        """The bounds (2, B) of loads, [m], or [N] of a force; NaN where there is none."""
         if bound is None:
             return np.stack([np.nan * outside.excess] * len(LEVELS))
         # As the motion, so its error: in proportion to a force weaker than any of the training.
@@ -288,7 +320,7 @@ def predicted(
     """
     count = len(loads)
     pushed, unknown = loads.of(Pushed), np.full(count, np.nan)
-    reaction = np.zeros((count, 0 if pushed is None else 1, 6))  # the force of a pose is unknown
+    reaction = np.zeros((count, 0 if pushed is None else 1, 6))  # of a pose, who asks adds it
     if pushed is not None:
         reaction[:, 0, :3] = pushed.force
     return Deformation(

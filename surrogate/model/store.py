@@ -35,6 +35,7 @@ from .left_out import LeftOut
 from .npz_archive import Archive
 from .own_learners import find_own, name_of
 from .tip_distance import TipModel
+from .tool_force import ForceModel
 from .training_range import Envelope
 from .vetting import demand_finite, demand_sound
 
@@ -123,8 +124,9 @@ def _keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
         for part in description["parts"]:
             yield from (part["nodes"], part["modes"], *part["state"].values())
         yield description["envelope"]["points"]
-        tip = description.get("tip") or {}
-        for named in (description["bounds"], tip.get("bound"), tip.get("correction")):
+        tip, force = description.get("tip") or {}, description.get("force") or {}
+        state = (force.get("learned") or {}).get("state")
+        for named in (description["bounds"], tip.get("bound"), tip.get("correction"), force.get("bound"), state):
             yield from (named or {}).values()
 
 
@@ -149,12 +151,10 @@ def _kind(name: str) -> type[Fitted]:
 
 
 def _described(model: Learned, put: Any) -> dict[str, Any]:
-    names = {kind: name for name, kind in FITTED.items()}
     parts = [
         {
             "encoder": part.encoder,
-            "regressor": names.get(type(part.regressor)) or _own_name(part.regressor),
-            "state": {name: put(array) for name, array in part.regressor.state().items()},
+            **_described_regressor(part.regressor, put),
             "nodes": put(part.basis.nodes),
             "modes": put(part.basis.modes),
         }
@@ -170,7 +170,38 @@ def _described(model: Learned, put: Any) -> dict[str, Any]:
         "ball": model.ball,
         "tip": None if model.tip is None else _described_tip(model.tip, put),
         "left_out": None if model.left_out is None else asdict(model.left_out),
+        "force": None if model.force is None else _described_force(model.force, put),
     }
+
+
+def _described_regressor(regressor: Fitted, put: Any) -> dict[str, Any]:
+    names = {kind: name for name, kind in FITTED.items()}
+    state = {name: put(array) for name, array in regressor.state().items()}
+    return {"regressor": names.get(type(regressor)) or _own_name(regressor), "state": state}
+
+
+def _rebuilt_regressor(description: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Fitted:
+    state = {name: arrays[key] for name, key in description["state"].items()}
+    demand_finite(state)
+    return _kind(description["regressor"]).restored(state)
+
+
+def _described_force(force: ForceModel, put: Any) -> dict[str, Any]:
+    learned = None if force.learned is None else _described_regressor(force.learned, put)
+    return {"encoder": force.encoder, "learned": learned, "bound": _put_bound(force.bound, put)}
+
+
+def _rebuilt_force(
+    description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], reach: float
+) -> ForceModel | None:
+    if description is None:
+        return None
+    learned = description["learned"]
+    return ForceModel(
+        description["encoder"],
+        None if learned is None else _rebuilt_regressor(learned, arrays),
+        _rebuilt_bound(description["bound"], arrays, reach),
+    )
 
 
 def _described_tip(tip: TipModel, put: Any) -> dict[str, Any]:
@@ -204,10 +235,8 @@ def _rebuilt_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray
 def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:
     parts = []
     for part in description["parts"]:
-        state = {name: arrays[key] for name, key in part["state"].items()}
-        demand_finite(state)
         basis = Basis(arrays[part["nodes"]], arrays[part["modes"]])
-        parts.append(Part(part["encoder"], _kind(part["regressor"]).restored(state), basis))
+        parts.append(Part(part["encoder"], _rebuilt_regressor(part, arrays), basis))
     envelope = dict(description["envelope"])
     envelope["points"] = arrays[envelope["points"]]
     for name in ("force", "footprint"):
@@ -223,4 +252,5 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         description.get("ball"),
         _rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
         None if (stated := description.get("left_out")) is None else LeftOut(**stated),
+        _rebuilt_force(description.get("force"), arrays, envelope["reach"]),
     )

@@ -11,6 +11,7 @@ from sim.errors import InputError
 
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS, Basis
+from ..regressors.ball_contact import Contact
 from .conformal import LEVELS, Bound
 from .learned import Learned, Part
 from .left_out import LeftOut
@@ -42,6 +43,7 @@ def demand_sound(name: str, model: Learned) -> None:
             _check_bounds(model.bounds)
         if model.tip is not None and model.tip.bound is not None:
             _check_bounds(model.tip.bound)
+        _check_force(model)
     except InputError as error:
         raise InputError(f"the model {name!r} cannot be: {error}. Make one with `sulcus train`.") from error
 
@@ -95,6 +97,21 @@ def _probe(encoder: str, model: Learned) -> np.ndarray:
     _check_envelope(envelope)
     inward = open_patch(model.anatomy).normal_near(envelope.points[:1].astype(float))[0]
     return np.array([[*envelope.points[0], *inward, envelope.force[1], envelope.footprint[1]]], float)
+
+
+def _check_force(model: Learned) -> None:
+    if model.force is None:
+        return
+    _demand(model.ball is not None, "it knows the force of a ball that it has not")
+    _demand(model.force.encoder in ENCODERS, f"no encoder is called {model.force.encoder!r}")
+    grips = [part.regressor.grip for part in model.parts if isinstance(part.regressor, Contact)]
+    _demand(bool(grips) or model.force.learned is not None, "it knows nothing of its ball's force")
+    _demand(all(grip.shape == (2,) for grip in grips), "what it knows of its ball's force is none")
+    if model.force.learned is not None:
+        found = model.force.learned.predict(_probe(model.force.encoder, model))
+        _demand(found.shape == (1, 3) and bool(np.isfinite(found).all()), "it answers no force")
+    if model.force.bound is not None:
+        _check_bounds(model.force.bound)
 
 
 def _check_envelope(envelope: Envelope) -> None:

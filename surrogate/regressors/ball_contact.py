@@ -12,7 +12,7 @@ Problems", chapter 23). Stiffness cancels: how stiff tissue is need not be known
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Self
 
 import numpy as np
@@ -57,6 +57,8 @@ class Contact:
         (3 k, r) [1/N] float32: coefficients of the basis's modes that unit forces have.
     line
         (2, r): at no depth, and what a depth of one radius adds.
+    grip
+        (2,): the same factor of the force that the ball exerts; (0,) where none was learned.
     """
 
     points: np.ndarray
@@ -64,6 +66,9 @@ class Contact:
     compliance: np.ndarray
     answers: np.ndarray
     line: np.ndarray
+    grip: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    # Features that were last asked for, and their forces: motion and reaction of one load are had from one search.
+    _last: tuple[bytes, np.ndarray] = field(default=(b"", np.zeros(0)), init=False, repr=False)
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of `tool_features` (B, 8), whose force is depth [m]."""
@@ -74,28 +79,44 @@ class Contact:
         """The same (B, r) of tissue that is linear."""
         return self.force(X).astype(np.float32) @ self.answers / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
 
+    def exerted(self, X: np.ndarray) -> np.ndarray:
+        """The force (B, 3) [N/m] that the ball exerts, by one metre of depth; `grip` must have been learned."""
+        return self._resultant(X) * (self.grip[0] + (X[:, 6:7] / X[:, 7:8]) * self.grip[1])
+
+    def _resultant(self, X: np.ndarray) -> np.ndarray:
+        """The same (B, 3) of tissue that is linear."""
+        whole = self.force(X).reshape(len(X), -1, 3).sum(axis=1)
+        return whole / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
+
     def force(self, X: np.ndarray) -> np.ndarray:
         """What the ball does to linear tissue at the nodes that it may touch (B, 3 k) [N]."""
+        asked, (known, found) = X.tobytes(), self._last
+        if asked == known:
+            return found
         out = np.zeros((len(X), len(self.compliance)))
         with one_thread():
             for row in np.flatnonzero(X[:, 6] > 0.0):
                 point, direction, depth, radius = X[row, :3], X[row, 3:6], X[row, 6], X[row, 7]
                 out[row] = self._pressed(point + (depth - radius) * direction, radius + THICKER)
+        out.flags.writeable = False
+        self._last = asked, out
         return out
 
-    def fitted(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray) -> Self:
-        """With the lines that fit coefficients Y (B, r) best; `alike` (r,) numbers those that share one."""
+    def fitted(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray, exerted: np.ndarray | None = None) -> Self:
+        """With the lines that fit coefficients Y (B, r) best; `alike` (r,) numbers those that share one.
+
+        `exerted` (B, 3) [N/m] is the ball's force by one metre of depth, where it is known.
+        """
         found, line = self.linear(X), np.zeros_like(self.line)
-        depth = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]])
         for each in np.unique(alike):
             mine = alike == each
-            factor = np.einsum("br,br->b", found[:, mine], Y[:, mine]) / np.square(found[:, mine]).sum(axis=1)
-            line[:, mine] = np.linalg.lstsq(depth, factor, rcond=None)[0][:, None]
-        return replace(self, line=line)
+            line[:, mine] = _line(X, found[:, mine], Y[:, mine])[:, None]
+        grip = self.grip if exerted is None else _line(X, self._resultant(X), exerted)
+        return replace(self, line=line, grip=grip)
 
     def state(self) -> dict[str, np.ndarray]:
         """All that it has."""
-        return dict(vars(self))
+        return {item.name: getattr(self, item.name) for item in fields(self) if item.init}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
@@ -137,6 +158,13 @@ class Contact:
         out = np.zeros(len(self.compliance))
         out[rows] = force
         return out
+
+
+def _line(X: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The factor (2,), at no depth and what one radius adds, of rows `found` (B, r) that fits `wanted` (B, r) best."""
+    depth = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]])
+    factor = np.einsum("br,br->b", found, wanted) / np.square(found).sum(axis=1)
+    return np.linalg.lstsq(depth, factor, rcond=None)[0]
 
 
 def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -30,6 +30,8 @@ TUMOUR = Way(CLASS, True)
 # A tip snaps through with the cortex here and there, so that the tail of its errors grows with the force: classes are
 # as small as 99 in 100 allows, and the scale's logarithm is linear.
 TIP = Way(100, False)
+# Of the force that a ball moved by pose exerts.
+FORCE = Way(CLASS, True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,7 @@ class Missed:
     features
         (B, f), of the scale of its bounds.
     error
-        (B,) [m]: the largest at the tumour's vertices, or of the distance.
+        (B,) [m]: the largest at the tumour's vertices, or of the distance; [N]: of the tool's force.
     """
 
     pushed: Pushed

@@ -24,11 +24,14 @@ class Examples:
         B pushes.
     tumour, cortex
         Displacements (B, n, 3) [m].
+    force
+        (B, 3) [N] that a ball moved by pose exerts, where it is known.
     """
 
     loads: Pushed
     tumour: np.ndarray
     cortex: np.ndarray
+    force: np.ndarray | None = None
 
 
 def left_by(parts: Sequence[Part], patch: Patch, loads: Pushed, moved: np.ndarray) -> np.ndarray:

@@ -14,7 +14,9 @@ from ..data.cortex_patch import Patch
 from ..data.encode import ENCODERS, Basis, directions, reduce, tool_features
 from ..model.learned import Part
 from ..model.own_learners import find_own, name_of
+from ..model.tool_force import ForceModel
 from ..regressors.ann import Ann
+from ..regressors.ball_contact import Contact
 from ..regressors.gp import Gp
 from ..regressors.pcr import Pcr
 from ..regressors.protocol import Fitted, Teachable
@@ -69,6 +71,24 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part,
     return (*before, learnt, *cortex)
 
 
+def force_of(name: str, parts: Sequence[Part], patch: Patch, examples: Examples) -> ForceModel | None:
+    """What one learner of poses knows of its ball's force, with the `parts` that it has learned; None if untold."""
+    if examples.force is None:
+        return None
+    if name == "contact":
+        return ForceModel()
+    encoder, make = LEARNT["gp"] if name in TOUCHED else _learnt(name)
+    X = ENCODERS[encoder](patch, examples.loads)
+    left = examples.force / directions(examples.loads)[0][:, None]
+    for part in parts:
+        if isinstance(part.regressor, Contact):
+            left = left - part.regressor.exerted(ENCODERS[part.encoder](patch, examples.loads))
+    learned = make().fit(X, left)
+    if name_of(type(learned)) is not None:
+        _check_own(learned, X, left)
+    return ForceModel(encoder, learned)
+
+
 def _learnt(name: str) -> tuple[str, Callable[[], Teachable]]:
     """Encoder and regressor of a learner, a user's own too."""
     if name in LEARNT:
@@ -85,7 +105,8 @@ def _touched(known: Expansion, examples: Examples) -> tuple[Part, list[tuple[np.
     truth = [examples.tumour, examples.cortex][: len(bases)]
     coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
     alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
-    part = Part("tool", contact.fitted(features, coefficients, alike), side_by_side(bases))
+    force = None if examples.force is None else examples.force / size[:, 0]
+    part = Part("tool", contact.fitted(features, coefficients, alike, force), side_by_side(bases))
     answered = np.split(size * part.response(features), [len(known.tumour)], axis=1)
     return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
 

@@ -17,6 +17,7 @@ from ..data.dataset import Dataset
 from ..data.disc_split import APART, MOST_APART, Split, leave_discs_out
 from ..data.indentation import indented
 from ..evaluation.coverage import TENTHS, Coverage
+from ..evaluation.force_score import ForceScore, force_errors, force_score
 from ..evaluation.score import Score, errors, score
 from ..model.conformal import LEVELS, USUAL_GROWTH, conformal
 from ..model.learned import Learned, only_pushed
@@ -24,10 +25,10 @@ from ..model.left_out import left_out_of
 from ..model.own_learners import OWN, find_own
 from ..model.tip_distance import TipModel
 from ..model.training_range import envelope_of
-from .bounds import TIP, TUMOUR, Missed, bound_by, bounds_on_discs, covered_by, growth_by, missed
+from .bounds import FORCE, TIP, TUMOUR, Missed, bound_by, bounds_on_discs, covered_by, growth_by, missed
 from .examples import Examples
 from .expansion import EXPANDED, TOUCHED, Expansion
-from .learners import LEARNT, POSED, parts_of
+from .learners import LEARNT, POSED, force_of, parts_of
 from .shared_inputs import SharedInputs
 from .tip_distance import Measured, corrected_if_better, distance_errors, with_correction
 
@@ -48,7 +49,8 @@ class Trained:
     calibrated the models' bounds, and the field after it counts the training loads. `left_out` gives by learner how
     often bounds held on the discs left out. These are bounds of the scored model, from loads outside the discs. By how
     much they grow with the distance from training loads, the other discs tell. `distance_left_out` gives the same
-    for the distance from tip to tumour.
+    for the distance from tip to tumour, and `force` how well the tool's force was known there, of poses whose
+    data has it.
     """
 
     models: dict[str, Learned]
@@ -59,6 +61,7 @@ class Trained:
     training_loads: int
     left_out: dict[str, Coverage]
     distance_left_out: dict[str, Coverage]
+    force: dict[str, ForceScore]
 
 
 def learners_for(data: Dataset) -> tuple[str, ...]:
@@ -152,15 +155,27 @@ def train(
         both = np.concatenate([truth, cortex], axis=1)
         distances = Measured(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.ball))
 
-    def examples(rows: np.ndarray) -> Examples:
-        return Examples(rows_of(pushed, rows), truth[rows], cortex[rows])
+    reaction = None if data.ball is None else data.reaction()
+    exerted = None if reaction is None else reaction[data.good, 0, :3]
+    ways = (*WAYS, FORCE) if exerted is not None else WAYS
 
-    def unseen(model: Learned, rows: np.ndarray) -> tuple[Missed, Missed]:
-        """How far a model is off at the tumour, and in its distance, on the chosen rows (B,) bool."""
+    def examples(rows: np.ndarray) -> Examples:
+        return Examples(rows_of(pushed, rows), truth[rows], cortex[rows], None if exerted is None else exerted[rows])
+
+    def forces_off(model: Learned, rows: np.ndarray) -> list[Missed]:
+        """How far a model is off in its tool's force on the chosen rows (B,) bool, if that is known: one, or none."""
+        if exerted is None:
+            return []
+        asked = rows_of(pushed, rows)
+        return [missed(model, patch, asked, force_errors(model.exerted(asked), exerted[rows]))]
+
+    def unseen(model: Learned, rows: np.ndarray) -> list[Missed]:
+        """How far a model is off at the tumour, in its distance, and in its force, on the chosen rows (B,) bool."""
         some, asked, known = np.flatnonzero(rows), rows_of(pushed, rows), distances.rows(rows)
         of_tumour = errors(model, loads.rows(some), truth[rows], nodes).max(axis=1)
         of_tip = distance_errors(model, known)
-        return missed(model, patch, asked, of_tumour), missed(model, patch, asked, of_tip)
+        both = [missed(model, patch, asked, error) for error in (of_tumour, of_tip)]
+        return both + forces_off(model, rows)
 
     chosen = [_first(split.train, most), *([_first(~apart, most)] if apart.any() else [])]
     example_sets = [examples(rows) for rows in chosen]
@@ -168,15 +183,17 @@ def train(
     test = loads.rows(np.flatnonzero(split.test))
     beside = apart & ~split.covers(pushed.point)
     envelopes = [envelope_of(patch, each.loads) for each in example_sets]
-    models, scores, left_out, distance_left_out = {}, [], {}, {}
+    models, scores, left_out, distance_left_out, force = {}, [], {}, {}, {}
     for name in wanted:
         with stage(f"learn {name}"):
+            parts = parts_of(name, inputs[0], example_sets[0])
             model = Learned(
                 data.anatomy,
-                parts_of(name, inputs[0], example_sets[0]),
+                parts,
                 envelopes[0],
                 training={"learner": name, **data.provenance},
                 ball=data.ball,
+                force=force_of(name, parts, patch, example_sets[0]),
             )
         with stage("score"):
             solves = inputs[0].solve_counts(name, example_sets[0])
@@ -185,30 +202,36 @@ def train(
             error = distance.max(axis=1)
             model, off = corrected_if_better(model, patch, distances.rows(chosen[0]), distances.rows(split.test))
             tested = rows_of(pushed, split.test)
-            far = missed(model, patch, tested, error), missed(model, patch, tested, off)
+            far = [missed(model, patch, tested, each) for each in (error, off)] + forces_off(model, split.test)
         models[name] = replace(model, bound=min(conformal(far[0].error, LEVELS[0]), float(far[0].error.max())))
-        growth = [USUAL_GROWTH, USUAL_GROWTH]
+        growth, promised = [USUAL_GROWTH] * len(ways), None
         if beside.sum() >= 2 * FEWEST_APART and len(test) >= TENTHS:
             with stage("calibrate"):
                 near = unseen(model, beside)
-                both = list(zip(near, far, WAYS, strict=True))
-                growth = [growth_by(here, there, way) for here, there, way in both]
-                bound = [bounds_on_discs(model, here, there, split, way) for here, there, way in both]
-                left_out[name], distance_left_out[name] = map(covered_by, bound, far)
+                every = list(zip(near, far, ways, strict=True))
+                growth = [growth_by(here, there, way) for here, there, way in every]
+                bound = [bounds_on_discs(model, here, there, split, way) for here, there, way in every]
+                left_out[name], distance_left_out[name] = map(covered_by, bound[: len(WAYS)], far)
                 alone = left_out_of(distance, motion[split.test], bound[0][0], far[0].extrapolated)
                 models[name] = replace(models[name], left_out=alone)
+                promised = bound[-1] if exerted is not None else None
+        if exerted is not None:
+            force[name] = force_score(far[-1].error, exerted[split.test], promised)
         if apart.any():
             with stage(f"learn {name}"):
                 parts = parts_of(name, inputs[1], example_sets[1])
-                models[name] = replace(models[name], parts=parts, envelope=envelopes[1])
+                of_force = force_of(name, parts, patch, example_sets[1])
+                models[name] = replace(models[name], parts=parts, envelope=envelopes[1], force=of_force)
                 if model.tip is not None and model.tip.correction is not None:
                     models[name] = with_correction(models[name], patch, distances.rows(chosen[1]))
         if apart.sum() >= FEWEST_APART:
             with stage("calibrate"):
                 used = models[name]
-                every = zip(unseen(used, apart), WAYS, growth, far, strict=True)
-                bounds, tip = (bound_by(near, way, grown, seen) for near, way, grown, seen in every)
+                each = zip(unseen(used, apart), ways, growth, far, strict=True)
+                bounds, tip, *of_force = (bound_by(near, way, grown, seen) for near, way, grown, seen in each)
                 models[name] = replace(used, bounds=bounds, tip=replace(used.tip or TipModel(), bound=tip))
+                if used.force is not None:
+                    models[name] = replace(models[name], force=replace(used.force, bound=of_force[0]))
         progress(name)
     return Trained(
         models,
@@ -219,6 +242,7 @@ def train(
         len(example_sets[-1].loads.point),
         left_out,
         distance_left_out,
+        force,
     )
 
 
