@@ -1,5 +1,6 @@
 """A model with finite elements behind it: who answers which load, and what is said of the answer."""
 
+import argparse
 import threading
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from theatres import player, small, theatre_of
 
+from scenes.commands.demo import add_theatre, theatre_asked
 from scenes.play.deformers import GUARDED, AtRest
 from scenes.play.page_cast import ALL, Cast
 from scenes.script.tool_paths import Touch
@@ -14,7 +16,7 @@ from sim.deformation import Outcome
 from sim.errors import InputError
 from surrogate.data.tool_loads import draw
 from surrogate.model.guarded import answering
-from surrogate.model.left_out import LeftOut, left_out_of
+from surrogate.model.left_out import LIMIT, LeftOut, left_out_of
 from surrogate.model.store import load, save
 
 
@@ -117,6 +119,20 @@ def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
     first, again = (cast.predicted(GUARDED, question).deformation for _ in range(2))
     assert first.iterations[0] > again.iterations[0] == 0
     assert again.displacement == pytest.approx(first.displacement, abs=1e-6)
+
+
+def test_the_limit_is_the_user_s(theatre):
+    strict = replace(theatre, limit=5e-5)
+    assert strict.deformer(GUARDED, small()).limit == 5e-5 and theatre.deformer(GUARDED, small()).limit == LIMIT
+    assert "where that may be over 0.05 mm off" in strict.described(GUARDED, small())
+    parser = argparse.ArgumentParser()
+    add_theatre(parser)
+    asked = parser.parse_args(["--guard-mm", "0.05", "--device", "cpu"])
+    assert theatre_asked(asked).limit == pytest.approx(5e-5)
+    assert theatre_asked(parser.parse_args(["--device", "cpu"])).limit == LIMIT
+    for words in ("0", "-1", "nan"):
+        with pytest.raises(InputError, match="give a positive number of millimetres"):
+            theatre_asked(parser.parse_args(["--guard-mm", words, "--device", "cpu"]))
 
 
 def test_it_is_named_where_a_model_knows_the_scene_and_says_what_it_is(theatre):

@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 
 from sim.arguments import at_least
 
-from .demo import add_theatre, deformer_name, scene_asked
+from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,6 @@ def run(args: argparse.Namespace) -> int:
 
     from ..bench.frame import batch_rate, frames_of, size_of, table
     from ..bench.stages import machine
-    from ..play.deformers import open_theatre
 
     at_least("--frames", args.frames, 1)
     if args.batch is not None:
@@ -44,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     width, height = size_of(args.size)
     scene = scene_asked(args, args.scene)
     scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
-    theatre = open_theatre(args.anatomy, args.model, args.device)
+    theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
     where = f"{machine(args.device)}; {scene.name} by {name}, {width} x {height}"

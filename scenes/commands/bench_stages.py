@@ -10,7 +10,7 @@ from dataclasses import asdict
 from sim.arguments import at_least
 from sim.errors import InputError
 
-from .demo import add_theatre, deformer_name, scene_asked
+from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from sim.effects import ToolForce
 
     from ..bench.stages import machine, rows
-    from ..play.deformers import open_theatre, plan_of
+    from ..play.deformers import plan_of
     from ..script.scene import SCENES, find_scene
 
     at_least("--batch", args.batch, 1)
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
             name for name in SCENES if find_scene(name).sight is None and ToolForce() in find_scene(name).effects
         )
         raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")
-    theatre = open_theatre(args.anatomy, args.model, args.device)
+    theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
     found, solvers = [], []

@@ -14,7 +14,7 @@ from sim.accuracy import TRAIN
 from sim.arguments import at_least
 from sim.errors import InputError
 
-from .demo import add_theatre, deformer_name, playable, scene_asked
+from .demo import add_theatre, deformer_name, playable, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
     from sim.deformation import Deformation
@@ -42,14 +42,13 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..play.checks import measure
-    from ..play.deformers import open_theatre
     from ..play.error_text import error_lines
     from ..play.reference import truth_of
     from ..script.scene import SCENES
 
     at_least("--every", args.every, 1)
     scenes = [scene_asked(args, name) for name in args.scenes or SCENES]
-    theatre = open_theatre(args.anatomy, args.model, args.device)
+    theatre = theatre_asked(args)
     scenes = playable(args, theatre, scenes)
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from .demo import add_theatre, deformer_name, scene_asked
+from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
 from .outputs import add_force, claimed
 
 
@@ -25,12 +25,11 @@ def run(args: argparse.Namespace) -> int:
     """Play and write."""
     from tqdm import tqdm
 
-    from ..play.deformers import open_theatre
     from ..play.episode import collect
 
     scene = scene_asked(args, args.scene)
     out = claimed(args.out, ".h5", "an episode of `sulcus collect`", args.force, [args.anatomy])
-    theatre = open_theatre(args.anatomy, args.model, args.device)
+    theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
     total = len(scene.times)

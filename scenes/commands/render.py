@@ -14,7 +14,7 @@ from sim.arguments import at_least
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
-from .demo import add_theatre, deformer_name, scene_asked
+from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
 from .outputs import add_force, claimed, claimed_folder, claimed_frames
 
 if TYPE_CHECKING:
@@ -38,7 +38,6 @@ def run(args: argparse.Namespace) -> int:
     """Draw, frame by frame. 1: a frame was answered badly."""
     from tqdm import tqdm
 
-    from ..play.deformers import open_theatre
     from ..play.player import labelled
 
     scene = scene_asked(args, args.scene)
@@ -48,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):
             raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
         claimed(args.film, args.film.suffix, "a film of `sulcus render`", args.force)
-    theatre = open_theatre(args.anatomy, args.model, args.device)
+    theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)
     run_of = _run(args, theatre, scene, name)

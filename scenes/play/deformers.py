@@ -45,7 +45,8 @@ TRUTH = "what an estimate is held against is the truth, as finite elements have 
 class Theatre:
     """An anatomy, its T1 scan if there is one, models by name, learnt from one data set, and uncertainties by scene.
 
-    `locator_file` is where the locator of its tumour is, for scenes with a sight.
+    `locator_file` is where the locator of its tumour is, for scenes with a sight. `limit` [m] is that of a guarded
+    model.
     """
 
     anatomy: Anatomy
@@ -54,6 +55,7 @@ class Theatre:
     device: str = "auto"
     locator_file: Path | None = None
     uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict)
+    limit: float = LIMIT
 
     @cached_property
     def site(self) -> Site:
@@ -129,7 +131,9 @@ class Theatre:
         """A deformer by name, in words: what solves, or what it learned from."""
         solver = solver_named(self.element_of(scene), scene.effects)
         if name == GUARDED:
-            return f"{self.models[self.best(scene)].source}; where that may be over {1e3 * LIMIT:g} mm off, {solver}"
+            return (
+                f"{self.models[self.best(scene)].source}; where that may be over {1e3 * self.limit:g} mm off, {solver}"
+            )
         return solver if name == "fem" else self.models[name].source
 
     def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
@@ -153,7 +157,7 @@ class Theatre:
             return self.fem(scene, scene.accuracy, live=True)
         allowed = ", ".join(self.names(scene))
         if name == GUARDED and self.knowing(scene):
-            return Guarded(self.models[self.best(scene)], self.fem(scene, scene.accuracy, live=True))
+            return Guarded(self.models[self.best(scene)], self.fem(scene, scene.accuracy, live=True), self.limit)
         if name not in self.models:
             raise InputError(
                 f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the trained ones."
