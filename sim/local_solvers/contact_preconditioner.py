@@ -14,8 +14,9 @@ from scipy.linalg import lu_factor, lu_solve
 from ..discretisation.problem import Problem
 from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
-from ..linalg.pcg import Preconditioner
+from ..linalg.pcg import BlockJacobi, Preconditioner
 from ..runtime.threads import one_thread
+from .contact_descent import ContactDescent
 from .contact_forces import FORCES
 
 
@@ -63,3 +64,17 @@ class ContactPreconditioner:
             with one_thread():
                 force[nodes] = lu_solve(whole, curvature @ own).reshape(-1, 3)
                 out.assign(z - self._compliance.spread(force.reshape(-1, 1)))
+
+
+def knowing_contact(problem: Problem, rest: Preconditioner, contact: ContactDescent | None) -> Preconditioner:
+    """A preconditioner that knows what tools touch: as `contact` does where that is, or beside another barrier.
+
+    Where a skull lets go too, the rest counts it as half shut, and tools are as stiff as ever.
+    """
+    if contact is not None:
+        return ContactPreconditioner(rest, contact.compliance, contact.barrier)
+    tools = [barrier for barrier in problem.barriers if isinstance(barrier, Local)]
+    if len(problem.barriers) == 1 or len(tools) != 1 or isinstance(rest, BlockJacobi):
+        return rest
+    (tool,) = tools
+    return ContactPreconditioner(rest, Compliance(problem, rest, tool.touchable), tool)

@@ -18,7 +18,7 @@ from ..discretisation.term import Cases, Local
 from ..linalg.pcg import Preconditioner
 from ..local_solvers.batch_elimination import BatchElimination
 from ..local_solvers.contact_descent import ContactDescent
-from ..local_solvers.contact_preconditioner import ContactPreconditioner
+from ..local_solvers.contact_preconditioner import knowing_contact
 from ..local_solvers.strained_part import ON_CARD
 from ..minimisers.lbfgs import Lbfgs, learnt_from
 from ..minimisers.lbfgs_kernels import BROKEN, DONE
@@ -121,10 +121,9 @@ class Strategy:
     @cached_property
     def _touched(self) -> Preconditioner:
         """The preconditioner that knows contact: on CUDA half precision is rougher than contact is stiff."""
-        touch = None if self.problem.device.on_cuda else self.contact
-        if touch is None:
+        if self.problem.device.on_cuda:
             return self.preconditioner
-        return ContactPreconditioner(self.preconditioner, touch.compliance, touch.barrier)
+        return knowing_contact(self.problem, self.preconditioner, self.contact)
 
     @property
     def held(self) -> int:
