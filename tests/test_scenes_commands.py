@@ -34,6 +34,7 @@ def test_a_patient_in_one_go(tmp_path, capsys):
     models = load(model_path(out), anatomy)
     assert set(models) == {"linear", "residual"} and sidecar(out).is_file()
     assert f"ready: sulcus demo --anatomy {out} --element p1" in text
+    assert f"sulcus uncertainty press --anatomy {out} --element p1" in text
     here = ["--anatomy", str(out), "--element", "p1"]
     assert main(["check", "slide", "draw", *here, "--every", "30", "--json"]) in (0, 1)  # of eighty loads
     report = json.loads(capsys.readouterr().out)

@@ -104,6 +104,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({"anatomy": str(args.out), "model": str(model), "seconds": seconds, "total": whole}))
     else:
         print(f"{_shares(seconds, whole)}\nready: sulcus demo --anatomy {args.out}{_physics(args)}")
+        print(f"for the error of the tumour: sulcus uncertainty press --anatomy {args.out}{_physics(args)}")
     return 0
 
 

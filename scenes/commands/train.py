@@ -52,7 +52,9 @@ def run(args: argparse.Namespace) -> int:
     learners = asked or list(learners_for(data))
     for note in notes_on(data, learners):
         print(f"sulcus train: {note}", file=sys.stderr)
-    with tqdm(total=len(learners), unit="learner", disable=args.json, file=sys.stderr) as bar:
+    # Without the time that is left: learners take seconds or minutes, whatever the first of them took.
+    shown = "{l_bar}{bar}| {n_fmt}/{total_fmt} learners [{elapsed}{postfix}]"
+    with tqdm(total=len(learners), bar_format=shown, disable=args.json, file=sys.stderr) as bar:
         expansion = Expansion(
             data, device, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places")
         )
