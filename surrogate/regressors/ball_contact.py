@@ -13,10 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import get_lapack_funcs
 from scipy.optimize import nnls
 
 from sim.effects import ToolContact
@@ -34,6 +35,10 @@ FORGETFUL = 15
 # Places that give less than this share of what nodes do on average are bone's, which the ball enters: no force, or one
 # beyond all bounds, would keep it out.
 LEAST = 0.02
+# Straight from LAPACK: the problems are so small that a wrapper takes longer than the work.
+FACTORED, SOLVED = get_lapack_funcs(("potrf", "trtrs"), dtype=np.float64)
+# The corner after each of a triangle.
+NEXT = np.array([1, 2, 0])
 # Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are distinct.
 APART = 1e-6
 
@@ -123,25 +128,35 @@ class Contact:
         """From `state`."""
         return cls(**state)
 
+    @cached_property
+    def _rounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Middles (S, 3) and radii (S,) [m] of balls that hold a triangle each."""
+        corners = self.points[self.triangles]
+        middle = corners.mean(axis=1)
+        return middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+
     def _pressed(self, middle: np.ndarray, radius: float) -> np.ndarray:
         """Nodal forces (3 k,) [N] of a ball."""
-        corners = self.points[self.triangles]
-        nodes, table = np.unique(
-            self.triangles[distances(corners, nearest_shares(corners, middle), middle)[0] < REACH * radius],
-            return_inverse=True,
-        )
+        around, wide = self._rounds
+        some = np.flatnonzero(np.linalg.norm(around - middle, axis=1) - wide < REACH * radius)
+        corners = self.points[self.triangles[some]]
+        near = distances(corners, nearest_shares(corners, middle), middle)[0] < REACH * radius
+        nodes, table = np.unique(self.triangles[some[near]], return_inverse=True)
         rows = (3 * nodes[:, None] + np.arange(3)).ravel()
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
         own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
-        least = LEAST * np.einsum("nii->", own) / max(3 * len(nodes), 1)
+        least, own = LEAST * np.einsum("nii->", own) / max(3 * len(nodes), 1), own[table]
         moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
         facet, share, settled = np.zeros(0, int), np.zeros((0, 3)), True
         for iteration in range(MOST):
             corners = (self.points[nodes] + moved)[table]
             nearest = nearest_shares(corners, middle)
             distance, normal = distances(corners, nearest, middle)
-            gives = np.einsum("sc,si,scij,sj->s", nearest**2, normal, own[table], normal)
-            entered = np.flatnonzero((distance < radius - TOLERANCE) & (gives > least))
+            entered = np.flatnonzero(distance < radius - TOLERANCE)
+            if len(entered):
+                share_of, way = nearest[entered], normal[entered]
+                gives = np.einsum("sc,scj,sj->s", share_of**2, np.einsum("si,scij->scj", way, own[entered]), way)
+                entered = entered[gives > least]
             if settled and not len(entered):
                 break
             facet, share = np.concatenate([facet, entered]), np.concatenate([share, nearest[entered]])
@@ -170,8 +185,10 @@ def _line(X: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """The least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain positive semi-definite."""
     gain.flat[:: len(gain) + 1] += APART * np.trace(gain) / len(gain)
-    lower = cholesky(gain, lower=True, check_finite=False)
-    return nnls(lower.T, solve_triangular(lower, wanted, lower=True, check_finite=False))[0]
+    lower, failed = FACTORED(gain, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("places that a ball touches do not give way")
+    return nnls(lower.T, SOLVED(lower, wanted, lower=True)[0])[0]
 
 
 def nearest_shares(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -180,7 +197,7 @@ def nearest_shares(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     The plane's foot where it lies inside, else the nearest of the three edges (Ericson 2005, "Real-Time Collision
     Detection", section 5.1.5).
     """
-    offset, edge = point - corners, np.roll(corners, -1, axis=1) - corners
+    offset, edge = point - corners, corners[:, NEXT] - corners
     along = np.einsum("sci,sci->sc", offset, edge)
     square = np.einsum("sci,sci->sc", edge, edge)
     part = np.clip(along / square, 0.0, 1.0)
@@ -195,7 +212,8 @@ def nearest_shares(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     v = (square[:, 2] * along[:, 0] + across * toward) / area
     w = (square[:, 0] * toward + across * along[:, 0]) / area
     shares[:, 3] = np.column_stack([1.0 - v - w, v, w])
-    far = np.linalg.norm(shares @ corners - point, axis=2)
+    away = shares @ corners - point
+    far = np.einsum("ski,ski->sk", away, away)
     far[(shares[:, 3] < 0.0).any(axis=1), 3] = np.inf
     return shares[np.arange(len(corners)), far.argmin(axis=1)]
 
