@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import trimesh
 from theatres import player, theatre_of
 
+from scenes.play.episode import collect
 from scenes.play.load_text import acting
 from scenes.play.player import Player
 from scenes.play.reference import truth_of
@@ -135,6 +137,18 @@ class TestPalpate:
             assert np.isnan(batch.reaction_bound).all() and batch.reaction.shape == (len(frames), force is not None, 6)
             if force is not None and not known:
                 assert batch.reaction[row] == pytest.approx(solved.deformation.reaction[0], abs=2e-3)
+
+    def test_an_episode_holds_the_force_of_the_model_and_of_the_finite_elements(self, theatre, tmp_path):
+        scene = replace(small("palpate"), path=lambda time: Touch(depth=2e-3), duration=0.1)
+        both = replace(theatre, models={"contact": untrained(theatre.anatomy, scene)})
+        collect(tmp_path / "palpate.h5", both, player(both, scene, "contact"), "contact", iter)
+        with h5py.File(tmp_path / "palpate.h5") as file:
+            found, solved = file["reaction_predicted"], file["reaction_fem"][:]
+            assert found.attrs["unit"] == "N, N m" and found.shape == solved.shape == (4, 1, 6)
+            size = np.linalg.norm(solved[:, 0, :3], axis=1)
+            along = np.einsum("fi,fi->f", found[:, 0, :3], solved[:, 0, :3])
+            assert (along > 0.9 * size * np.linalg.norm(found[:, 0, :3], axis=1)).all()
+            assert np.isnan(file["reaction_bound"][:]).all() and file["reaction_bound"].shape == (4, 2)
 
     def test_linear_contact_plays_it_untrained(self, theatre, palpated):
         """Nearly as finite elements of softer tissue that stiffens do, on tumour and cortex."""
