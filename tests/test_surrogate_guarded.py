@@ -169,3 +169,8 @@ def test_a_file_keeps_errors_on_left_out_cortex(theatre, tmp_path):
         save(tmp_path / "b.npz", {name: replace(model, left_out=bad)})
         with pytest.raises(InputError, match="left-out"):
             load(tmp_path / "b.npz", model.anatomy)
+
+
+def test_where_no_model_knows_the_scene_the_reason_is_said(theatre):
+    with pytest.raises(InputError, match=r"could ask knows the scene retract: .*Retraction\. Choose fem\."):
+        theatre.deformer(GUARDED, small("retract"))

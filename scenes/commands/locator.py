@@ -30,7 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--small",
         action="store_true",
-        help="keep open cortex and tumour alone, a tenth of the file: enough for scenes, not for `sulcus locate`",
+        help="keep open cortex and tumour alone, a tenth of the file: enough for scenes and `sulcus fit`, "
+        "not for `sulcus locate`",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="from which causes are drawn (default %(default)s)")

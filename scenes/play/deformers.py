@@ -158,6 +158,11 @@ class Theatre:
         allowed = ", ".join(self.names(scene))
         if name == GUARDED and self.knowing(scene):
             return Guarded(self.models[self.best(scene)], self.fem(scene, scene.accuracy, live=True), self.limit)
+        if name == GUARDED and self.models:
+            why = next(iter(self.refusals(scene).values()))
+            raise InputError(
+                f"no model that {GUARDED} could ask knows the scene {scene.name}: {why}. Choose {allowed}."
+            )
         if name not in self.models:
             raise InputError(
                 f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the trained ones."
