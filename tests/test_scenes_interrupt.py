@@ -37,8 +37,8 @@ class Demo:
         self.solve.join()
         print("all closed", flush=True)
 
-theatre = Names(models={"linear"}, best=lambda scene: "linear", knowing=lambda scene: True,
-                refusals=lambda scene: {}, described=lambda name, scene: name)
+theatre = Names(models={"linear"}, best=lambda scene: "linear", usual=lambda scene: "linear",
+                knowing=lambda scene: True, refusals=lambda scene: {}, described=lambda name, scene: name)
 sys.modules["ar.overlay"] = Names(load_kernels=lambda: None)
 sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
 sys.modules["scenes.play.page"] = Names(Demo=Demo)
