@@ -53,8 +53,13 @@ def closest(points: np.ndarray, corners: np.ndarray) -> Closest:
     weights[on_edge] = 0.0
     weights[some, start] = 1.0 - along
     weights[some, (start + 1) % 3] = along
-    at = corners[np.minimum(row, len(corners) - 1), triangle]
-    return Closest(np.einsum("bc,bci->bi", weights, at), triangle, weights)
+    return Closest(np.einsum("bc,bci->bi", weights, corners[row, triangle]), triangle, weights)
+
+
+def bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middles (S, 3) and radii (S,) [m] of balls that hold a triangle each, of corners (S, 3, 3) [m]."""
+    middle = corners.mean(axis=1)
+    return middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
 
 
 def _candidates(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -62,8 +67,7 @@ def _candidates(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
     Each row begins with those that may be the closest, in rising order, so that of equal ones the first is found.
     """
-    middle = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    middle, reach = bounding_balls(corners)
     away = np.linalg.norm(points[:, None] - middle, axis=2)
     maybe = ~(away - reach > (1.0 + ROUNDING) * away.min(axis=1, keepdims=True))
     return np.argsort(~maybe, axis=1, kind="stable")[:, : maybe.sum(axis=1).max()]

@@ -73,15 +73,16 @@ def force_score(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None =
             "no tool presses under any of these loads, so that no force can be judged: give poses that do."
         )
     share = 100.0 * error[some] / size[some]
-    known = bound is not None and not np.isnan(bound).all()
+    if bound is not None and np.isnan(bound).all():
+        bound = None
     return ForceScore(
         int(some.sum()),
         float(size[some].mean()),
         float(error[some].mean()),
         float(share.mean()),
         float(np.percentile(share, 95.0)),
-        tuple((error[some] <= bound[:, some]).mean(axis=1).tolist()) if bound is not None and known else None,
-        float(np.median(bound[0, some])) if bound is not None and known else None,
+        tuple((error[some] <= bound[:, some]).mean(axis=1).tolist()) if bound is not None else None,
+        float(np.median(bound[0, some])) if bound is not None else None,
     )
 
 

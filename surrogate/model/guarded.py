@@ -11,7 +11,7 @@ from sim.deformation import Cost, Deformation, Deformer, Outcome, joined
 from sim.loads import Loads
 
 from .learned import Learned
-from .left_out import LIMIT
+from .left_out import LIMIT, handed_over
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Guarded:
     def unsure(self, predicted: Deformation) -> np.ndarray:
         """(B,) bool: which of the model's answers are not good enough."""
         bound = np.where(np.isnan(predicted.bound[0]), self.model.bound, predicted.bound[0])
-        return ~(bound <= self.limit) | np.array([not outcome.good for outcome in predicted.outcome])
+        return handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
 
 
 def model_of(deformer: Deformer) -> Learned | None:

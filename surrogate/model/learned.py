@@ -227,10 +227,9 @@ class Learned:
 
         Beyond the forces of the training the response stays what it was at the nearest of them.
         """
-        magnitude, direction = directions(pushed)
+        magnitude, asked = self._within(pushed)
         if not len(nodes):
             return np.zeros((len(magnitude), 0, 3))
-        asked = replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
         groups = self._modes_at(np.asarray(nodes, np.int64).tobytes())
         names = {part.encoder for parts, _ in groups for part in parts}
         features = {name: encoders[name](self._patch, asked) for name in sorted(names)}
@@ -239,6 +238,11 @@ class Learned:
             for parts, modes in groups
         ]
         return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
+
+    def _within(self, pushed: Pushed) -> tuple[np.ndarray, Pushed]:
+        """Sizes (B,) of forces [N] or depths [m], and the same loads no weaker and no stronger than any in training."""
+        magnitude, direction = directions(pushed)
+        return magnitude, replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
 
     def exerted(self, pushed: Pushed) -> np.ndarray:
         """Forces (B, 3) [N] that the ball exerts at indentations; as `motion`, in proportion beyond the training.
@@ -250,8 +254,7 @@ class Learned:
         """
         if self.force is None:
             raise InputError("this model does not know its tool's force: train it anew, on newly simulated poses.")
-        magnitude, direction = directions(pushed)
-        asked = replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
+        magnitude, asked = self._within(pushed)
         found = np.zeros(pushed.force.shape) + self.force.added(self._patch, asked)
         for part in self.parts:
             if isinstance(part.regressor, Contact):
@@ -288,9 +291,8 @@ class Learned:
                 answer = self.deform(loads, at=self.nodes)
             apart = tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.ball)
         tip = self.tip or TipModel()
-        magnitude, direction = directions(pushed)
-        within = np.clip(magnitude, *self.envelope.force)[:, None] * direction
-        found = tip.corrected(apart, self._patch, replace(pushed, force=within), magnitude)
+        magnitude, within = self._within(pushed)
+        found = tip.corrected(apart, self._patch, within, magnitude)
         known = measured(self._patch, pushed)
         return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.outside(pushed, known)))
 

@@ -46,6 +46,14 @@ class LeftOut:
         return f"{100 * self.mean:.2f} % of the motion off alone, {behind}: {verdict}"
 
 
+def handed_over(bound: np.ndarray, outside: np.ndarray, limit: float = LIMIT) -> np.ndarray:
+    """Which loads (B,) bool finite elements answer behind a model: of no bound within the limit, or `outside`.
+
+    `bound` (B,) and `limit` are in metres, `outside` (B,) bool.
+    """
+    return ~(bound <= limit) | outside
+
+
 def left_out_of(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> LeftOut:
     """Errors on B loads.
 
@@ -61,6 +69,6 @@ def left_out_of(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, out
         Which loads (B,) bool lie outside the training range.
     """
     share = distance.mean(axis=1) / motion
-    solved = ~(bound <= LIMIT) | outside
+    solved = handed_over(bound, outside)
     p999 = float(np.percentile(distance, 99.9)) if len(distance) >= FEWEST_FOR_P999 else None
     return LeftOut(float(share.mean()), float(np.where(solved, 0.0, share).mean()), p999, float(solved.mean()))

@@ -21,6 +21,7 @@ from scipy.linalg import get_lapack_funcs
 from scipy.optimize import nnls
 
 from sim.effects import ToolContact
+from sim.geometry.closest_point import bounding_balls
 from sim.runtime.threads import one_thread
 from sim.tools import Ball
 
@@ -131,9 +132,7 @@ class Contact:
     @cached_property
     def _rounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Middles (S, 3) and radii (S,) [m] of balls that hold a triangle each."""
-        corners = self.points[self.triangles]
-        middle = corners.mean(axis=1)
-        return middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+        return bounding_balls(self.points[self.triangles])
 
     def _pressed(self, middle: np.ndarray, radius: float) -> np.ndarray:
         """Nodal forces (3 k,) [N] of a ball."""
