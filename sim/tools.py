@@ -7,13 +7,18 @@ In a tool's own frame its lowest point is the origin and its shaft goes along +z
 
 from __future__ import annotations
 
+import ast
 import math
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from .errors import InputError
+
+# Sine of the angle at which an edge counts as square to a direction.
+SQUARE = 1e-6
 
 
 def _check(tool: object) -> None:
@@ -117,6 +122,22 @@ class OwnTool(Protocol):
 Tool = BuiltIn | OwnTool
 
 
+def tool_from_text(text: str) -> BuiltIn:
+    """The tool whose `repr` is this text, of a file from outside: nothing of it is carried out.
+
+    Raises
+    ------
+    InputError
+        A text that is no tool of `BuiltIn`, or one of impossible sizes.
+    """
+    kinds = {kind.__name__: kind for kind in BuiltIn.__args__}
+    with suppress(SyntaxError, ValueError, TypeError, RecursionError, MemoryError):
+        match ast.parse(text, mode="eval").body:
+            case ast.Call(ast.Name(name), [], sizes) if name in kinds:
+                return kinds[name](**{str(item.arg): float(ast.literal_eval(item.value)) for item in sizes})
+    raise InputError(f"{text[:60]!r} is no tool: give one of {', '.join(kinds)} with its sizes in metres.")
+
+
 def check_tool(effect: str, tool: object) -> None:
     """Refuse what tissue cannot touch.
 
@@ -155,6 +176,16 @@ def core_of(tool: BuiltIn) -> Core:
 def extent_of(tool: Tool) -> float:
     """How far the tool's farthest point is from its origin [m], at most."""
     return max(core.extent for core in cores_of(tool))
+
+
+def foremost(tool: BuiltIn, pose: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """The points (B, 3) [m] of a tool at T_world_tool `pose` (B, 4, 4) that are farthest in a unit `direction` (3,).
+
+    Of an edge or a face that stands square to it the middle.
+    """
+    core, local = core_of(tool), np.einsum("bji,j->bi", pose[:, :3, :3], direction)
+    corner = core.centre + np.where(np.abs(local) < SQUARE, 0.0, np.sign(local)) * core.half
+    return pose[:, :3, 3] + np.einsum("bij,bj->bi", pose[:, :3, :3], corner) + core.radius * direction
 
 
 def distances_to(tool: Tool, pose: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -63,7 +63,7 @@ def untrained(anatomy: Anatomy, scene: Scene) -> Learned:
     envelope = Envelope(patch.points, 1.0, 1.0, np.pi, (1e-6, 1.0), (ball.radius, ball.radius), np.inf)
     said = {"effects": repr(scene.effects)}
     parts = (Part("tool", replace(contact, grip=np.array([1.0, 0.0])), side_by_side(bases)),)
-    return Learned(anatomy, parts, envelope, training=said, ball=ball.radius, force=ForceModel())
+    return Learned(anatomy, parts, envelope, training=said, tool=ball, force=ForceModel())
 
 
 class TestPalpate:

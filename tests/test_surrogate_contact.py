@@ -22,19 +22,19 @@ from surrogate.data.answer_rows import checksums, row_type
 from surrogate.data.cortex_patch import barycentric_lattice, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import Basis, tool_features
-from surrogate.data.indentation import indented
+from surrogate.data.indentation import indented, posed
 from surrogate.data.simulate import simulate
-from surrogate.data.tool_poses import ball_of, draw_poses, poses_at
+from surrogate.data.tool_poses import draw_poses, poses_at, tool_of
 from surrogate.evaluation.force_score import judged_force
 from surrogate.evaluation.score import errors
 from surrogate.model.store import load, save
 from surrogate.model.tool_force import wrench
-from surrogate.regressors.ball_contact import THICKER, Contact, nearest_shares
+from surrogate.regressors.rigid_contact import THICKER, Contact
 from surrogate.training.condense_contact import condensed, unit_responses
 from surrogate.training.expansion import TOUCHED
 from surrogate.training.train import Trained, learners_for, train
 
-BALL = ball_of("palpation")
+BALL = tool_of("palpation")
 SOFT = Material("linear", 3000.0, 0.45)
 # What the pretender's forces do far away: at no depth, and more by so much a radius of depth.
 LINE = (0.97, 0.3)
@@ -44,7 +44,7 @@ GRIP = (1.05, 0.5)
 
 def features(anatomy: Anatomy, loads: Loads) -> np.ndarray:
     patch = open_patch(anatomy)
-    return tool_features(patch, indented(loads, BALL.radius, patch))
+    return tool_features(patch, indented(loads, BALL, patch))
 
 
 def bodily(anatomy: Anatomy, tissue: Material) -> Fem:
@@ -54,21 +54,6 @@ def bodily(anatomy: Anatomy, tissue: Material) -> Fem:
 @pytest.fixture(scope="module")
 def pressed(box: Anatomy) -> tuple[Contact, list[Basis]]:
     return condensed(bodily(box, SOFT), [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)])
-
-
-def test_the_nearest_place_on_a_triangle_is_nearest() -> None:
-    """Against a fine lattice on random triangles, needles among them: nothing is nearer, and something is as near."""
-    rng = np.random.default_rng(0)
-    corners = rng.normal(size=(200, 3, 3)) * rng.uniform(0.02, 1.0, (200, 1, 3))
-    point = np.array([0.3, -0.2, 0.1])
-    share = nearest_shares(corners, point)
-    assert share.min() >= 0.0
-    np.testing.assert_allclose(share.sum(axis=1), 1.0, atol=1e-12)
-    far = np.linalg.norm(np.einsum("sc,sci->si", share, corners) - point, axis=1)
-    lattice = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60.0
-    best = np.linalg.norm(np.einsum("qc,sci->sqi", lattice, corners) - point, axis=2).min(axis=1)
-    assert (far <= best + 1e-12).all()
-    assert (best - far).max() < 0.05
 
 
 def test_the_ball_enters_no_facet_and_pulls_nothing(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> None:
@@ -177,7 +162,7 @@ class Stiffening:
             np.zeros(count, int),
             np.zeros(count),
             loads.times,
-            wrench(force, loads.of(Touching), BALL.radius),
+            wrench(force, posed(loads, BALL), BALL),
         )
         return answer if at is None else answer.at(at)
 
@@ -190,7 +175,7 @@ def elements(box: Anatomy, pressed: tuple[Contact, list[Basis]]) -> Stiffening:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory, elements: Stiffening) -> Dataset:
     path = tmp_path_factory.mktemp("touched") / "data.h5"
-    said = {"ball": repr(BALL.radius), "tissue": tissue_to_json(SOFT), "effects": "as given", "element": "p1"}
+    said = {"shape": repr(BALL), "tissue": tissue_to_json(SOFT), "effects": "as given", "element": "p1"}
     simulate(path, elements, draw_poses("palpation", elements.anatomy, 160, 0), said)
     return read_dataset(path)
 
@@ -289,6 +274,6 @@ def test_what_contact_needs_is_said(data: Dataset) -> None:
     assert not set(TOUCHED) & set(learners_for(untold))
     with pytest.raises(InputError, match="does not state its tissue, so no series or contact can be had"):
         train(untold, ["contact"])
-    pushes = replace(data, provenance={name: said for name, said in data.provenance.items() if name != "ball"})
+    pushes = replace(data, provenance={name: said for name, said in data.provenance.items() if name != "shape"})
     with pytest.raises(InputError, match="holds pushes, of which contact-gp cannot be had: choose from linear"):
         train(pushes, ["contact-gp"])

@@ -129,7 +129,7 @@ def test_the_limit_is_the_user_s(theatre):
     add_theatre(parser)
     asked = parser.parse_args(["--guard-mm", "0.05", "--device", "cpu"])
     assert theatre_asked(asked).limit == pytest.approx(5e-5)
-    assert theatre_asked(parser.parse_args(["--device", "cpu"])).limit == LIMIT
+    assert theatre_asked(parser.parse_args(["--device", "cpu"])).limit is None
     for words in ("0", "-1", "nan"):
         with pytest.raises(InputError, match="give a positive number of millimetres"):
             theatre_asked(parser.parse_args(["--guard-mm", words, "--device", "cpu"]))
@@ -150,6 +150,22 @@ def test_errors_on_left_out_cortex_count_what_finite_elements_answer_as_exact():
     many = left_out_of(np.full((1000, 2), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.1e-3), np.zeros(1000, bool))
     assert many.p999 == pytest.approx(0.3e-3) and many.mean < 0.01 and not many.enough
     assert left_out_of(distance[1:2], np.full(1, 10e-3), np.full(1, np.nan), np.zeros(1, bool)).solved == 1.0
+
+
+def test_finite_elements_answer_as_much_as_a_model_s_errors_on_left_out_cortex_ask_for(theatre):
+    """The widest limit that leaves 1 % of the motion, and 0.2 mm at 99.9 % of the vertices; at none all are solved."""
+    bound, inside = 1e-3 * np.array([0.15, 0.08, 0.03, 0.005]), np.zeros(4, bool)
+    distance = 1e-3 * np.array([[0.30], [0.06], [0.02], [0.004]])
+    wide, middle, none = (left_out_of(distance, np.full(4, size), bound, inside) for size in (1e-2, 1e-3, 5e-5))
+    assert (wide.limit, wide.solved) == (LIMIT, 0.0) and wide.guarded == pytest.approx(wide.mean)
+    assert (middle.limit, middle.solved) == (0.05e-3, 0.5) and middle.guarded == pytest.approx(0.024 / 4)
+    assert (none.limit, none.solved, none.guarded) == (0.0, 1.0, 0.0) and "over 0 mm off, 0.00 %" in str(none)
+    many = left_out_of(np.full((1000, 1), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.15e-3), np.zeros(1000, bool))
+    assert (many.limit, many.solved) == (0.1e-3, 1.0)
+    (_, model), *_ = theatre.models.items()
+    some = replace(theatre, models={"series-gp": replace(model, left_out=middle)})
+    assert some.deformer(GUARDED, small()).limit == 0.05e-3
+    assert replace(some, limit=1e-3).deformer(GUARDED, small()).limit == 1e-3
 
 
 @pytest.mark.parametrize(("mean", "who"), [(0.009, "series-gp"), (0.011, GUARDED), (None, "series-gp")])

@@ -23,7 +23,7 @@ from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.indentation import indented
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import TOOLS, draw
-from surrogate.data.tool_poses import DEEP, SHALLOW, ball_of, draw_poses, poses_at
+from surrogate.data.tool_poses import DEEP, SHALLOW, draw_poses, poses_at, tool_of
 from surrogate.evaluation.score import errors
 from surrogate.model.applicability import refusal
 from surrogate.model.learned import Learned
@@ -32,9 +32,9 @@ from surrogate.model.training_range import envelope_of
 from surrogate.training.learners import POSED
 from surrogate.training.train import Trained, learners_for, train
 
-BALL = ball_of("palpation")
+BALL = tool_of("palpation")
 EFFECTS = (Elasticity(), Held(), ToolContact((BALL,)))
-SAID = {"ball": repr(BALL.radius), "effects": repr(EFFECTS)}
+SAID = {"shape": repr(BALL), "effects": repr(EFFECTS)}
 
 
 def domed(points: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ def test_a_pose_is_where_the_ball_is_deepest(box: Anatomy) -> None:
     patch = open_patch(box)
     bumpy = replace(patch, points=domed(patch.points))
     loads = draw_poses("palpation", box, 60, 3)
-    pushed = indented(loads, BALL.radius, bumpy)
+    pushed = indented(loads, BALL, bumpy)
     cause = loads.of(Touching)
     assert cause is not None
     pose = cause.pose[:, 0]
@@ -86,10 +86,10 @@ def test_how_a_ball_came_there_is_nothing(box: Anatomy) -> None:
     normal = patch.normal_near(forces.point)
     motion = 3e-3 * unit(forces.force)
     straight = np.einsum("bi,bi->b", motion, normal)[:, None] * normal
-    found = indented(Loads((poses_at(BALL, forces.point, normal, motion),)), BALL.radius, patch)
+    found = indented(Loads((poses_at(BALL, forces.point, normal, motion),)), BALL, patch)
     np.testing.assert_allclose(found.point, forces.point + motion - straight, atol=1e-9)
     np.testing.assert_allclose(found.force, straight, atol=1e-9)
-    sunk = indented(Loads((poses_at(BALL, forces.point, normal, BALL.radius * normal),)), BALL.radius, patch)
+    sunk = indented(Loads((poses_at(BALL, forces.point, normal, BALL.radius * normal),)), BALL, patch)
     np.testing.assert_allclose(sunk.force, BALL.radius * normal, atol=1e-9)
 
 
@@ -98,7 +98,7 @@ def test_a_ball_in_the_air_or_beside_the_cortex_has_no_depth(box: Anatomy) -> No
     point = patch.points[[3, 3]] + [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
     away = poses_at(BALL, point, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[0.0, 0.0, -1e-3]] * 2))
     away.pose[0, 0, 2, 3] += 2e-3
-    found = indented(Loads((away,)), BALL.radius, patch)
+    found = indented(Loads((away,)), BALL, patch)
     assert not found.force.any()
     assert np.isfinite(found.point).all()
 
@@ -112,7 +112,7 @@ def test_draws_are_each_of_their_own_number(box: Anatomy) -> None:
     other = draw_poses("palpation", box, 10, 5).of(Touching)
     assert other is not None
     assert not np.array_equal(some.pose, other.pose)
-    depth = np.linalg.norm(indented(many, BALL.radius, open_patch(box)).force, axis=1) / BALL.radius
+    depth = np.linalg.norm(indented(many, BALL, open_patch(box)).force, axis=1) / BALL.radius
     assert depth.min() >= SHALLOW * np.cos(TOOLS["palpation"].cone) - 1e-9
     assert depth.max() <= DEEP + 1e-9
 
@@ -128,7 +128,7 @@ class PosedPretender:
         return self.pretender.anatomy
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        pushed = indented(loads, BALL.radius, open_patch(self.anatomy))
+        pushed = indented(loads, BALL, open_patch(self.anatomy))
         depth = np.linalg.norm(pushed.force, axis=1, keepdims=True)
         force = 400.0 * np.sqrt(BALL.radius) * np.sqrt(depth) * pushed.force
         return self.pretender.deform(Loads((replace(pushed, force=force),), loads.times), start, at)
@@ -179,10 +179,10 @@ def test_deeper_or_elsewhere_than_in_training_is_said(trained: Trained, box: Ana
     assert model.deform(air).outcome == (Outcome.PREDICTED,)
 
 
-def test_a_stored_model_knows_its_ball(tmp_path: Path, trained: Trained, box: Anatomy) -> None:
+def test_a_stored_model_knows_its_tool(tmp_path: Path, trained: Trained, box: Anatomy) -> None:
     save(tmp_path / "model.npz", trained.models)
     again, fresh = load(tmp_path / "model.npz", box)["gp"], draw_poses("palpation", box, 5, 1)
-    assert again.ball == BALL.radius
+    assert again.tool == BALL
     np.testing.assert_array_equal(again.deform(fresh).displacement, trained.models["gp"].deform(fresh).displacement)
 
 
@@ -191,7 +191,7 @@ def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses() -> 
     template = read_anatomy(template_path())
     patch, corners = open_patch(template), template.mesh.nodes
     first, same, other = (
-        indented(draw_poses("palpation", template, 900, seed), ball_of("palpation").radius, patch) for seed in (0, 0, 1)
+        indented(draw_poses("palpation", template, 900, seed), tool_of("palpation"), patch) for seed in (0, 0, 1)
     )
     known = envelope_of(patch, first)
     shared = (known.points[:, None] == other.point.astype(np.float32)).all(axis=2).any(axis=1)
@@ -201,10 +201,10 @@ def test_poses_nearest_to_the_same_corner_are_not_taken_for_the_same_poses() -> 
 
 def test_models_of_poses_and_of_forces_refuse_each_others_loads_and_scenes(trained: Trained, box: Anatomy) -> None:
     model = trained.models["gp"]
-    with pytest.raises(InputError, match="causes Pushed, but this model was trained on the poses of one ball"):
+    with pytest.raises(InputError, match="causes Pushed, but this model was trained on the poses of one Ball"):
         model.deform(draw("palpation", box, 2, 0))
     two = Touching(np.tile(np.eye(4), (1, 2, 1, 1)))
-    with pytest.raises(InputError, match="poses of one ball"):
+    with pytest.raises(InputError, match="poses of one Ball"):
         model.deform(Loads((two,)))
     forces = Learned(box, model.parts, model.envelope)
     with pytest.raises(InputError, match="loads is None: give Loads"):
@@ -227,7 +227,7 @@ def test_what_poses_cannot_train_is_refused(data: Dataset, box: Anatomy) -> None
     with pytest.raises(InputError, match="no ball stands for the preset spatula: choose one of palpation"):
         draw_poses("spatula", box, 2, 0)
     with pytest.raises(InputError, match=r"Ball.radius is -0.001 m: give a positive number"):
-        draw_poses("palpation", box, 2, 0, -1e-3)
+        draw_poses("palpation", box, 2, 0, Ball(-1e-3))
     with pytest.raises(InputError, match="holds other loads than `Pushed`"):
         train(replace(data, provenance={}), ["gp"])
 
@@ -239,12 +239,12 @@ def test_the_command_makes_poses_that_finite_elements_answer(
     write_anatomy(mesh, box)
     wanted = ["simulate", str(mesh), "--out", str(out), "--count", "3", "--json"]
     assert main([*wanted, "--ball", "7"]) == 2
-    assert "--ball is the radius of a ball moved by pose" in capsys.readouterr().err
+    assert "--blade are moved by pose: give --poses too" in capsys.readouterr().err
     assert main([*wanted, "--poses", "--ball", "7"]) == 0
     ball = Ball(7e-3)
     data = read_dataset(out)
     assert data.good.all()
-    assert data.ball == ball.radius
+    assert data.tool == ball
     assert "NodalForce" not in data.provenance["effects"]
     fem = Fem(read_anatomy(mesh), (Elasticity(), Held(), ToolContact((ball,))), device="cpu", batch=1)
     truth = fem.deform(data.loads)
@@ -262,5 +262,5 @@ def test_the_command_makes_poses_that_finite_elements_answer(
 def test_a_ball_half_in_the_tissue_presses_inward(box: Anatomy) -> None:
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -BALL.radius]  # its middle is on the box's top
-    pushed = indented(Loads((Touching(pose[None, None]),)), BALL.radius, open_patch(box))
+    pushed = indented(Loads((Touching(pose[None, None]),)), BALL, open_patch(box))
     np.testing.assert_allclose(pushed.force[0], [0.0, 0.0, -BALL.radius], atol=1e-9)

@@ -85,7 +85,6 @@ def encoder(name):
         ),
         (encoder("nodal"), "cannot be read as a model"),
         (lambda model: replace(model, bound=-1.0), "bound is no distance"),
-        (lambda model: replace(model, ball=-0.01), "ball has no radius"),
         (envelope(reach=-1.0), "reach is none"),
         (envelope(angle=float("nan")), "angle is none"),
         (envelope(force=(1.0, 0.1)), "range of force is none"),

@@ -17,6 +17,7 @@ from sim.bodies.tip_distance import tip_gauge
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, Touching
+from sim.tools import Ball
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.disc_split import APART
@@ -103,15 +104,15 @@ def test_it_is_measured_from_a_ball_that_rests_on_the_deformed_cortex(box, prete
 
 
 def test_of_a_pose_the_tip_is_where_the_pose_has_it(box, gauge):
-    loads = draw_poses("palpation", box, 5, 0, 6e-3)
+    loads = draw_poses("palpation", box, 5, 0, Ball(6e-3))
     still = np.zeros((5, len(gauge.nodes), 3))
     touching = loads.of(Touching)
     assert touching is not None
     pose = touching.pose[:, 0]
     tip = pose[:, :3, 3] + 6e-3 * pose[:, :3, 2] + 6e-3 * open_cortex(box).axis
     away = trimesh.proximity.closest_point_naive(surface(box.mesh.nodes, box.tumour_surface), tip)[1]
-    assert gauge.distances(loads, still, gauge.nodes, 6e-3) == pytest.approx(away, abs=1e-12)
-    with pytest.raises(InputError, match="no ball of known radius"):
+    assert gauge.distances(loads, still, gauge.nodes, Ball(6e-3)) == pytest.approx(away, abs=1e-12)
+    with pytest.raises(InputError, match="no known tool"):
         gauge.distances(loads, still, gauge.nodes)
 
 

@@ -14,7 +14,7 @@ from sim.loads import Loads
 from sim.material import BRAIN
 from sim.strategy.plan import Step
 from surrogate.data.tool_loads import draw
-from surrogate.data.tool_poses import ball_of, draw_poses
+from surrogate.data.tool_poses import draw_poses, tool_of
 
 from ..script.scene import find_scene
 from ..script.site import Site
@@ -96,7 +96,7 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
     yield Work("L-BFGS before Newton", "a palpation load from rest", Step.LBFGS, single, pushed)
     poses = draw_poses("palpation", anatomy, POSES * (runs + 1), SEED)
     together = [poses.rows(np.arange(first, first + POSES)) for first in range(0, len(poses), POSES)]
-    tool = (*pushed, ToolContact((ball_of("palpation"),)))
+    tool = (*pushed, ToolContact((tool_of("palpation"),)))
     yield Work("contact solved apart", f"{POSES} poses of a ball together", Step.CONTACT, together, tool)
     for scene, step, shortcut in (
         ("press", Step.PATCH, "nonlinear elimination of a patch"),

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a load did not converge."""
     from sim.effects import ToolContact
     from sim.runtime.device import device_names
-    from surrogate.data.tool_poses import ROUND, ball_of
+    from surrogate.data.tool_poses import ROUND, tool_of
 
     from ..bench.robustness import Trial
     from ..bench.stages import machine
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     sets = drawn(anatomy, args.presets or (ROUND if args.poses else PRESETS), count, args.poses)
     groups: list[tuple[dict[str, Drawn], tuple[Effect, ...]]] = [(sets, ())]
     if args.poses:
-        groups = [({name: loads}, (ToolContact((ball_of(name),)),)) for name, loads in sets.items()]
+        groups = [({name: loads}, (ToolContact((tool_of(name),)),)) for name, loads in sets.items()]
     table = sys.stderr if args.json else sys.stdout
     where = machine(devices[0]) + (f"; at once on {', '.join(devices)}" if len(devices) > 1 else "")
     print(where, file=table)

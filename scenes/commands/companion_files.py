@@ -13,7 +13,7 @@ from sim.runtime.atomic_files import unfinished_path
 from .outputs import HEAD, model_header
 
 # What of a data set must stay as it was for a run to go on with it.
-KEPT = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "ball")
+KEPT = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")
 
 
 def stated(path: Path) -> dict[str, str]:

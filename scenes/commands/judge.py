@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     scores = [score(name, model, loads, truth, nodes) for name, model in models.items()]
     promised = {name: coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None}
     gauge = tip_gauge(data.anatomy)
-    distance = gauge.distances(loads, data.displacement(gauge.nodes)[data.good], gauge.nodes, data.ball)
+    distance = gauge.distances(loads, data.displacement(gauge.nodes)[data.good], gauge.nodes, data.tool)
     ranged = {
         name: distance_coverage(model, loads, distance)
         for name, model in models.items()
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         if model.force is not None and reaction is not None
     }
     motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())
-    preset = "" if data.ball is not None else data.provenance.get("preset", "")
+    preset = "" if data.tool is not None else data.provenance.get("preset", "")
     if args.json:
         covered, of_tip = ({name: asdict(found) for name, found in held.items()} for held in (promised, ranged))
         figures = {"scores": [asdict(row) for row in scores], "coverage": covered, "distance_coverage": of_tip}

@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
         return _factorial(args)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     anatomy = theatre.anatomy
-    pushed = (model for model in theatre.models.values() if model.ball is None)
+    pushed = (model for model in theatre.models.values() if model.tool is None)
     model = min(pushed, key=lambda model: model.bound, default=None)
     loads = draw(args.preset, anatomy, args.count, args.seed)
     body = Body(element=args.element or ("smoothed" if anatomy.mesh.middles is None else "p2"))

@@ -25,12 +25,12 @@ from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.device import device_names
 from sim.runtime.memory import Budget
 from sim.runtime.timing import stage
-from sim.tools import Ball
+from sim.tools import Ball, BuiltIn, Capsule, Spatula
 from surrogate.data.crew import Asked, solving
 from surrogate.data.dataset import read_outcomes
 from surrogate.data.simulate import Solved, simulate
 from surrogate.data.tool_loads import PRESETS, draw, refused_share, refused_words
-from surrogate.data.tool_poses import ball_of, draw_poses
+from surrogate.data.tool_poses import draw_poses, tool_of
 
 from ..script.shipped_files import template_path
 from .companion_files import batch_begun, remove_data
@@ -57,14 +57,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--poses",
         action="store_true",
-        help="press with a rigid ball of the tool's middle radius, moved by pose, instead of a force on its footprint",
+        help="press with a rigid tool that is moved by pose, instead of a force on its footprint: a ball of the "
+        "preset's middle radius, unless --ball, --capsule or --blade is given",
     )
-    parser.add_argument(
-        "--ball",
+    shape = parser.add_mutually_exclusive_group()
+    shape.add_argument("--ball", type=float, metavar="MM", help="of this radius [mm] (in the scene palpate 7)")
+    shape.add_argument(
+        "--capsule",
         type=float,
-        metavar="MM",
-        help="with --poses: radius of that ball [mm] (in the scene palpate 7)",
+        nargs=2,
+        metavar=("RADIUS", "LENGTH"),
+        help="a round rod, as a dissector or a closed bipolar: radius, and length of its straight part [mm]",
     )
+    shape.add_argument(
+        "--blade", type=float, nargs=3, metavar=("WIDTH", "LENGTH", "EDGE"),
+        help="a flat blade: sizes, and radius of its edge [mm] (in the scene retract 12 26 1.5)",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default %(default)s)")
     add_tissue_arguments(parser)
     add_element_argument(parser)
@@ -86,13 +94,13 @@ def run(args: argparse.Namespace) -> int:
     out = claimed(args.out, ".h5", DATA, args.force)
     with stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
-        ball, loads = _drawn(args, anatomy)
+        tool, loads = _drawn(args, anatomy)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
     tissue = tissue_of(args)
     effects: tuple[Effect, ...] = (*pushed_effects(anatomy, tissue, args.skull), NodalForce())
-    if ball is not None:
+    if tool is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
-        effects = (*passive, ToolContact((ball,)))
+        effects = (*passive, ToolContact((tool,)))
     devices = device_names(args.device)
     batch = batch_begun(out) if args.batch is None else args.batch
     with ExitStack() as closing:
@@ -107,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
             "device": devices[0].split(":")[0],
             "preset": args.preset,
             "seed": str(args.seed),
-            **({} if ball is None else {"ball": repr(ball.radius)}),
+            **({} if tool is None else {"shape": repr(tool)}),
             **{f"{name} version": version(name) for name in ("sulcus", "warp-lang", "numpy")},
         }
         if args.force:
@@ -128,14 +136,24 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _drawn(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Ball | None, Loads]:
-    """The ball whose poses were asked for, if they were, and the loads."""
+def _drawn(args: argparse.Namespace, anatomy: Anatomy) -> tuple[BuiltIn | None, Loads]:
+    """The tool whose poses were asked for, if they were, and the loads."""
+    asked = _asked(args)
     if not args.poses:
-        if args.ball is not None:
-            raise InputError("--ball is the radius of a ball moved by pose: give --poses too, or leave it out.")
+        if asked is not None:
+            raise InputError("--ball, --capsule and --blade are moved by pose: give --poses too, or leave them out.")
         return None, draw(args.preset, anatomy, args.count, args.seed)
-    radius = None if args.ball is None else 1e-3 * args.ball
-    return ball_of(args.preset, radius), draw_poses(args.preset, anatomy, args.count, args.seed, radius)
+    tool = tool_of(args.preset) if asked is None else asked
+    return tool, draw_poses(args.preset, anatomy, args.count, args.seed, tool)
+
+
+def _asked(args: argparse.Namespace) -> BuiltIn | None:
+    """The tool that the options name, if they name one."""
+    if args.ball is not None:
+        return Ball(1e-3 * args.ball)
+    if args.capsule is not None:
+        return Capsule(*(1e-3 * size for size in args.capsule))
+    return None if args.blade is None else Spatula(*(1e-3 * size for size in args.blade))
 
 
 def _report(args: argparse.Namespace, solver: str, asked: int, solved: Solved) -> None:

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     with stage("save"):
         save(out, trained.models)
     failed = int(np.sum(~data.good))
-    preset = "" if data.ball is not None else data.provenance.get("preset", "")
+    preset = "" if data.tool is not None else data.provenance.get("preset", "")
     show = _for_machines if args.json else _for_people
     print(show(trained, args.out, failed, preset))
     return 0

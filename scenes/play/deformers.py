@@ -46,7 +46,7 @@ class Theatre:
     """An anatomy, its T1 scan if there is one, models by name, learnt from one data set, and uncertainties by scene.
 
     `locator_file` is where the locator of its tumour is, for scenes with a sight. `limit` [m] is that of a guarded
-    model.
+    model; None: the one that its own errors on left-out cortex ask for.
     """
 
     anatomy: Anatomy
@@ -55,7 +55,7 @@ class Theatre:
     device: str = "auto"
     locator_file: Path | None = None
     uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict)
-    limit: float = LIMIT
+    limit: float | None = None
 
     @cached_property
     def site(self) -> Site:
@@ -121,6 +121,13 @@ class Theatre:
         knowing = self.knowing(scene)
         return min(knowing, key=lambda name: knowing[name].bound, default="fem")
 
+    def limit_of(self, scene: Scene) -> float:
+        """Where finite elements answer behind the best model that knows a scene [m]."""
+        stated = self.models[self.best(scene)].left_out
+        if self.limit is not None:
+            return self.limit
+        return LIMIT if stated is None else stated.limit
+
     def usual(self, scene: Scene) -> str:
         """Who plays a scene unless somebody else is asked: the best model, guarded where it may not answer alone."""
         name = self.best(scene)
@@ -131,9 +138,8 @@ class Theatre:
         """A deformer by name, in words: what solves, or what it learned from."""
         solver = solver_named(self.element_of(scene), scene.effects)
         if name == GUARDED:
-            return (
-                f"{self.models[self.best(scene)].source}; where that may be over {1e3 * self.limit:g} mm off, {solver}"
-            )
+            model, limit = self.models[self.best(scene)], 1e3 * self.limit_of(scene)
+            return f"{model.source}; where that may be over {limit:g} mm off, {solver}"
         return solver if name == "fem" else self.models[name].source
 
     def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | Operated:
@@ -157,7 +163,8 @@ class Theatre:
             return self.fem(scene, scene.accuracy, live=True)
         allowed = ", ".join(self.names(scene))
         if name == GUARDED and self.knowing(scene):
-            return Guarded(self.models[self.best(scene)], self.fem(scene, scene.accuracy, live=True), self.limit)
+            model, limit = self.models[self.best(scene)], self.limit_of(scene)
+            return Guarded(model, self.fem(scene, scene.accuracy, live=True), limit)
         if name == GUARDED and self.models:
             why = next(iter(self.refusals(scene).values()))
             raise InputError(

@@ -78,7 +78,7 @@ def measured(
     ball = _ball(loads, tool)
     if ball is None:
         return None
-    found = tip_gauge(anatomy).distances(loads, answer.displacement, answer.nodes, ball.radius, lift)
+    found = tip_gauge(anatomy).distances(loads, answer.displacement, answer.nodes, ball.shape, lift)
     return Reading(float(found[0]), None)
 
 

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..geometry.ball_at_rest import resting_tips
 from ..geometry.closest_point import closest
 from ..loads import Loads, Pushed, Touching
+from ..tools import BuiltIn, foremost
 from .open_cortex import OpenCortex, open_cortex
 
 
@@ -63,7 +64,7 @@ class TipGauge:
         loads: Loads,
         displacement: np.ndarray,
         nodes: np.ndarray,
-        ball: float | None = None,
+        tool: BuiltIn | None = None,
         lift: float = 0.0,
     ) -> np.ndarray:
         """Distances (B,) [m] from tip to tumour.
@@ -71,18 +72,18 @@ class TipGauge:
         Parameters
         ----------
         loads
-            B pushes, or poses of one ball.
+            B pushes, or poses of one tool.
         displacement, nodes
             (B, n, 3) [m] of mesh vertices (n,), among them all of `self.nodes`.
-        ball
-            Radius [m] of the ball whose poses the loads are.
+        tool
+            The one whose poses the loads are.
         lift
             How far [m] a tool that pushes has been lifted off, against the axis.
 
         Raises
         ------
         InputError
-            Loads of another kind, poses of a ball of unknown radius, vertices that are missing, an anatomy without
+            Loads of another kind, poses of an unknown tool, vertices that are missing, an anatomy without
             tumour, or a ball that passes the open cortex by.
         """
         if not len(self.anatomy.tumour_nodes):
@@ -94,7 +95,7 @@ class TipGauge:
                 f"the distance from tip to tumour needs vertex {self.nodes[row[self.nodes] < 0][0]}, which this answer "
                 "does not know: ask for the open cortex and the tumour."
             )
-        tips = self._tips(loads, displacement, row[self._open[0]], ball, lift)
+        tips = self._tips(loads, displacement, row[self._open[0]], tool, lift)
         found, at = np.empty(len(loads)), row[self._tumour[0]]
         for first in range(0, len(loads), self.together):
             some = slice(first, first + self.together)
@@ -104,16 +105,15 @@ class TipGauge:
         return found
 
     def _tips(
-        self, loads: Loads, displacement: np.ndarray, row: np.ndarray, ball: float | None, lift: float
+        self, loads: Loads, displacement: np.ndarray, row: np.ndarray, tool: BuiltIn | None, lift: float
     ) -> np.ndarray:
         """Of the tool (B, 3) [m]; `row` (m,) of the open cortex's vertices in `displacement`."""
         axis, touching = self.cortex.axis, loads.of(Touching)
-        if touching is not None and ball is not None:
-            pose = touching.pose[:, 0]
-            return pose[:, :3, 3] + ball * (pose[:, :3, 2] + axis)
+        if touching is not None and tool is not None:
+            return foremost(tool, touching.pose[:, 0], axis)
         pushed = loads.of(Pushed)
         if pushed is None:
-            raise InputError("there is no tip where no tool pushes, and no ball of known radius is moved.")
+            raise InputError("there is no tip where no tool pushes, and no known tool is moved.")
         nodes, triangles = self._open
         rest, tips = self.anatomy.mesh.nodes[nodes], np.empty((len(loads), 3))
         for first in range(0, len(loads), self.together):

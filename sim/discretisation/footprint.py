@@ -234,7 +234,7 @@ def _nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
-def _on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+def on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
     """The point nearest to `point` on a triangle.
 
     Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the plane's foot where it lies inside, else the
@@ -279,7 +279,7 @@ def _search(
     for s in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, ball.shape[0])):
         near = ball[s][3] + best
         if wp.length_sq(_place(ball[s]) - point) <= near * near:
-            nearest = _on_triangle(corners[s, 0], corners[s, 1], corners[s, 2], point)
+            nearest = on_triangle(corners[s, 0], corners[s, 1], corners[s, 2], point)
             far = wp.length(nearest - point)
             if far <= best:
                 best = far

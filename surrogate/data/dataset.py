@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 
 import h5py
@@ -24,6 +25,7 @@ from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushe
 from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
 from sim.runtime.outside_files import path_of, read_as
+from sim.tools import BuiltIn, tool_from_text
 
 from .answer_rows import checksums, numbered, row_type
 from .cortex_patch import open_patch
@@ -69,8 +71,8 @@ class Dataset:
     Raises
     ------
     InputError
-        Columns of another length than the loads, residuals of good cases that are no positive numbers, a ball that has
-        no radius.
+        Columns of another length than the loads, residuals of good cases that are no positive numbers, a tool that is
+        none.
     """
 
     path: Path
@@ -97,20 +99,14 @@ class Dataset:
                 f"{self.path}: {numbered(wrong)} of `answers` converged, but to a residual that is no number: it is "
                 "damaged. Simulate anew."
             )
-        try:
-            good = self.ball is None or 0.0 < self.ball < np.inf
-        except ValueError:
-            good = False
-        if not good:
-            raise InputError(
-                f"{self.path}: its ball has the radius {self.provenance['ball'][:20]!r}, which is none: it is damaged. "
-                "Simulate anew."
-            )
+        _ = self.tool  # a text that is none is refused at once
 
-    @property
-    def ball(self) -> float | None:
-        """Radius [m] of the ball whose poses the loads are; None: they are pushes."""
-        return float(self.provenance["ball"]) if "ball" in self.provenance else None
+    @cached_property
+    def tool(self) -> BuiltIn | None:
+        """The tool whose poses the loads are; None: they are pushes."""
+        older = self.provenance.get("ball")
+        text = self.provenance.get("shape", None if older is None else f"Ball(radius={older})")
+        return None if text is None else tool_from_text(text)
 
     @property
     def good(self) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from sim.loads import Pushed
 
 from .cortex_patch import Patch
+from .indentation import Indented
 
 Encoder = Callable[[Patch, Pushed], np.ndarray]
 
@@ -45,14 +46,41 @@ def shared_out(weights: np.ndarray, pushed: Pushed) -> np.ndarray:
 def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Point [m], unit direction, force [N] and footprint radius [m]: (B, 8).
 
+    Of a rod or a blade then its shaft, and products x_i x_j of its other axis, which are the same either way: (B, 17).
+
     The published 13 features describe the load as one node sees it (its distance, its angles). A model of all nodes at
     once needs the load alone, because the basis knows where the nodes are.
     """
     magnitude, direction = directions(pushed)
-    return np.column_stack([pushed.point, direction, magnitude, pushed.footprint])
+    found = [pushed.point, direction, magnitude, pushed.footprint]
+    if isinstance(pushed, Indented):
+        x, first, second = pushed.axes[:, :, 0], *np.triu_indices(3)
+        found += [pushed.axes[:, :, 2], x[:, first] * x[:, second]]
+    return np.column_stack(found)
 
 
-ENCODERS: dict[str, Encoder] = {"nodal": nodal_shares, "rooted": rooted_shares, "tool": tool_features}
+def core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
+    """How a rod or a blade stands (B, 17): as `tool_features` of a ball, middle of its core [m], its axes x and z.
+
+    Raises
+    ------
+    TypeError
+        What is no `Indented`.
+    """
+    if not isinstance(pushed, Indented):
+        raise TypeError("only rods and blades have a core that stands: give `Indented`.")
+    magnitude, direction = directions(pushed)
+    middle = pushed.point + pushed.force + pushed.offset
+    axes = pushed.axes[:, :, 0], pushed.axes[:, :, 2]
+    return np.column_stack([pushed.point, direction, magnitude, pushed.footprint, middle, *axes])
+
+
+ENCODERS: dict[str, Encoder] = {
+    "nodal": nodal_shares,
+    "rooted": rooted_shares,
+    "tool": tool_features,
+    "core": core_features,
+}
 
 
 @dataclass(frozen=True, eq=False)

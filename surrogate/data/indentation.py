@@ -1,46 +1,105 @@
-"""Poses of a ball as pushes: where on the cortex at rest it is deepest, and how deep.
+"""Poses of a rigid tool as pushes: where on the cortex at rest it is deepest, and how deep.
 
-A tool's pose is tracked where its force is not known. A ball without friction presses along the surface's normal, and
-its answer depends on where its middle is, not on how it came there: place and depth determine it. To learners a depth
-is what a force is: both are nothing where nothing moves.
+A tool's pose is tracked where its force is not known. Without friction the answer depends on where the tool is, not on
+how it came there. To learners a depth is what a force is: both are nothing where nothing moves.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sim.errors import InputError
-from sim.loads import Loads, Pushed, Touching
+from sim.loads import Loads, Pushed, Retracted, Touching
+from sim.tools import Ball, BuiltIn, Capsule, Core, core_of, extent_of
 
 from .cortex_patch import Patch
+from .tool_loads import across
 
-# A middle so near to the surface [m] has the surface's normal.
+# A foot so near to the surface [m] has the surface's normal.
 ON_IT = 1e-6
+# A core is looked at in points so many of its radii apart; of a rod's so many, from its end on.
+APART, ALONG = 1.0, 6
 
 
-def indented(loads: Loads, radius: float, patch: Patch) -> Pushed:
-    """One ball's poses as pushes: point (B, 3) [m] nearest to its middle, depth along the normal for force [m], radius.
+@dataclass(frozen=True, eq=False)
+class Indented(Pushed):
+    """Indentations by a rod or a blade, whose answer depends on how it stands, too.
 
-    A ball that touches nothing has no depth.
+    axes (B, 3, 3) are the tool's, as columns; offset (B, 3) [m] is from the indented point, point + force, to the
+    middle of the tool's core. The footprint is the rod's radius, or that of a ball round the blade.
+    """
+
+    axes: np.ndarray
+    offset: np.ndarray
+
+
+def posed(loads: Loads, tool: BuiltIn) -> np.ndarray:
+    """T_world_tool (B, 4, 4) of one tool: of `Touching` of it alone, or of a blade's `Retracted`.
+
+    Raises
+    ------
+    InputError
+        Loads of another kind.
+    """
+    touching, retracted = loads.only(Touching), loads.only(Retracted)
+    if touching is not None and touching.pose.shape[1] == 1:
+        return touching.pose[:, 0]
+    if retracted is None:
+        names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
+        raise InputError(
+            f"the loads have the causes {names}, but this model was trained on the poses of one {tool}: give "
+            "`Touching` of one tool alone, or ask the finite elements."
+        )
+    pose = retracted.pose.copy()
+    pose[:, :3, 3] += retracted.displacement
+    return pose
+
+
+def indented(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
+    """One tool's poses as pushes: point (B, 3) [m] nearest to its foot, depth along the normal for force [m], radius.
+
+    The foot is the middle of a ball, of a rod's lower end, or of a blade. A tool that touches nothing has no depth.
 
     Raises
     ------
     InputError
         Loads that are not the poses of one tool.
     """
-    touching = loads.only(Touching)
-    if touching is None or touching.pose.shape[1] != 1:
-        names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
-        raise InputError(
-            f"the loads have the causes {names}, but this model was trained on the poses of one ball: give `Touching` "
-            "of one tool alone, or ask the finite elements."
-        )
-    pose = touching.pose[:, 0]
-    middle = pose[:, :3, 3] + radius * pose[:, :3, 2]
-    point = patch.skin.nearest(middle, np.full(len(middle), np.inf))[0]
-    inward, away = patch.normal_near(point), point - middle
-    # Positive where the middle is still outside.
-    distance = np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, inward))
+    pose, core = posed(loads, tool), core_of(tool)
+    foot = pose[:, :3, 3] + pose[:, :3, :3] @ (core.centre - [0.0, 0.0, core.half[2]])
+    point, distance = _off(patch, foot)
+    inward = patch.normal_near(point)
     near = np.abs(distance) < ON_IT
-    direction = np.where(near[:, None], inward, away / np.where(near, 1.0, distance)[:, None])
-    return Pushed(point, np.maximum(radius - distance, 0.0)[:, None] * direction, np.full(len(pose), radius))
+    direction = np.where(near[:, None], inward, (point - foot) / np.where(near, 1.0, distance)[:, None])
+    if isinstance(tool, Ball):
+        depth = np.maximum(core.radius - distance, 0.0)
+        return Pushed(point, depth[:, None] * direction, np.full(len(pose), core.radius))
+    places = _places(core)
+    at = np.einsum("bij,kj->bki", pose[:, :3, :3], places) + pose[:, None, :3, 3]
+    deepest = core.radius - _off(patch, at.reshape(-1, 3))[1].reshape(len(pose), -1).min(axis=1)
+    force = np.maximum(deepest, 0.0)[:, None] * direction
+    axes = pose[:, :3, :3]
+    if isinstance(tool, Capsule):  # which is round: however it is turned about its shaft, it is the same
+        axes = np.stack([*across(axes[:, :, 2]), axes[:, :, 2]], axis=2)
+    middle = pose[:, :3, 3] + pose[:, :3, :3] @ core.centre
+    wide = np.full(len(pose), core.radius if isinstance(tool, Capsule) else extent_of(tool))
+    return Indented(point, force, wide, axes, middle - point - force)
+
+
+def _off(patch: Patch, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest places (n, 3) on the cortex at rest to points (n, 3), and how far outside these are (n,) [m]."""
+    near = patch.skin.nearest(points, np.full(len(points), np.inf))[0]
+    away = near - points
+    return near, np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, patch.normal_near(near)))
+
+
+def _places(core: Core) -> np.ndarray:
+    """Points (k, 3) [m] of a core in the tool's frame, its border among them; of a rod those near its lower end."""
+    steps = np.ceil(2.0 * core.half / (APART * core.radius)).astype(int)
+    low, high = core.centre - core.half, core.centre + core.half
+    if steps[2] > ALONG:
+        steps[2], high[2] = ALONG, low[2] + ALONG * APART * core.radius
+    axes = [np.linspace(first, last, count + 1) for first, last, count in zip(low, high, steps, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

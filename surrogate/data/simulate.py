@@ -295,7 +295,7 @@ def _tool(loads: Loads, stated: Mapping[str, str]) -> str:
     """What acts, in a sentence."""
     if loads.of(Touching) is None:
         return "a force on a round footprint that stays with the tissue: see loads/Pushed"
-    return f"a rigid ball, radius {stated.get('ball', 'not stated')} m, moved by pose: see loads/Touching"
+    return f"the rigid tool {stated.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
 
 
 def _batch(file: h5py.File, work: Work, batch: Batch) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -95,10 +95,22 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     if preset == "seed":
         return _published(anatomy, patch, count, seed)
     tools = list(TOOLS.values()) if preset == "mixed" else [{**TOOLS, BRUTAL.name: BRUTAL}[preset]]
+    rows = _in_blocks(tools, patch, count, seed)
+    return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
+
+
+def drawn_of(tool: Tool, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where a tool presses, and its unit directions, (count, 3) each: as `draw` has them, of any force."""
+    free = replace(tool, pressure=(0.0, np.inf), depth=np.inf)
+    rows = _in_blocks([free], patch, count, seed)
+    return rows[:, :3], rows[:, 3:6] / np.linalg.norm(rows[:, 3:6], axis=1, keepdims=True)
+
+
+def _in_blocks(tools: list[Tool], patch: Patch, count: int, seed: int) -> np.ndarray:
+    """Point [m], force [N] and footprint [m] of each load: (count, 7)."""
     key = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
     blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
-    rows = np.concatenate([_drawn(tools, patch, key, block) for block in blocks])
-    return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
+    return np.concatenate([_drawn(tools, patch, key, block) for block in blocks])
 
 
 def refused_share(preset: str) -> float:

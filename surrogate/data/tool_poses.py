@@ -1,54 +1,80 @@
-"""Poses of a rigid ball as surgery makes them: where it touches, in which direction, how deep."""
+"""Poses of a rigid tool as surgery makes them: where it touches, in which direction, how deep."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from scipy.spatial import KDTree
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, Touching
-from sim.tools import Ball
+from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to, extent_of
 
-from .cortex_patch import open_patch
-from .tool_loads import TOOLS, across, draw
+from .cortex_patch import Patch, barycentric_lattice, open_patch
+from .tool_loads import TOOLS, across, draw, drawn_of
 
 # What a ball may stand for.
 ROUND = ("palpation", "bipolar", "dissector")
-# Depths as shares of the radius: a deeper ball would be swallowed, having no shaft.
+# Least depth as a share of the radius; a ball that goes deeper than this would be swallowed, having no shaft.
 SHALLOW, DEEP = 0.05, 0.9
+# Greatest depth of a rod in radii, and of a blade in widths; a blade leans by so much at most [rad].
+ROD, BLADE, LEAN = 2.0, 2.0 / 3.0, np.radians(20.0)
+# A tool comes down until it is so near [m], in so many steps at most; triangles are seen at so many rows of points.
+TOUCHES, STEPS, ROWS = 1e-6, 200, 4
 
 
-def ball_of(preset: str, radius: float | None = None) -> Ball:
-    """The ball that stands for a round tool: of a radius [m], or of the middle of the tool's own.
+def tool_of(preset: str) -> Ball:
+    """The ball that stands for a round tool: of the middle of the tool's own radii.
 
     Raises
     ------
     InputError
-        A preset that is not one round tool, or a radius that is not positive.
+        A preset that is not one round tool.
     """
     if preset not in ROUND:
-        raise InputError(f"no ball stands for the preset {preset}: choose one of {', '.join(ROUND)}.")
-    return Ball(0.5 * sum(TOOLS[preset].footprint) if radius is None else radius)
+        raise InputError(
+            f"no ball stands for the preset {preset}: choose one of {', '.join(ROUND)}, or give --blade or --capsule."
+        )
+    return Ball(0.5 * sum(TOOLS[preset].footprint))
 
 
-def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, radius: float | None = None) -> Loads:
-    """Draw `count` poses of the preset's ball, pressed into the open cortex; load i depends as in `surrogate.draw`.
+def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: BuiltIn | None = None) -> Loads:
+    """Draw `count` poses of a tool, pressed into the open cortex; load i depends as in `surrogate.draw`.
 
-    Places and directions are those of the preset's forces: uniform by area, its footprint inside the rim, within the
-    tool's cone. Depths are uniform from 0.05 to 0.9 of the radius, and no deeper than the tool goes.
+    Places are uniform by area, and the tool's end lies inside the rim. Of a ball, places and directions are those of
+    the preset's forces. Depths are uniform from 0.05 to 0.9 of the radius, and no deeper than the preset's tool goes.
+    Rods and blades go straight ahead from where they touch first. They are turned at random about their shaft. Rods
+    lean as the preset's tool does, and go to two radii. Blades lean by 20 degrees, and go to two thirds of their width.
+
+    Parameters
+    ----------
+    tool
+        By default the ball that stands for the preset.
 
     Raises
     ------
     InputError
-        As `draw` and `ball_of`.
+        As `draw` and `tool_of`.
     """
-    ball, patch = ball_of(preset, radius), open_patch(anatomy)
-    (pushed,) = draw(preset, anatomy, count, seed).every(Pushed)
-    deepest = min(DEEP * ball.radius, TOOLS[preset].depth)
-    share = np.random.Generator(np.random.Philox(key=seed)).random(count)
-    depth = SHALLOW * ball.radius + (deepest - SHALLOW * ball.radius) * share
-    direction = pushed.force / np.linalg.norm(pushed.force, axis=1, keepdims=True)
-    return Loads((poses_at(ball, pushed.point, patch.normal_near(pushed.point), depth[:, None] * direction),))
+    tool, patch = tool_of(preset) if tool is None else tool, open_patch(anatomy)
+    source = np.random.Generator(np.random.Philox(key=seed))
+    if isinstance(tool, Ball):
+        (pushed,) = draw(preset, anatomy, count, seed).every(Pushed)
+        direction = pushed.force / np.linalg.norm(pushed.force, axis=1, keepdims=True)
+        depth = _between(SHALLOW * tool.radius, min(DEEP * tool.radius, TOOLS[preset].depth), source.random(count))
+        return Loads((poses_at(tool, pushed.point, patch.normal_near(pushed.point), depth[:, None] * direction),))
+    if isinstance(tool, Capsule):
+        room, deepest, cone = tool.radius, ROD * tool.radius, TOOLS[preset].cone
+    else:
+        room, deepest, cone = extent_of(tool), BLADE * tool.width, LEAN
+    kind = replace(TOOLS[preset], name=type(tool).__name__, footprint=(room, room), cone=cone)
+    point, direction = drawn_of(kind, patch, count, seed)
+    share = source.random((count, 2))
+    depth = _between(SHALLOW * core_of(tool).radius, min(deepest, TOOLS[preset].depth), share[:, 0])
+    rotation = _turned(-direction, 2.0 * np.pi * share[:, 1])
+    return Loads((_lowered(tool, patch, point, rotation, depth),))
 
 
 def poses_at(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarray) -> Touching:
@@ -58,4 +84,40 @@ def poses_at(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarr
     pose[:, 0, 3, 3] = 1.0
     pose[:, 0, :3, 3] = point + motion - ball.radius * (normal + shaft)
     pose[:, 0, :3, :3] = np.stack([*across(shaft), shaft], axis=2)
+    return Touching(pose)
+
+
+def _between(least: float, most: float, share: np.ndarray) -> np.ndarray:
+    return least + (most - least) * share
+
+
+def _turned(shaft: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Rotations (B, 3, 3) whose z is `shaft` (B, 3), turned about it by angles (B,) [rad]."""
+    first, second = across(shaft)
+    x = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    return np.stack([x, np.cross(shaft, x), shaft], axis=2)
+
+
+def _lowered(
+    tool: Capsule | Spatula, patch: Patch, point: np.ndarray, rotation: np.ndarray, depth: np.ndarray
+) -> Touching:
+    """Poses of a tool that comes down its shaft over point (B, 3) until it touches, and goes on by depth (B,) [m].
+
+    How far it may go without touching is at least its distance from the nearest point of the surface, which is looked
+    at in `ROWS`^2 points a triangle (sphere tracing: Hart 1996, "Sphere tracing", Visual Comput. 12:527-545).
+    """
+    share = barycentric_lattice(ROWS)
+    surface = np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)
+    reach, tree = extent_of(tool), KDTree(surface)
+    pose = np.tile(np.eye(4), (len(point), 1, 1, 1))
+    pose[:, 0, :3, :3] = rotation
+    for here, start, shaft, deep in zip(pose[:, 0], point, rotation[:, :, 2], depth, strict=True):
+        near = surface[tree.query_ball_point(start, 3.0 * reach)]
+        here[:3, 3] = start + reach * shaft
+        for _ in range(STEPS):
+            room = float(distances_to(tool, here, near).min())
+            if room < TOUCHES:
+                break
+            here[:3, 3] -= room * shaft
+        here[:3, 3] -= deep * shaft
     return Touching(pose)

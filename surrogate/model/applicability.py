@@ -13,13 +13,14 @@ from sim.effects import (
     Gravity,
     Held,
     NodalForce,
+    Retraction,
     Slide,
     ToolContact,
     ToolDisplacement,
     ToolForce,
 )
 from sim.material import tissue_from_json
-from sim.tools import Ball
+from sim.tools import Tool
 
 from .learned import Learned
 
@@ -49,17 +50,18 @@ def trained_skull(stated: Mapping[str, str]) -> str:
 def refusal(model: Learned, effects: Iterable[Effect], element: str | None = None) -> str | None:
     """Why a model may not answer under these effects, on this element, or None if it may.
 
-    A model of poses answers where its ball touches, one of pushes where a tool's force acts. Where its
+    A model of poses answers where its tool touches, one of pushes where a tool's force acts. Where its
     anatomy has no skull it is all one whether `Bonded` or `Slide` is asked for. Tissue and element must be those that
     it learned from; an `element` of None is not compared, nor what the model's file does not state.
     """
     effects = tuple(effects)
     trained, asked = trained_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
-    if model.ball is not None:
-        here = next((effect.tools for effect in effects if isinstance(effect, ToolContact)), ())
-        if here != (Ball(model.ball),):
+    if model.tool is not None:
+        here = tuple(tool for effect in effects for tool in _moved(effect))
+        if here != (model.tool,):
             tools = ", ".join(map(repr, here)) or "none"
-            return f"it was trained on the poses of one ball of {1e3 * model.ball:g} mm, and the tools here are {tools}"
+            return f"it was trained on the poses of one {model.tool}, and the tools here are {tools}"
+        asked = asked - {Retraction.__name__} | {ToolContact.__name__}
     elif ToolForce.__name__ not in asked:
         others = ", ".join(sorted(asked - trained))
         return f"it was trained on what a tool's force does, and here is none{f', but {others}' if others else ''}"
@@ -70,6 +72,13 @@ def refusal(model: Learned, effects: Iterable[Effect], element: str | None = Non
     differences = [f"not under {', '.join(sorted(strange))}"] * bool(strange)
     differences += [f"never without {', '.join(sorted(missing))}"] * bool(missing)
     return f"it was trained under {', '.join(sorted(trained))}, {' and '.join(differences)}"
+
+
+def _moved(effect: Effect) -> tuple[Tool, ...]:
+    """The tools that an effect moves by pose."""
+    if isinstance(effect, Retraction):
+        return (effect.blade,)
+    return effect.tools if isinstance(effect, ToolContact) else ()
 
 
 def _other_body(model: Learned, effects: tuple[Effect, ...], element: str | None) -> str | None:

@@ -58,7 +58,7 @@ class Guarded:
         good = np.array([outcome.good for outcome in solved.outcome])
         if at is None and good.all() and len(unsure) == len(loads):
             return solved
-        pushed = self.model.ball is None
+        pushed = self.model.tool is None
         return _replaced(predicted, unsure[good], solved.rows(np.flatnonzero(good)), pushed)
 
     def unsure(self, predicted: Deformation) -> np.ndarray:

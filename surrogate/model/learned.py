@@ -16,15 +16,16 @@ from sim.arguments import whole_numbers
 from sim.bodies.tip_distance import tip_gauge
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
-from sim.loads import Loads, Pushed, Touching, check_loads
+from sim.loads import Loads, Pushed, check_loads
 from sim.material import tissue_from_json
 from sim.runtime.threads import one_thread
+from sim.tools import BuiltIn
 
 from ..data.cortex_patch import Patch, nearest, open_patch
 from ..data.encode import ENCODERS, Basis, Encoder, directions
-from ..data.indentation import indented
-from ..regressors.ball_contact import Contact
+from ..data.indentation import indented, posed
 from ..regressors.protocol import Fitted
+from ..regressors.rigid_contact import Contact
 from .conformal import LEVELS, Bound, features_of
 from .left_out import LeftOut
 from .tip_distance import Distance, TipModel
@@ -82,14 +83,14 @@ class Learned:
         What it promises of each load, if loads were kept apart to calibrate it.
     training
         What it was trained with, as text.
-    ball
-        Radius [m] of the ball whose poses it answers; None: it answers pushes. Depth [m] then stands for force.
+    tool
+        The one whose poses it answers; None: it answers pushes. Depth [m] then stands for force.
     tip
         What it has learned of the distance from tip to tumour, if anything.
     left_out
         How far it was off on cortex left out of a training; None where none was left out, or in older files.
     force
-        What it has learned of the force that its ball exerts, if anything.
+        What it has learned of the force that its tool exerts, if anything.
     """
 
     anatomy: Anatomy
@@ -98,7 +99,7 @@ class Learned:
     bound: float = float("nan")
     bounds: Bound | None = None
     training: Mapping[str, str] = field(default_factory=dict)
-    ball: float | None = None
+    tool: BuiltIn | None = None
     tip: TipModel | None = None
     left_out: LeftOut | None = None
     force: ForceModel | None = None
@@ -155,7 +156,7 @@ class Learned:
         """
         if not len(doubtful):
             return
-        force = ("a force", 1.0, "N") if self.ball is None else ("a depth", 1e3, "mm")
+        force = ("a force", 1.0, "N") if self.tool is None else ("a depth", 1e3, "mm")
         for (name, unit, symbol), size, (_, most) in (
             (force, directions(pushed)[0], self.envelope.force),
             (("a footprint", 1e3, "mm"), pushed.footprint, self.envelope.footprint),
@@ -181,7 +182,7 @@ class Learned:
             )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Predict the static answer to `Pushed` loads, or to `Touching` of its ball; `start` has no influence.
+        """Predict the static answer to `Pushed` loads, or to the poses of its tool; `start` has no influence.
 
         Raises
         ------
@@ -212,12 +213,11 @@ class Learned:
         self._demand_answerable(pushed, np.flatnonzero(far | small))
         promised = self.promised(self.bounds, pushed, known, outside)
         answer = predicted(self.motion(pushed, nodes), nodes, loads, far, begun, promised, self.source)
-        touching = loads.of(Touching)
-        if self.force is None or self.ball is None or touching is None:
+        if self.force is None or self.tool is None:
             return answer
         return replace(
             answer,
-            reaction=wrench(self.exerted(pushed), touching, self.ball),
+            reaction=wrench(self.exerted(pushed), posed(loads, self.tool), self.tool),
             reaction_bound=self.promised(self.force.bound, pushed, known, outside),
             cost=Cost({"predict": time.perf_counter() - begun}),
         )
@@ -245,7 +245,7 @@ class Learned:
         return magnitude, replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
 
     def exerted(self, pushed: Pushed) -> np.ndarray:
-        """Forces (B, 3) [N] that the ball exerts at indentations; as `motion`, in proportion beyond the training.
+        """Forces (B, 3) [N] that the tool exerts at indentations; as `motion`, in proportion beyond the training.
 
         Raises
         ------
@@ -289,7 +289,7 @@ class Learned:
         if apart is None:
             if answer is None:
                 answer = self.deform(loads, at=self.nodes)
-            apart = tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.ball)
+            apart = tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.tool)
         tip = self.tip or TipModel()
         magnitude, within = self._within(pushed)
         found = tip.corrected(apart, self._patch, within, magnitude)
@@ -297,14 +297,14 @@ class Learned:
         return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.outside(pushed, known)))
 
     def asked(self, loads: Loads) -> Pushed:
-        """What the model is asked: pushes, or the poses of its ball as `indentation.indented` has them.
+        """What the model is asked: pushes, or the poses of its tool as `indentation.indented` has them.
 
         Raises
         ------
         InputError
             Loads of another kind.
         """
-        return only_pushed(loads) if self.ball is None else indented(loads, self.ball, self._patch)
+        return only_pushed(loads) if self.tool is None else indented(loads, self.tool, self._patch)
 
 
 def predicted(

@@ -16,10 +16,10 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import path_of, read_as
+from sim.tools import BuiltIn, tool_from_text
 
 from ..data.encode import Basis
 from ..regressors.ann import Ann
-from ..regressors.ball_contact import Contact
 from ..regressors.bayesian import Bayesian
 from ..regressors.compliance_table import Linear
 from ..regressors.force_pairs import Pairs
@@ -27,6 +27,7 @@ from ..regressors.force_series import Series
 from ..regressors.gp import Gp
 from ..regressors.pcr import Pcr
 from ..regressors.protocol import Fitted, Regressor
+from ..regressors.rigid_contact import Contact
 from ..regressors.series_residual import Remainder
 from ..regressors.svr import Svr
 from .conformal import GROWTH, Bound
@@ -167,7 +168,7 @@ def _described(model: Learned, put: Any) -> dict[str, Any]:
         "bound": model.bound,
         "bounds": _put_bound(model.bounds, put),
         "training": dict(model.training),
-        "ball": model.ball,
+        "tool": None if model.tool is None else repr(model.tool),
         "tip": None if model.tip is None else _described_tip(model.tip, put),
         "left_out": None if model.left_out is None else asdict(model.left_out),
         "force": None if model.force is None else _described_force(model.force, put),
@@ -220,6 +221,13 @@ def _rebuilt_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.nda
     return TipModel(correction, _rebuilt_bound(description["bound"], arrays, reach))
 
 
+def _rebuilt_tool(description: dict[str, Any]) -> BuiltIn | None:
+    """The tool whose poses a model answers; older files have a ball's radius alone."""
+    older = description.get("ball")
+    text = description.get("tool", None if older is None else f"Ball(radius={older})")
+    return None if text is None else tool_from_text(text)
+
+
 def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
     return None if bound is None else {name: put(array) for name, array in vars(bound).items()}
 
@@ -249,7 +257,7 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         _rebuilt_bound(description["bounds"], arrays, envelope["reach"]),
         description["training"],
         # Older files do not have these.
-        description.get("ball"),
+        _rebuilt_tool(description),
         _rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
         None if (stated := description.get("left_out")) is None else LeftOut(**stated),
         _rebuilt_force(description.get("force"), arrays, envelope["reach"]),

@@ -1,4 +1,4 @@
-"""The force that a ball moved by pose exerts: learned beside the motion, with a bound of its own."""
+"""The force that a tool moved by pose exerts: learned beside the motion, with a bound of its own."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.loads import Pushed, Touching
+from sim.loads import Pushed
+from sim.tools import Ball, BuiltIn
 
 from ..data.cortex_patch import Patch
 from ..data.encode import ENCODERS
@@ -16,7 +17,7 @@ from .conformal import Bound
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
-    """What a model of poses has learned of the ball's force.
+    """What a model of poses has learned of its tool's force.
 
     Parameters
     ----------
@@ -38,10 +39,11 @@ class ForceModel:
         return 0.0 if self.learned is None else self.learned.predict(ENCODERS[self.encoder](patch, asked))
 
 
-def wrench(force: np.ndarray, touching: Touching, ball: float) -> np.ndarray:
-    """Force [N] and moment about the tool's origin [N m] of one ball at its poses: (B, 1, 6), of forces (B, 3).
+def wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.ndarray:
+    """Force [N] and moment about the tool's origin [N m] of one tool at poses (B, 4, 4): (B, 1, 6), of forces (B, 3).
 
-    What presses on a ball of radius `ball` [m] without friction goes through its middle.
+    What presses on a ball without friction goes through its middle. The moment of other tools is not known: NaN.
     """
-    arm = ball * touching.pose[:, 0, :3, 2]
-    return np.concatenate([force, np.cross(arm, force)], axis=1)[:, None]
+    known = isinstance(tool, Ball)
+    moment = np.cross(tool.radius * pose[:, :3, 2], force) if known else np.full(force.shape, np.nan)
+    return np.concatenate([force, moment], axis=1)[:, None]

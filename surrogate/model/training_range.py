@@ -13,6 +13,7 @@ from sim.loads import Pushed
 from ..array_functions import squared_distances
 from ..data.cortex_patch import Patch
 from ..data.encode import directions
+from ..data.indentation import Indented
 
 # Round-off must not put a training load outside.
 SLACK = 1e-6
@@ -131,8 +132,10 @@ def _reach(point: np.ndarray) -> float:
 
 
 def measured(patch: Patch, pushed: Pushed) -> Measured:
-    """Measure loads as the envelope compares them."""
-    magnitude, direction = directions(pushed)
-    cosine = np.einsum("bi,bi->b", direction, patch.normal_near(pushed.point))
+    """Measure loads as the envelope compares them; of a rod or a blade the shaft counts, where it leans more."""
+    (magnitude, direction), inward = directions(pushed), patch.normal_near(pushed.point)
+    cosine = np.einsum("bi,bi->b", direction, inward)
+    if isinstance(pushed, Indented):
+        cosine = np.minimum(cosine, -np.einsum("bi,bi->b", pushed.axes[:, :, 2], inward))
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     return Measured(magnitude, angle, pushed.footprint - patch.rim_distance(pushed.point))

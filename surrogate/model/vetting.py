@@ -8,10 +8,14 @@ import numpy as np
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
+from sim.loads import Pushed
+from sim.tools import Ball
 
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS, Basis
-from ..regressors.ball_contact import Contact
+from ..data.indentation import Indented
+from ..data.tool_loads import across
+from ..regressors.rigid_contact import Contact
 from .conformal import LEVELS, Bound
 from .learned import Learned, Part
 from .left_out import LeftOut
@@ -35,7 +39,6 @@ def demand_sound(name: str, model: Learned) -> None:
             _check_part(part, model)
         _check_envelope(model.envelope)
         _demand(isinstance(model.bound, float) and not model.bound < 0.0, "its bound is no distance")
-        _demand(model.ball is None or _positive(model.ball), "its ball has no radius")
         _demand(model.left_out is None or _sound(model.left_out), "its errors on left-out cortex are no errors")
         texts = (*model.training, *model.training.values())
         _demand(all(isinstance(text, str) for text in texts), "what it states of its training is no text")
@@ -96,17 +99,22 @@ def _probe(encoder: str, model: Learned) -> np.ndarray:
     envelope = model.envelope
     _check_envelope(envelope)
     inward = open_patch(model.anatomy).normal_near(envelope.points[:1].astype(float))[0]
-    return np.array([[*envelope.points[0], *inward, envelope.force[1], envelope.footprint[1]]], float)
+    depth, wide = envelope.force[1], envelope.footprint[1]
+    pushed = Pushed(envelope.points[:1].astype(float), depth * inward[None], np.array([wide]))
+    if model.tool is not None and not isinstance(model.tool, Ball):
+        axes = np.stack([*across(-inward[None]), -inward[None]], axis=2)
+        pushed = Indented(pushed.point, pushed.force, pushed.footprint, axes, -wide * inward[None])
+    return ENCODERS[encoder](open_patch(model.anatomy), pushed)
 
 
 def _check_force(model: Learned) -> None:
     if model.force is None:
         return
-    _demand(model.ball is not None, "it knows the force of a ball that it has not")
+    _demand(model.tool is not None, "it knows the force of a tool that it has not")
     _demand(model.force.encoder in ENCODERS, f"no encoder is called {model.force.encoder!r}")
     grips = [part.regressor.grip for part in model.parts if isinstance(part.regressor, Contact)]
-    _demand(bool(grips) or model.force.learned is not None, "it knows nothing of its ball's force")
-    _demand(all(grip.shape == (2,) for grip in grips), "what it knows of its ball's force is none")
+    _demand(bool(grips) or model.force.learned is not None, "it knows nothing of its tool's force")
+    _demand(all(grip.shape == (2,) for grip in grips), "what it knows of its tool's force is none")
     if model.force.learned is not None:
         found = model.force.learned.predict(_probe(model.force.encoder, model))
         _demand(found.shape == (1, 3) and bool(np.isfinite(found).all()), "it answers no force")

@@ -30,7 +30,7 @@ TUMOUR = Way(CLASS, True)
 # A tip snaps through with the cortex here and there, so that the tail of its errors grows with the force: classes are
 # as small as 99 in 100 allows, and the scale's logarithm is linear.
 TIP = Way(100, False)
-# Of the force that a ball moved by pose exerts.
+# Of the force that a tool moved by pose exerts.
 FORCE = Way(CLASS, True)
 
 

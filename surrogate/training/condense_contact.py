@@ -6,9 +6,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from sim.fem import Fem
+from sim.tools import Ball, BuiltIn, core_of
 
 from ..data.encode import Basis, reduce
-from ..regressors.ball_contact import Contact
+from ..regressors.rigid_contact import Contact
 
 # Nodes whose unit responses are asked for together: bounds the memory that they take.
 STRIP = 64
@@ -16,10 +17,11 @@ STRIP = 64
 TOLERANCE = 1e-4
 
 
-def condensed(fem: Fem, parts: list[np.ndarray]) -> tuple[Contact, list[Basis]]:
-    """Contact on a body at rest, answered for `parts` of its vertices, and a basis of each of them.
+def condensed(fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None) -> tuple[Contact, list[Basis]]:
+    """Contact of a tool with a body at rest, answered for `parts` of its vertices, and a basis of each of them.
 
-    The answers are coefficients of the bases, one after the other.
+    Without a `tool` it is a ball of the radius that features have. The answers are coefficients of the bases, one after
+    the other.
     """
     surface = fem.anatomy.mesh.surface[fem.anatomy.bare]
     nodes, triangles = np.unique(surface, return_inverse=True)
@@ -34,8 +36,15 @@ def condensed(fem: Fem, parts: list[np.ndarray]) -> tuple[Contact, list[Basis]]:
         compliance.reshape(rows, rows),
         coefficients,
         np.repeat([[1.0], [0.0]], coefficients.shape[1], axis=1),
+        core=np.zeros(0) if tool is None or isinstance(tool, Ball) else _sizes(tool),
     )
     return contact, bases
+
+
+def _sizes(tool: BuiltIn) -> np.ndarray:
+    """Half sizes of what a tool lies round, and its radius (4,) [m]."""
+    core = core_of(tool)
+    return np.append(core.half, core.radius)
 
 
 def side_by_side(bases: list[Basis]) -> Basis:

@@ -25,7 +25,7 @@ class Examples:
     tumour, cortex
         Displacements (B, n, 3) [m].
     force
-        (B, 3) [N] that a ball moved by pose exerts, where it is known.
+        (B, 3) [N] that a tool moved by pose exerts, where it is known.
     """
 
     loads: Pushed

@@ -26,11 +26,11 @@ from ..data.encode import Basis, nodal_shares, reduce
 from ..data.tool_loads import spread
 from ..model.applicability import trained_skull
 from ..model.learned import Part, only_pushed
-from ..regressors.ball_contact import Contact
 from ..regressors.compliance_table import Linear
 from ..regressors.force_pairs import Pairs
 from ..regressors.force_series import FACTORS, SPANS, Series
 from ..regressors.left_out_tables import filled
+from ..regressors.rigid_contact import Contact
 from .condense_contact import condensed, side_by_side
 from .examples import Examples, left_by
 from .tabulate_series import in_one_disc, radii_between, tabulated, with_middles
@@ -182,7 +182,7 @@ class Expansion:
 
     @cached_property
     def contact(self) -> tuple[Contact, list[Basis], float]:
-        """The ball on linear tissue, the bases of tumour and cortex whose coefficients it answers with, and seconds.
+        """The tool on linear tissue, the bases of tumour and cortex whose coefficients it answers with, and seconds.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class Expansion:
             Data that do not state what tissue they are of.
         """
         begun = time.perf_counter()
-        contact, bases = condensed(self.fem(), self._known)
+        contact, bases = condensed(self.fem(), self._known, self.data.tool)
         return contact, bases, time.perf_counter() - begun
 
     def _compliance(self, nodes: np.ndarray) -> Part:

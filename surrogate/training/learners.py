@@ -11,15 +11,15 @@ from sim.errors import InputError
 from sim.loads import Pushed
 
 from ..data.cortex_patch import Patch
-from ..data.encode import ENCODERS, Basis, directions, reduce, tool_features
+from ..data.encode import ENCODERS, Basis, directions, reduce
 from ..model.learned import Part
 from ..model.own_learners import find_own, name_of
 from ..model.tool_force import ForceModel
 from ..regressors.ann import Ann
-from ..regressors.ball_contact import Contact
 from ..regressors.gp import Gp
 from ..regressors.pcr import Pcr
 from ..regressors.protocol import Fitted, Teachable
+from ..regressors.rigid_contact import Contact
 from ..regressors.series_residual import Remainder
 from ..regressors.svr import Svr
 from .condense_contact import side_by_side
@@ -39,7 +39,7 @@ LEARNT: dict[str, tuple[str, Callable[[], Teachable]]] = {
     "gp": ("tool", Gp),
     "residual": ("tool", partial(Tuned, ANN)),
 }
-# Learners of poses: the ball's place stands for its force.
+# Learners of poses: the tool's place stands for its force.
 POSED = ("gp", "ann", "svr")
 
 
@@ -62,7 +62,7 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part,
         if name == "contact":
             return (contact,)
         return (contact, *(trained(LEARNT["gp"], (), nodes, rest) for nodes, rest in left))
-    if known.data.ball is not None:
+    if known.data.tool is not None:
         both = ((known.tumour, examples.tumour), (known.cortex, examples.cortex))
         return tuple(trained(_learnt(name), (), nodes, truth) for nodes, truth in both if len(nodes))
     tumour, *cortex = known.tables
@@ -72,7 +72,7 @@ def parts_of(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Part,
 
 
 def force_of(name: str, parts: Sequence[Part], patch: Patch, examples: Examples) -> ForceModel | None:
-    """What one learner of poses knows of its ball's force, with the `parts` that it has learned; None if untold."""
+    """What one learner of poses knows of its tool's force, with the `parts` that it has learned; None if untold."""
     if examples.force is None:
         return None
     if name == "contact":
@@ -99,14 +99,15 @@ def _learnt(name: str) -> tuple[str, Callable[[], Teachable]]:
 
 
 def _touched(known: Expansion, examples: Examples) -> tuple[Part, list[tuple[np.ndarray, np.ndarray]]]:
-    """The ball on tissue that stiffens as examples have it, and what that leaves of it: vertices, and (B, n, 3) [m]."""
+    """The tool on tissue that stiffens as examples have it, and what that leaves of it: vertices, and (B, n, 3) [m]."""
     contact, bases, _ = known.contact
-    features, size = tool_features(known.patch, examples.loads), directions(examples.loads)[0][:, None, None]
+    encoder = "core" if len(contact.core) else "tool"
+    features, size = ENCODERS[encoder](known.patch, examples.loads), directions(examples.loads)[0][:, None, None]
     truth = [examples.tumour, examples.cortex][: len(bases)]
     coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
     alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
     force = None if examples.force is None else examples.force / size[:, 0]
-    part = Part("tool", contact.fitted(features, coefficients, alike, force), side_by_side(bases))
+    part = Part(encoder, contact.fitted(features, coefficients, alike, force), side_by_side(bases))
     answered = np.split(size * part.response(features), [len(known.tumour)], axis=1)
     return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
 

@@ -50,7 +50,7 @@ class SharedInputs:
         units = series = inside = 0
         seconds = [data.seconds("load", loads)]
         of_tumour = name in ("linear", "residual", *EXPANDED)
-        if data.ball is None and (len(known.cortex) or of_tumour):
+        if data.tool is None and (len(known.cortex) or of_tumour):
             units = len(data.unit_good)
             inside = 3 * of_tumour * int(self._left_out(known.patch.points).sum())
             seconds.append(data.seconds("unit response", units))

@@ -67,7 +67,7 @@ class Trained:
 def learners_for(data: Dataset) -> tuple[str, ...]:
     """All learners that a data set can train: series and contact need finite elements of a stated tissue."""
     stated = "tissue" in data.provenance
-    kinds = LEARNERS if data.ball is None else OF_POSES
+    kinds = LEARNERS if data.tool is None else OF_POSES
     return tuple(name for name in kinds if stated or name not in (*EXPANDED, *TOUCHED))
 
 
@@ -125,11 +125,11 @@ def train(
     ------
     InputError
         Unknown learners, or such as loads of the data's kind do not train; nothing to train on. Data with other causes
-        than `Pushed` or the `Touching` of a ball, an anatomy without tumour, too few loads, or unit responses that did
-        not converge.
+        than `Pushed` or the `Touching` of one tool, an anatomy without tumour, too few loads, or unit responses that
+        did not converge.
     """
     wanted = learners_for(data) if learners is None else tuple(dict.fromkeys(learners))
-    check_learners(wanted, of_poses=data.ball is not None, where=str(data.path))
+    check_learners(wanted, of_poses=data.tool is not None, where=str(data.path))
     if most is not None and most < 1:
         raise InputError(f"{most} loads train nothing: give at least 1.")
     if not data.unit_good.all():
@@ -153,9 +153,9 @@ def train(
         cortex = data.displacement(shared.cortex)[data.good]
         at = np.concatenate([nodes, shared.cortex])
         both = np.concatenate([truth, cortex], axis=1)
-        distances = Measured(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.ball))
+        distances = Measured(loads, tip_gauge(data.anatomy).distances(loads, both, at, data.tool))
 
-    reaction = None if data.ball is None else data.reaction()
+    reaction = None if data.tool is None else data.reaction()
     exerted = None if reaction is None else reaction[data.good, 0, :3]
     ways = (*WAYS, FORCE) if exerted is not None else WAYS
 
@@ -192,7 +192,7 @@ def train(
                 parts,
                 envelopes[0],
                 training={"learner": name, **data.provenance},
-                ball=data.ball,
+                tool=data.tool,
                 force=force_of(name, parts, patch, example_sets[0]),
             )
         with stage("score"):
@@ -260,11 +260,11 @@ def _without(split: Split, apart: np.ndarray) -> Split:
 
 def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
     """What loads of a data set ask of a model, as `Learned.asked` has it."""
-    if data.ball is not None:
-        return indented(loads, data.ball, patch)
+    if data.tool is not None:
+        return indented(loads, data.tool, patch)
     if loads.only(Pushed) is None:
         raise InputError(
-            "the data holds other loads than `Pushed`, which the learners do not take: simulate pushes, or one ball's "
+            "the data holds other loads than `Pushed`, which the learners do not take: simulate pushes, or one tool's "
             "poses."
         )
     return only_pushed(loads)

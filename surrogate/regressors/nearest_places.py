@@ -1,0 +1,105 @@
+"""Where a rigid tool's core comes nearest to triangles, and how far it is from places on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from sim.discretisation.footprint import on_triangle
+from sim.runtime.device import find_device, forward_kernel
+
+# How often a place on a triangle and the nearest one of a core that is no point take turns.
+TURNS = 16
+
+
+class Near(NamedTuple):
+    """Corner coordinates (S, 3) of places, how far they are (S,) [m], and the directions to them (S, 3)."""
+
+    share: np.ndarray
+    distance: np.ndarray
+    normal: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A box where it stands, of which a tool is all within a radius: a point of a ball, a line of a rod.
+
+    middle (3,) [m]; axes (3, 3), as columns; half (3,) [m].
+    """
+
+    middle: np.ndarray
+    axes: np.ndarray
+    half: np.ndarray
+
+    def moved(self, way: np.ndarray) -> Placed:
+        """The same, moved by (3,) [m]."""
+        return replace(self, middle=self.middle + way)
+
+    def nearest(self, corners: np.ndarray) -> Near:
+        """The places nearest to it on triangles with `corners` (S, 3, 3) [m].
+
+        A place of one takes turns with the nearest of the other, with momentum (Beck, Teboulle 2009, "A fast iterative
+        shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2:183-202, equations 4.1 to 4.3).
+        """
+        count, device = len(corners), find_device("cpu", "float64")
+        found = Near(np.empty((count, 3)), np.empty(count), np.empty((count, 3)))
+        kinds = (wp.vec3d, wp.float64, wp.vec3d)
+        out = [wp.array(each, dtype=kind, device="cpu", copy=False) for each, kind in zip(found, kinds, strict=True)]
+        known = wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device="cpu", copy=False)
+        stands = [wp.vec3d(*self.middle), wp.mat33d(*self.axes.ravel()), wp.vec3d(*self.half)]
+        device.launch(_nearest, (count,), [known, *stands, TURNS if self.half.any() else 1], out)
+        return found
+
+    def distances(self, corners: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far (n,) [m] the places of corner coordinates (n, 3) are from it, and the directions (n, 3)."""
+        place = np.einsum("nc,nci->ni", share, corners) - self.middle
+        local = place @ self.axes
+        away = place - np.clip(local, -self.half, self.half) @ self.axes.T
+        distance = np.sqrt(np.einsum("ni,ni->n", away, away))
+        return distance, away / np.maximum(distance, np.finfo(float).tiny)[:, None]
+
+
+@forward_kernel
+def _nearest(
+    corners: wp.array2d(dtype=wp.vec3d),
+    middle: wp.vec3d,
+    axes: wp.mat33d,
+    half: wp.vec3d,
+    turns: int,
+    share: wp.array(dtype=wp.vec3d),
+    distance: wp.array(dtype=wp.float64),
+    normal: wp.array(dtype=wp.vec3d),
+):
+    """y = x + (t - 1) / t' (x - x'), x the triangle's place nearest to the box's nearest to y; t' = (1 + r) / 2."""
+    face = wp.tid()
+    a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
+    one, pace = wp.float64(1.0), wp.float64(1.0)
+    place = (a + b + c) / wp.float64(3.0)
+    ahead = wp.vec3d(place)  # copies, as a plain assignment would be another name of the same
+    for _turn in range(turns):
+        last, before = wp.vec3d(place), wp.float64(pace)
+        place = on_triangle(a, b, c, _of_box(ahead, middle, axes, half))
+        pace = (one + wp.sqrt(one + wp.float64(4.0) * before * before)) / wp.float64(2.0)
+        ahead = place + ((before - one) / pace) * (place - last)
+    first, second, offset = b - a, c - a, place - a
+    aa, ab, bb = wp.dot(first, first), wp.dot(first, second), wp.dot(second, second)
+    pa, pb = wp.dot(offset, first), wp.dot(offset, second)
+    area = wp.max(aa * bb - ab * ab, wp.float64(1.0e-300))
+    v = wp.clamp((bb * pa - ab * pb) / area, wp.float64(0.0), one)
+    w = wp.clamp((aa * pb - ab * pa) / area, wp.float64(0.0), one - v)
+    share[face] = wp.vec3d(one - v - w, v, w)
+    away = place - _of_box(place, middle, axes, half)
+    distance[face] = wp.length(away)
+    normal[face] = wp.normalize(away)
+
+
+@wp.func
+def _of_box(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.vec3d:
+    """The box's place that is nearest to a point."""
+    local = wp.transpose(axes) @ (point - middle)
+    for i in range(3):
+        local[i] = wp.clamp(local[i], -half[i], half[i])
+    return middle + axes @ local

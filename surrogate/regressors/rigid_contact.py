@@ -1,0 +1,217 @@
+"""A rigid tool on linear tissue: what needs no learning where the tool's pose is known.
+
+The body is condensed to the nodes that a tool may touch: u = C f, C their compliance at rest. Of all frictionless
+forces that keep the tool out of every facet it bears those of least energy f.Cf / 2 (Signorini's problem). A tool is
+all within a radius of a point, a line or a rectangle, and enters a flat facet first where that is nearest. So
+constraints are added where a facet is entered, until none is (the exchange method: Hettich, Kortanek 1993,
+"Semi-infinite programming", SIAM Rev. 35:380-429). Each is linearised where its point has come to: a distance from
+something convex is convex, so that what satisfies the linear ones satisfies all. Their multipliers are a nonnegative
+least-squares problem (Lawson, Hanson 1974, "Solving Least Squares Problems", chapter 23). Stiffness cancels: how stiff
+tissue is need not be known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs
+from scipy.optimize import nnls
+
+from sim.effects import ToolContact
+from sim.geometry.closest_point import bounding_balls
+from sim.runtime.threads import one_thread
+from sim.tools import Ball
+
+from .nearest_places import Placed
+
+# Finite elements keep tissue within a gap of the ball [m]: on average half of it.
+THICKER = 0.5 * ToolContact((Ball(1.0),)).gap
+# Facets within so many radii of what a tool lies round may come to touch.
+REACH = 1.5
+# A facet entered by less [m], and motions smaller than that, end the search, which so many rounds bound.
+TOLERANCE, MOST = 1e-6, 60
+# A rod or a blade goes in by so many radii at once, so that tissue stays before it; there a facet is entered by more.
+STRIDE, COARSER = 0.5, 1e-5
+# Constraints that bear nothing are dropped, which is faster; after so many rounds they stay: nothing goes in circles.
+FORGETFUL = 15
+# Places that give less than this share of what nodes do on average are bone's, which the tool enters: no force, or one
+# beyond all bounds, would keep it out.
+LEAST = 0.02
+# Straight from LAPACK: the problems are so small that a wrapper takes longer than the work.
+FACTORED, SOLVED = get_lapack_funcs(("potrf", "trtrs"), dtype=np.float64)
+# Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are distinct.
+APART = 1e-6
+
+
+@dataclass(eq=False)
+class Contact:
+    """A regressor that predicts the response to one metre of indentation.
+
+    It is given `tool_features` of a ball, and `core_features` of a rod or a blade.
+
+    What nonlinearity adds far from the tool is nearly a factor of the force, that grows with depth over radius: a line,
+    which is all that is learned.
+
+    Parameters
+    ----------
+    points
+        (k, 3) [m] of the nodes that a tool may touch.
+    triangles
+        (S, 3) positions in `points`.
+    compliance
+        (3 k, 3 k) [m/N] float32.
+    answers
+        (3 k, r) [1/N] float32: coefficients of the basis's modes that unit forces have.
+    line
+        (2, r): at no depth, and what a depth of one radius adds.
+    grip
+        (2,): the same factor of the force that the tool exerts; (0,) where none was learned.
+    core
+        (4,) [m]: half sizes of what a rod or a blade lies round, and its radius. (0,): a ball, its radius a feature.
+    """
+
+    points: np.ndarray
+    triangles: np.ndarray
+    compliance: np.ndarray
+    answers: np.ndarray
+    line: np.ndarray
+    grip: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    core: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    # Features that were last asked for, and their forces: motion and reaction of one load are had from one search.
+    _last: tuple[bytes, np.ndarray] = field(default=(b"", np.zeros(0)), init=False, repr=False)
+
+    def predict(self, X: np.ndarray) -> np.ndarray:
+        """Coefficients (B, r) float32 of features (B, f), whose force is depth [m]."""
+        found = self.linear(X)
+        return (found * (self.line[0] + (X[:, 6:7] / X[:, 7:8]) * self.line[1])).astype(np.float32)
+
+    def linear(self, X: np.ndarray) -> np.ndarray:
+        """The same (B, r) of tissue that is linear."""
+        return self.force(X).astype(np.float32) @ self.answers / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
+
+    def exerted(self, X: np.ndarray) -> np.ndarray:
+        """The force (B, 3) [N/m] that the tool exerts, by one metre of depth; `grip` must have been learned."""
+        return self._resultant(X) * (self.grip[0] + (X[:, 6:7] / X[:, 7:8]) * self.grip[1])
+
+    def _resultant(self, X: np.ndarray) -> np.ndarray:
+        """The same (B, 3) of tissue that is linear."""
+        whole = self.force(X).reshape(len(X), -1, 3).sum(axis=1)
+        return whole / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
+
+    def force(self, X: np.ndarray) -> np.ndarray:
+        """What the tool does to linear tissue at the nodes that it may touch (B, 3 k) [N]."""
+        asked, (known, found) = X.tobytes(), self._last
+        if asked == known:
+            return found
+        out = np.zeros((len(X), len(self.compliance)))
+        with one_thread():
+            for row in np.flatnonzero(X[:, 6] > 0.0):
+                out[row] = self._pressed(*self._placed(X[row]))
+        out.flags.writeable = False
+        self._last = asked, out
+        return out
+
+    def fitted(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray, exerted: np.ndarray | None = None) -> Self:
+        """With the lines that fit coefficients Y (B, r) best; `alike` (r,) numbers those that share one.
+
+        `exerted` (B, 3) [N/m] is the tool's force by one metre of depth, where it is known.
+        """
+        found, line = self.linear(X), np.zeros_like(self.line)
+        for each in np.unique(alike):
+            mine = alike == each
+            line[:, mine] = _line(X, found[:, mine], Y[:, mine])[:, None]
+        grip = self.grip if exerted is None else _line(X, self._resultant(X), exerted)
+        return replace(self, line=line, grip=grip)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that it has."""
+        return {item.name: getattr(self, item.name) for item in fields(self) if item.init}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
+        """From `state`."""
+        return cls(**state)
+
+    @cached_property
+    def _rounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Middles (S, 3) and radii (S,) [m] of balls that hold a triangle each."""
+        return bounding_balls(self.points[self.triangles])
+
+    def _placed(self, x: np.ndarray) -> tuple[list[Placed], float]:
+        """Where the tool of a row of features stands, from where it goes in on, and its radius [m]."""
+        point, direction, depth, radius = x[:3], x[3:6], x[6], x[7]
+        if not len(self.core):
+            return [Placed(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + THICKER
+        axes = np.column_stack([x[11:14], np.cross(x[14:17], x[11:14]), x[14:17]])
+        there = Placed(x[8:11], axes, self.core[:3])
+        steps = int(np.ceil(depth / (STRIDE * self.core[3])))
+        ways = [(k / steps - 1.0) * depth * direction for k in range(1, steps + 1)]
+        return [there.moved(way) for way in ways], self.core[3] + THICKER
+
+    def _pressed(self, stations: list[Placed], radius: float) -> np.ndarray:
+        """Nodal forces (3 k,) [N] of a tool of a radius [m] at the last of the stations that it goes through."""
+        nodes, table, rows = self._touchable(stations, radius)
+        compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
+        own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
+        least, own = LEAST * np.einsum("nii->", own) / max(3 * len(nodes), 1), own[table]
+        tolerance = COARSER if len(self.core) else TOLERANCE
+        moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
+        facet, share = np.zeros(0, int), np.zeros((0, 3))
+        for station in stations:
+            settled = True
+            for iteration in range(MOST):
+                corners = (self.points[nodes] + moved)[table]
+                near = station.nearest(corners)
+                entered = np.flatnonzero(near.distance < radius - tolerance)
+                if len(entered):
+                    share_of, way = near.share[entered], near.normal[entered]
+                    gives = np.einsum("sc,scj,sj->s", share_of**2, np.einsum("si,scij->scj", way, own[entered]), way)
+                    entered = entered[gives > least]
+                if settled and not len(entered):
+                    break
+                facet, share = np.concatenate([facet, entered]), np.concatenate([share, near.share[entered]])
+                distance, normal = station.distances(corners[facet], share)
+                lever = np.zeros((len(facet), len(nodes), 3))
+                lever[np.arange(len(facet))[:, None], table[facet]] = share[:, :, None] * normal[:, None]
+                lever = lever.reshape(len(facet), -1)
+                bears = _bearing(lever @ compliance @ lever.T, radius - distance + lever @ moved.ravel())
+                force = bears @ lever
+                last, moved = moved, (compliance @ force).reshape(-1, 3)
+                kept = (bears > 0.0) | (iteration >= FORGETFUL)
+                facet, share = facet[kept], share[kept]
+                settled = bool(np.abs(moved - last).max() < tolerance)
+        out = np.zeros(len(self.compliance))
+        out[rows] = force
+        return out
+
+    def _touchable(self, stations: list[Placed], radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the facets that a tool may touch: nodes (n,), their positions there (S, 3), and rows of the compliance."""
+        around, wide = self._rounds
+        reach = REACH * radius
+        far = wide + reach + np.linalg.norm(stations[0].half)
+        ends = [stations[0], stations[len(stations) // 2], stations[-1]] if len(stations) > 1 else stations
+        some = np.flatnonzero(np.any([np.linalg.norm(around - each.middle, axis=1) < far for each in ends], axis=0))
+        corners = self.points[self.triangles[some]]
+        near = np.any([each.nearest(corners).distance < reach for each in ends], axis=0)
+        nodes, table = np.unique(self.triangles[some[near]], return_inverse=True)
+        return nodes, table, (3 * nodes[:, None] + np.arange(3)).ravel()
+
+
+def _line(X: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The factor (2,), at no depth and what one radius adds, of rows `found` (B, r) that fits `wanted` (B, r) best."""
+    depth = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]])
+    factor = np.einsum("br,br->b", found, wanted) / np.square(found).sum(axis=1)
+    return np.linalg.lstsq(depth, factor, rcond=None)[0]
+
+
+def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain positive semi-definite."""
+    gain.flat[:: len(gain) + 1] += APART * np.trace(gain) / len(gain)
+    lower, failed = FACTORED(gain, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("places that a tool touches do not give way")
+    return nnls(lower.T, SOLVED(lower, wanted, lower=True)[0])[0]

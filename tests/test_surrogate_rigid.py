@@ -1,0 +1,276 @@
+"""Rods and blades moved by pose: how they are drawn, what contact says of them, and models that learn them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes.cli import main
+from scenes.script.scene import find_scene
+from sim.accuracy import REFERENCE
+from sim.anatomy import Anatomy
+from sim.bodies.meshfile import write_anatomy
+from sim.deformation import Deformation, Outcome
+from sim.effects import Elasticity, Held, Retraction, ToolContact, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Retracted, Touching
+from sim.material import BRAIN, Material, tissue_to_json
+from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to, foremost, tool_from_text
+from surrogate.data.cortex_patch import barycentric_lattice, open_patch
+from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.encode import Basis, core_features, tool_features
+from surrogate.data.indentation import Indented, indented, posed
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_poses import BLADE, LEAN, ROD, SHALLOW, draw_poses
+from surrogate.evaluation.score import errors
+from surrogate.model.applicability import refusal
+from surrogate.model.learned import Learned
+from surrogate.model.store import load, save
+from surrogate.model.tool_force import wrench
+from surrogate.regressors.nearest_places import Placed
+from surrogate.regressors.rigid_contact import THICKER, Contact
+from surrogate.training.condense_contact import condensed
+from surrogate.training.train import train
+
+ROD_OF_4 = Capsule(2e-3, 0.02)
+SMALL_BLADE = Spatula(8e-3, 12e-3, 1.5e-3)
+TOOLS = {"dissector": ROD_OF_4, "spatula": SMALL_BLADE}
+SOFT = Material("linear", 3000.0, 0.45)
+
+
+def condensed_box(box: Anatomy, tool: BuiltIn | None) -> tuple[Contact, list[Basis]]:
+    fem = Fem(box, pushed_effects(box, SOFT), REFERENCE, "cpu", element="p1")
+    return condensed(fem, [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)], tool)
+
+
+def asked(box: Anatomy, loads: Loads, tool: BuiltIn) -> Indented:
+    found = indented(loads, tool, open_patch(box))
+    assert isinstance(found, Indented)
+    return found
+
+
+def upright(box: Anatomy, tool: BuiltIn, depth: float) -> Loads:
+    """Over the middle of the box's flat top, straight down."""
+    points = open_patch(box).points
+    pose = np.eye(4)
+    pose[:3, 3] = 0.5 * (points.min(axis=0) + points.max(axis=0)) - [1e-4, 2e-4, depth]
+    return Loads((Touching(pose[None, None]),))
+
+
+def test_a_tool_is_read_from_what_it_prints_as_and_nothing_else_is() -> None:
+    for tool in (Ball(7e-3), ROD_OF_4, SMALL_BLADE):
+        assert tool_from_text(repr(tool)) == tool
+    for text in ("", "Ball", "Ball(7e-3)", "Ball(radius=x)", "Ball(radius=-1.0)", "print(radius=1.0)"):
+        with pytest.raises(InputError, match="is no tool"):
+            tool_from_text(text)
+    with pytest.raises(InputError, match="is no tool"):
+        tool_from_text("(" * 100_000)
+
+
+def test_the_foremost_point_is_on_the_tool_and_nothing_of_it_is_farther() -> None:
+    rng = np.random.default_rng(0)
+    for tool in (Ball(7e-3), ROD_OF_4, SMALL_BLADE):
+        pose = np.tile(np.eye(4), (5, 1, 1))
+        pose[:, :3, :3] = np.linalg.qr(rng.normal(size=(5, 3, 3)))[0]
+        pose[:, :3, :3] *= np.linalg.det(pose[:, :3, :3])[:, None, None]
+        pose[:, :3, 3] = rng.normal(size=(5, 3))
+        way = np.array([0.6, 0.0, -0.8])
+        found = foremost(tool, pose, way)
+        core = core_of(tool)
+        for row in range(5):
+            assert distances_to(tool, pose[row], found[row][None])[0] == pytest.approx(0.0, abs=1e-9)
+            corners = core.corners @ pose[row, :3, :3].T + pose[row, :3, 3]
+            assert found[row] @ way == pytest.approx((corners @ way).max() + core.radius)
+    flat = foremost(SMALL_BLADE, np.eye(4)[None], np.array([0.0, 0.0, -1.0]))
+    np.testing.assert_allclose(flat, 0.0, atol=1e-12)  # the middle of its face
+
+
+@pytest.mark.parametrize("half", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.4], [0.3, 0.5, 0.0], [0.2, 0.3, 0.4]])
+def test_the_place_nearest_to_a_core_is_nearest(half: list[float]) -> None:
+    """Against a fine lattice on random triangles, whether or not they cut the core."""
+    rng = np.random.default_rng(1)
+    corners = rng.normal(size=(150, 3, 3)) * rng.uniform(0.3, 1.0, (150, 1, 3))
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    core = Placed(np.array([0.3, -0.2, 0.1]), axes, np.array(half))
+    share, far, way = core.nearest(corners)
+    assert share.min() >= 0.0
+    again, direction = core.distances(corners, share)
+    np.testing.assert_allclose(again, far, atol=1e-12)
+    np.testing.assert_allclose(direction[far > 1e-9], way[far > 1e-9], atol=1e-6)
+    lattice = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60.0
+    best = np.min([core.distances(corners, np.tile(each, (150, 1)))[0] for each in lattice], axis=0)
+    off = np.maximum(far - best, 0.0)
+    assert off.max() < 0.02 and np.percentile(off, 90) < 1e-6 and (best - far).max() < 0.05
+    np.testing.assert_allclose(np.linalg.norm(way[far > 1e-9], axis=1), 1.0)
+
+
+@pytest.mark.parametrize("preset", TOOLS)
+def test_drawn_poses_go_in_from_where_they_touch_first(box: Anatomy, preset: str) -> None:
+    tool, patch = TOOLS[preset], open_patch(box)
+    loads = draw_poses(preset, box, 40, 3, tool)
+    pose = posed(loads, tool)
+    few = posed(draw_poses(preset, box, 9, 3, tool), tool)
+    np.testing.assert_allclose(few, pose[:9], atol=1e-12)
+    assert not np.allclose(posed(draw_poses(preset, box, 9, 4, tool), tool), pose[:9])
+    deepest = ROD * ROD_OF_4.radius if isinstance(tool, Capsule) else BLADE * SMALL_BLADE.width
+    surface = np.einsum("qc,scx->sqx", barycentric_lattice(4), patch.points[patch.triangles]).reshape(-1, 3)
+    back = np.arange(0.0, 2.0 * deepest, 2e-5)
+    for each in pose:
+        way = np.tile(each, (len(back), 1, 1))
+        way[:, :3, 3] += back[:, None] * each[:3, 2]
+        touches = [bool(distances_to(tool, one, surface).min() < 0.0) for one in way]
+        depth = back[np.flatnonzero(touches)[-1]]
+        assert SHALLOW * core_of(tool).radius - 4e-5 < depth < deepest + 4e-5
+        cosine = -patch.normal_near(each[None, :3, 3])[0] @ each[:3, 2]
+        assert cosine >= np.cos(LEAN if isinstance(tool, Spatula) else np.pi / 4.0) - 1e-9
+
+
+def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box: Anatomy) -> None:
+    """Where its side touches nothing: the same indentation, the same forces, and how it is turned does not matter."""
+    loads, ball = upright(box, ROD_OF_4, 1.2e-3), Ball(ROD_OF_4.radius)
+    rod, round_ = asked(box, loads, ROD_OF_4), indented(loads, ball, open_patch(box))
+    for name in ("point", "force", "footprint"):
+        np.testing.assert_allclose(getattr(rod, name), getattr(round_, name), atol=1e-9)
+    patch = open_patch(box)
+    force = condensed_box(box, ROD_OF_4)[0].force(core_features(patch, rod))
+    alike = condensed_box(box, ball)[0].force(tool_features(patch, round_))
+    np.testing.assert_allclose(force, alike, atol=0.02 * np.abs(alike).max())
+    turned = loads.of(Touching)
+    assert turned is not None
+    pose = turned.pose.copy()
+    pose[0, 0, :3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    np.testing.assert_array_equal(asked(box, Loads((Touching(pose),)), ROD_OF_4).axes, rod.axes)
+
+
+def test_a_blade_may_be_laid_on_and_moved(box: Anatomy) -> None:
+    """`Retracted` loads are the pose that they end in; either way round the blade is the same to a learner."""
+    there = upright(box, SMALL_BLADE, 2e-3)
+    pose = posed(there, SMALL_BLADE)
+    above = pose.copy()
+    above[:, :3, 3] -= [1e-3, 0.0, -9e-3]
+    moved = Loads((Retracted(above, np.array([[1e-3, 0.0, -9e-3]])),))
+    one, other = asked(box, there, SMALL_BLADE), asked(box, moved, SMALL_BLADE)
+    np.testing.assert_allclose(core_features(open_patch(box), one), core_features(open_patch(box), other), atol=1e-12)
+    turned = pose.copy()
+    turned[:, :3, :2] *= -1.0
+    back = asked(box, Loads((Touching(turned[:, None]),)), SMALL_BLADE)
+    np.testing.assert_allclose(tool_features(open_patch(box), back), tool_features(open_patch(box), one), atol=1e-12)
+    with pytest.raises(TypeError, match="only rods and blades"):
+        core_features(open_patch(box), indented(upright(box, Ball(5e-3), 1e-3), Ball(5e-3), open_patch(box)))
+
+
+@pytest.mark.parametrize("preset", TOOLS)
+def test_no_facet_is_entered_and_finite_elements_answer_so(box: Anatomy, preset: str) -> None:
+    """Signorini's conditions on a dense lattice of every facet; and against the barrier of the finite elements."""
+    tool, patch = TOOLS[preset], open_patch(box)
+    contact, bases = condensed_box(box, tool)
+    loads = draw_poses(preset, box, 5, 5, tool)
+    X = core_features(patch, asked(box, loads, tool))
+    force = contact.force(X)
+    moved = contact.points + (force @ contact.compliance.astype(np.float64).T).reshape(len(X), -1, 3)
+    for row, pose in enumerate(posed(loads, tool)):
+        facets = np.einsum("qc,sci->sqi", barycentric_lattice(12), moved[row][contact.triangles]).reshape(-1, 3)
+        nearest = distances_to(tool, pose, facets).min()
+        assert THICKER - 3e-5 < nearest < THICKER + 1e-4
+    fem = Fem(box, [Elasticity(SOFT), Held(), ToolContact((tool,))], device="cpu", batch=1, element="p1")
+    truth = fem.deform(loads)
+    assert all(outcome.good for outcome in truth.outcome)
+    found = bases[0].decode((contact.predict(X) * X[:, 6:7])[:, : len(bases[0].modes)])
+    theirs = truth.at(box.tumour_nodes).displacement
+    off = np.linalg.norm(found - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
+    assert off.mean() < 0.05 and off.max() < 0.1
+    bears, reads = force.reshape(len(X), -1, 3).sum(axis=1), truth.reaction[:, 0, :3]
+    assert (np.linalg.norm(bears - reads, axis=1) < 0.15 * np.linalg.norm(reads, axis=1)).all()
+
+
+class Stiffening:
+    """Answers poses of the rod as on linear tissue, whose forces grow with depth."""
+
+    def __init__(self, anatomy: Anatomy):
+        self.anatomy = anatomy
+        self.contact, self.bases = condensed_box(anatomy, ROD_OF_4)
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        X = core_features(open_patch(self.anatomy), asked(self.anatomy, loads, ROD_OF_4))
+        grown = 1.0 + 0.2 * X[:, 6:7] / X[:, 7:8]
+        answered = self.contact.linear(X) * X[:, 6:7] * grown
+        split, displacement = len(self.bases[0].modes), np.zeros((len(loads), len(self.anatomy.mesh.nodes), 3))
+        for basis, coefficients in zip(self.bases, (answered[:, :split], answered[:, split:]), strict=True):
+            displacement[:, basis.nodes] = basis.decode(coefficients)
+        force = self.contact.force(X).reshape(len(loads), -1, 3).sum(axis=1) * grown
+        nodes, count = np.arange(len(self.anatomy.mesh.nodes)), len(loads)
+        reaction = np.nan_to_num(wrench(force, posed(loads, ROD_OF_4), ROD_OF_4))
+        outcome = (Outcome.CONVERGED,) * count
+        answer = Deformation(displacement, nodes, outcome, np.zeros(count, int), np.zeros(count), loads.times, reaction)
+        return answer if at is None else answer.at(at)
+
+
+@pytest.fixture(scope="module")
+def elements(box: Anatomy) -> Stiffening:
+    return Stiffening(box)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory, elements: Stiffening) -> Dataset:
+    path = tmp_path_factory.mktemp("rod") / "data.h5"
+    effects = repr((Elasticity(), Held(), ToolContact((ROD_OF_4,))))
+    said = {"shape": repr(ROD_OF_4), "tissue": tissue_to_json(SOFT), "effects": effects, "element": "p1"}
+    simulate(path, elements, draw_poses("dissector", elements.anatomy, 80, 0, ROD_OF_4), said)
+    return read_dataset(path)
+
+
+@pytest.fixture(scope="module")
+def model(data: Dataset) -> Learned:
+    return train(data, ["contact"]).models["contact"]
+
+
+def test_a_model_learns_a_rod_and_keeps_it(
+    tmp_path: Path, data: Dataset, model: Learned, elements: Stiffening, box: Anatomy
+) -> None:
+    assert data.tool == model.tool == ROD_OF_4
+    fresh, nodes = draw_poses("dissector", box, 30, 77, ROD_OF_4), box.tumour_nodes
+    truth, found = elements.deform(fresh), model.deform(fresh)
+    moved = truth.at(nodes).displacement
+    assert errors(model, fresh, moved, nodes).mean() < 0.01 * np.linalg.norm(moved, axis=2).mean()
+    size = np.linalg.norm(truth.reaction[:, 0, :3], axis=1)
+    assert (np.linalg.norm((found.reaction - truth.reaction)[:, 0, :3], axis=1) < 0.02 * size).all()
+    assert np.isnan(found.reaction[:, 0, 3:]).all()  # of a rod's moment a model knows nothing
+    save(tmp_path / "model.npz", {"contact": model})
+    again = load(tmp_path / "model.npz", box)["contact"]
+    assert again.tool == ROD_OF_4
+    np.testing.assert_array_equal(again.deform(fresh).displacement, found.displacement)
+
+
+def test_a_rod_that_leans_more_than_any_in_training_is_told_apart(model: Learned, box: Anatomy) -> None:
+    pose = posed(upright(box, ROD_OF_4, 1e-3), ROD_OF_4)
+    angle = np.radians(70.0)
+    pose[0, :3, :3] = [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
+    assert model.deform(upright(box, ROD_OF_4, 1e-3)).outcome == (Outcome.PREDICTED,)
+    assert model.deform(Loads((Touching(pose[:, None]),))).outcome == (Outcome.EXTRAPOLATED,)
+
+
+def test_models_of_blades_play_retraction_on_tissue_that_does_not_relax(model: Learned) -> None:
+    blade = SMALL_BLADE
+    tissue = tissue_to_json(BRAIN)
+    effects = (Elasticity(), Held(), ToolContact((blade,)))
+    known = replace(model, tool=blade, training={"effects": repr(effects), "tissue": tissue})
+    laid = (Elasticity(), Held(), Retraction(blade))
+    assert refusal(known, laid) is None
+    assert "the tools here are" in str(refusal(known, (Elasticity(), Held(), Retraction(Spatula(9e-3, 12e-3, 1e-3)))))
+    relaxing = find_scene("retract").effects[0]
+    assert "it learned from the tissue" in str(refusal(known, (relaxing, Held(), Retraction(blade))))
+
+
+def test_the_command_presses_rods_and_blades(tmp_path: Path, box: Anatomy, capsys: pytest.CaptureFixture[str]) -> None:
+    mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
+    write_anatomy(mesh, box)
+    wanted = ["simulate", str(mesh), "--out", str(out), "--count", "2", "--preset", "dissector", "--poses", "--json"]
+    assert main([*wanted, "--capsule", "2", "20"]) == 0
+    found = read_dataset(out)
+    assert found.tool == ROD_OF_4 and found.good.all()
+    assert main([*wanted, "--blade", "8", "12", "-1.5", "--force"]) == 2
+    assert "Spatula.edge is -0.0015 m: give a positive number" in capsys.readouterr().err
