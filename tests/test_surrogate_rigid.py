@@ -14,6 +14,7 @@ from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Deformation, Outcome
+from sim.discretisation.nearest_places import Placed
 from sim.effects import Elasticity, Held, Retraction, ToolContact, pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
@@ -31,7 +32,6 @@ from surrogate.model.applicability import refusal
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
 from surrogate.model.tool_force import wrench
-from surrogate.regressors.nearest_places import Placed
 from surrogate.regressors.rigid_contact import THICKER, Contact
 from surrogate.training.condense_contact import condensed
 from surrogate.training.train import train
@@ -245,7 +245,7 @@ def test_a_model_learns_a_rod_and_keeps_it(
     np.testing.assert_array_equal(again.deform(fresh).displacement, found.displacement)
 
 
-def test_a_rod_that_leans_more_than_any_in_training_is_told_apart(model: Learned, box: Anatomy) -> None:
+def test_a_rod_that_leans_more_than_any_in_training_is_extrapolated(model: Learned, box: Anatomy) -> None:
     pose = posed(upright(box, ROD_OF_4, 1e-3), ROD_OF_4)
     angle = np.radians(70.0)
     pose[0, :3, :3] = [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]

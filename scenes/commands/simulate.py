@@ -57,8 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--poses",
         action="store_true",
-        help="press with a rigid tool that is moved by pose, instead of a force on its footprint: a ball of the "
-        "preset's middle radius, unless --ball, --capsule or --blade is given",
+        help="press with a rigid tool that is moved by pose, instead of a force on its footprint. Without --ball, "
+        "--capsule or --blade it is a ball of the preset's middle radius",
     )
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument("--ball", type=float, metavar="MM", help="of this radius [mm] (in the scene palpate 7)")

@@ -103,8 +103,8 @@ def _lowered(
 ) -> Touching:
     """Poses of a tool that comes down its shaft over point (B, 3) until it touches, and goes on by depth (B,) [m].
 
-    How far it may go without touching is at least its distance from the nearest point of the surface, which is looked
-    at in `ROWS`^2 points a triangle (sphere tracing: Hart 1996, "Sphere tracing", Visual Comput. 12:527-545).
+    It may go at least as far as it is from the surface's nearest point (Hart 1996, "Sphere tracing", Visual Comput.
+    12:527-545). The surface is looked at in `ROWS`^2 points a triangle.
     """
     share = barycentric_lattice(ROWS)
     surface = np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)

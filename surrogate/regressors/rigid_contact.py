@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -26,7 +26,8 @@ from sim.geometry.closest_point import bounding_balls
 from sim.runtime.threads import one_thread
 from sim.tools import Ball
 
-from .nearest_places import Placed
+if TYPE_CHECKING:
+    from sim.discretisation.nearest_places import Placed
 
 # Finite elements keep tissue within a gap of the ball [m]: on average half of it.
 THICKER = 0.5 * ToolContact((Ball(1.0),)).gap
@@ -143,6 +144,9 @@ class Contact:
 
     def _placed(self, x: np.ndarray) -> tuple[list[Placed], float]:
         """Where the tool of a row of features stands, from where it goes in on, and its radius [m]."""
+        # Warp is loaded where a tool is pressed, not where a model is read.
+        from sim.discretisation.nearest_places import Placed
+
         point, direction, depth, radius = x[:3], x[3:6], x[6], x[7]
         if not len(self.core):
             return [Placed(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + THICKER

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from sim.discretisation.footprint import on_triangle
-from sim.runtime.device import find_device, forward_kernel
+from ..runtime.device import find_device, forward_kernel
+from .footprint import on_triangle
 
 # How often a place on a triangle and the nearest one of a core that is no point take turns.
 TURNS = 16
