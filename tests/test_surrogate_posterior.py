@@ -12,6 +12,7 @@ from surrogate.locating.causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
 from surrogate.locating.evidence import SHIFT, SIGMA, TURN, of_motions
 from surrogate.locating.posterior import COARSENED, MIXED, SeenPrior, conditioned, seen_prior
 from surrogate.locating.prior import NOWHERE, SETS, WITH_PLACE, Prior
+from surrogate.locating.whitened import whitened
 
 POINTS = 30
 
@@ -61,7 +62,7 @@ def seen_unknowns(prior, evidence):
 
 def test_what_is_seen_of_shapes_is_their_motion_at_the_points(prior):
     evidence = seen(prior, np.zeros((len(prior.anatomy.mesh.nodes), 3)))
-    found = np.hstack([prior.seen(evidence.place, evidence.axis), evidence.rigid * evidence.rigid_scale])
+    found = np.hstack([prior.seen(*evidence.weights), evidence.rigid * evidence.rigid_scale])
     assert found == pytest.approx(seen_unknowns(prior, evidence), abs=1e-9)
 
 
@@ -80,16 +81,25 @@ def test_hypotheses_are_sets_of_causes_in_one_skull_with_and_without_a_tool(prio
     assert {hypothesis.rigid for hypothesis in prior.hypotheses} == {0.1, 1.0}
 
 
-def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_covariance(prior):
-    """Bayes' formula by precisions instead of covariances, and the density of what is seen, with a place or without."""
+@pytest.mark.parametrize("single", [False, True])
+def test_an_answer_is_that_of_the_normal_equations_and_its_evidence_that_of_the_covariance(prior, single):
+    """Bayes' formula by precisions instead of covariances, and the density of what is seen, with a place or without.
+
+    Of whole motions, and of one with a row less, so that axes are not alike. A skull has fewer shapes of swelling.
+    """
     _, evidence = drawn(prior, np.random.default_rng(1), 2)
+    evidence = evidence.rows(np.arange(len(evidence) - single))
+    kept = np.ones(len(prior.kind), bool)
+    kept[np.flatnonzero((prior.kind == SWELLING) & (prior.skull == 1))[1:]] = False
+    prior = replace(prior, **{name: getattr(prior, name)[kept] for name in ("shape", "kind", "skull", "place")})
     sight = seen_prior(prior, evidence)
     noise = evidence.noise(np.sqrt((evidence.value**2).sum() / POINTS))
     unknown = seen_unknowns(prior, evidence).T
     logs, density = [], []
-    for hypothesis in prior.hypotheses[:5]:
-        weighed = sight.weighed(hypothesis)
-        for number, log in enumerate(weighed):
+    for hypothesis, found in zip(prior.hypotheses, sight.logs, strict=True):
+        pressed = len(hypothesis.places)
+        assert np.isfinite(found[: 1 + pressed]).all() and (found[1 + pressed :] == -np.inf).all()
+        for number, log in enumerate(found[: 1 + pressed]):
             place = hypothesis.places[number - 1] if number else np.zeros(0, int)
             answer = sight.answer(hypothesis, place, 1.0)
             size = np.concatenate(
@@ -124,15 +134,29 @@ def test_axes_that_are_alike_are_whitened_as_all_rows_together(prior):
         )
 
 
+@pytest.mark.parametrize("count", [12, 90])
+def test_rows_of_unknowns_and_their_products_are_those_of_all_points(prior, count):
+    """Of fewer points than vertices and of more, which are seen as fewer rows; of whole motions, and of single rows."""
+    box, random = prior.anatomy, np.random.default_rng(0)
+    some = random.integers(40, size=(count, 4))
+    place = Located(box.mesh.tets[some[:, 0]], random.dirichlet(np.ones(4), count))
+    at = np.einsum("nc,nci->ni", place.weights, box.mesh.nodes[place.vertices])
+    whole = of_motions(place, at, 1e-3 * random.standard_normal((count, 3)), np.full(count, SIGMA))
+    for evidence in (whole, whole.rows(random.permutation(len(whole)))):
+        found, unknown = whitened(prior, evidence, 1e-3), seen_unknowns(prior, evidence)
+        exact = evidence.whitening(1e-3).white(np.column_stack([unknown, evidence.value]))
+        assert found.products == pytest.approx(exact.T @ exact, rel=1e-9, abs=1e-9 * np.abs(exact.T @ exact).max())
+        columns = random.permutation(unknown.shape[1])[:9]
+        assert found.unknown(columns) == pytest.approx(exact[:, columns], abs=1e-9 * np.abs(exact).max())
+        assert found.value == pytest.approx(exact[:, -1])
+
+
 def test_ellipsoids_hold_what_is_drawn(prior):
     random, hypothesis, square = np.random.default_rng(3), prior.hypotheses[2], []
     for _ in range(200):
         truth, evidence = drawn(prior, random, 2)
-        sight = seen_prior(prior, evidence)
         # What shapes lack is no part of these draws, and their size is known.
-        exact = evidence.whitening(0.0)
-        unknown = seen_unknowns(prior, evidence)
-        sight = SeenPrior(prior, 3.0, exact, exact.white(unknown), exact.white(evidence.value), np.zeros(3))
+        sight = SeenPrior(prior, 3.0, whitened(prior, evidence, 0.0), np.zeros(3))
         answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
         scale = np.append(np.ones(len(prior.kind)), RIGID)
         off = answer.mean - (truth / scale)[answer.rows]
@@ -191,10 +215,8 @@ def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
     )
     assert not without.odds.any()
     assert near.odds == pytest.approx([np.log(0.05), -0.5 * (0.02**2 + 0.004**2) / 0.004**2, -0.5])
-    hypothesis = prior.hypotheses[0]
-    assert near.weighed(hypothesis) - without.weighed(hypothesis) == pytest.approx(near.odds)
-    last = prior.hypotheses[-1]  # with which no tool may press
-    assert near.weighed(last) - without.weighed(last) == pytest.approx(near.odds[:1])
+    assert near.logs[0] - without.logs[0] == pytest.approx(near.odds)
+    assert near.logs[-1, 0] - without.logs[-1, 0] == pytest.approx(near.odds[0])  # with which no tool may press
 
 
 def test_what_is_seen_may_be_little_because_a_motion_and_a_rigid_error_cancel(prior):

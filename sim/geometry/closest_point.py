@@ -65,9 +65,16 @@ def bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _candidates(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Numbers (B, k) of triangles among which the closest is: no middle lies nearer than their nearest corner may.
 
-    Each row begins with those that may be the closest, in rising order, so that of equal ones the first is found.
+    Each row begins with those that may be the closest, in rising order, so that of equal ones the first is found. The
+    first of them fills the rest.
     """
     middle, reach = bounding_balls(corners)
-    away = np.linalg.norm(points[:, None] - middle, axis=2)
+    x, y, z = (points[:, axis, None] - middle[:, axis] for axis in range(3))
+    away = np.sqrt(x * x + y * y + z * z)
     maybe = ~(away - reach > (1.0 + ROUNDING) * away.min(axis=1, keepdims=True))
-    return np.argsort(~maybe, axis=1, kind="stable")[:, : maybe.sum(axis=1).max()]
+    row, triangle = np.divmod(np.flatnonzero(maybe), len(corners))
+    count = np.bincount(row, minlength=len(points))
+    first = np.cumsum(count) - count
+    near = np.repeat(triangle[first][:, None], count.max(), axis=1)
+    near[row, np.arange(len(row)) - first[row]] = triangle
+    return near

@@ -29,7 +29,7 @@ def of_drained(drained: Responses, prior: Prior, evidence: Evidence) -> np.ndarr
     lower, seen = errors(evidence)
     rows = {name: seen_of(drained, name, evidence) for name in LINEAR}
     own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
-    lets_go = prior.seen(evidence.place, evidence.axis)[:, own].T
+    lets_go = prior.seen(*evidence.weights)[:, own].T
     size = np.mean([_size(each) for each in rows.values()])
     found = {name: _weighed(each / size, evidence, lower, seen) for name, each in rows.items()}
     found["contact"] = _weighed((lets_go / _size(lets_go))[None, None], evidence, lower, seen)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cholesky
+from scipy.linalg.lapack import dtrtri
 
 from sim.geometry.locate import Located
 
@@ -89,44 +90,62 @@ class Evidence:
         out[np.diag_indices(len(self))] += share * sigma**2 + (LACK_WHITE * scale) ** 2
         return out
 
+    @property
+    def copies(self) -> int:
+        """3 where rows are of motions along three axes, point after point; else 1."""
+        threefold = len(self) % 3 == 0 and np.array_equal(self.axis, np.tile(np.eye(3), (len(self) // 3, 1)))
+        return 3 if threefold else 1
+
+    @property
+    def weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (v,) that rows are seen at, and what of their motions makes rows.
+
+        That is (m / 3, v) where rows are of three axes, one after the other, else (m, 3 v): of all axes of a vertex.
+        """
+        copies = self.copies
+        vertices, number = np.unique(self.place.vertices[::copies], return_inverse=True)
+        weights = np.zeros((len(self) // copies, len(vertices)))
+        row = np.arange(len(weights))[:, None]
+        np.add.at(weights, (row, number.reshape(len(weights), -1)), self.place.weights[::copies])
+        if copies == 1:
+            weights = (weights[:, :, None] * self.axis[:, None]).reshape(len(weights), -1)
+        return vertices, weights
+
     def whitening(self, scale: float) -> Whitening:
         """What makes errors independent and of variance 1, where `scale` [m] is seen."""
-        threefold = len(self) % 3 == 0 and np.array_equal(self.axis, np.tile(np.eye(3), (len(self) // 3, 1)))
-        some = self.rows(np.arange(0, len(self), 3)) if threefold else self
-        return Whitening(cholesky(some.noise(scale), lower=True), 3 if threefold else 1)
+        copies = self.copies
+        lower = cholesky(self.rows(np.arange(0, len(self), copies)).noise(scale), lower=True)
+        return Whitening(dtrtri(lower, lower=1)[0], copies)
 
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """The Cholesky factor L of a covariance of errors.
+    """The inverse R of the Cholesky factor of a covariance of errors, which is R^-1 R^-T.
 
     Parameters
     ----------
-    lower
+    root
         (m / copies, m / copies).
     copies
         3 where the errors along three axes are alike and independent, row after row; else 1.
     """
 
-    lower: np.ndarray
+    root: np.ndarray
     copies: int
 
     def white(self, rows: np.ndarray) -> np.ndarray:
-        """L^-1 rows, (m, k) or (m,)."""
-        wide = rows.reshape(len(self.lower), -1)
-        return solve_triangular(self.lower, wide, lower=True, check_finite=False).reshape(rows.shape)
+        """R rows, (m, k) or (m,)."""
+        return (self.root @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
     def back(self, rows: np.ndarray) -> np.ndarray:
-        """L^-T rows, (m, k) or (m,)."""
-        wide = rows.reshape(len(self.lower), -1)
-        return solve_triangular(self.lower, wide, lower=True, trans=1, check_finite=False).reshape(rows.shape)
+        """R^T rows, (m, k) or (m,)."""
+        return (self.root.T @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
     def precision(self, table: np.ndarray) -> np.ndarray:
-        """Blocks (n, c, c) of the inverse covariance, for rows (n, c)."""
-        inverse = cho_solve((self.lower, True), np.eye(len(self.lower)))
-        point, axis = np.divmod(table, self.copies)
-        alike = axis[:, :, None] == axis[:, None]
-        return np.where(alike, inverse[point[:, :, None], point[:, None]], 0.0)
+        """Blocks (n, c, c) of the inverse covariance, for rows (n, c): of all axes of points, where `copies` is 3."""
+        columns = self.root.T[table[:, :: self.copies] // self.copies]
+        alike = columns @ columns.transpose(0, 2, 1)
+        return np.kron(alike, np.eye(self.copies))
 
 
 def alike(square: np.ndarray, length: float) -> np.ndarray:

@@ -90,7 +90,7 @@ class Location:
     def explained(self) -> float:
         """Share of the seen motion, in mean square, that the mean motion and the rigid error explain."""
         evidence, found = self.posterior.evidence, self.posterior
-        left = evidence.value - self.prior.seen(evidence.place, evidence.axis) @ found.weight
+        left = evidence.value - self.prior.seen(*evidence.weights) @ found.weight
         left -= evidence.rigid @ found.rigid
         whole = float(evidence.value @ evidence.value)
         return max(0.0, 1.0 - float(left @ left) / whole) if whole else 0.0

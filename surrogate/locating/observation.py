@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
 from sim.geometry.closest_point import closest
 from sim.geometry.locate import Located, locate
@@ -26,7 +25,7 @@ FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
 # Motions [m] beyond which no brain goes, and rigid errors that no tracker has.
 LONGEST_MOTION, FARTHEST_OFF = 0.05, 0.02
 # Points of a cloud that are looked at together, and at most.
-TOGETHER, MOST = 64, 400
+TOGETHER, MOST = 128, 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +200,7 @@ def _demand_spread(where: np.ndarray) -> None:
 
 def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     """Distances (n,) [m] from the open cortex."""
-    corners = open_cortex(anatomy).corners
+    corners = anatomy.mesh.nodes[anatomy.open_surface]
     parts = [points[some : some + TOGETHER] for some in range(0, len(points), TOGETHER)]
     away = [np.linalg.norm(closest(part, corners).point - part, axis=1) for part in parts]
     return np.concatenate([np.zeros(0), *away])

@@ -13,15 +13,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dtrtri
 from scipy.special import chdtri
 
-from .evidence import Evidence, Whitening
-from .prior import Hypothesis, Prior
+from .causes import TOOL
+from .elimination import Equations
+from .evidence import Evidence
+from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, Prior
+from .whitened import Whitened, whitened
 
 # A point is taken for an outlier if a better one is so improbable; so few points are not tested against each other.
 IMPROBABLE, FEWEST = 1e-4, 4
-NO_TIPS = np.zeros((0, 3))
+NO_TIPS, NO_ROWS = np.zeros((0, 3)), np.zeros(0, int)
 # Evidence counts as one part in so many: hypotheses are seldom as wrong as they look.
 COARSENED = 2.0
 # So many of the most probable hypotheses make a mixture.
@@ -87,93 +90,92 @@ class SeenPrior:
         What is believed.
     scale
         Size that motions may have [mm], in root mean square.
-    whitening
-        What its errors were made independent by.
-    unknown
-        (m, r + 6): what unit weights and a rigid error of one standard deviation do, whitened.
-    value
-        (m,): what is seen, whitened.
+    rows
+        What unit weights, and a rigid error of one standard deviation, do where something is seen.
     odds
         As `Prior.odds`.
     """
 
     prior: Prior
     scale: float
-    whitening: Whitening
-    unknown: np.ndarray
-    value: np.ndarray
+    rows: Whitened
     odds: np.ndarray
-
-    @cached_property
-    def pull(self) -> np.ndarray:
-        """(r + 6,): products of the unknowns with what is seen."""
-        return self.value @ self.unknown
 
     def answers(self) -> list[Answer]:
         """Of the most probable hypotheses; their shares sum to 1."""
-        found = [
-            (log, hypothesis, hypothesis.places[number - 1] if number else hypothesis.places[:0].ravel())
-            for hypothesis in self.prior.hypotheses
-            for number, log in enumerate(self.weighed(hypothesis))
-        ]
-        found = sorted(found, key=lambda each: -each[0])[:MIXED]
-        share = np.exp([log - found[0][0] for log, _, _ in found])
+        logs = self.logs
+        best = np.argsort(-logs, axis=None, kind="stable")[: min(MIXED, np.isfinite(logs).sum())]
+        share = np.exp(logs.flat[best] - logs.flat[best[0]])
         share /= share.sum()
-        return [self.answer(some, place, float(own)) for own, (_, some, place) in zip(share, found, strict=True)]
+        found = []
+        for own, number, place in zip(share, *np.unravel_index(best, logs.shape), strict=True):
+            hypothesis = self.prior.hypotheses[number]
+            rows = hypothesis.places[place - 1] if place else NO_ROWS
+            found.append(self.answer(hypothesis, rows, float(own)))
+        return found
 
     @cached_property
-    def gram(self) -> np.ndarray:
-        """(r + 6, r + 6): products of the unknowns with each other."""
-        return self.unknown.T @ self.unknown
+    def logs(self) -> np.ndarray:
+        """Logarithms (h, 1 + p) of odds and coarsened evidence of hypotheses, less what all share.
 
-    def weighed(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Logarithms of odds and coarsened evidence (1 + p,): no tool, one on each place; less what all share."""
-        own, size = self._base(hypothesis)
-        lower = self._lower(own, size)
-        half = solve_triangular(lower, size * self.pull[own], lower=True, check_finite=False)
-        alone = 0.5 * half @ half - np.log(np.diagonal(lower)).sum()
-        # Each place's shapes are bordered to the matrix that all have in common: its Schur complement is small.
-        table = hypothesis.places
-        across = self.scale * size[:, None] * self.gram[np.ix_(own, table.ravel())]
-        across = solve_triangular(lower, across, lower=True, check_finite=False)
-        rest = (self.scale * self.pull[table.ravel()] - across.T @ half).reshape(table.shape)
-        apart = across.reshape(len(own), *table.shape).transpose(1, 2, 0)
-        blocks = self.scale**2 * self.gram[table[:, :, None], table[:, None]]
-        schur = np.eye(table.shape[1]) + blocks - apart @ apart.transpose(0, 2, 1)
-        gain = np.einsum("pi,pi->p", rest, np.linalg.solve(schur, rest[..., None])[..., 0])
-        own_odds = self.odds[: 1 + len(table)]
-        pressed = alone + 0.5 * (gain - np.linalg.slogdet(schur)[1])
-        return own_odds + np.append(alone, pressed) / COARSENED
+        First without a tool, then with one on each place; -inf where none may press.
+        """
+        # Tools all over the cortex and the rigid error take part in all hypotheses, and a set extends an earlier one.
+        found: dict[tuple[int, ...], Equations] = {(): self._equations().eliminated(TOOL)}
+        for some in SETS[1:]:
+            found[some] = found[some[:-1]].eliminated(some[-1])
+        evidence = np.full((*found[()].evidence.shape, len(SETS), len(self.odds)), -np.inf)
+        for number, some in enumerate(SETS):
+            evidence[..., number, 0] = found[some].evidence
+            if some in WITH_PLACE:
+                evidence[..., number, 1:] = found[some].with_places
+        return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / COARSENED
+
+    def _equations(self) -> Equations:
+        """Of all unknowns, each over its prior standard deviation: in each skull, with each rigid error."""
+        shared, products = self.prior.together, self.rows.products
+        skulls, places = len(shared.rows), shared.places
+        rows = np.concatenate([shared.rows, np.tile(self._rigid, (skulls, 1))], axis=1)
+        size = np.empty((skulls, len(RIGIDS), rows.shape[1]))
+        size[..., :-6], size[..., -6:] = self.scale * shared.size[:, None], np.array(RIGIDS)[:, None]
+        # Of each place, and the data beside them.
+        beside = np.concatenate([places, np.full((*places.shape[:2], 1), len(products) - 1)], axis=2)
+        beside_size = np.append(np.full(places.shape[2], self.scale), 1.0)
+        columns = np.concatenate([rows, beside.reshape(skulls, -1)], axis=1)
+        wide = np.tile(beside_size, places.shape[1])
+        wide = np.concatenate([size, np.broadcast_to(wide, (*size.shape[:2], len(wide)))], axis=2)
+        table = products[rows[:, None, :, None], columns[:, None, None]] * size[..., None] * wide[:, :, None]
+        table[..., *np.diag_indices(rows.shape[1])] += 1.0
+        place = products[places[:, None, ..., None], beside[:, None, :, None]] * self.scale * beside_size
+        place[..., *np.diag_indices(places.shape[2])] += 1.0
+        return Equations(np.append(shared.kind, np.full(6, TOOL)), table, place, np.zeros(size.shape[:2]))
+
+    @property
+    def _rigid(self) -> np.ndarray:
+        """Rows (6,) of the rigid error."""
+        return np.arange(-7, -1) + len(self.rows.products)
 
     def answer(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> Answer:
         """What a hypothesis says with some more rows (q,), those of one place."""
         own, size = self._base(hypothesis)
         own, size = np.append(own, place), np.append(size, np.full(len(place), self.scale))
-        back = solve_triangular(self._lower(own, size), np.diag(size), lower=True, check_finite=False)
-        return Answer(share, own, back.T @ (back @ self.pull[own]), back)
-
-    def _lower(self, own: np.ndarray, size: np.ndarray) -> np.ndarray:
-        """Cholesky factor of the precision of some unknowns, each over its prior standard deviation."""
-        inner = size[:, None] * self.gram[np.ix_(own, own)] * size
-        return cholesky(np.eye(len(own)) + inner, lower=True, check_finite=False)
+        # The inverse of the Cholesky factor of the precision of unknowns, each over its prior standard deviation.
+        inner = np.eye(len(own)) + size[:, None] * self.rows.products[own[:, None], own] * size
+        back = size * dtrtri(np.linalg.cholesky(inner), lower=1)[0]
+        return Answer(share, own, back.T @ (back @ self.rows.products[-1, own]), back)
 
     def _base(self, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
         """Rows and standard deviations of its unknowns, the rigid error's last."""
-        rigid = np.arange(len(self.pull) - 6, len(self.pull))
         size = np.append(self.scale * hypothesis.size, np.full(6, hypothesis.rigid))
-        return np.append(hypothesis.rows, rigid), size
+        return np.append(hypothesis.rows, self._rigid), size
 
 
 def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> SeenPrior:
     """How a prior is seen by some evidence, where tips of tools (k, 3) [m] touch the cortex."""
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
-    whitening = evidence.whitening(seen)
-    unknown = np.concatenate([prior.seen(evidence.place, evidence.axis), evidence.rigid * evidence.rigid_scale], axis=1)
     # A motion and a rigid error may cancel, so that little is seen of either.
     scale = 1e3 * float(np.hypot(seen, np.sqrt(3.0) * evidence.shift))
-    return SeenPrior(
-        prior, scale, whitening, whitening.white(unknown), whitening.white(evidence.value), prior.odds(tips)
-    )
+    return SeenPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips))
 
 
 def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> Posterior:
@@ -183,12 +185,12 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) ->
         some = evidence.rows(kept)
         seen = seen_prior(prior, some, tips)
         answers = seen.answers()
-        odd = _oddness(seen, max(answers, key=lambda answer: answer.share), some.point)
+        odd = _oddness(seen.rows, max(answers, key=lambda answer: answer.share), some.point)
         excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], IMPROBABLE)
         if excess.max() <= 1.0 or len(excess) <= FEWEST:
             break
         kept &= ~np.isin(point, np.unique(some.point)[excess >= max(1.0, 0.5 * excess.max())])
-    means, share = np.zeros((len(answers), len(seen.pull))), np.array([answer.share for answer in answers])
+    means, share = np.zeros((len(answers), len(prior.kind) + 6)), np.array([answer.share for answer in answers])
     for row, answer in zip(means, answers, strict=True):
         row[answer.rows] = answer.mean
     mean = share @ means
@@ -202,17 +204,17 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) ->
     )  # fmt: skip
 
 
-def _oddness(seen: SeenPrior, answer: Answer, point: np.ndarray) -> np.ndarray:
+def _oddness(rows: Whitened, answer: Answer, point: np.ndarray) -> np.ndarray:
     """Square Mahalanobis distance of each point (n,) from what all others predict of it, by one hypothesis."""
-    root = seen.unknown[:, answer.rows] @ answer.back.T
-    gain = seen.whitening.back(seen.value - root @ (root.T @ seen.value))
-    known, number = seen.whitening.back(root), np.unique(point, return_inverse=True)[1]
+    root = rows.unknown(answer.rows) @ answer.back.T
+    gain = rows.whitening.back(rows.value - root @ (root.T @ rows.value))
+    known, number = rows.whitening.back(root), np.unique(point, return_inverse=True)[1]
     order, count = np.argsort(number, kind="stable"), np.bincount(number)
     found, first = np.empty(len(count)), np.cumsum(count) - count
     for size in np.unique(count):
         some = np.flatnonzero(count == size)
         table = order[first[some][:, None] + np.arange(size)]
-        inverse = seen.whitening.precision(table) - known[table] @ known[table].transpose(0, 2, 1)
+        inverse = rows.whitening.precision(table) - known[table] @ known[table].transpose(0, 2, 1)
         own = gain[table]
         found[some] = np.einsum("ni,ni->n", own, np.linalg.solve(inverse, own[..., None])[..., 0])
     return found

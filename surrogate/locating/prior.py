@@ -15,7 +15,6 @@ import numpy as np
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.effects import SKULLS
 from sim.errors import InputError
-from sim.geometry.locate import Located
 
 from .causes import DRAINAGE, SWELLING, TOOL, TUMOUR_SWELLING
 from .ensemble import Ensemble, surface_size
@@ -28,7 +27,7 @@ SMALLEST_SHARE = 1e-6
 PLACES, PLACE_SHAPES, REACH = 30, 6, 6e-3
 # Sizes as shares of the seen motion: of what takes part; of a tumour's swelling where a brain swells; of forces all
 # over the cortex, which make good what the other shapes lack.
-FULL, LESS, LEAST = 1.0, 0.3, 0.15
+SIZE = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, TOOL: 0.15}
 # The rigid error, as shares of what an observation states: a brain that sinks looks much like one.
 RIGIDS = (0.1, 1.0)
 # A skull that lets go holds what tools press against it, as one does in which the brain slides.
@@ -61,6 +60,28 @@ class Hypothesis:
     rows: np.ndarray
     size: np.ndarray
     rigid: float
+    places: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """What may take part in each of s skulls, in tables whose columns are of one kind.
+
+    Parameters
+    ----------
+    rows
+        (s, k) of the prior's shapes. A skull with fewer of a kind has some row instead, of size 0.
+    size
+        (s, k), as of a `Hypothesis`.
+    kind
+        (k,) of the columns; tools all over the cortex.
+    places
+        (s, p, q), as of a `Hypothesis`.
+    """
+
+    rows: np.ndarray
+    size: np.ndarray
+    kind: np.ndarray
     places: np.ndarray
 
 
@@ -131,16 +152,17 @@ class Prior:
 
     @cached_property
     def _by_vertex(self) -> np.ndarray:
-        """(n, r * 3) float32 [m]: the shapes, so that those at a few places are near each other."""
-        return np.ascontiguousarray(self.shape.transpose(1, 0, 2)).reshape(self.shape.shape[1], -1)
+        """(n, 3, r) float32 [m]: the shapes, so that those at a few places are near each other."""
+        return np.ascontiguousarray(self.shape.transpose(1, 2, 0))
 
-    def seen(self, place: Located, axis: np.ndarray) -> np.ndarray:
-        """What would be seen (m, r) [m] of each shape at m places, along axes (m, 3)."""
-        vertices, number = np.unique(place.vertices, return_inverse=True)
-        weights = np.zeros((len(axis), len(vertices)), np.float32)
-        np.add.at(weights, (np.arange(len(axis))[:, None], number.reshape(place.vertices.shape)), place.weights)
-        moved = (weights @ self._by_vertex[self._columns(vertices)]).reshape(len(axis), -1, 3)
-        return np.einsum("mri,mi->mr", moved, axis)
+    def at_vertices(self, nodes: np.ndarray) -> np.ndarray:
+        """The shapes (k, 3, r) float32 [m] at some vertices (k,); it raises InputError as `at` does."""
+        return self._by_vertex[self._columns(nodes)]
+
+    def seen(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """What would be seen (m, r) [m] of each shape, by vertices and weights as `Evidence.weights` has them."""
+        shape = self.at_vertices(vertices)
+        return (weights @ shape.reshape(weights.shape[1], -1)).reshape(-1, shape.shape[2])
 
     def odds(self, tips: np.ndarray) -> np.ndarray:
         """Logarithms (1 + p,) of how likely no tool presses, or one on each place, where tips (k, 3) [m] touch."""
@@ -149,29 +171,37 @@ class Prior:
         away = ((self.centre[:, None] - tips) ** 2).sum(axis=2).min(axis=1)
         return np.append(np.log(UNTOUCHED), -away / (2.0 * TOUCHED**2))
 
+    def _in_skull(self, number: int) -> tuple[dict[int, np.ndarray], np.ndarray]:
+        """Rows by kind in a skull, of tools those all over the cortex; and (p, q), those of a tool on each place."""
+        rows = {kind: np.flatnonzero((self.kind == kind) & (self.skull == number)) for kind in SETS[-1]}
+        pressed = (self.kind == TOOL) & (self.skull == list(SKULLS).index(PRESSED[list(SKULLS)[number]]))
+        places = [np.flatnonzero(pressed & (self.place == place)) for place in range(self.place.max() + 1)]
+        return rows | {TOOL: np.flatnonzero(pressed & (self.place == NOWHERE))}, np.array(places)
+
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
         """Every set of causes in every skull, with and without much of a rigid error."""
         made = []
-        for number, name in enumerate(SKULLS):
-            pressed = (self.kind == TOOL) & (self.skull == list(SKULLS).index(PRESSED[name]))
-            spread = np.flatnonzero(pressed & (self.place == NOWHERE))
-            places = np.array(
-                [np.flatnonzero(pressed & (self.place == place)) for place in range(self.place.max() + 1)]
-            )
+        for number in range(len(SKULLS)):
+            rows, places = self._in_skull(number)
             for some, rigid in product(SETS, RIGIDS):
-                rows = [np.flatnonzero((self.kind == kind) & (self.skull == number)) for kind in some]
-                size = [
-                    np.full(len(own), LESS if kind == TUMOUR_SWELLING else FULL)
-                    for own, kind in zip(rows, some, strict=True)
-                ]
-                size = np.concatenate([*size, np.full(len(spread), LEAST)])
-                made.append(
-                    Hypothesis(
-                        np.concatenate([*rows, spread]), size, rigid, places if some in WITH_PLACE else places[:0]
-                    )
-                )
+                own = [rows[kind] for kind in (*some, TOOL)]
+                size = np.repeat([SIZE[kind] for kind in (*some, TOOL)], [len(each) for each in own])
+                some_places = places if some in WITH_PLACE else places[:0]
+                made.append(Hypothesis(np.concatenate(own), size, rigid, some_places))
         return tuple(made)
+
+    @cached_property
+    def together(self) -> Together:
+        """What may take part in each skull, in tables."""
+        found, places = zip(*map(self._in_skull, range(len(SKULLS))), strict=True)
+        rows, size, kinds = [], [], []
+        for kind in (TOOL, *SETS[-1]):
+            most = max(len(own[kind]) for own in found)
+            rows.append([np.pad(own[kind], (0, most - len(own[kind]))) for own in found])
+            size.append([np.where(np.arange(most) < len(own[kind]), SIZE[kind], 0.0) for own in found])
+            kinds += most * [kind]
+        return Together(np.concatenate(rows, axis=1), np.concatenate(size, axis=1), np.array(kinds), np.array(places))
 
 
 def prior_of(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = None) -> Prior:

@@ -1,0 +1,78 @@
+"""What unknowns do at the points that are seen, in rows whose errors are independent and of variance 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from .evidence import Evidence, Whitening
+from .prior import Prior
+
+
+@dataclass(frozen=True, eq=False)
+class Whitened:
+    """Rows (m,) of unknowns, which are weights of r shapes and a rigid error, and of what is seen.
+
+    A shape's rows are `weights` times its motions at the vertices: many points see few vertices, so that products
+    of rows are had from fewer numbers.
+
+    Parameters
+    ----------
+    whitening
+        What made errors independent.
+    weights
+        (m / c, v c'), as those of `Evidence.weights` and whitened. Rows of c = 3 axes see c' = 1 axis at once.
+    shape
+        (v c', c r) [m]: motions of the vertices.
+    rest
+        (m, 7): what a rigid error of one standard deviation does, and what is seen.
+    """
+
+    whitening: Whitening
+    weights: np.ndarray
+    shape: np.ndarray
+    rest: np.ndarray
+
+    @property
+    def value(self) -> np.ndarray:
+        """(m,): what is seen."""
+        return self.rest[:, -1]
+
+    def unknown(self, columns: np.ndarray) -> np.ndarray:
+        """Rows (m, k) of some of the r + 6 unknowns (k,)."""
+        wide = self.shape.reshape(-1, self._shapes)
+        shapes = wide[:, columns[columns < self._shapes]]
+        rigid = self.rest[:, columns[columns >= self._shapes] - self._shapes]
+        found = np.empty((len(rigid), len(columns)))
+        found[:, columns < self._shapes] = (self.weights @ shapes.reshape(len(self.shape), -1)).reshape(len(rigid), -1)
+        found[:, columns >= self._shapes] = rigid
+        return found
+
+    @property
+    def _shapes(self) -> int:
+        return self.shape.shape[1] * len(self.weights) // len(self.rest)
+
+    @cached_property
+    def products(self) -> np.ndarray:
+        """(r + 7, r + 7): of the rows of unknowns, and of what is seen as the last, with each other."""
+        count, tall = self._shapes, len(self.weights) > len(self.shape)
+        few = np.linalg.qr(self.weights, mode="r") if tall else self.weights
+        rows = (few @ self.shape).reshape(-1, count)
+        across = self.weights.T @ self.rest.reshape(len(self.weights), -1)
+        found = np.empty((count + 7, count + 7))
+        found[:count, :count] = rows.T @ rows
+        found[:count, count:] = self.shape.reshape(-1, count).T @ across.reshape(-1, 7)
+        found[count:, :count] = found[:count, count:].T
+        found[count:, count:] = self.rest.T @ self.rest
+        return found
+
+
+def whitened(prior: Prior, evidence: Evidence, seen: float) -> Whitened:
+    """Rows of a prior's shapes and of evidence, where shapes lack what belongs to motions of `seen` [m]."""
+    whitening = evidence.whitening(seen)
+    vertices, weights = evidence.weights
+    shape = prior.at_vertices(vertices).reshape(weights.shape[1], -1).astype(float)
+    rest = np.column_stack([evidence.rigid * evidence.rigid_scale, evidence.value])
+    return Whitened(whitening, whitening.root @ weights, shape, whitening.white(rest))
