@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import make_box
 from locators import in_a_skull
 
 from sim.errors import InputError
@@ -12,7 +13,7 @@ from surrogate.locating.causes import KINDS, LETS_GO, Causes, drainages, groups,
 from surrogate.locating.ensemble import members, solved, surface_size
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_files import load_locator, save_locator
-from surrogate.locating.observation import Observation
+from surrogate.locating.observation import Observation, placed
 from surrogate.locating.prior import NOWHERE, PLACES, middle_of
 from surrogate.locating.setup import make_locator
 
@@ -293,6 +294,18 @@ def test_points_off_the_cortex_are_left_out_and_named(locator, body, truth):
     assert found.centroid == pytest.approx(without.centroid) and found.p95 == pytest.approx(without.p95)
     with pytest.raises(InputError, match="24 of 60 points lie off the open cortex"):
         locator.locate(spoilt[1])
+
+
+def test_points_far_from_vertices_lie_on_the_cortex_all_the_same():
+    """In the middle of triangles of 40 mm, and as far above them as may be; farther ones are left out."""
+    body = make_box(cells=(4, 4, 2), spacing=40e-3, tumour=60e-3, depth=40e-3, opening=70e-3)
+    middle = body.mesh.nodes[body.open_surface].mean(axis=1)
+    for above, kept in ((0.0, len(middle)), (11e-3, len(middle)), (13e-3, len(middle) - 3)):
+        rest = middle + np.where(np.arange(len(middle)) < 3, above, 0.0)[:, None] * [0.0, 0.0, 1.0]
+        evidence = placed(body, Observation(rest + 1e-3, rest))
+        assert len(np.unique(evidence.point)) == kept
+    with pytest.raises(InputError, match="half of the points lie more than 7 mm off the open cortex"):
+        placed(body, Observation(middle + [0.0, 0.0, 7e-3], middle + [0.0, 0.0, 7e-3]))
 
 
 def test_a_tip_without_support_is_left_out_and_says_nothing_of_the_tool(locator, body, truth):

@@ -11,8 +11,8 @@ from scipy.spatial import KDTree
 
 from .tetmesh import TetMesh
 
-# Tetrahedra that are looked at first: 99 of 100 points are in one of them. A point with no weight below this is inside.
-FIRST, INSIDE = 8, -1e-12
+# Tetrahedra that are looked at first: 97 of 100 points are in one of them. Weights below this are rounding.
+FIRST, ROUNDING = 4, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +33,9 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> Located:
     In graded meshes the tetrahedron that holds a point is among the 64 `candidates` whose middles are nearest to it.
     """
     tet, weights = _best(mesh, points, min(FIRST, candidates))
-    unheld = np.flatnonzero(weights.min(axis=1) < INSIDE)
+    unheld = np.flatnonzero(weights.min(axis=1) < -ROUNDING)
     tet[unheld], weights[unheld] = _best(mesh, points[unheld], candidates)
-    inside = np.maximum(weights, 0.0)
+    inside = np.where(weights > ROUNDING, weights, 0.0)
     return Located(mesh.tets[tet], inside / inside.sum(axis=1, keepdims=True))
 
 

@@ -138,4 +138,4 @@ def _square(prior: Prior, evidence: Evidence, middle: np.ndarray) -> float:
     """The square of an estimate's error (3,) [m], by its own covariance."""
     found = conditioned(prior, evidence)
     off = found.weight @ prior.middle - middle
-    return float(off @ np.linalg.solve(prior.middle.T @ found.spread @ prior.middle, off))
+    return float(off @ np.linalg.solve(found.covariance(prior.middle[:, None])[0], off))

@@ -1,10 +1,10 @@
 """The evidence of many sets of unknowns at once: what several of them share is eliminated once.
 
 Unknowns are scaled to a prior variance of 1, and data d are whitened. The normal equations have the matrix
-M = 1 + A^T A and the right side b = A^T d. The logarithm of a set's evidence is b^T M^-1 b / 2 - log(det M) / 2, but
-for what all sets share (Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equation 5.8). Both terms
-are sums over blocks that are eliminated one after another, each from the Schur complement that is left (Golub, Van
-Loan 2013, "Matrix Computations", section 4.2).
+M = 1 + A^T A and the right side b = A^T d. But for what all sets share, the logarithm of a set's evidence is
+b^T M^-1 b / 2 - log(det M) / 2. Source: Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equation
+5.8. Both terms are sums over blocks that are eliminated one after another, each from the Schur complement that is
+left. Source: Golub, Van Loan 2013, "Matrix Computations", section 4.2.
 """
 
 from __future__ import annotations
@@ -47,6 +47,16 @@ class Equations:
         place = self.place - here[..., :-1].swapaxes(-1, -2) @ there
         gain = (rows[..., -1] * solved[..., -1]).sum(axis=-1)
         return Equations(self.kind[left], table, place, self.evidence + _logarithm(gain, block))
+
+    def varied(self, kind: int, sizes: np.ndarray) -> Equations:
+        """The same (..., b) where unknowns of one kind have b prior standard deviations in turn, in place of 1."""
+        own = np.flatnonzero(self.kind == kind)
+        size = np.ones((len(sizes), self.table.shape[-1]))
+        size[:, own] = sizes[:, None]
+        rows = size[:, : len(self.kind), None]
+        table = self.table[..., None, :, :] * rows * size[:, None]
+        table[..., own, own] += 1.0 - sizes[:, None] ** 2
+        return Equations(self.kind, table, self.place[..., None, :, :, :], self.evidence[..., None])
 
     @property
     def with_places(self) -> np.ndarray:

@@ -26,6 +26,9 @@ SHIFT = 0.8e-3
 # How far they are turned about each axis [rad], for each metre of that.
 TURN = float(np.radians(0.3)) / SHIFT
 
+# Triangular matrices that are inverted at once have fewer rows than twice this.
+SMALL = 32
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -83,11 +86,11 @@ class Evidence:
 
     def noise(self, scale: float = 0.0) -> np.ndarray:
         """Covariance (m, m) [m^2] of errors that are not rigid, and of what shapes lack where `scale` [m] is seen."""
-        share, sigma, square = (WHITE / SIGMA) ** 2, self.sigma, squared_distances(self.at, self.at)
-        out = (1.0 - share) * np.outer(sigma, sigma) * alike(square, LENGTH)
-        out += (LACK_SMOOTH * scale) ** 2 * alike(square, LACK_LENGTH)
+        share, square = (WHITE / SIGMA) ** 2, squared_distances(self.at, self.at)
+        out = alike(square, LENGTH) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
+        out += alike(square, LACK_LENGTH) * (LACK_SMOOTH * scale) ** 2
         out *= self.axis @ self.axis.T
-        out[np.diag_indices(len(self))] += share * sigma**2 + (LACK_WHITE * scale) ** 2
+        out[np.diag_indices(len(self))] += share * self.sigma**2 + (LACK_WHITE * scale) ** 2
         return out
 
     @property
@@ -103,10 +106,11 @@ class Evidence:
         That is (m / 3, v) where rows are of three axes, one after the other, else (m, 3 v): of all axes of a vertex.
         """
         copies = self.copies
-        vertices, number = np.unique(self.place.vertices[::copies], return_inverse=True)
-        weights = np.zeros((len(self) // copies, len(vertices)))
-        row = np.arange(len(weights))[:, None]
-        np.add.at(weights, (row, number.reshape(len(weights), -1)), self.place.weights[::copies])
+        place = Located(self.place.vertices[::copies], self.place.weights[::copies])
+        row, corner = np.nonzero(place.weights)
+        vertices, number = np.unique(place.vertices[row, corner], return_inverse=True)
+        weights = np.zeros((len(place.weights), len(vertices)))
+        np.add.at(weights, (row, number), place.weights[row, corner])
         if copies == 1:
             weights = (weights[:, :, None] * self.axis[:, None]).reshape(len(weights), -1)
         return vertices, weights
@@ -115,7 +119,7 @@ class Evidence:
         """What makes errors independent and of variance 1, where `scale` [m] is seen."""
         copies = self.copies
         lower = cholesky(self.rows(np.arange(0, len(self), copies)).noise(scale), lower=True)
-        return Whitening(dtrtri(lower, lower=1)[0], copies)
+        return Whitening(_inverse(lower), copies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +152,20 @@ class Whitening:
         return np.kron(alike, np.eye(self.copies))
 
 
+def _inverse(lower: np.ndarray) -> np.ndarray:
+    """Inverse of a lower triangular matrix (n, n), by halves: products are what a library does fastest."""
+    half = len(lower) // 2
+    if half < SMALL:
+        return dtrtri(lower, lower=1)[0]
+    found = np.zeros_like(lower)
+    found[:half, :half], found[half:, half:] = _inverse(lower[:half, :half]), _inverse(lower[half:, half:])
+    found[half:, :half] = found[half:, half:] @ (lower[half:, :half] @ -found[:half, :half])
+    return found
+
+
 def alike(square: np.ndarray, length: float) -> np.ndarray:
     """Correlation (n, n) of smooth errors at squared distances (n, n) [m^2], which fades over a length [m]."""
-    return np.exp(-0.5 * square / length**2)
+    return np.exp(square * (-0.5 / length**2))
 
 
 def smooth_root(points: np.ndarray, length: float = LENGTH) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from sim.runtime.threads import one_thread
 from .calibration import covering_factor, was_tried
 from .causes import KINDS
 from .observation import Observation, placed, placed_anew
-from .posterior import Posterior, conditioned, scaled
+from .posterior import Posterior, conditioned
 from .prior import Prior
 
 # Rounds in which points without a place at rest look for it on the surface as it is believed to be.
@@ -61,10 +62,7 @@ class Location:
 
     def covariance(self, nodes: np.ndarray) -> np.ndarray:
         """Covariances (n, 3, 3) [m^2] of the motion of vertices (n,)."""
-        rows = self.posterior.rows
-        shape = self.prior.at(nodes)[rows]
-        spread = np.tensordot(self.posterior.spread[np.ix_(rows, rows)], shape, 1)
-        return np.einsum("rvi,rvj->vij", shape, spread, optimize=True)
+        return self.posterior.covariance(self.prior.at(nodes))
 
     @property
     def centroid(self) -> np.ndarray:
@@ -74,7 +72,7 @@ class Location:
     @property
     def centroid_covariance(self) -> np.ndarray:
         """(3, 3) [m^2] of that."""
-        return self.prior.middle.T @ self.posterior.spread @ self.prior.middle
+        return self.posterior.covariance(self.prior.middle[:, None])[0]
 
     @property
     def bias(self) -> np.ndarray:
@@ -164,13 +162,11 @@ class Locator:
         off = np.setdiff1d(np.arange(count), named) if observation.rest is not None else np.zeros(0, int)
         outliers = np.union1d(off, found.outliers[found.outliers < count])
         _demand_explained(found, len(outliers), len(off) + int((np.unique(evidence.point) < count).sum()))
-        found = scaled(found, covering_factor(self.tried, found.evidence))
-        root = np.linalg.cholesky(prior.middle.T @ found.spread @ prior.middle)
-        radius = np.linalg.norm(np.random.default_rng(0).standard_normal((DRAWS, 3)) @ root.T, axis=1)
+        found = replace(found, factor=covering_factor(self.tried, found.evidence))
         return Location(
             prior,
             found,
-            float(np.quantile(radius, 0.95)),
+            _radius(found.covariance(prior.middle[:, None])[0]),
             outliers,
             found.outliers[found.outliers >= count] - count,
             was_tried(self.tried, found.evidence),
@@ -183,6 +179,18 @@ def telling_nodes(anatomy: Anatomy) -> np.ndarray:
     mesh = anatomy.mesh
     at_cortex = np.isin(mesh.tets, anatomy.open_surface).any(axis=1)
     return np.union1d(mesh.tets[at_cortex], anatomy.tumour_nodes)
+
+
+def _radius(covariance: np.ndarray) -> float:
+    """How far [m] 95 in 100 draws of a Gaussian of some covariance (3, 3) [m^2] are from its mean, at most."""
+    drawn = _normal() @ np.linalg.cholesky(covariance).T
+    return float(np.quantile(np.sqrt((drawn**2).sum(axis=1)), 0.95))
+
+
+@cache
+def _normal() -> np.ndarray:
+    """Normal numbers (DRAWS, 3)."""
+    return np.random.default_rng(0).standard_normal((DRAWS, 3))
 
 
 def _demand_explained(found: Posterior, outliers: int, points: int) -> None:

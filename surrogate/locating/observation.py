@@ -13,6 +13,7 @@ from sim.geometry.closest_point import closest
 from sim.geometry.locate import Located, locate
 from sim.geometry.surface import unit
 
+from ..array_functions import squared_distances
 from .evidence import SHIFT, SIGMA, Evidence, of_motions
 
 FEWEST = 6
@@ -71,7 +72,7 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
     _check(observation)
     where = observation.now if observation.rest is None else observation.rest
     off = _off_surface(anatomy, where)
-    if np.median(off) > NEAR:
+    if _mostly_off(off):
         raise InputError(_elsewhere(anatomy, where, float(np.median(off))))
     _demand_spread(where)
     if observation.rest is not None:
@@ -199,19 +200,27 @@ def _demand_spread(where: np.ndarray) -> None:
 
 
 def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
-    """Distances (n,) [m] from the open cortex."""
-    corners = anatomy.mesh.nodes[anatomy.open_surface]
-    parts = [points[some : some + TOGETHER] for some in range(0, len(points), TOGETHER)]
-    away = [np.linalg.norm(closest(part, corners).point - part, axis=1) for part in parts]
-    return np.concatenate([np.zeros(0), *away])
+    """Distances (n,) [m] from the open cortex; of points within `NEAR` of a vertex, from the nearest one."""
+    nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
+    away = np.sqrt(squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
+    far = np.flatnonzero(away > NEAR)
+    for some in range(0, len(far), TOGETHER):
+        part = far[some : some + TOGETHER]
+        away[part] = np.linalg.norm(closest(points[part], nodes[triangles]).point - points[part], axis=1)
+    return away
+
+
+def _mostly_off(off: np.ndarray) -> bool:
+    """Whether more than half of distances (n,) [m] are more than `NEAR`."""
+    return bool(np.count_nonzero(off > NEAR) > 0.5 * len(off))
 
 
 def _elsewhere(anatomy: Anatomy, points: np.ndarray, off: float) -> str:
     """Why points may be so far off the open cortex [m]."""
     start = f"half of the points lie more than {1e3 * off:.3g} mm off the open cortex"
     for scale, unit_meant in ((1e-3, "a thousandth"), (1e3, "a thousand times")):
-        if np.median(_off_surface(anatomy, scale * points)) <= NEAR:
+        if not _mostly_off(_off_surface(anatomy, scale * points)):
             return f"{start}, and would lie on it if they were {unit_meant} of that: files are in mm, arrays in metres."
-    if np.median(_off_surface(anatomy, points * [-1.0, -1.0, 1.0])) <= NEAR:
+    if not _mostly_off(_off_surface(anatomy, points * [-1.0, -1.0, 1.0])):
         return f"{start}, and would lie on it if x and y were turned: they are LPS. Give RAS."
     return f"{start}: they are of another brain or frame. Give the scan's own RAS, in millimetres."

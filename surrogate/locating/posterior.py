@@ -9,7 +9,7 @@ inference via coarsening", J. Am. Stat. Assoc. 114:1113-1125. Leaving points out
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -27,44 +27,10 @@ IMPROBABLE, FEWEST = 1e-4, 4
 NO_TIPS, NO_ROWS = np.zeros((0, 3)), np.zeros(0, int)
 # Evidence counts as one part in so many: hypotheses are seldom as wrong as they look.
 COARSENED = 2.0
+# The kind of the rigid error's unknowns, beside those of causes.
+RIGID = -1
 # So many of the most probable hypotheses make a mixture.
 MIXED = 24
-
-
-@dataclass(frozen=True, eq=False)
-class Posterior:
-    """What is known after seeing.
-
-    Parameters
-    ----------
-    evidence
-        What it was conditioned on: without outliers.
-    weight, spread
-        Mean (r,) and covariance (r, r) of the shapes' weights.
-    rigid, rigid_spread
-        The same of the rigid error (6,), (6, 6): translation [m], rotation [rad].
-    surprise
-        Mean over points of how improbable each is by all others, as a share of what is expected: 1 where all fits.
-    outliers
-        Numbers of the points that were left out.
-    """
-
-    evidence: Evidence
-    weight: np.ndarray
-    spread: np.ndarray
-    rigid: np.ndarray
-    rigid_spread: np.ndarray
-    surprise: float
-    outliers: np.ndarray
-
-    def bias_at(self, places: np.ndarray) -> np.ndarray:
-        """The mean rigid error (n, 3) [m] at places (n, 3) [m]."""
-        return self.rigid[:3] + np.cross(self.rigid[3:], places - self.evidence.middle)
-
-    @property
-    def rows(self) -> np.ndarray:
-        """(k,) of the shapes that take part."""
-        return np.flatnonzero(np.diagonal(self.spread) > 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +44,60 @@ class Answer:
     rows: np.ndarray
     mean: np.ndarray
     back: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What is known after seeing: a mixture of what hypotheses say.
+
+    Parameters
+    ----------
+    evidence
+        What it was conditioned on: without outliers.
+    answers
+        Of hypotheses; their shares sum to 1.
+    unknown
+        Mean (r + 6,) of the shapes' weights, and of the rigid error in its prior's standard deviations.
+    surprise
+        Mean over points of how improbable each is by all others, as a share of what is expected: 1 where all fits.
+    outliers
+        Numbers of the points that were left out.
+    factor
+        What covariances are larger by than the mixture's.
+    """
+
+    evidence: Evidence
+    answers: list[Answer]
+    unknown: np.ndarray
+    surprise: float
+    outliers: np.ndarray
+    factor: float = 1.0
+
+    @property
+    def weight(self) -> np.ndarray:
+        """Mean (r,) of the shapes' weights."""
+        return self.unknown[:-6]
+
+    @property
+    def rigid(self) -> np.ndarray:
+        """Mean (6,) of the rigid error: translation [m], rotation [rad]."""
+        return self.unknown[-6:] * self.evidence.rigid_scale
+
+    def bias_at(self, places: np.ndarray) -> np.ndarray:
+        """The mean rigid error (n, 3) [m] at places (n, 3) [m]."""
+        return self.rigid[:3] + np.cross(self.rigid[3:], places - self.evidence.middle)
+
+    def covariance(self, shape: np.ndarray) -> np.ndarray:
+        """Covariances (q, 3, 3) [m^2] of motions that shapes (r, q, 3) [m] make."""
+        flat = shape.reshape(len(shape), -1)
+        mean, found = self.weight @ flat, np.zeros((shape.shape[1], 3, 3))
+        for answer in self.answers:
+            chosen = answer.rows < len(flat)
+            part = flat[answer.rows[chosen]]
+            off = np.concatenate([answer.back[:, chosen] @ part, [answer.mean[chosen] @ part - mean]])
+            off = off.reshape(len(off), -1, 3).transpose(1, 2, 0)
+            found += answer.share * off @ off.transpose(0, 2, 1)
+        return self.factor * found
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +122,7 @@ class SeenPrior:
     odds: np.ndarray
 
     def answers(self) -> list[Answer]:
-        """Of the most probable hypotheses; their shares sum to 1."""
+        """Of the most probable hypotheses, the best first; their shares sum to 1."""
         logs = self.logs
         best = np.argsort(-logs, axis=None, kind="stable")[: min(MIXED, np.isfinite(logs).sum())]
         share = np.exp(logs.flat[best] - logs.flat[best[0]])
@@ -121,7 +141,8 @@ class SeenPrior:
         First without a tool, then with one on each place; -inf where none may press.
         """
         # Tools all over the cortex and the rigid error take part in all hypotheses, and a set extends an earlier one.
-        found: dict[tuple[int, ...], Equations] = {(): self._equations().eliminated(TOOL)}
+        rigid = self._equations().eliminated(TOOL).varied(RIGID, np.array(RIGIDS)).eliminated(RIGID)
+        found: dict[tuple[int, ...], Equations] = {(): rigid}
         for some in SETS[1:]:
             found[some] = found[some[:-1]].eliminated(some[-1])
         evidence = np.full((*found[()].evidence.shape, len(SETS), len(self.odds)), -np.inf)
@@ -132,23 +153,21 @@ class SeenPrior:
         return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / COARSENED
 
     def _equations(self) -> Equations:
-        """Of all unknowns, each over its prior standard deviation: in each skull, with each rigid error."""
+        """In each skull, of all unknowns, each over its prior standard deviation."""
         shared, products = self.prior.together, self.rows.products
         skulls, places = len(shared.rows), shared.places
         rows = np.concatenate([shared.rows, np.tile(self._rigid, (skulls, 1))], axis=1)
-        size = np.empty((skulls, len(RIGIDS), rows.shape[1]))
-        size[..., :-6], size[..., -6:] = self.scale * shared.size[:, None], np.array(RIGIDS)[:, None]
+        size = np.concatenate([self.scale * shared.size, np.ones((skulls, 6))], axis=1)
         # Of each place, and the data beside them.
         beside = np.concatenate([places, np.full((*places.shape[:2], 1), len(products) - 1)], axis=2)
         beside_size = np.append(np.full(places.shape[2], self.scale), 1.0)
         columns = np.concatenate([rows, beside.reshape(skulls, -1)], axis=1)
-        wide = np.tile(beside_size, places.shape[1])
-        wide = np.concatenate([size, np.broadcast_to(wide, (*size.shape[:2], len(wide)))], axis=2)
-        table = products[rows[:, None, :, None], columns[:, None, None]] * size[..., None] * wide[:, :, None]
+        wide = np.concatenate([size, np.tile(beside_size, (skulls, places.shape[1]))], axis=1)
+        table = products[rows[:, :, None], columns[:, None]] * size[:, :, None] * wide[:, None]
         table[..., *np.diag_indices(rows.shape[1])] += 1.0
-        place = products[places[:, None, ..., None], beside[:, None, :, None]] * self.scale * beside_size
+        place = products[places[..., None], beside[:, :, None]] * self.scale * beside_size
         place[..., *np.diag_indices(places.shape[2])] += 1.0
-        return Equations(np.append(shared.kind, np.full(6, TOOL)), table, place, np.zeros(size.shape[:2]))
+        return Equations(np.append(shared.kind, np.full(6, RIGID)), table, place, np.zeros(skulls))
 
     @property
     def _rigid(self) -> np.ndarray:
@@ -157,17 +176,15 @@ class SeenPrior:
 
     def answer(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> Answer:
         """What a hypothesis says with some more rows (q,), those of one place."""
-        own, size = self._base(hypothesis)
-        own, size = np.append(own, place), np.append(size, np.full(len(place), self.scale))
+        own = np.concatenate([hypothesis.rows, self._rigid, place])
+        size = np.full(len(own), self.scale)
+        size[: len(hypothesis.rows)] *= hypothesis.size
+        size[len(hypothesis.rows) : len(own) - len(place)] = hypothesis.rigid
         # The inverse of the Cholesky factor of the precision of unknowns, each over its prior standard deviation.
-        inner = np.eye(len(own)) + size[:, None] * self.rows.products[own[:, None], own] * size
-        back = size * dtrtri(np.linalg.cholesky(inner), lower=1)[0]
+        inner = self.rows.products[own[:, None], own] * size * size[:, None]
+        inner[np.diag_indices(len(own))] += 1.0
+        back = size * dtrtri(np.linalg.cholesky(inner).T, lower=0)[0].T
         return Answer(share, own, back.T @ (back @ self.rows.products[-1, own]), back)
-
-    def _base(self, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and standard deviations of its unknowns, the rigid error's last."""
-        size = np.append(self.scale * hypothesis.size, np.full(6, hypothesis.rigid))
-        return np.append(hypothesis.rows, self._rigid), size
 
 
 def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> SeenPrior:
@@ -185,30 +202,24 @@ def conditioned(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) ->
         some = evidence.rows(kept)
         seen = seen_prior(prior, some, tips)
         answers = seen.answers()
-        odd = _oddness(seen.rows, max(answers, key=lambda answer: answer.share), some.point)
+        odd = _oddness(seen.rows, answers[0], some.point)
         excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], IMPROBABLE)
         if excess.max() <= 1.0 or len(excess) <= FEWEST:
             break
         kept &= ~np.isin(point, np.unique(some.point)[excess >= max(1.0, 0.5 * excess.max())])
-    means, share = np.zeros((len(answers), len(prior.kind) + 6)), np.array([answer.share for answer in answers])
-    for row, answer in zip(means, answers, strict=True):
-        row[answer.rows] = answer.mean
-    mean = share @ means
-    spread = (share * (means - mean).T) @ (means - mean)
+    unknown = np.zeros(len(prior.kind) + 6)
     for answer in answers:
-        spread[np.ix_(answer.rows, answer.rows)] += answer.share * answer.back.T @ answer.back
-    scale = evidence.rigid_scale
-    return Posterior(
-        some, mean[:-6], spread[:-6, :-6], scale * mean[-6:], np.outer(scale, scale) * spread[-6:, -6:],
-        float(odd.sum() / len(some)), np.setdiff1d(point, some.point),
-    )  # fmt: skip
+        unknown[answer.rows] += answer.share * answer.mean
+    return Posterior(some, answers, unknown, float(odd.sum() / len(some)), np.setdiff1d(point, some.point))
 
 
 def _oddness(rows: Whitened, answer: Answer, point: np.ndarray) -> np.ndarray:
     """Square Mahalanobis distance of each point (n,) from what all others predict of it, by one hypothesis."""
-    root = rows.unknown(answer.rows) @ answer.back.T
-    gain = rows.whitening.back(rows.value - root @ (root.T @ rows.value))
-    known, number = rows.whitening.back(root), np.unique(point, return_inverse=True)[1]
+    data = len(rows.products) - 1
+    precise = rows.precise(np.append(answer.rows, data))
+    known = precise[:, :-1] @ answer.back.T
+    gain = precise[:, -1] - known @ (answer.back @ rows.products[data, answer.rows])
+    number = np.unique(point, return_inverse=True)[1]
     order, count = np.argsort(number, kind="stable"), np.bincount(number)
     found, first = np.empty(len(count)), np.cumsum(count) - count
     for size in np.unique(count):
@@ -218,8 +229,3 @@ def _oddness(rows: Whitened, answer: Answer, point: np.ndarray) -> np.ndarray:
         own = gain[table]
         found[some] = np.einsum("ni,ni->n", own, np.linalg.solve(inverse, own[..., None])[..., 0])
     return found
-
-
-def scaled(posterior: Posterior, factor: float) -> Posterior:
-    """The same, with covariances times a factor."""
-    return replace(posterior, spread=factor * posterior.spread, rigid_spread=factor * posterior.rigid_spread)

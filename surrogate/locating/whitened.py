@@ -35,19 +35,13 @@ class Whitened:
     shape: np.ndarray
     rest: np.ndarray
 
-    @property
-    def value(self) -> np.ndarray:
-        """(m,): what is seen."""
-        return self.rest[:, -1]
-
-    def unknown(self, columns: np.ndarray) -> np.ndarray:
-        """Rows (m, k) of some of the r + 6 unknowns (k,)."""
-        wide = self.shape.reshape(-1, self._shapes)
-        shapes = wide[:, columns[columns < self._shapes]]
-        rigid = self.rest[:, columns[columns >= self._shapes] - self._shapes]
-        found = np.empty((len(rigid), len(columns)))
-        found[:, columns < self._shapes] = (self.weights @ shapes.reshape(len(self.shape), -1)).reshape(len(rigid), -1)
-        found[:, columns >= self._shapes] = rigid
+    def precise(self, columns: np.ndarray) -> np.ndarray:
+        """The errors' inverse covariance times rows (m, k) of some of the unknowns and of what is seen (k,)."""
+        shapes = columns < self._shapes
+        found, back = np.empty((len(self.rest), len(columns))), self.whitening.back
+        some = self.shape.reshape(-1, self._shapes)[:, columns[shapes]].reshape(len(self.shape), -1)
+        found[:, shapes] = (back(self.weights) @ some).reshape(len(found), -1)
+        found[:, ~shapes] = back(self.rest[:, columns[~shapes] - self._shapes])
         return found
 
     @property
