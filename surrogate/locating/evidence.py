@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cholesky
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg import cholesky, get_lapack_funcs
 
 from sim.geometry.locate import Located
 
@@ -27,7 +26,8 @@ SHIFT = 0.8e-3
 TURN = float(np.radians(0.3)) / SHIFT
 
 # Triangular matrices that are inverted at once have fewer rows than twice this.
-SMALL = 32
+SMALL = 48
+(trtri,) = get_lapack_funcs(("trtri",), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ class Evidence:
         """What makes errors independent and of variance 1, where `scale` [m] is seen."""
         copies = self.copies
         lower = cholesky(self.rows(np.arange(0, len(self), copies)).noise(scale), lower=True)
-        return Whitening(_inverse(lower), copies)
+        return Whitening(triangular_inverse(lower), copies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +152,14 @@ class Whitening:
         return np.kron(alike, np.eye(self.copies))
 
 
-def _inverse(lower: np.ndarray) -> np.ndarray:
+def triangular_inverse(lower: np.ndarray) -> np.ndarray:
     """Inverse of a lower triangular matrix (n, n), by halves: products are what a library does fastest."""
     half = len(lower) // 2
     if half < SMALL:
-        return dtrtri(lower, lower=1)[0]
+        return trtri(lower.T, lower=0)[0].T
     found = np.zeros_like(lower)
-    found[:half, :half], found[half:, half:] = _inverse(lower[:half, :half]), _inverse(lower[half:, half:])
+    found[:half, :half] = triangular_inverse(lower[:half, :half])
+    found[half:, half:] = triangular_inverse(lower[half:, half:])
     found[half:, :half] = found[half:, half:] @ (lower[half:, :half] @ -found[:half, :half])
     return found
 

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.lapack import dtrtri
 from scipy.special import chdtri
 
 from .causes import TOOL
 from .elimination import Equations
-from .evidence import Evidence
+from .evidence import Evidence, triangular_inverse
 from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, Prior
 from .whitened import Whitened, whitened
 
@@ -183,7 +182,7 @@ class SeenPrior:
         # The inverse of the Cholesky factor of the precision of unknowns, each over its prior standard deviation.
         inner = self.rows.products[own[:, None], own] * size * size[:, None]
         inner[np.diag_indices(len(own))] += 1.0
-        back = size * dtrtri(np.linalg.cholesky(inner).T, lower=0)[0].T
+        back = size * triangular_inverse(np.linalg.cholesky(inner))
         return Answer(share, own, back.T @ (back @ self.rows.products[-1, own]), back)
 
 
