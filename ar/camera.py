@@ -1,4 +1,4 @@
-"""A pinhole camera: where a world point lands in the picture.
+"""A camera: where a world point lands in the picture.
 
 OpenCV's convention throughout: camera frame x right, y down, z forward; pixel (u, v) = (column, row) with whole numbers
 at pixel centres, so that the picture spans -0.5 .. width - 0.5. World points are in metres (RAS in this project).
@@ -7,14 +7,17 @@ at pixel centres, so that the picture spans -0.5 .. width - 0.5. World points ar
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 
+from .lens import Lens, straightened, with_focus, without_focus
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A distortion-free camera.
+    """A pinhole camera, or one with a lens that distorts.
 
     Parameters
     ----------
@@ -24,6 +27,8 @@ class Camera:
         (4, 4) rigid transform: x_camera = T_camera_world x_world [m].
     width, height
         Size of the picture [pixel].
+    lens
+        How the lens distorts; None, or all coefficients 0: not at all.
 
     Raises
     ------
@@ -35,6 +40,7 @@ class Camera:
     T_camera_world: np.ndarray
     width: int
     height: int
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         K, T = np.asarray(self.K, np.float64), np.asarray(self.T_camera_world, np.float64)
@@ -49,6 +55,8 @@ class Camera:
             raise ValueError(f"a picture of {self.width} x {self.height} pixels is empty: both must be at least 1.")
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "T_camera_world", T)
+        if self.lens is not None and not self.lens.coefficients.any():
+            object.__setattr__(self, "lens", None)
 
     @property
     def centre(self) -> np.ndarray:
@@ -57,7 +65,7 @@ class Camera:
 
     @property
     def vertical_fov(self) -> float:
-        """Angle between the upper and the lower border [rad]; exact when the principal point is centred."""
+        """Angle between the upper and the lower border [rad]; exact without lens, if the principal point is centred."""
         return float(2.0 * np.arctan(0.5 * self.height / self.K[1, 1]))
 
     def in_frame(self, points: np.ndarray) -> np.ndarray:
@@ -65,16 +73,37 @@ class Camera:
         return points @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (..., 2) and depth (...) [m] of world points (..., 3); pixels are NaN where depth <= 0 (behind)."""
-        homogeneous = self.in_frame(np.asarray(points, np.float64)) @ self.K.T
+        """Pixels (..., 2) and depth (...) [m] of world points (..., 3).
+
+        Pixels are NaN where depth <= 0 (behind), and beyond the reach of the lens (`Lens.reach`).
+        """
+        in_camera = self.in_frame(np.asarray(points, np.float64))
+        if self.lens is not None:
+            depth = in_camera[..., 2]
+            places = in_camera[..., :2] / np.where(depth > 0.0, depth, np.nan)[..., None]
+            return with_focus(self.K, self.lens.bent(places)), depth
+        homogeneous = in_camera @ self.K.T
         depth = homogeneous[..., 2]
         return homogeneous[..., :2] / np.where(depth > 0.0, depth, np.nan)[..., None], depth
 
     def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """World points (..., 3) [m] at `depth` (...) [m] (z, not range) behind pixels (..., 2)."""
+        """World points (..., 3) [m] at `depth` (...) [m] (z, not range) behind pixels (..., 2).
+
+        NaN at pixels where the lens sees nothing.
+        """
+        if self.lens is not None:
+            pixels = with_focus(self.K, self.lens.straight(without_focus(self.K, np.asarray(pixels, np.float64))))
         homogeneous = np.concatenate([pixels, np.ones((*np.shape(pixels)[:-1], 1))], axis=-1)
         in_camera = homogeneous @ np.linalg.inv(self.K).T * np.asarray(depth)[..., None]
         return (in_camera - self.T_camera_world[:3, 3]) @ self.T_camera_world[:3, :3]
+
+    @cached_property
+    def straight(self) -> np.ndarray:
+        """Where each pixel would be without the lens, (H, W, 2) [pixel]; NaN where the lens sees nothing."""
+        if self.lens is None:
+            rows, columns = np.mgrid[: self.height, : self.width].astype(np.float64)
+            return np.stack([columns, rows], axis=-1)
+        return straightened(self.lens, tuple(self.K.ravel().tolist()), self.width, self.height)
 
     def perturbed(self, degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Camera:
         """The same camera, before which the world is turned about its centre by an angle [degree].
@@ -102,7 +131,10 @@ class Camera:
         """The camera of `picture[rows, columns]`, slices with start and stop."""
         shift = np.zeros((3, 3))
         shift[:2, 2] = columns.start, rows.start
-        return replace(self, K=self.K - shift, width=columns.stop - columns.start, height=rows.stop - rows.start)
+        part = replace(self, K=self.K - shift, width=columns.stop - columns.start, height=rows.stop - rows.start)
+        if self.lens is not None:  # to find it again would take longer
+            part.__dict__["straight"] = self.straight[rows, columns] - shift[:2, 2]
+        return part
 
     def padded(self, aspect: float) -> Camera:
         """The same picture centred on the smallest canvas of width / height = `aspect` that contains it."""
@@ -143,5 +175,6 @@ def project_cv2(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Pixels (N, 2) of world points (N, 3) [m] by `cv2.projectPoints`: the independent check on `Camera.project`."""
     rotation = cv2.Rodrigues(camera.T_camera_world[:3, :3])[0]
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 1, 3)
-    pixels, _ = cv2.projectPoints(points, rotation, camera.T_camera_world[:3, 3], camera.K, None)
+    coefficients = None if camera.lens is None else camera.lens.coefficients
+    pixels, _ = cv2.projectPoints(points, rotation, camera.T_camera_world[:3, 3], camera.K, coefficients)
     return pixels.reshape(-1, 2)

@@ -37,6 +37,8 @@ GAUGE = 0.6
 BESIDE = 10
 # A motion of fewer pixels has no arrow.
 LEAST_ARROW = 4.0
+# Points of a straight line that a lens bends.
+BENDS = 33
 # Of a sheet's fourth channel, where a line covers what is under it.
 OPAQUE = 255
 
@@ -230,9 +232,9 @@ def draw_before(sheet: np.ndarray, camera: Camera, box: tuple[slice, slice], bef
         rows, columns = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(there, box, strict=True))
         sheet[rows, columns] = dotted(camera, before)
     middles = np.stack([before.vertices.mean(axis=0), hidden.vertices.mean(axis=0)])
-    ends, depth = camera.cropped(*box).project(middles)
+    ends, _ = camera.cropped(*box).project(middles)
     length = float(np.linalg.norm(ends[1] - ends[0]))
-    if (depth <= 0.0).any() or not length >= LEAST_ARROW:
+    if not length >= LEAST_ARROW:  # nor where one has no pixel
         return
     start, end = (tuple(each) for each in np.clip(ends, -1e4, 1e4).round().astype(int).tolist())
     for ink, width in ((DARK, 4), (ink_of(BEFORE), 2)):
@@ -255,10 +257,29 @@ def box_around(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None
     pixels, depth = camera.project(points)
     if not (depth > 0.0).all():
         return slice(0, camera.height), slice(0, camera.width)
+    if camera.lens is not None:
+        pixels = corners_between(camera, points)
+        if not len(pixels):
+            return None
     low = np.maximum(np.floor(pixels.min(axis=0)) - SURROUND, 0.0).astype(int).tolist()
     high = np.minimum(np.ceil(pixels.max(axis=0)) + SURROUND + 1.0, (camera.width, camera.height)).astype(int).tolist()
     box = slice(low[1], high[1]), slice(low[0], high[0])
     return box if all(side.start < side.stop for side in box) else None
+
+
+def corners_between(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Corners (n, 2) of the pixels that may lie between points (V, 3) in front of a camera with a lens.
+
+    A lens bends the lines between points, but not out of the box that holds them in its straight picture.
+    """
+    ends, _ = replace(camera, lens=None).project(points)
+    (left, top), (right, below) = ends.min(axis=0), ends.max(axis=0)
+    u, v = camera.straight[..., 0], camera.straight[..., 1]
+    inside = (u >= left) & (u <= right) & (v >= top) & (v <= below)
+    near, _ = camera.project(points)
+    rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    corners = np.array([(columns[end], rows[end]) for end in (0, -1) if len(rows)]).reshape(-1, 2)
+    return np.concatenate([corners, near[np.isfinite(near).all(axis=1)]])
 
 
 def silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -300,9 +321,9 @@ def inner(line: np.ndarray, width: int, height: int) -> list[np.ndarray]:
 
 
 def draw_trace(sheet: np.ndarray, camera: Camera, trace: Trace) -> None:
-    """Draw a trace, in place; nothing when its dot lies behind the camera."""
-    (at,), (depth,) = camera.project(np.asarray(trace.dot)[None])
-    if depth <= 0.0:
+    """Draw a trace, in place; nothing when its dot lies behind the camera or beyond its lens."""
+    (at,), _ = camera.project(np.asarray(trace.dot)[None])
+    if not np.isfinite(at).all():
         return
     ink = ink_of(trace.layer.colour)
     dash(sheet, outlines(silhouette(camera, trace.layer.vertices, trace.layer.triangles)), ink, trace.pattern)
@@ -314,8 +335,8 @@ def draw_trace(sheet: np.ndarray, camera: Camera, trace: Trace) -> None:
 
 def draw_points(drawn: Overlaid, camera: Camera, points: np.ndarray, where: np.ndarray) -> None:
     """Draw a small dot at each of the points (n, 3) [m] where `where` (H, W) bool is true and no line is; in place."""
-    pixels, depth = camera.project(points)
-    here = pixels[depth > 0.0].round().astype(int)
+    pixels, _ = camera.project(points)
+    here = pixels[np.isfinite(pixels).all(axis=1)].round().astype(int)
     here = here[((here >= 0) & (here < (camera.width, camera.height))).all(axis=1)]
     for column, row in here[where[here[:, 1], here[:, 0]] & (drawn.taken[here[:, 1], here[:, 0]] == 0)].tolist():
         cv2.circle(drawn.colour, (column, row), 2, DARK, -1)
@@ -323,23 +344,25 @@ def draw_points(drawn: Overlaid, camera: Camera, points: np.ndarray, where: np.n
 
 
 def draw_line(sheet: np.ndarray, camera: Camera, gauge: Gauge) -> None:
-    """Draw the gauge's line, in place; nothing when an end lies behind the camera."""
-    ends, depth = camera.project(np.stack([gauge.tip, gauge.nearest]))
-    if (depth <= 0.0).any():
+    """Draw the gauge's line, in place; nothing when a part of it lies behind the camera or beyond its lens."""
+    # A lens bends it.
+    shares = np.linspace(0.0, 1.0, 2 if camera.lens is None else BENDS)[:, None]
+    line, _ = camera.project((1.0 - shares) * gauge.tip + shares * gauge.nearest)
+    if not np.isfinite(line).all():
         return
-    tip, nearest = (tuple(end) for end in np.clip(ends, -1e4, 1e4).round().astype(int).tolist())
-    cv2.line(sheet, tip, nearest, (12, 14, 16, OPAQUE), 3, cv2.LINE_AA)
-    cv2.line(sheet, tip, nearest, (250, 250, 250, OPAQUE), 1, cv2.LINE_AA)
-    cv2.circle(sheet, nearest, 3, (250, 250, 250, OPAQUE), -1, cv2.LINE_AA)
+    line = np.clip(line, -1e4, 1e4).round().astype(np.int32)[:, None]
+    cv2.polylines(sheet, [line], False, (12, 14, 16, OPAQUE), 3, cv2.LINE_AA)
+    cv2.polylines(sheet, [line], False, (250, 250, 250, OPAQUE), 1, cv2.LINE_AA)
+    cv2.circle(sheet, line[-1, 0].tolist(), 3, (250, 250, 250, OPAQUE), -1, cv2.LINE_AA)
 
 
 def write_gauge(drawn: Overlaid, camera: Camera, gauge: Gauge, covered: np.ndarray) -> None:
-    """Write the gauge's number near the end of its line, in place; nothing when that lies behind the camera.
+    """Write the gauge's number near the end of its line, in place; nothing when that has no pixel.
 
     covered (H, W) uint8: above 0 where tools are, which the number leaves in sight if it can.
     """
-    (end,), (depth,) = camera.project(np.asarray(gauge.nearest)[None])
-    if depth > 0.0:
+    (end,), _ = camera.project(np.asarray(gauge.nearest)[None])
+    if np.isfinite(end).all():
         column, row = np.clip(end, -1e4, 1e4).round().astype(int).tolist()
         lay(drawn.colour, drawn.taken, [str(gauge)], (column + BESIDE, row), GAUGE, sights=covered)
 

@@ -7,6 +7,8 @@ Triangles are tested in homogeneous pixel coordinates q = K x_camera = (u w, v w
     n = (q_b - q_a) x (q_c - q_a)                   p . n is the sum of the edge functions
     n . q_a / p . n                                 depth
     e / sum e                                       weights on the triangle itself, hence perspective-correct
+
+A lens bends the picture, not the formulas: p is then where the pixel would be without it.
 """
 
 from __future__ import annotations
@@ -17,7 +19,10 @@ import numpy as np
 import warp as wp
 
 from .camera import Camera
+from .lens_rasteriser import keep_nearest_through_lens
 from .parallel import forward_kernel, in_bands, launch_in_bands, load, run_length
+from .triangle import beyond, edge, weights_of
+from .unbent import Unbent, pixel_at, unbent
 
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 """Of a z-buffer where nothing is seen."""
@@ -78,7 +83,7 @@ def rasterise(
     face = wp.full(shape, value=-1, dtype=wp.int32, device=device)
     weights = wp.zeros(shape, dtype=wp.vec3f, device=device)
     depth = wp.zeros(shape, dtype=wp.float32, device=device)
-    inputs = [found.nearest[0, rows], found.points, found.triangles, rows.start]
+    inputs = [found.nearest[0, rows], found.points, found.triangles, rows.start, found.unbent.pixels]
     launch_in_bands(
         read_nearest, inputs, [face[rows], weights[rows], depth[rows]], (rows.stop - rows.start) * camera.width, device
     )
@@ -89,14 +94,15 @@ def rasterise(
 class Seen:
     """A surface in one picture, on a device.
 
-    points (1, V) vec3d: homogeneous; triangles (F,) vec3i; nearest (1, H, W): z-buffer of (depth, face); rows: those
-    that may be covered.
+    points (1, V) vec3d: homogeneous, without the lens; triangles (F,) vec3i; nearest (1, H, W): z-buffer of (depth,
+    face); rows: those that may be covered. `unbent` is where pixels would be without the lens.
     """
 
     points: wp.array
     triangles: wp.array
     nearest: wp.array
     rows: slice
+    unbent: Unbent
 
     @property
     def mask(self) -> np.ndarray:
@@ -112,12 +118,13 @@ def seen(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: floa
     if not near > 0.0:
         raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
     homogeneous = camera.in_frame(vertices) @ camera.K.T
-    rows = slice(*rows_reached(homogeneous, near, camera.height))
+    rows = slice(*rows_reached(homogeneous, near, camera.height)) if camera.lens is None else slice(0, camera.height)
     points = wp.array(homogeneous[None], dtype=wp.vec3d, device=device)
     corners = wp.array(triangles, dtype=wp.vec3i, device=device, copy=False)
     nearest = empty_buffer(1, camera.height, camera.width, device)
-    draw(points, corners, 0, rows, nearest, device, near)
-    return Seen(points, corners, nearest, rows)
+    through = unbent([camera], device)
+    draw(points, corners, 0, rows, nearest, device, near, through)
+    return Seen(points, corners, nearest, rows, through)
 
 
 def empty_buffer(count: int, height: int, width: int, device: str) -> wp.array:
@@ -133,12 +140,16 @@ def draw(
     nearest: wp.array,
     device: str,
     near: float = NEAR,
+    through: Unbent | None = None,
 ) -> None:
     """Draw the triangles from number `since` on into z-buffers (B, H, W), in some rows.
 
-    points (B, V) vec3d: homogeneous, in each picture; triangles (F,) vec3i, the same in all pictures.
+    points (B, V) vec3d: homogeneous, in each picture; triangles (F,) vec3i, the same in all pictures; `through`: the
+    lenses of the cameras, if they have any.
     """
-    load(device, __name__)
+    bent = through is not None and through.pixels.size > 0
+    kernel = keep_nearest_through_lens if bent else keep_nearest
+    load(device, kernel.module)
     count, run = triangles.shape[0] - since, run_length(device)
     # On a card the rows of a triangle are shared by several threads.
     parts = 1 if device == "cpu" else PARTS
@@ -146,7 +157,7 @@ def draw(
 
     def scan(begin: int, end: int) -> None:
         inputs = [points, triangles, since, wp.float64(near), rows.start + begin, rows.start + end, parts, run]
-        wp.launch(keep_nearest, size, inputs, [nearest], device=device)
+        wp.launch(kernel, size, inputs + [through] * bent, [nearest], device=device)
 
     in_bands(scan, rows.stop - rows.start, device)
 
@@ -185,49 +196,6 @@ def depth_of(key: wp.uint64) -> wp.float32:
 def face_of(key: wp.uint64) -> wp.int32:
     """The face in an entry of the z-buffer."""
     return wp.int32(key & wp.uint64(0xFFFFFFFF))
-
-
-@wp.func
-def weights_at(column: wp.int32, row: wp.int32, edge_b: wp.vec3d, edge_c: wp.vec3d, normal: wp.vec3d) -> wp.vec3f:
-    """The barycentric weights e / sum e of a triangle's corners at a pixel, by two edges and their sum."""
-    p = wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
-    scale = wp.float64(1.0) / wp.dot(p, normal)
-    wb = wp.float32(wp.dot(p, edge_b) * scale)
-    wc = wp.float32(wp.dot(p, edge_c) * scale)
-    return wp.vec3f(1.0 - wb - wc, wb, wc)
-
-
-@wp.func
-def weights_of(column: wp.int32, row: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3f:
-    """The barycentric weights of a triangle's corners at a pixel."""
-    return weights_at(column, row, wp.cross(c, a - c), wp.cross(a, b - a), wp.cross(b - a, c - a))
-
-
-@wp.func
-def edge(a: wp.vec3d, b: wp.vec3d, i: wp.int32, j: wp.int32) -> wp.vec3d:
-    """a x b, vertices i and j, rounded alike for both neighbours of the edge: exactly edge(i, j) = -edge(j, i)."""
-    if i < j:
-        return wp.cross(a, b)
-    return -wp.cross(b, a)
-
-
-@wp.func
-def around(q: wp.vec3d, box: wp.vec4d) -> wp.vec4d:
-    """The pixel box (u min, v min, u max, v max) grown to hold the pixel of q."""
-    scale = wp.float64(1.0) / q[2]
-    u = q[0] * scale
-    v = q[1] * scale
-    return wp.vec4d(wp.min(box[0], u), wp.min(box[1], v), wp.max(box[2], u), wp.max(box[3], v))
-
-
-@wp.func
-def beyond(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4d:
-    """The pixel box grown to hold the part of the edge a b that lies beyond the near plane."""
-    if a[2] >= near:
-        box = around(a, box)
-    if (a[2] < near) != (b[2] < near):
-        box = around(a + (b - a) * ((near - a[2]) / (b[2] - a[2])), box)
-    return box
 
 
 @wp.func
@@ -355,6 +323,7 @@ def read_nearest(
     q: wp.array2d(dtype=wp.vec3d),
     triangles: wp.array(dtype=wp.vec3i),
     first: wp.int32,
+    pixels: wp.array3d(dtype=wp.vec2d),
     # outputs
     face: wp.array2d(dtype=wp.int32),
     weights: wp.array2d(dtype=wp.vec3f),
@@ -370,5 +339,6 @@ def read_nearest(
             winner = face_of(key)
             t = triangles[winner]
             face[row, column] = winner
-            weights[row, column] = weights_of(column, first + row, q[0, t[0]], q[0, t[1]], q[0, t[2]])
+            p = pixel_at(0, column, first + row, pixels)
+            weights[row, column] = weights_of(p, q[0, t[0]], q[0, t[1]], q[0, t[2]])
             depth[row, column] = depth_of(key)

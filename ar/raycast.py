@@ -16,8 +16,7 @@ def raycast(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: f
     shape = camera.height, camera.width
     if not len(triangles):
         return Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32))
-    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    pixels = np.stack([columns, rows, np.ones(shape)], axis=-1)
+    pixels = np.concatenate([camera.straight, np.ones((*shape, 1))], axis=-1)
     with wp.ScopedDevice("cpu"):
         # In the camera frame a ray that is one long in z has its depth as parameter.
         mesh = wp.Mesh(

@@ -17,6 +17,7 @@ from .rasteriser import NEAR, draw, empty_buffer, rows_reached
 from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
 from .shade_structs import Light, Placed, Shadow
 from .surfaces import Stack
+from .unbent import Unbent, unbent
 
 DRAPE = (0.13, 0.30, 0.36)
 SHADOW_PIXELS = 384
@@ -181,9 +182,10 @@ class Renderer:
             nearest, placed = wp.clone(backdrop.nearest), copied(backdrop.placed)
             pictures = Pictures(*(wp.clone(array) for array in backdrop.pictures.arrays))
         self._place(cameras, moved, placed, vertex)
-        rows = self._rows(placed.seen, vertex, height)
-        draw(placed.seen, stack.surfaces.triangles, face, rows, nearest, self.device)
-        self._shade(cameras, placed, nearest, stack.casting, face, lit_at, pictures)
+        through = unbent(cameras, self.device)
+        rows = slice(0, height) if through.pixels.size else self._rows(placed.seen, vertex, height)
+        draw(placed.seen, stack.surfaces.triangles, face, rows, nearest, self.device, through=through)
+        self._shade(cameras, placed, nearest, stack.casting, face, lit_at, through, pictures)
         return pictures
 
     def _shade(
@@ -194,6 +196,7 @@ class Renderer:
         casting: wp.array,
         still: int,
         lit_at: wp.array,
+        through: Unbent,
         pictures: Pictures,
     ) -> None:
         """Light what the z-buffers hold, in the shadow of some triangles, into pictures that hold all else."""
@@ -201,7 +204,7 @@ class Renderer:
         shadow = self._shadow(placed, casting)
         inputs = [
             width, height * width, nearest.flatten(), self.stack.surfaces, placed, self._eyes(cameras), self.light,
-            shadow, self.curve, still, lit_at,
+            shadow, self.curve, still, lit_at, through.pixels,
         ]  # fmt: skip
         outputs = [array.flatten() for array in pictures.arrays]
         launch_in_bands(shade, inputs, outputs, count * height * width, self.device, bands=4)
@@ -246,10 +249,11 @@ class Renderer:
         pictures = empty_pictures(1, height, width, self.device)
         self._place([camera], moved, placed, 0)
         there = stack.surfaces.triangles[: stack.still_faces]
-        draw(placed.seen, there, 0, slice(0, height), nearest, self.device)
-        self._shade([camera], placed, nearest, self.unshaded, 0, self.nowhere, pictures)
+        through = unbent([camera], self.device)
+        draw(placed.seen, there, 0, slice(0, height), nearest, self.device, through=through)
+        self._shade([camera], placed, nearest, self.unshaded, 0, self.nowhere, through, pictures)
         lit_at = wp.zeros(height * width, dtype=wp.vec3f, device=self.device)
-        inputs = [width, nearest.flatten(), stack.surfaces, placed, self._eyes([camera]), self.light]
+        inputs = [width, nearest.flatten(), stack.surfaces, placed, self._eyes([camera]), self.light, through.pixels]
         launch_in_bands(remember, inputs, [lit_at], height * width, self.device)
         self.backdrop = Backdrop(camera, nearest, placed, pictures, lit_at)
         return self.backdrop

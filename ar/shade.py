@@ -5,8 +5,10 @@ from __future__ import annotations
 import warp as wp
 
 from .parallel import forward_kernel
-from .rasteriser import NOTHING, depth_of, face_of, weights_at
+from .rasteriser import NOTHING, depth_of, face_of
 from .shade_structs import Corners, Light, Look, Placed, Point, Shadow, Surfaces
+from .triangle import weights_at
+from .unbent import pixel_at
 
 # A caster must be this much nearer to the lamp [m] than what it shades.
 BIAS = wp.constant(0.0002)
@@ -83,11 +85,9 @@ def corners_of(picture: wp.int32, winner: wp.int32, surfaces: Surfaces, placed: 
 
 
 @wp.func
-def point_at(
-    column: wp.int32, row: wp.int32, corners: Corners, look: Look, texels: wp.array(dtype=wp.vec4f), eye: wp.vec3f
-) -> Point:
-    """What a pixel sees of a face."""
-    w = weights_at(column, row, corners.edge_b, corners.edge_c, corners.normal)
+def point_at(p: wp.vec3d, corners: Corners, look: Look, texels: wp.array(dtype=wp.vec4f), eye: wp.vec3f) -> Point:
+    """What a pixel p = (u, v, 1) sees of a face."""
+    w = weights_at(p, corners.edge_b, corners.edge_c, corners.normal)
     out = Point()
     out.place = blend(w, corners.a, corners.b, corners.c)
     out.view = unit(eye - out.place)
@@ -227,6 +227,7 @@ def remember(
     placed: Placed,
     eyes: wp.array(dtype=wp.vec3f),
     light: Light,
+    pixels: wp.array3d(dtype=wp.vec2d),
     # outputs
     at: wp.array(dtype=wp.vec3f),
 ):
@@ -240,7 +241,8 @@ def remember(
             winner = face_of(key)
             look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
             corners = corners_of(0, winner, surfaces, placed)
-            point = point_at(column, row, corners, look, surfaces.texels, eyes[0])
+            p = pixel_at(0, column, row, pixels)
+            point = point_at(p, corners, look, surfaces.texels, eyes[0])
             at[index] = read_at(point.place, point.normal, light)
 
 
@@ -260,6 +262,7 @@ def shade(
     curve: wp.array(dtype=wp.uint8),
     still: wp.int32,
     lit_at: wp.array(dtype=wp.vec3f),
+    pixels: wp.array3d(dtype=wp.vec2d),
     # outputs
     colour: wp.array(dtype=wp.vec3ub),
     depth: wp.array(dtype=wp.float32),
@@ -293,7 +296,8 @@ def shade(
                 last = winner
                 corners = corners_of(picture, winner, surfaces, placed)
                 look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
-            point = point_at(column, row, corners, look, surfaces.texels, eyes[picture])
+            p = pixel_at(picture, column, row, pixels)
+            point = point_at(p, corners, look, surfaces.texels, eyes[picture])
             if winner >= still:
                 depth[index] = depth_of(key)
                 segmentation[index] = look.id

@@ -13,8 +13,10 @@ import warp as wp
 from .camera import Camera
 from .layer import Layer, vertex_normals
 from .parallel import forward_kernel, launch_in_bands, load
-from .rasteriser import NOTHING, Seen, depth_of, face_of, weights_of
+from .rasteriser import NOTHING, Seen, depth_of, face_of
 from .renderer import Pictures
+from .triangle import weights_of
+from .unbent import pixel_at
 
 # Light that falls to 1 / e over this depth under the surface [m]: the deeper, the darker.
 FADE = wp.constant(0.03)
@@ -81,8 +83,8 @@ def overlaid(
     towards = vertex_normals(hidden.vertices, hidden.triangles) @ camera.T_camera_world[2, :3]
     looks = np.column_stack([towards, 255.0 * np.asarray(hidden.colour)])
     inputs = [
-        box[0].start, box[1].start, camera.width, seen.nearest[0], seen.points, seen.triangles, from_edge(seen),
-        wp.array(looks, dtype=wp.vec4f, device=device), drawn.depth[0], drawn.segmentation[0],
+        box[0].start, box[1].start, camera.width, seen.nearest[0], seen.points, seen.triangles, seen.unbent.pixels,
+        from_edge(seen), wp.array(looks, dtype=wp.vec4f, device=device), drawn.depth[0], drawn.segmentation[0],
         on_device(tuple(occluders), device), style == "window", style == "fill", lines.solid, wp.vec3f(lines.ink),
         sheet(lines.under, device), sheet(lines.above, device),
     ]  # fmt: skip
@@ -225,17 +227,19 @@ def over(line: wp.vec4ub, light: wp.vec3f) -> wp.vec3f:
 
 @wp.func
 def shining(
-    column: wp.int32,
-    row: wp.int32,
+    p: wp.vec3d,
     key: wp.uint64,
     q: wp.array2d(dtype=wp.vec3d),
     triangles: wp.array(dtype=wp.vec3i),
     looks: wp.array(dtype=wp.vec4f),
     surface: wp.float32,
 ) -> wp.vec3f:
-    """The light of a hidden surface through the ground, which lies at depth `surface` [m]; 0 where there is none."""
+    """The light of a hidden surface at a pixel p = (u, v, 1), through the ground at depth `surface` [m].
+
+    0 where there is none.
+    """
     t = triangles[face_of(key)]
-    w = weights_of(column, row, q[0, t[0]], q[0, t[1]], q[0, t[2]])
+    w = weights_of(p, q[0, t[0]], q[0, t[1]], q[0, t[2]])
     look = w[0] * looks[t[0]] + w[1] * looks[t[1]] + w[2] * looks[t[2]]
     under = wp.float32(0.0)
     if surface > 0.0:
@@ -254,6 +258,7 @@ def lay_over(
     nearest: wp.array2d(dtype=wp.uint64),
     q: wp.array2d(dtype=wp.vec3d),
     triangles: wp.array(dtype=wp.vec3i),
+    pixels: wp.array3d(dtype=wp.vec2d),
     away: wp.array2d(dtype=wp.float32),
     looks: wp.array(dtype=wp.vec4f),
     depth: wp.array2d(dtype=wp.float32),
@@ -306,7 +311,8 @@ def lay_over(
             if shines:
                 light *= 1.0 - 0.62 * window * window * (3.0 - 2.0 * window)
                 if inside:
-                    light += shining(column, row, key, q, triangles, looks, depth[y, x])
+                    p = pixel_at(0, column, row, pixels)
+                    light += shining(p, key, q, triangles, looks, depth[y, x])
             light = wp.min(light, wp.vec3f(255.0))
             if tinted and inside:
                 light = 0.55 * light + 0.45 * ink

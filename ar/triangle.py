@@ -1,0 +1,47 @@
+"""A triangle in homogeneous pixel coordinates, as kernels see it: its edges, its box in the picture, weights in it."""
+
+from __future__ import annotations
+
+import warp as wp
+
+
+@wp.func
+def weights_at(p: wp.vec3d, edge_b: wp.vec3d, edge_c: wp.vec3d, normal: wp.vec3d) -> wp.vec3f:
+    """The barycentric weights e / sum e of a triangle's corners at p = (u, v, 1), by two edges and their sum."""
+    scale = wp.float64(1.0) / wp.dot(p, normal)
+    wb = wp.float32(wp.dot(p, edge_b) * scale)
+    wc = wp.float32(wp.dot(p, edge_c) * scale)
+    return wp.vec3f(1.0 - wb - wc, wb, wc)
+
+
+@wp.func
+def weights_of(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3f:
+    """The barycentric weights of a triangle's corners at a pixel p = (u, v, 1)."""
+    return weights_at(p, wp.cross(c, a - c), wp.cross(a, b - a), wp.cross(b - a, c - a))
+
+
+@wp.func
+def edge(a: wp.vec3d, b: wp.vec3d, i: wp.int32, j: wp.int32) -> wp.vec3d:
+    """a x b, vertices i and j, rounded alike for both neighbours of the edge: exactly edge(i, j) = -edge(j, i)."""
+    if i < j:
+        return wp.cross(a, b)
+    return -wp.cross(b, a)
+
+
+@wp.func
+def around(q: wp.vec3d, box: wp.vec4d) -> wp.vec4d:
+    """The pixel box (u min, v min, u max, v max) grown to hold the pixel of q."""
+    scale = wp.float64(1.0) / q[2]
+    u = q[0] * scale
+    v = q[1] * scale
+    return wp.vec4d(wp.min(box[0], u), wp.min(box[1], v), wp.max(box[2], u), wp.max(box[3], v))
+
+
+@wp.func
+def beyond(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4d:
+    """The pixel box grown to hold the part of the edge a b that lies beyond the near plane."""
+    if a[2] >= near:
+        box = around(a, box)
+    if (a[2] < near) != (b[2] < near):
+        box = around(a + (b - a) * ((near - a[2]) / (b[2] - a[2])), box)
+    return box

@@ -1,0 +1,219 @@
+"""Cameras with a lens: against OpenCV's own distortion, and against what a picture must do."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from test_ar_raster import sphere
+from test_ar_renderer import BALL, FLOOR, LAMP, ball, floor, scene
+
+from ar.camera import Camera, look_at, project_cv2
+from ar.layer import Layer
+from ar.lens import Lens
+from ar.overlay import Gauge, box_around, composite, silhouette
+from ar.rasteriser import rasterise
+from ar.raycast import raycast
+from ar.refind import of_ink, outline_gap
+from ar.renderer import Renderer, render
+
+LENSES = {
+    "barrel": Lens(-0.35, 0.15, 1e-3, -2e-3, -0.02),
+    "pincushion": Lens(0.4, 0.3),
+    "folding": Lens(-0.5),
+    "rational": Lens(-0.4, 0.12, 0.01, 0.02, 0.0, 0.1, 0.02, 0.001),
+}
+each_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+SOME = LENSES["barrel"]
+
+
+def places(lens: Lens, count: int = 5000) -> np.ndarray:
+    """Normalised places within a lens' reach, or a field of view of 126 degrees."""
+    found = min(lens.reach, 2.0) * np.random.default_rng(1).uniform(-1.0, 1.0, (count, 2))
+    return found[np.hypot(*found.T) < min(lens.reach, 2.0)]
+
+
+def by_opencv(lens: Lens, where: np.ndarray) -> np.ndarray:
+    points = np.c_[where, np.ones(len(where))]
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), lens.coefficients)[0].reshape(-1, 2)
+
+
+def seen_by(lens: Lens | None = SOME, width: int = 320, height: int = 240, fov: float = 60.0) -> Camera:
+    """A camera that looks on the floor at the origin, its principal point off the middle."""
+    here = look_at(np.array([0.02, -0.05, 0.14]), np.zeros(3), np.array([0.0, 1, 0]), np.radians(fov), width, height)
+    return replace(here, K=here.K + [[0, 0, 11.0], [0, 9.0, -7.0], [0, 0, 0]], lens=lens)
+
+
+def points_in_view() -> np.ndarray:
+    return 0.03 * np.random.default_rng(0).standard_normal((200, 3))
+
+
+@each_lens
+def test_a_lens_bends_as_opencvs_and_is_inverted_to_its_reach(lens):
+    where = places(lens)
+    assert len(where) > 1000 and np.abs(lens.bent(where) - by_opencv(lens, where)).max() < 1e-9
+    assert np.abs(lens.straight(lens.bent(where)) - where).max() < 1e-9
+    assert lens.straight(np.zeros((3, 4, 2))).shape == (3, 4, 2) and not lens.straight(np.zeros(2)).any()
+
+
+def test_a_lens_that_folds_back_sees_nothing_beyond():
+    """By calculus r - r^3 / 2 turns back at r = sqrt(2 / 3), where it is 2 / 3 of that."""
+    lens, turn = LENSES["folding"], np.sqrt(2.0 / 3.0)
+    assert lens.reach == pytest.approx(turn, rel=2e-3) and lens.reach < turn
+    beyond = np.array([[1.2, 0.0], [0.0, -1.5], [4.0, 3.0], [np.nan, 0.0]])
+    assert np.isnan(lens.bent(beyond)).all()
+    assert np.abs(by_opencv(lens, beyond[:2])).max() < 0.5  # where it would be drawn, in the midst of the picture
+    assert np.isnan(lens.straight(np.array([[2.0 * turn / 3.0 + 0.01, 0.0], [0.5, 0.5]]))).all()
+    assert Lens().reach > 20.0 and Lens(0.1).reach > 20.0
+    # A denominator that comes to nothing throws places to infinity.
+    assert Lens(k4=-1.0).reach == pytest.approx(1.0, rel=2e-3)
+
+
+@each_lens
+def test_no_two_places_come_to_one(lens):
+    """Along rays of all directions, with the tangential part: places are kept in their order."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
+    ways = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    radii = np.linspace(0.0, min(0.999 * lens.reach, 5.0), 500)[:, None, None]
+    assert ((np.diff(lens.bent(radii * ways), axis=0) * ways).sum(axis=-1) > 0.0).all()
+
+
+def test_a_lens_that_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="finite"):
+        Lens(np.nan)
+    with pytest.raises(ValueError, match="folds"):
+        Lens(k1=-1e30)
+
+
+@each_lens
+def test_a_camera_projects_as_opencv_and_back(lens):
+    camera = seen_by(lens)
+    for one in (camera, camera.perturbed(3.0, (1.0, 2.0, -1.0))):
+        pixels, depth = one.project(points_in_view())
+        there = np.isfinite(pixels).all(axis=1)
+        assert there.sum() > 100
+        assert np.abs(pixels - project_cv2(one, points_in_view()))[there].max() < 1e-8
+        assert np.abs(one.unproject(pixels, depth) - points_in_view())[there].max() < 1e-10
+    assert np.abs(pixels - replace(one, lens=None).project(points_in_view())[0])[there].max() > 1.0
+
+
+def test_scaled_cropped_and_padded_cameras_see_the_same():
+    camera, points = seen_by(), points_in_view()
+    pixels, _ = camera.project(points)
+    assert np.allclose(camera.scaled(2.0).project(points)[0] + 0.5, 2.0 * (pixels + 0.5))
+    assert np.allclose(camera.cropped(slice(20, 150), slice(30, 290)).project(points)[0] + [30, 20], pixels)
+    wide = camera.padded(2.0)
+    assert np.allclose(wide.project(points)[0] - pixels, [(wide.width - 320) // 2, 0.0])
+
+
+@each_lens
+def test_straight_pixels_are_bent_back_to_their_own(lens):
+    camera = seen_by(lens)
+    rows, columns = np.mgrid[:240, :320]
+    points = replace(camera, lens=None).unproject(camera.straight, np.ones((240, 320)))
+    back, seen = camera.project(points)[0], np.isfinite(camera.straight).all(axis=2)
+    assert seen.mean() > 0.5 and np.abs(back - np.stack([columns, rows], axis=-1))[seen].max() < 1e-6
+    part = camera.cropped(slice(20, 150), slice(30, 290))
+    again = Camera(part.K, part.T_camera_world, part.width, part.height, lens)
+    assert np.allclose(part.straight, again.straight, atol=1e-6, equal_nan=True)
+
+
+@each_lens
+def test_the_rasteriser_sees_what_rays_see(lens):
+    """Of triangles as large as the picture, which reach behind the camera and beyond the lens, and of small ones."""
+    camera, (vertices, triangles) = seen_by(lens), sphere(20, 30, 0.02)
+    vertices = np.concatenate([vertices + [0.01, 0.0, 0.03], [[-9.0, -9, -0.3], [9, -8, -0.3], [0, 9, 0.3]]])
+    triangles = np.concatenate([triangles, [[600, 601, 602]] + np.array(len(vertices) - 603)])
+    drawn, cast = rasterise(camera, vertices, triangles), raycast(camera, vertices, triangles)
+    same = drawn.face == cast.face
+    assert same.mean() > 0.998 and len(np.unique(cast.face)) > 200 and (cast.face == len(triangles) - 1).mean() > 0.2
+    assert np.abs(drawn.depth - cast.depth)[same].max() < 1e-5
+    assert np.abs(drawn.weights - cast.weights)[same].max() < 1e-2
+    assert (drawn.face[np.isnan(camera.straight[..., 0])] == -1).all()
+
+
+def test_small_balls_are_drawn_where_opencv_has_them():
+    camera = seen_by(SOME, 640, 480, 75.0)
+    spread = np.linspace(-0.11, 0.11, 7)
+    for x in spread:
+        for y in 0.8 * spread:
+            vertices, triangles = sphere(12, 16, 1e-3)
+            mask = silhouette(camera.scaled(4.0), vertices + [x, y, 0.0], triangles)
+            (at,) = project_cv2(camera, np.array([[x, y, 0.0]]))
+            if (at > 8).all() and (at < [631, 471]).all():
+                found = (np.argwhere(mask)[:, ::-1].mean(axis=0) + 0.5) / 4.0 - 0.5
+                assert np.abs(found - at).max() < 0.05, (x, y)
+
+
+def test_colours_depth_and_segmentation_are_those_of_a_large_straight_picture():
+    camera, layers = seen_by(), scene()
+    picture = render(camera, layers, LAMP)
+    wide = replace(camera, lens=None, K=camera.K + [[0, 0, 200.0], [0, 0, 200.0], [0, 0, 0]], width=720, height=640)
+    straight = render(wide.scaled(3.0), layers, LAMP)
+    u, v = (3.0 * (camera.straight + 200.5) - 0.5).astype(np.float32).transpose(2, 0, 1)
+    wanted = cv2.remap(straight.colour, u, v, cv2.INTER_LINEAR).astype(int)
+    ids = cv2.remap(straight.segmentation, u, v, cv2.INTER_NEAREST)
+    depth = cv2.remap(straight.depth, u, v, cv2.INTER_NEAREST)
+    same = picture.segmentation == ids
+    assert same.mean() > 0.995 and {FLOOR, BALL} <= set(np.unique(ids))
+    on = same & (ids > 0)
+    assert np.percentile(np.abs(wanted - picture.colour).max(axis=2)[on], 99) <= 3
+    assert np.percentile(np.abs(depth - picture.depth)[on], 99) < 2e-4
+
+
+def test_what_stands_still_and_pictures_together_look_the_same_through_a_lens():
+    renderer, still = Renderer(scene(still=True), LAMP), scene()
+    cameras = [seen_by(), seen_by(None), seen_by(LENSES["folding"])]
+    together = renderer.pictures(np.stack([ball().vertices] * 3), cameras)
+    for row, camera in enumerate(cameras):
+        one, other = renderer.picture(camera, [ball().vertices]), render(camera, still, LAMP)
+        for name in ("colour", "depth", "segmentation"):
+            assert np.array_equal(getattr(one, name), getattr(other, name))
+            assert np.array_equal(getattr(together, name).numpy()[row], getattr(other, name))
+
+
+def test_a_lens_that_does_nothing_is_none_and_its_kernel_draws_the_same():
+    assert seen_by(Lens()).lens is None
+    one, other = (render(seen_by(lens), scene(), LAMP) for lens in (None, Lens(k3=1e-15)))
+    assert (one.segmentation == other.segmentation).mean() > 0.9999
+    assert np.abs(one.depth - other.depth).max() < 1e-5 or (one.depth != other.depth).mean() < 1e-4
+
+
+@each_lens
+def test_the_overlay_is_in_register_through_a_lens(lens):
+    camera, ground = seen_by(lens, 640, 480), [floor()]
+    hidden = replace(ball((0.04, 0.02, -0.03)), colour=(0.3, 0.95, 0.55))
+    picture = render(camera, ground, LAMP)
+    before = replace(hidden, vertices=hidden.vertices - [0.01, 0.0, 0.0])
+    gauge = Gauge(np.array([-0.03, -0.03, 0.0]), hidden.vertices[0])
+    shown = composite(picture, camera, hidden, gauge=gauge, before=before).colour
+    mask = raycast(camera, hidden.vertices, hidden.triangles).mask
+    ink = tuple(np.rint(255.0 * np.array([0.3, 0.95, 0.55])))
+    clear = np.zeros(mask.shape, bool)
+    assert of_ink(shown, ink).sum() > 200 and outline_gap(shown, ink, mask, clear) < 1.5
+    off = raycast(replace(camera, lens=None), hidden.vertices, hidden.triangles).mask
+    assert outline_gap(shown, ink, off, clear) > 2.0
+
+
+@each_lens
+def test_a_box_holds_what_a_lens_bends_out_of_the_corners(lens):
+    """A triangle as large as the picture: its edges are no lines."""
+    camera = seen_by(lens)
+    points = np.array([[-0.08, -0.05, 0.0], [0.08, -0.05, 0.0], [0.0, 0.08, 0.0]])
+    mask = silhouette(camera, points, np.array([[0, 1, 2]]))
+    rows, columns = box_around(camera, points)
+    outside = mask.copy()
+    outside[rows, columns] = False
+    assert mask.sum() > 5000 and not outside.any()
+
+
+def test_what_lies_beyond_the_lens_is_not_drawn():
+    """OpenCV's polynomial has it in the picture."""
+    camera = replace(look_at(np.zeros(3), np.array([0.0, 0, 1]), np.array([0.0, 1, 0])), lens=LENSES["folding"])
+    vertices, triangles = sphere(20, 30, 0.05)
+    aside = Layer("ball", BALL, vertices + [1.2, 0.0, 1.0], triangles)
+    assert np.abs(project_cv2(camera, aside.vertices) - camera.K[:2, 2]).max() < 0.5 * camera.K[0, 0]
+    picture = render(camera, [aside], LAMP)
+    assert not picture.segmentation.any() and np.isnan(camera.project(aside.vertices)[0]).all()
+    shown = composite(picture, camera, aside, gauge=Gauge(np.array([0.0, 0.0, 1.0]), aside.vertices[0]), before=aside)
+    assert np.array_equal(shown.colour, picture.colour) or shown.taken.any() == 0
