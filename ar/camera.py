@@ -115,6 +115,50 @@ class Camera:
         turn[:3, :3] = cv2.Rodrigues(np.radians(degrees) * direction)[0]
         return replace(self, T_camera_world=turn @ self.T_camera_world)
 
+    def moved(self, shift: np.ndarray) -> Camera:
+        """The same camera elsewhere: moved by `shift` (3,) [m] in its own frame, right, down and forward."""
+        T = self.T_camera_world.copy()
+        T[:3, 3] -= shift
+        return replace(self, T_camera_world=T)
+
+    def zoomed(self, factor: float) -> Camera:
+        """The same camera of `factor` times the focal length, about its principal point; the lens keeps its shape.
+
+        Raises
+        ------
+        ValueError
+            A factor that is not a number above 0.
+        """
+        if not 0.0 < factor < np.inf:
+            raise ValueError(f"a camera cannot zoom by {factor}: give a number above 0.")
+        K = self.K.copy()
+        K[:2, :2] *= factor
+        return replace(self, K=K)
+
+    def refocused(self, focal_length: float, before: float, now: float) -> Camera:
+        """The same camera focused on another distance, which changes how large it draws.
+
+        A thin lens of focal length f has the picture of what lies at d at the distance f d / (d - f) behind it.
+
+        Parameters
+        ----------
+        focal_length
+            Of the lens itself [m].
+        before, now
+            The distances [m] that it was focused on when calibrated, and is now.
+
+        Raises
+        ------
+        ValueError
+            A focal length that is not above 0, or a distance that is not larger.
+        """
+        if not 0.0 < focal_length < min(before, now) < np.inf:
+            raise ValueError(
+                f"a lens of {focal_length:g} m has no picture of what is {min(before, now):g} m away: focus farther."
+            )
+        behind = [distance / (distance - focal_length) for distance in (now, before)]
+        return self.zoomed(behind[0] / behind[1])
+
     def scaled(self, factor: float) -> Camera:
         """The same view on `factor` times as many pixels along each side."""
         width, height = round(self.width * factor), round(self.height * factor)
