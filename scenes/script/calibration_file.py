@@ -1,0 +1,54 @@
+"""Calibrations of real cameras as files: those of OpenCV and ROS are read, and written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from ar.calibration import Calibration, opencv_text, ros_text
+from ar.calibration_text import LONGEST_TEXT, WANTED, parsed
+from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import path_of, read_as
+
+SUFFIXES = (".yaml", ".yml")
+FORMATS = {"opencv": opencv_text, "ros": ros_text}
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """The calibration in a YAML file of OpenCV, or of ROS's camera_info.
+
+    OpenCV's has image_width, image_height, camera_matrix and distortion_coefficients. ROS's has distortion_model too.
+
+    Raises
+    ------
+    InputError
+        No such file, one that is too large or of another kind, or what `ar.calibration_text.parsed` refuses.
+    """
+    path = path_of(path)
+    with read_as(path, "a camera's calibration", WANTED):
+        if path.exists() and not path.is_file():
+            raise InputError(f"is no file. {WANTED}")
+        with path.open("rb") as file:
+            text = file.read(4 * LONGEST_TEXT + 1).decode("utf-8")
+        try:
+            return parsed(text)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+
+
+def write_calibration(path: str | Path, calibration: Calibration, form: Literal["opencv", "ros"] = "opencv") -> None:
+    """Write a calibration as OpenCV's YAML or ROS's, .yaml or .yml; it appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        An unknown form, a name of another ending, or a file that cannot be written.
+    """
+    path = path_of(path)
+    if form not in FORMATS:
+        raise InputError(f"calibrations are written as {' or '.join(FORMATS)}, not as {form!r}: choose one.")
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: calibrations are written as {' or '.join(SUFFIXES)}; give a name that ends so.")
+    with written_whole(path, path.suffix) as partial:
+        partial.write_text(FORMATS[form](calibration), encoding="utf-8")
