@@ -89,7 +89,7 @@ def test_the_foremost_point_is_on_the_tool_and_nothing_of_it_is_farther() -> Non
     np.testing.assert_allclose(flat, 0.0, atol=1e-12)  # the middle of its face
 
 
-@pytest.mark.parametrize("half", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.4], [0.3, 0.5, 0.0], [0.2, 0.3, 0.4]])
+@pytest.mark.parametrize("half", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.4], [0.3, 0.5, 1e-9], [0.2, 0.3, 0.4]])
 def test_the_place_nearest_to_a_core_is_nearest(half: list[float]) -> None:
     """Against a fine lattice on random triangles, whether or not they cut the core."""
     rng = np.random.default_rng(1)
@@ -106,6 +106,20 @@ def test_the_place_nearest_to_a_core_is_nearest(half: list[float]) -> None:
     off = np.maximum(far - best, 0.0)
     assert off.max() < 0.02 and np.percentile(off, 90) < 1e-6 and (best - far).max() < 0.05
     np.testing.assert_allclose(np.linalg.norm(way[far > 1e-9], axis=1), 1.0)
+
+
+def test_what_came_through_a_blade_is_pushed_down_again() -> None:
+    """The farther above, the deeper inside; beside the blade the nearest edge counts."""
+    blade = Placed(np.zeros(3), np.eye(3), np.array([4.0, 6.0, 0.0]))
+    flat = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+    tilted = flat + [[0.0, 0.0, 0.1], [0.0, 0.0, 0.7], [0.0, 0.0, -0.2]]
+    near = blade.nearest(np.array([flat + [0.0, 0.0, 0.5], tilted, flat - [0.0, 0.0, 0.5], flat + [8.0, 0.0, 0.5]]))
+    np.testing.assert_allclose(near.distance, [-0.5, -0.7, 0.5, np.hypot(3.0, 0.5)])
+    np.testing.assert_allclose(near.normal[:3], [[0.0, 0.0, -1.0]] * 3, atol=1e-12)
+    np.testing.assert_allclose(near.share[1], [0.0, 1.0, 0.0])
+    distance, normal = blade.distances(np.array([tilted] * 2), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
+    np.testing.assert_allclose(distance, [-0.7, 0.2])
+    np.testing.assert_allclose(normal, [[0.0, 0.0, -1.0]] * 2, atol=1e-12)
 
 
 @pytest.mark.parametrize("preset", TOOLS)

@@ -27,6 +27,8 @@ class Near(NamedTuple):
 class Placed:
     """A box where it stands, of which a tool is all within a radius: a point of a ball, a line of a rod.
 
+    A flat one, of a blade, has tissue below it alone. What came through it is as far inside as it is above.
+
     middle (3,) [m]; axes (3, 3), as columns; half (3,) [m].
     """
 
@@ -59,7 +61,11 @@ class Placed:
         local = place @ self.axes
         away = place - np.clip(local, -self.half, self.half) @ self.axes.T
         distance = np.sqrt(np.einsum("ni,ni->n", away, away))
-        return distance, away / np.maximum(distance, np.finfo(float).tiny)[:, None]
+        normal = away / np.maximum(distance, np.finfo(float).tiny)[:, None]
+        if self.half[2] == 0.0 and self.half[:2].all():
+            through = (np.abs(local[:, :2]) <= self.half[:2]).all(axis=1) & (local[:, 2] >= 0.0)
+            return np.where(through, -local[:, 2], distance), np.where(through[:, None], -self.axes[:, 2], normal)
+        return distance, normal
 
 
 @forward_kernel
@@ -94,6 +100,28 @@ def _nearest(
     away = place - _of_box(place, middle, axes, half)
     distance[face] = wp.length(away)
     normal[face] = wp.normalize(away)
+    down = -wp.vec3d(axes[0, 2], axes[1, 2], axes[2, 2])
+    above = _through(place, middle, axes, half)
+    if above >= wp.float64(0.0):
+        distance[face] = -above
+        normal[face] = down
+    for corner in range(3):
+        above = _through(corners[face, corner], middle, axes, half)
+        if above >= wp.float64(0.0) and -above < distance[face]:
+            distance[face] = -above
+            normal[face] = down
+            weight = wp.vec3d()
+            weight[corner] = one
+            share[face] = weight
+
+
+@wp.func
+def _through(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.float64:
+    """How far above a flat box a point is that came through it; negative where it did not."""
+    none = wp.float64(0.0)
+    local = wp.transpose(axes) @ (point - middle)
+    within = wp.abs(local[0]) <= half[0] and wp.abs(local[1]) <= half[1] and local[2] >= none
+    return wp.where(within and half[2] == none and half[0] > none and half[1] > none, local[2], wp.float64(-1.0))
 
 
 @wp.func
