@@ -37,6 +37,7 @@ from scenes.script.uncertainty import (
     write_uncertainties,
 )
 from sim.anatomy import TUMOUR_LABEL
+from sim.deformation import Outcome
 from sim.effects import SKULLS, Elasticity
 from sim.errors import InputError
 from sim.material import BRAIN
@@ -48,6 +49,23 @@ SAME = Draw(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
 @pytest.fixture(scope="module")
 def theatre(box):
     return theatre_of(box)
+
+
+class Hasty:
+    """A theatre whose finite elements find no equilibrium at calls of some numbers."""
+
+    def __init__(self, theatre, failing):
+        self.theatre, self.failing, self.starts, self.site = theatre, failing, [], theatre.site
+
+    def fem(self, *asked, **named):
+        self.solver = self.theatre.fem(*asked, **named)
+        return self
+
+    def deform(self, loads, start=None):
+        self.starts.append(start)
+        answer = self.solver.deform(loads, start=start)
+        wrong = len(self.starts) - 1 in self.failing
+        return replace(answer, outcome=np.array([Outcome.BUDGET], object)) if wrong else answer
 
 
 def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
@@ -152,6 +170,20 @@ class TestEnsemble:
         assert uncertainty(theatre, short(), still, draws, [*answers, None]).failed == 1
         with pytest.raises(InputError, match="too few"):
             uncertainty(theatre, short(), still, draws, [*answers[:7], None, None, None])
+
+    @pytest.mark.parametrize(("failing", "asked"), [((), 5), ((1,), 9), ((1, 3), 4)])
+    def test_a_moment_that_is_not_reached_at_once_is_by_way_of_times_between(self, theatre, failing, asked):
+        """After a call that failed the solver is asked again from the moment before; failing again is no answer."""
+        hasty = Hasty(theatre, failing)
+        found, whole = solved(hasty, short()), solved(theatre, short())
+        assert len(hasty.starts) == asked
+        if len(failing) == 2:
+            assert found is None
+            return
+        for ours, theirs in zip(found, whole, strict=True):
+            assert ours == pytest.approx(theirs, abs=2e-5)
+        if failing:
+            assert hasty.starts[1] is hasty.starts[2] is not None
 
     def test_the_moments_of_a_scene_end_where_it_does(self, theatre):
         still = nominal(theatre, short())

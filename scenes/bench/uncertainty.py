@@ -43,6 +43,8 @@ from ..script.uncertainty import LEVEL, Uncertainty, mark_of
 ACCURACY = Accuracy(tolerance=3e-3)
 # Moments of a scene that are solved; a scene cannot be known where fewer draws than this share have an answer.
 MOMENTS, LEAST = 5, 0.8
+# A moment that is not reached at once is in so many steps.
+PARTS = 4
 # Errors of registration and segmentation to each body.
 SHIFTS = 200
 
@@ -146,14 +148,27 @@ def nominal(theatre: Theatre, scene: Scene) -> Motions:
 
 
 def solved(theatre: Theatre, scene: Scene) -> Answer:
-    """Motions (n, 3) [m] of the tumour's surface at each moment; None where some has no equilibrium."""
-    fem, last, found, stage = theatre.fem(scene, ACCURACY, batch=1), None, [], Stage(scene, theatre.site)
+    """Motions (n, 3) [m] of the tumour's surface at each moment; None where some has no equilibrium.
+
+    A moment that has none from the one before is gone to by way of times between.
+    """
+    fem, last, found, stage, before = theatre.fem(scene, ACCURACY, batch=1), None, [], Stage(scene, theatre.site), 0.0
+
+    def gone_to(times: Sequence[float], start: Deformation | None) -> Deformation | None:
+        for time in times:
+            start = fem.deform(scene.loads(theatre.site, scene.path(time), time), start=start)
+            if not start.outcome[0].good:
+                return None
+        return start
+
     for time in moments(scene):
-        loads = scene.loads(theatre.site, scene.path(time), time)
-        last = fem.deform(loads, start=last)
-        if not last.outcome[0].good:
+        answer = gone_to([time], last)
+        if answer is None and time > before:
+            answer = gone_to(np.linspace(before, time, 1 + PARTS)[1:].tolist(), last)
+        if answer is None:
             return None
-        found.append(_surface(stage.at(loads), last))
+        last, before = answer, time
+        found.append(_surface(stage.at(scene.loads(theatre.site, scene.path(time), time)), last))
     return tuple(found)
 
 
