@@ -11,6 +11,7 @@ from boxes import box, hold, top_forces
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation
+from sim.discretisation.term import Cases
 from sim.effects import Effect, Elasticity, Held, NodalForce, SkullContact, Slide
 from sim.errors import InputError
 from sim.fem import Fem
@@ -84,6 +85,16 @@ def test_pressed_on_it_is_as_held_by_it() -> None:
 
 def test_nothing_acts_nothing_moves() -> None:
     np.testing.assert_array_equal(body("p1", SkullContact(GAP)).deform(lifted(0.0)).displacement, 0.0)
+
+
+def test_brain_that_starts_at_rest_may_come_far() -> None:
+    """As far as without a start: where nothing acted, nothing says how far away the next equilibrium is."""
+    skull, rest = body("p1", SkullContact(GAP)).problem.barriers[0], np.zeros((1, len(MESH.nodes), 3))
+
+    def far(displacement: np.ndarray | None, anew: np.ndarray | None = None) -> float:
+        return float(skull.gaps(Cases(lifted(1.0), np.zeros(1), displacement=displacement, anew=anew))[0])
+
+    assert far(None) == far(rest) == far(rest + 1e-4, np.ones(1, bool)) > 10.0 * far(rest + 1e-4)
 
 
 def test_the_wall_bends_as_a_sphere_does() -> None:

@@ -278,7 +278,9 @@ class Skull:
 
     def gaps(self, cases: Cases) -> np.ndarray:
         """As far as brain may have to come from rest, or else from where it was."""
-        known = np.full(len(cases.loads), cases.displacement is not None)
+        known = np.zeros(len(cases.loads), bool)
+        if cases.displacement is not None:
+            known |= cases.displacement.any(axis=(1, 2))
         if cases.anew is not None:
             known &= ~cases.anew
         return np.where(known, self._settings.again, self._settings.at_first) / self._bone.felt.min()
