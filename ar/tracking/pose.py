@@ -1,0 +1,165 @@
+"""Where a target is, from its corners in a picture: with a covariance, or with the reason why it is not known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import cv2
+import numpy as np
+
+from ..camera import Camera
+from .detection import Corners
+from .targets import Target
+
+# Corners that a pose needs at least; residuals are believed to be no smaller, and no larger, than these [pixel].
+FEWEST, LEAST, MOST = 6, 0.1, 1.0
+# Another pose must fit worse by so much of chi^2 before it is ruled out, unless it lies within these of the best one.
+CLEARLY, ALIKE_TURN, ALIKE_SHIFT = 30.0, np.radians(2.0), 1e-3
+# A pose before this one decides between two if it is within this of one, and twice as far from the other [rad].
+NEAR = np.radians(15.0)
+
+
+class Verdict(Enum):
+    """What is known of a target in a picture, as a person reads it."""
+
+    GOOD = "seen"
+    LOST = "lost: too few corners are seen"
+    POOR = "lost: the corners fit no pose"
+    AMBIGUOUS = "not certain: two poses fit the corners"
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where a target is in the camera's frame.
+
+    Parameters
+    ----------
+    T_camera_target
+        (4, 4) [m].
+    covariance
+        (6, 6) of a shift in the camera's frame [m] and a small turn about the target's origin in its axes [rad].
+    residual
+        Root mean square distance [pixel] of the corners from where the pose has them.
+    corners
+        How many there are.
+    """
+
+    T_camera_target: np.ndarray
+    covariance: np.ndarray
+    residual: float
+    corners: int
+
+    def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A place of the target (3,) [m] in the camera's frame (3,) [m], and its covariance (3, 3) [m^2]."""
+        arm = self.T_camera_target[:3, :3] @ place
+        slope = np.hstack([np.eye(3), -_cross(arm)])
+        return arm + self.T_camera_target[:3, 3], slope @ self.covariance @ slope.T
+
+
+def pose_of(
+    camera: Camera, target: Target, corners: Corners | None, before: np.ndarray | None = None
+) -> tuple[Verdict, Pose | None]:
+    """Where a target is; no pose unless it is certain.
+
+    Every face has two poses that mirror each other (Schweighofer, Pinz 2006, "Robust pose estimation from a planar
+    target", IEEE Trans. Pattern Anal. Mach. Intell. 28:2024-2030). Each is fitted to all corners. A pose is given where
+    no other one fits about as well, or where a pose just `before` tells them apart.
+
+    Parameters
+    ----------
+    camera
+        As it took the picture; where it stands is of no account.
+    corners
+        Of `target`, as `Detector.seen` has them; None: none.
+    before
+        T_camera_target (4, 4) a moment ago, if it was certain.
+    """
+    if corners is None or len(corners.points) < FEWEST:
+        return Verdict.LOST, None
+    fits = sorted(_fits(camera, target, corners), key=lambda fit: fit[1])
+    if not fits:
+        return Verdict.POOR, None
+    best, squares = fits[0]
+    count = len(corners.points)
+    residual = float(np.sqrt(squares / count))
+    if not residual <= MOST:
+        return Verdict.POOR, None
+    variance = max(squares / (2 * count - 6), LEAST**2)
+    rivals = [T for T, other in fits[1:] if other < squares + CLEARLY * variance and not _alike(T, best)]
+    if rivals:
+        near = sorted([best, *rivals], key=lambda T: np.inf if before is None else _turn(T, before))
+        if before is None or _turn(near[0], before) > NEAR or _turn(near[1], before) < 2.0 * _turn(near[0], before):
+            return Verdict.AMBIGUOUS, None
+        best = near[0]
+    return Verdict.GOOD, Pose(best, variance * _inverse_normal(camera, best, corners.points), residual, count)
+
+
+def _fits(camera: Camera, target: Target, corners: Corners) -> list[tuple[np.ndarray, float]]:
+    """Poses (4, 4) that may be, and their squared distances of all corners [pixel^2]."""
+    bent = np.zeros(8) if camera.lens is None else camera.lens.coefficients
+    out = []
+    for number in np.unique(corners.face):
+        rows = corners.face == number
+        if rows.sum() < 4:
+            continue
+        T_face = target.faces[number].T_target_face
+        flat = (corners.points[rows] - T_face[:3, 3]) @ T_face[:3, :3]
+        flat[:, 2] = 0.0
+        found = cv2.solvePnPGeneric(flat, corners.pixels[rows], camera.K, bent, flags=cv2.SOLVEPNP_IPPE)
+        for turn, shift in zip(found[1], found[2], strict=True):
+            T = _rigid(turn, shift) @ np.linalg.inv(T_face)
+            if np.isfinite(T).all():
+                fit = _refined(camera, bent, corners, T)
+                out += [fit] if _faces_camera(target, corners, fit[0]) else []
+    return out
+
+
+def _refined(camera: Camera, bent: np.ndarray, corners: Corners, T: np.ndarray) -> tuple[np.ndarray, float]:
+    """A pose fitted to all corners from T (4, 4) on, and the sum of squares [pixel^2]."""
+    turn, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3].reshape(3, 1).copy()
+    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, camera.K, bent, turn, shift)
+    pixels = cv2.projectPoints(corners.points, turn, shift, camera.K, bent)[0].reshape(-1, 2)
+    return _rigid(turn, shift), float(np.square(pixels - corners.pixels).sum())
+
+
+def _faces_camera(target: Target, corners: Corners, T: np.ndarray) -> bool:
+    """Whether every face with corners is seen from its front, and lies before the camera."""
+    for number in np.unique(corners.face):
+        T_camera_face = T @ target.faces[number].T_target_face
+        if T_camera_face[2, 3] <= 0.0 or T_camera_face[:3, 2] @ T_camera_face[:3, 3] <= 0.0:
+            return False
+    return True
+
+
+def _inverse_normal(camera: Camera, T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The covariance (6, 6) that corners of unit variance give."""
+    arm = points @ T[:3, :3].T
+    bent = np.zeros(8) if camera.lens is None else camera.lens.coefficients
+    slopes = cv2.projectPoints(arm + T[:3, 3], np.zeros(3), np.zeros(3), camera.K, bent)[1][:, 3:6]
+    by_place = slopes.reshape(-1, 2, 3)
+    J = np.concatenate([by_place, -by_place @ _cross(arm)], axis=2).reshape(-1, 6)
+    return np.linalg.inv(J.T @ J)
+
+
+def _rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+    return T
+
+
+def _cross(vectors: np.ndarray) -> np.ndarray:
+    """Matrices (..., 3, 3) of the cross product with vectors (..., 3) from the left."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    none = np.zeros_like(x)
+    return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*vectors.shape, 3)
+
+
+def _turn(one: np.ndarray, other: np.ndarray) -> float:
+    """The angle [rad] between two poses."""
+    cosine = 0.5 * (np.trace(one[:3, :3] @ other[:3, :3].T) - 1.0)
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+    return _turn(one, other) < ALIKE_TURN and float(np.linalg.norm(one[:3, 3] - other[:3, 3])) < ALIKE_SHIFT
