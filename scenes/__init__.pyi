@@ -3,22 +3,29 @@
 from .play.deformers import Theatre, open_theatre
 from .play.episode import collect
 from .play.player import Frame, Player
+from .script.calibration_file import read_calibration, write_calibration
+from .script.camera_paths import Focus, HandHeld, Microscope, Orbit
 from .script.debulking import Debulking
 from .script.head_posture import Lying
-from .script.scene import Bounds, Scene, Viewpoint, find_scene
+from .script.scene import Bounds, Scene, find_scene
 from .script.shipped_files import template_path
 from .script.sight import Sight
 from .script.site import Site, site_of
 from .script.tool import Blade, Instrument, Probe
 from .script.tool_paths import Touch, draw, idle, lay, palpate, press, slide, wander
+from .script.viewpoint import Viewpoint
 
 __all__ = [
     "Blade",
     "Bounds",
     "Debulking",
+    "Focus",
     "Frame",
+    "HandHeld",
     "Instrument",
     "Lying",
+    "Microscope",
+    "Orbit",
     "Player",
     "Probe",
     "Scene",
@@ -35,8 +42,10 @@ __all__ = [
     "open_theatre",
     "palpate",
     "press",
+    "read_calibration",
     "site_of",
     "slide",
     "template_path",
     "wander",
+    "write_calibration",
 ]

@@ -10,10 +10,11 @@ from theatres import PUSHING, on_template, small, template_theatre
 from ar.camera import project_cv2
 from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage, clipped
 from scenes.script.head_posture import Lying
-from scenes.script.scene import SCENES, UNDER, Viewpoint, find_scene
+from scenes.script.scene import SCENES, find_scene
 from scenes.script.site import site_of
 from scenes.script.tool import Probe
 from scenes.script.tool_paths import AIR, Touch, draw, lay, lifted, palpate, press, slide, smooth
+from scenes.script.viewpoint import UNDER, Viewpoint
 from sim.compile import check_causes
 from sim.errors import InputError
 from surrogate.data.cortex_patch import open_patch

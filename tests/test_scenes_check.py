@@ -61,7 +61,7 @@ def truth(theatre, play, frames):
 
 
 def broken(play, frames, truth, camera=None):
-    figures = measure(play, play.camera if camera is None else camera, frames, truth)
+    figures = measure(play, play.camera_at if camera is None else lambda time: camera, frames, truth)
     return set(figures.broken(Bounds())), figures
 
 
@@ -88,8 +88,8 @@ def test_every_bound_has_its_sentence():
 
 def test_what_passes_the_skull_is_reported(play, frames, truth):
     leaky = replace(truth, leaked=np.linspace(0.0, 0.35, len(truth)))
-    assert measure(play, play.camera, frames, leaky).leaked == 0.35
-    assert measure(play, play.camera, frames, truth).leaked == truth.leaked.max() < 1e-5
+    assert measure(play, play.camera_at, frames, leaky).leaked == 0.35
+    assert measure(play, play.camera_at, frames, truth).leaked == truth.leaked.max() < 1e-5
 
 
 def test_what_was_not_perturbed_passes(play, frames, truth):

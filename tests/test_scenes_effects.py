@@ -184,7 +184,9 @@ class TestWithoutATool:
 
     def test_it_can_be_checked(self, theatre, frames):
         play = player(theatre, sinking(), "fem")
-        figures = measure(play, play.camera, frames, truth_of(theatre, play.scene, [frame.loads for frame in frames]))
+        figures = measure(
+            play, play.camera_at, frames, truth_of(theatre, play.scene, [frame.loads for frame in frames])
+        )
         assert not figures.broken(Bounds()) and figures.motion_mm > 0.01
 
     def test_its_episode_tells_the_posture(self, theatre, tmp_path):

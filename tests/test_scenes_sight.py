@@ -126,7 +126,7 @@ def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
 
 
 def test_the_checks_pass_and_tell_what_an_estimate_is_worth(play, frames, truth):
-    figures = measure(play, play.camera, frames, truth)
+    figures = measure(play, play.camera_at, frames, truth)
     assert figures.broken(Bounds(overlap=0.5, error=3e-3)) == []
     # One frame moves, and by nothing that the locator's dents are: 26 % of it are removed.
     assert figures.covered == 1.0 and 0.2 < figures.removed < 1.0 and figures.error_mm > 0.01
@@ -136,7 +136,7 @@ def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
     frame, others = frames[1], [frames[0], *frames[2:]]
 
     def sentences(wrong):
-        figures = measure(play, play.camera, [others[0], wrong, *others[1:]], truth)
+        figures = measure(play, play.camera_at, [others[0], wrong, *others[1:]], truth)
         return " ".join(figures.broken(Bounds(overlap=0.0, error=1.0, covered=1.0)))
 
     plain = replace(play, stage=replace(play.stage, observer=None))

@@ -6,9 +6,10 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.material import Material
 
-from ..script.scene import Bounds, Scene, Viewpoint
+from ..script.scene import Bounds, Scene
 from ..script.sight import Sight
 from ..script.tool_paths import press
+from ..script.viewpoint import Viewpoint
 
 # Softer than usual, with a stiffer tumour: the estimate is given neither.
 BRAIN = Material("linear", young=1800.0, poisson=0.49)

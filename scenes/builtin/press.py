@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from ..script.scene import Scene, Viewpoint
+from ..script.scene import Scene
 from ..script.tool_paths import press
+from ..script.viewpoint import Viewpoint
 
 # Near enough to see a motion of 1.6 mm: the outlines of scan and now are a dozen pixels apart.
 VIEW = Viewpoint(fov=np.radians(13.0), width=800, height=600)

@@ -5,8 +5,9 @@ from sim.effects import Elasticity, Gravity, Held, Slide
 from sim.material import Material
 
 from ..script.head_posture import drained
-from ..script.scene import Bounds, Scene, Viewpoint
+from ..script.scene import Bounds, Scene
 from ..script.sight import Sight
+from ..script.viewpoint import Viewpoint
 
 # Softer than usual, with a stiffer tumour: the estimate is given neither.
 BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)

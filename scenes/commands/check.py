@@ -14,6 +14,7 @@ from sim.accuracy import TRAIN
 from sim.arguments import at_least
 from sim.errors import InputError
 
+from .camera_options import add_camera, filmed
 from .demo import add_theatre, deformer_name, playable, scene_asked, theatre_asked
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--certify", action="store_true", help="give each frame's error without solving to the end, and correct it"
     )
     add_theatre(parser)
+    add_camera(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
 
@@ -47,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from ..script.scene import SCENES
 
     at_least("--every", args.every, 1)
-    scenes = [scene_asked(args, name) for name in args.scenes or SCENES]
+    scenes = [filmed(args, scene_asked(args, name)) for name in args.scenes or SCENES]
     theatre = theatre_asked(args)
     scenes = playable(args, theatre, scenes)
     rows, table = [], sys.stderr if args.json else sys.stdout
@@ -62,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
                 frames.append(frame)
                 bar.update()
             truth = truth_of(theatre, scene, [frame.loads for frame in frames], bar.update)
-        figures = measure(player, player.camera, frames, truth)
+        figures = measure(player, player.camera_at, frames, truth)
         broken = figures.broken(scene.bounds)
         played = {"scene": scene.name, "deformer": name, "solver": theatre.described(name, scene)}
         promised, error = _errors(frames)

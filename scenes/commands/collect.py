@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from .camera_options import add_camera, filmed
 from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
 from .outputs import add_force, claimed
 
@@ -17,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--out", required=True, type=Path, help="the episode, .h5")
     add_theatre(parser)
+    add_camera(parser)
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
@@ -27,8 +29,8 @@ def run(args: argparse.Namespace) -> int:
 
     from ..play.episode import collect
 
-    scene = scene_asked(args, args.scene)
-    out = claimed(args.out, ".h5", "an episode of `sulcus collect`", args.force, [args.anatomy])
+    scene = filmed(args, scene_asked(args, args.scene))
+    out = claimed(args.out, ".h5", "an episode of `sulcus collect`", args.force, [args.anatomy, args.camera])
     theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
+from .camera_options import add_camera, filmed
 from .tissue_options import add_element_argument, add_tissue_arguments, tissue_asked
 
 if TYPE_CHECKING:
@@ -139,6 +140,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", nargs="?", default="press", help="a built-in scene or MY_SCENE.py (default press)")
     add_theatre(parser)
+    add_camera(parser)
     parser.add_argument(
         "--host",
         default="127.0.0.1",
@@ -177,12 +179,15 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
 
     from ..play.page import Demo
 
-    scene = scene_asked(args, args.scene)
+    def asked(scene: str) -> Scene:
+        return filmed(args, scene_asked(args, scene))
+
+    scene = asked(args.scene)
     theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
     anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:
-        demo = Demo(theatre, scene, name, args.host, args.port, anatomy, partial(scene_asked, args))
+        demo = Demo(theatre, scene, name, args.host, args.port, anatomy, asked)
     except UnguardedError as error:
         raise InputError(str(error)) from error
     closing.callback(demo.close)

@@ -14,6 +14,7 @@ from sim.arguments import at_least
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
+from .camera_options import add_camera, filmed
 from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
 from .outputs import add_force, claimed, claimed_folder, claimed_frames
 
@@ -30,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--film", type=Path, help="also write a film: .mp4, .gif or .webp")
     parser.add_argument("--plain", action="store_true", help="leave out the panel of figures")
     add_theatre(parser)
+    add_camera(parser)
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
@@ -40,13 +42,13 @@ def run(args: argparse.Namespace) -> int:
 
     from ..play.player import labelled
 
-    scene = scene_asked(args, args.scene)
+    scene = filmed(args, scene_asked(args, args.scene))
     at_least("--every", args.every, 1)
     claimed_folder(args.out, "frames")
     if args.film is not None:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):
             raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
-        claimed(args.film, args.film.suffix, "a film of `sulcus render`", args.force)
+        claimed(args.film, args.film.suffix, "a film of `sulcus render`", args.force, [args.camera])
     theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
     player = theatre.player(name, scene)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -106,10 +106,12 @@ class Figures:
         return {name: value if name == "doubt" or np.isfinite(value) else None for name, value in figures.items()}
 
 
-def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Deformation) -> Figures:
+def measure(
+    player: Player, camera_at: Callable[[float], Camera], frames: Sequence[Frame], truth: Deformation
+) -> Figures:
     """Hold drawn frames against the finite elements' answers to the same loads (one row per frame).
 
-    `camera` is the one that should have drawn them.
+    `camera_at` gives the camera that should have drawn what is seen at a time [s].
     """
     doubts = _doubts(frames, truth)
     moved = [
@@ -117,7 +119,10 @@ def measure(player: Player, camera: Camera, frames: Sequence[Frame], truth: Defo
         for row, frame in enumerate(frames)
     ]
     finite = [_finite(frame) for frame in frames]
-    misses = [_miss(player, camera, frame, truth, row) if finite[row] else NOWHERE for row, frame in enumerate(frames)]
+    misses = [
+        _miss(player, camera_at(frame.time), frame, truth, row) if finite[row] else NOWHERE
+        for row, frame in enumerate(frames)
+    ]
     overlap, error, pixels, drawn = zip(*misses, strict=True)
     return Figures(
         overlap=min(overlap),

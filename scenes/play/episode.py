@@ -43,7 +43,9 @@ MEANINGS = {
     "pictures/overlay": "JPEG bytes: the same with the predicted tumour drawn into it",
     "pictures/segmentation": "PNG bytes, 8 bit: the id of what is seen, see the root's `segmentation`",
     "pictures/tumour_mask": "PNG bytes, 8 bit: 1 where the predicted tumour would be seen were nothing in front of it",
-    "K": "pinhole camera matrix (3, 3) [pixel]",
+    "K": "pinhole camera matrix (3, 3) [pixel]; of a camera that zooms or focuses, as it starts",
+    "K_of_frame": "(frames, 3, 3): the same in each frame, where the camera moves",
+    "distortion": "(8,) k1 k2 p1 p2 k3 k4 k5 k6 of the lens, as cv2.projectPoints takes them; none without a lens",
     "bound": "(frames, 2): the model's largest error of a tumour vertex against its finite elements, in 95 and "
     "in 99 of 100 loads; NaN: none is stated",
     "tumour_nodes": "mesh vertices of the rows of tumour_*", "tumour_left": "which of them are not cut out",
@@ -77,7 +79,8 @@ UNITS = {
     "direction": "1", "csf_level": "m", "share": "1", "done": "1",
     "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "bound": "m", "seconds": "s",
     "reaction_fem": "N, N m", "reaction_predicted": "N, N m", "reaction_bound": "N",
-    "K": "pixel", "pose": "m", "displacement": "m", "tumour_nodes": "1", "tumour_left": "1",
+    "K": "pixel", "K_of_frame": "pixel", "distortion": "1",
+    "pose": "m", "displacement": "m", "tumour_nodes": "1", "tumour_left": "1",
     "outcome_predicted": "text", "outcome_fem": "text", "colour": "JPEG", "overlay": "JPEG", "segmentation": "PNG",
     "tumour_mask": "PNG",
     "depth": f"{DEPTH_SCALE:g} m (PNG, 16 bit)",
@@ -144,6 +147,7 @@ def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
     return {
         "time": frame.time,
         "T_camera_world": frame.camera.T_camera_world,
+        **({} if player.scene.viewpoint.path is None else {"K_of_frame": frame.camera.K}),
         **({} if frame.pose is None or frame.tip is None else held(frame, frame.pose, frame.tip)),
         **caused(frame.loads),
         **(felt(frame.deformation) if player.scene.posed else {}),
@@ -222,6 +226,8 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str) -
     """Units, frames and provenance as attributes."""
     scene, camera, model = player.scene, player.camera, model_of(player.deformer)
     file.create_dataset("K", data=camera.K)
+    if camera.lens is not None:
+        file.create_dataset("distortion", data=camera.lens.coefficients)
     for name, unit in UNITS.items():
         for place in (name, f"pictures/{name}"):
             if place in file:  # what no frame has is not written

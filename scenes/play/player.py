@@ -149,8 +149,13 @@ class Player:
 
     @cached_property
     def camera(self) -> Camera:
-        """The scene's camera."""
+        """The scene's camera as it starts."""
         return self.scene.viewpoint.camera(self.site)
+
+    def camera_at(self, time: float) -> Camera:
+        """The scene's camera at a time [s]: one that stays is the same, whose backdrop is kept."""
+        view = self.scene.viewpoint
+        return self.camera if view.path is None else view.camera(self.site, time)
 
     @cached_property
     def remembers(self) -> bool:
@@ -183,8 +188,8 @@ class Player:
         begun = clock.perf_counter()
         positions = self.positions(deformation)
         held = None if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
-        stage = self.stage.at(loads)
-        picture = stage.picture(self.camera, positions, None if held is None else held.pose)
+        stage, camera = self.stage.at(loads), self.camera_at(float(loads.times[0]))
+        picture = stage.picture(camera, positions, None if held is None else held.pose)
         rendered = clock.perf_counter()
         estimate = None if stage.observer is None else self._estimate(stage.observer, number, positions, held)
         located = 0.0 if estimate is None else estimate.seconds
@@ -199,20 +204,20 @@ class Player:
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
         band = 0.0 if estimate is not None else error.bound or 0.0
         trained = answering(self.deformer, deformation) is not None
-        lines = error_lines(promised, error, trained, doubt, self.camera.width < FEW)
-        head = [part for line in lines for part in folded(line, WIDE * self.camera.width)]
+        lines = error_lines(promised, error, trained, doubt, camera.width < FEW)
+        head = [part for line in lines for part in folded(line, WIDE * camera.width)]
         over = composite(
-            picture, self.camera, tumour, (TOOL,), self.style, band, plain, rest, doubt, traces, moved, head
+            picture, camera, tumour, (TOOL,), self.style, band, plain, rest, doubt, traces, moved, head
         )  # fmt: skip
         if estimate is not None and self.style != "none":
-            draw_points(over, self.camera, estimate.observation.now, picture.segmentation == CORTEX)
+            draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
         remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         annotate(over, number, remark)
         spent = seconds, rendered - begun, clock.perf_counter() - rendered - located
         took = dict(zip(STAGES, spent, strict=True)) | ({} if estimate is None else {"locate": located})
         return Frame(
-            number, float(loads.times[0]), touch, loads, deformation, self.camera,
+            number, float(loads.times[0]), touch, loads, deformation, camera,
             None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
             None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
             float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()) if moved is None else moved[0],

@@ -14,10 +14,11 @@ from sim.geometry.ball_at_rest import resting_tip
 from sim.loads import Pushed
 
 from ..play.stage import TOOL, Stage
-from ..script.scene import Viewpoint, find_scene
+from ..script.scene import find_scene
 from ..script.shipped_files import template_path
 from ..script.site import Site, site_of
 from ..script.tool import Probe
+from ..script.viewpoint import Viewpoint
 from .reference import reference_of
 from .study import Study
 

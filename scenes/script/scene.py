@@ -11,7 +11,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from ar.camera import Camera, look_at
 from sim.accuracy import LIVE, Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import Place
@@ -38,32 +37,10 @@ from .sight import Sight
 from .site import Site
 from .tool import Instrument, Probe
 from .tool_paths import AIR, Path, Touch, idle
+from .viewpoint import USUAL, Viewpoint
 
-# So far under the cortex a camera looks: between the tool and the tumour [m].
-UNDER = 10e-3
 # Of a scene: an hour at 30 a second.
 MOST_FRAMES = 108_000
-
-
-@dataclass(frozen=True)
-class Viewpoint:
-    """A camera by its place relative to the open cortex: from the side, for a tool moves a tumour mostly downwards.
-
-    It has a distance [m] from the site, a vertical field of view [rad] and a size of the picture [pixel]. Its tilt
-    [rad] is that of the way to the camera, from the outward normal towards the site's `up`.
-    """
-
-    distance: float = 0.20
-    tilt: float = -0.8
-    fov: float = np.radians(16.0)
-    width: int = 640
-    height: int = 480
-
-    def camera(self, site: Site) -> Camera:
-        """The camera that looks at a site."""
-        outward = -np.cos(self.tilt) * site.axis + np.sin(self.tilt) * site.up
-        target = site.origin + UNDER * site.axis
-        return look_at(target + self.distance * outward, target, site.up, self.fov, self.width, self.height)
 
 
 @dataclass(frozen=True)
@@ -135,7 +112,7 @@ class Scene:
     lying: Lie = supine
     surgery: Debulking | None = None
     sight: Sight | None = None
-    viewpoint: Viewpoint = Viewpoint()
+    viewpoint: Viewpoint = USUAL
     element: str | None = None
     accuracy: Accuracy = LIVE
     bounds: Bounds = Bounds()

@@ -1,0 +1,88 @@
+"""Where a scene's camera is, what it is, and how it moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ar.calibration import Calibration
+from ar.camera import Camera, look_at
+from ar.stereo import stereo_pair
+from sim.errors import InputError
+
+from .camera_paths import CameraPath
+from .site import Site
+
+# So far under the cortex a camera looks: between the tool and the tumour [m].
+UNDER = 10e-3
+Eye = Literal["left", "right"]
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera by its place relative to the open cortex: from the side, for a tool moves a tumour mostly downwards.
+
+    It has a distance [m] from the site, a vertical field of view [rad] and a size of the picture [pixel]. Its tilt
+    [rad] is that of the way to the camera, from the outward normal towards the site's `up`.
+
+    Parameters
+    ----------
+    calibration
+        That of a real camera, in place of the field of view.
+    path
+        How the camera moves, zooms and focuses; None: it stays.
+    eye
+        Which of an operating microscope's two ways of light is shown, with the axes meeting at the site; None: the
+        middle.
+
+    Raises
+    ------
+    InputError
+        A calibration for pictures of another size, or another eye than left and right.
+    """
+
+    distance: float = 0.20
+    tilt: float = -0.8
+    fov: float = np.radians(16.0)
+    width: int = 640
+    height: int = 480
+    calibration: Calibration | None = None
+    path: CameraPath | None = None
+    eye: Eye | None = None
+
+    def __post_init__(self) -> None:
+        if self.eye not in (None, "left", "right"):
+            raise InputError(f"an operating microscope has no eye {self.eye!r}: choose left or right.")
+        if self.calibration is not None:
+            try:
+                self.calibration.sized(self.width, self.height)
+            except ValueError as error:
+                raise InputError(str(error)) from error
+
+    def calibrated(self, calibration: Calibration) -> Viewpoint:
+        """The same place, with a calibrated camera and pictures of its size."""
+        return replace(self, calibration=calibration, width=calibration.width, height=calibration.height)
+
+    def target(self, site: Site) -> np.ndarray:
+        """What a camera looks at (3,) [m]."""
+        return site.origin + UNDER * site.axis
+
+    def camera(self, site: Site, time: float = 0.0) -> Camera:
+        """The camera that looks at a site at a time [s]."""
+        outward = -np.cos(self.tilt) * site.axis + np.sin(self.tilt) * site.up
+        target = self.target(site)
+        found = look_at(target + self.distance * outward, target, site.up, self.fov, self.width, self.height)
+        if self.calibration is not None:
+            found = self.calibration.camera(found.T_camera_world)
+        if self.path is not None:
+            found = self.path(found, target, time)
+        if self.eye is None:
+            return found
+        left, right = stereo_pair(found, working_distance=float(found.in_frame(target)[2]))
+        return left if self.eye == "left" else right
+
+
+USUAL = Viewpoint()
+"""That of scenes that say nothing else."""
