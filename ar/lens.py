@@ -16,6 +16,8 @@ STEPS, ROUND = 4096, 32
 # Newton's steps at most, and the residual that ends them, in normalised coordinates: 1e-9 pixel at a focal length of
 # 1000.
 NEWTON, EXACT = 20, 1e-12
+# So many places are solved for together: their arrays stay in a processor's cache. All at once take longer by a half.
+TOGETHER = 8192
 
 
 @dataclass(frozen=True)
@@ -88,9 +90,10 @@ class Lens:
         _, moved = self._along
         # No tangential part moves a place further than this.
         far = moved[-1] + 3.0 * (abs(self.p1) + abs(self.p2)) * self.reach**2
-        near = np.hypot(*wanted) <= far
+        near = np.flatnonzero(np.hypot(*wanted) <= far)
         out = np.full(wanted.shape, np.nan)
-        out[:, near] = self._solved(wanted[:, near])
+        for part in np.split(near, range(TOGETHER, len(near), TOGETHER)):
+            out[:, part] = self._solved(wanted[:, part])
         return out.T.reshape(places.shape)
 
     def _solved(self, wanted: np.ndarray) -> np.ndarray:

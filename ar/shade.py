@@ -277,6 +277,7 @@ def shade(
     picture = start / size
     pixel = start - picture * size - 1
     last = wp.int32(-1)
+    bent = pixels.shape[0] > 0
     corners = Corners()
     look = Look()
     for index in range(start, wp.min(start + run, end)):
@@ -296,7 +297,9 @@ def shade(
                 last = winner
                 corners = corners_of(picture, winner, surfaces, placed)
                 look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
-            p = pixel_at(picture, column, row, pixels)
+            p = wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
+            if bent:  # asked here, pictures without a lens take a seventh less time
+                p = pixel_at(picture, column, row, pixels)
             point = point_at(p, corners, look, surfaces.texels, eyes[picture])
             if winner >= still:
                 depth[index] = depth_of(key)
