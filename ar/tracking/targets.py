@@ -1,7 +1,7 @@
 """Printed targets that a camera sees: the tool's cube, the patient's reference, and the board that calibrates cameras.
 
-Every face is a ChArUco board of odd by odd squares, whose corners are those of a chessboard. OpenCV finds them to a tenth
-of a pixel. A marker's own corners are off by a fifth, always inwards.
+Every face is a ChArUco board of odd by odd squares, whose corners are those of a chessboard. OpenCV finds them to a
+tenth of a pixel. A marker's own corners are off by a fifth, always inwards.
 """
 
 from __future__ import annotations

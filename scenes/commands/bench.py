@@ -17,6 +17,7 @@ BENCHES = {
     "published": "how far the published learners are off, one force position left out at a time",
     "locate": "how much of a tumour's motion is found from points on the open cortex, by us and by rivals",
     "fit": "how rightly tissue and skull of known patients are found from several frames",
+    "track": "how far off a tool's tip is that a camera sees by its printed cube",
     "shortcuts": "how much time each shortcut of the solver saves on typical loads",
     "solver": "time of the first load on a mesh and of a further one, compared with other packages",
     "all": "every figure of the performance pages in one go: a record, its tables, and what got slower",

@@ -1,0 +1,212 @@
+"""How well a printed cube tells where a tool's tip is: pictures with known poses, by two published protocols.
+
+FMAC (arXiv 2601.07723) spreads poses evenly over all six freedoms. ASTM F2554 (2022) has one point touched again and
+again, the tool turned about it, and distances between points.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, qmc
+
+from ar.camera import Camera
+from ar.lens import Lens
+from ar.tracking.drawn import drawn
+from ar.tracking.pose import Pose, Verdict
+from ar.tracking.targets import MARKER, TIP, tool_cube
+from ar.tracking.track import Tracker
+
+# The camera of the published trials: pixels, focal length [pixel], how far its targets are [m], and a usual lens.
+WIDTH, HEIGHT, FOCAL, AWAY = 1280, 960, 1400.0, 0.4
+LENS = Lens(-0.1, 0.02, 5e-4, -3e-4)
+# Blur [pixel] and noise [of 255] of its pictures; a marker that is smaller [pixel] need not be found.
+BLUR, NOISE, SEEN = 0.5, 2.0, 20.0
+# Half the volume that the cube is in [m], and how far it is turned at most [degree].
+VOLUME, TURNED = np.array([0.09, 0.06, 0.03]), 45.0
+# Half the cube in which points are touched [m], and the tool's turns there.
+TOUCHED, LEANING = 0.03, 30.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One protocol; errors of the tip in millimetres.
+
+    Parameters
+    ----------
+    median, p95, most
+        Of what the protocol measures: distance from the truth, from the mean, or between points.
+    certain
+        Of the pictures in which a face's markers have 20 pixels, those with a certain pose [%]; None: there are none.
+    wrong
+        Poses that were called certain, and are off by more than 5 of their own standard deviations and 1 mm.
+    held
+        How often the ellipsoid of 95 % held the tip [%].
+    milliseconds
+        Of a picture, the target being followed: median.
+    """
+
+    protocol: str
+    pictures: int
+    median: float
+    p95: float
+    most: float
+    certain: float | None
+    wrong: int
+    held: float
+    milliseconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One picture: where the tip was, and where it was found, if that is certain, with its covariance; and the time."""
+
+    tip: np.ndarray
+    markers: float
+    found: np.ndarray | None
+    covariance: np.ndarray | None
+    seconds: float
+
+
+def trial_camera() -> Camera:
+    """The camera of the trials, at the world's origin."""
+    K = np.array([[FOCAL, 0.0, 0.5 * WIDTH - 20.0], [0.0, FOCAL, 0.5 * HEIGHT + 12.0], [0.0, 0.0, 1.0]])
+    return Camera(K, np.eye(4), WIDTH, HEIGHT, LENS)
+
+
+def studied(count: int, seed: int = 0, progress: Callable[[int, int], object] = lambda done, total: None) -> list[Row]:
+    """All protocols, of `count` pictures each."""
+    plans = {
+        "FMAC: all six freedoms": (_spread(count, seed), _off),
+        "F2554: one point": (_pivoted(count, seed, np.zeros(3)), _from_mean),
+        "F2554: between points": (_pivoted(count, seed, None), _between),
+    }
+    rows, done, total = [], 0, count * len(plans)
+    for name, (poses, measure) in plans.items():
+        shots = []
+        for shot in _shots(poses, seed):
+            shots.append(shot)
+            done += 1
+            progress(done, total)
+        rows.append(_row(name, shots, measure))
+    return rows
+
+
+def _row(name: str, shots: list[Shot], measure: Callable[[list[Shot]], np.ndarray]) -> Row:
+    certain = [shot for shot in shots if shot.found is not None]
+    fair = [shot for shot in shots if shot.markers >= SEEN]
+    error = 1e3 * measure(certain)
+    far = [_in_deviations(shot) for shot in certain]
+    off = 1e3 * _off(certain)
+    median, p95, most = np.percentile(error, [50, 95, 100]).tolist()
+    return Row(
+        name,
+        len(shots),
+        median,
+        p95,
+        most,
+        100.0 * float(np.mean([shot.found is not None for shot in fair])) if fair else None,
+        int(sum(each > 5.0**2 and here > 1.0 for each, here in zip(far, off, strict=True))),
+        100.0 * float(np.mean(np.array(far) <= chi2.ppf(0.95, 3))),
+        1e3 * float(np.median([shot.seconds for shot in shots])),
+    )
+
+
+def _in_deviations(shot: Shot) -> float:
+    """Squared distance of the found tip from the true one, in units of its covariance."""
+    assert shot.found is not None and shot.covariance is not None
+    error = shot.found - shot.tip
+    return float(error @ np.linalg.solve(shot.covariance, error))
+
+
+def _off(shots: list[Shot]) -> np.ndarray:
+    """Distances (n,) [m] from where the tip was."""
+    return np.array([np.linalg.norm(shot.found - shot.tip) for shot in shots if shot.found is not None])
+
+
+def _from_mean(shots: list[Shot]) -> np.ndarray:
+    """Distances (n,) [m] of repeated touches from their mean."""
+    found = np.array([shot.found for shot in shots])
+    return np.linalg.norm(found - found.mean(axis=0), axis=1)
+
+
+def _between(shots: list[Shot]) -> np.ndarray:
+    """By how much distances between points, each and the next, are off (n - 1,) [m]."""
+    found, true = (np.array([getattr(shot, name) for shot in shots]) for name in ("found", "tip"))
+    lengths = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in (found, true)]
+    return np.abs(lengths[0] - lengths[1])
+
+
+def _spread(count: int, seed: int) -> Iterator[np.ndarray]:
+    """Poses (4, 4) of the cube, evenly over its volume and its turns."""
+    for u in _numbers(count, seed):
+        axis = _direction(u[0], u[1])
+        T = _facing(Rotation.from_rotvec(np.radians(TURNED) * np.cbrt(u[2]) * axis))
+        T[:3, 3] = (2.0 * u[3:] - 1.0) * VOLUME + [0.0, 0.0, AWAY]
+        yield T
+
+
+def _numbers(count: int, seed: int) -> np.ndarray:
+    """Numbers (count, 6) in [0, 1) of low discrepancy; those of another seed go on where these end."""
+    return qmc.Halton(6, scramble=False).fast_forward(1 + seed * count).random(count)
+
+
+def _pivoted(count: int, seed: int, point: np.ndarray | None) -> Iterator[np.ndarray]:
+    """Poses (4, 4) of the cube, the tip on a point (3,) [m] beside the middle of the volume, or on one of many."""
+    for u in _numbers(count, seed):
+        axis = _direction(u[0], u[1])
+        T = _facing(Rotation.from_rotvec(np.radians(LEANING) * np.cbrt(u[2]) * axis))
+        tip = (2.0 * u[3:] - 1.0) * TOUCHED if point is None else point
+        middle = _facing(Rotation.identity())[:3, :3] @ [0.0, 0.0, -TIP]
+        T[:3, 3] = [0.0, 0.0, AWAY] + middle + tip - T[:3, :3] @ [0.0, 0.0, -TIP]
+        yield T
+
+
+def _direction(u: float, v: float) -> np.ndarray:
+    """A unit vector (3,) of two numbers in [0, 1), uniform by area."""
+    z = 2.0 * u - 1.0
+    ring = np.sqrt(1.0 - z * z)
+    return np.array([ring * np.cos(2.0 * np.pi * v), ring * np.sin(2.0 * np.pi * v), z])
+
+
+def _facing(turn: Rotation) -> np.ndarray:
+    """The cube turned from where the corner between its faces looks at the camera (4, 4)."""
+    forward = -np.ones(3) / np.sqrt(3.0)
+    right = -np.cross([0.0, 0.0, 1.0], forward)
+    right = right / np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = turn.as_matrix() @ np.stack([right, np.cross(forward, right), forward])
+    return T
+
+
+def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[Shot]:
+    camera, cube, rng = trial_camera(), tool_cube(), np.random.default_rng(seed)
+    tracker = Tracker(camera, (cube,))
+    for T in poses:
+        sharp = drawn(np.full((HEIGHT, WIDTH), 120, np.uint8), camera, [(cube, T)])
+        blurred = cv2.GaussianBlur(sharp.astype(np.float32), (0, 0), BLUR)
+        picture = np.clip(blurred + rng.normal(0.0, NOISE, blurred.shape), 0.0, 255.0).astype(np.uint8)
+        first = tracker.track(picture)
+        begun = time.perf_counter()
+        again = tracker.track(picture, first)  # as it is followed
+        seconds = time.perf_counter() - begun
+        tip = np.array([0.0, 0.0, -TIP])
+        pose: Pose | None = again.poses.get(cube.name) if again.verdicts[cube.name] is Verdict.GOOD else None
+        found, covariance = (None, None) if pose is None else pose.point(tip)
+        yield Shot(T[:3, :3] @ tip + T[:3, 3], _markers(camera, T), found, covariance, seconds)
+
+
+def _markers(camera: Camera, T: np.ndarray) -> float:
+    """Side [pixel] of the markers on the face that is seen largest: the root of what a square covers."""
+    sides = [0.0]
+    for face in tool_cube().faces:
+        pixels = camera.project(face.outline @ T[:3, :3].T + T[:3, 3])[0]
+        (x, y), (x_next, y_next) = pixels.T, np.roll(pixels, -1, axis=0).T
+        area = 0.5 * float(np.sum(x * y_next - x_next * y))  # negative where it is seen from behind
+        sides.append(MARKER * np.sqrt(max(area, 0.0) / (face.columns * face.rows)))
+    return float(max(sides))
