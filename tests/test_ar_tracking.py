@@ -134,6 +134,21 @@ def test_a_covariance_is_what_noise_does() -> None:
     assert np.mean(np.array(found) < 12.6) == pytest.approx(0.95, abs=0.05)
 
 
+def test_a_pose_beside_another_target_has_the_errors_of_both() -> None:
+    """The tip in the patient's frame, many times: what noise does to both poses is what the covariance says."""
+    rng, T = np.random.default_rng(6), looking((10.0, 5.0, -20.0), (0.0, 0.02, 0.3))
+    plate = flat((30.0, 20.0, 0.0), (-0.1, 0.0, 0.3))
+    true = (np.linalg.inv(plate) @ T @ [0.0, 0.0, -TIP, 1.0])[:3]
+    found = []
+    for _ in range(150):
+        tool = pose_of(CAMERA, CUBE, seen_from_front(T, 0.2, rng, CUBE))[1]
+        patient = pose_of(CAMERA, PLATE, seen_from_front(plate, 0.2, rng))[1]
+        assert tool is not None and patient is not None
+        place, covariance = tool.seen_from(patient).point(TIP_AT)
+        found.append((place - true) @ np.linalg.solve(covariance, place - true))
+    assert np.mean(found) == pytest.approx(3.0, rel=0.25)
+
+
 def test_a_mirrored_pose_is_never_called_good() -> None:
     """A plate far away and nearly square to the view has two poses that fit: whichever is given is the right one."""
     rng, verdicts = np.random.default_rng(2), []

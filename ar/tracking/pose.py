@@ -31,7 +31,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where a target is in the camera's frame.
+    """Where a target is in the camera's frame, or in that of another target.
 
     Parameters
     ----------
@@ -49,6 +49,16 @@ class Pose:
     covariance: np.ndarray
     residual: float
     corners: int
+
+    def seen_from(self, other: Pose) -> Pose:
+        """The same target in the frame of another one, of the same picture; both errors are in its covariance."""
+        into, away = other.T_camera_target[:3, :3].T, self.T_camera_target[:3, 3] - other.T_camera_target[:3, 3]
+        none = np.zeros((3, 3))
+        own = np.block([[into, none], [none, into]])
+        theirs = np.block([[-into, into @ _cross(away)], [none, -into]])
+        covariance = own @ self.covariance @ own.T + theirs @ other.covariance @ theirs.T
+        T = np.linalg.inv(other.T_camera_target) @ self.T_camera_target
+        return Pose(T, covariance, max(self.residual, other.residual), min(self.corners, other.corners))
 
     def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A place of the target (3,) [m] in the camera's frame (3,) [m], and its covariance (3, 3) [m^2]."""
