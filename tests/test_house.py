@@ -57,6 +57,7 @@ OWNERS = {
     "nilearn": {"sim/bodies/template.py"},
     "onnx": {"surrogate/onnx_export/export.py", "surrogate/onnx_export/graph.py"},
     "pyamg": {"sim/linalg/amg.py"},
+    "PIL": {"ar/tracking/pages.py"},
     "nibabel": {"sim/bodies/intensity.py", "sim/bodies/nifti.py"},
 }
 """Libraries that nobody else imports."""
@@ -76,12 +77,8 @@ PLAIN = ("ar", "scenes", "sim", "surrogate")
 """Packages whose docstrings and messages are held to plain English."""
 OURS = re.compile(r"\b(?:(?:un)?taught|teach(?:es|ing)?|told|vicinit(?:y|ies)|lanes?|rungs?)\b", re.IGNORECASE)
 """Words of our own, for which the field has others: trained, given or stated, local problem, columns, steps."""
-IMPORT_NAMES = {
-    "opencv-python-headless": "cv2",
-    "scikit-learn": "sklearn",
-    "lazy-loader": "lazy_loader",
-    "warp-lang": "warp",
-}
+IMPORT_NAMES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-learn": "sklearn", "warp-lang": "warp"}
+"""Where they are other than the name to install by, with `_` for `-`."""
 FILES = sorted(path for room in ROOMS for path in (HOUSE / room).rglob("*.py"))
 
 
@@ -217,7 +214,7 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
     project = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]
     declared = [*project["dependencies"], *project["optional-dependencies"]["onnx"]]
     names = {re.split(r"[<>=!~\[ ]", line)[0] for line in declared}
-    allowed = {IMPORT_NAMES.get(name, name) for name in names}
+    allowed = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
     used = set().union(*map(libraries, FILES)) - set(sys.stdlib_module_names) - set(ROOMS)
     assert used == allowed
 

@@ -61,6 +61,9 @@ next: sulcus collect press --out press.h5, for depth, segmentation and forces to
     "collect": """example:
   sulcus collect press --out press.h5
 next: read it by h5py; its attributes give units and frames""",
+    "markers": """example:
+  sulcus markers --out markers
+next: print markers/markers.pdf at 100 %, measure its rulers, and glue the pages onto stiff, flat plates""",
     "sensitivity": """example:
   sulcus sensitivity --count 8 --out sensitivity.csv
 next: open the table in a spreadsheet""",

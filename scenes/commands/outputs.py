@@ -168,6 +168,12 @@ def _is_film(path: Path) -> bool:
     return is_our_film(path)
 
 
+def _is_printed(path: Path) -> bool:
+    from ar.tracking.pages import is_page
+
+    return is_page(path.read_bytes())
+
+
 def _is_scan(path: Path) -> bool:
     from sim.bodies.intensity import is_sidecar
 
@@ -197,5 +203,7 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "a record of `sulcus bench all`": _is_record,
     "a picture of sulcus": _is_picture,
     "a film of `sulcus render`": _is_film,
+    "a page of `sulcus markers`": _is_printed,
+    "a list of `sulcus markers`": _begins(b'"format": "sulcus targets'),
 }
 """What may be replaced by the same: in words, and how it is recognised."""

@@ -1,0 +1,304 @@
+"""Pages of A4 to print the targets from, exact in millimetres, and the list of targets as other programs read it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
+
+from .targets import BORDER, MARKER, MARKERS, TIP, Face, Target, calibration_board, patient_reference, tool_cube
+
+# Pixels in a millimetre: each module of each marker takes a whole number of them.
+PER_MM = 20
+DPI = 25.4 * PER_MM
+A4 = (210.0, 297.0)
+RULER = 100.0
+MAKER = "sulcus markers"
+"""Who made a page, as PDF and PNG say it."""
+# Of lines, of the text, of titles and of the names of faces [mm].
+THIN, SMALL, LARGE, TINY = 0.2, 3.4, 6.0, 2.6
+LINE = 4.8
+"""From a line of text to the next [mm]."""
+PRINTING = (
+    "Print at 100 % on A4 ('actual size', not 'fit to page'), then measure both rulers.",
+    f"If a ruler is not {RULER:.0f} mm long to 0.2 mm, do not use this page: correct the scale, and print it again.",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Where a face stands on its page.
+
+    Parameters
+    ----------
+    face
+        What is printed.
+    left, top
+        Its left and upper side [mm] from the page's upper left corner, without its border.
+    turns
+        Quarter turns clockwise.
+    """
+
+    face: Face
+    left: float
+    top: float
+    turns: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """One page.
+
+    Parameters
+    ----------
+    name
+        Of its target.
+    pixels
+        (H, W) uint8, 0 or 255, `PER_MM` a millimetre.
+    placed
+        The faces on it.
+    """
+
+    name: str
+    pixels: np.ndarray
+    placed: tuple[Placed, ...]
+
+
+def printed_pages() -> tuple[Page, ...]:
+    """The pages of the tool's cube, the patient's reference and the calibration board."""
+    return _cube_page(tool_cube()), _plate_page(patient_reference()), _board_page(calibration_board())
+
+
+def face_name(face: Face) -> str:
+    """The axis of the target that a face looks along: "+x", "-z"."""
+    outwards = -face.T_target_face[:3, 2]
+    axis = int(np.abs(outwards).argmax())
+    return f"{'+' if outwards[axis] > 0.0 else '-'}{'xyz'[axis]}"
+
+
+def png_bytes(page: Page) -> bytes:
+    """A page as PNG of one bit a pixel, which says how many there are in a metre."""
+    said = PngInfo()
+    said.add_text("Software", MAKER)
+    return _saved([page], "PNG", dpi=(DPI, DPI), pnginfo=said)
+
+
+def pdf_bytes(pages: Sequence[Page]) -> bytes:
+    """Pages as one PDF, each as large as its paper."""
+    return _saved(pages, "PDF", resolution=DPI, creator=MAKER, title="Targets of sulcus")
+
+
+def is_page(content: bytes) -> bool:
+    """Whether `png_bytes` or `pdf_bytes` made a file's content."""
+    return MAKER.encode() in content or MAKER.encode("utf-16-be") in content
+
+
+def dictionary_name() -> str:
+    """OpenCV's name of the dictionary that the markers are from."""
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    return next(name for name in names if getattr(cv2.aruco, name) == MARKERS)
+
+
+def listed_targets() -> dict:
+    """All targets as JSON takes them, in millimetres: sizes, markers, and places of corners in the target's frame.
+
+    Corners are the inner ones of the chessboard in OpenCV's order, row by row as the face is seen. The outline is that
+    of the squares, clockwise from the upper left.
+    """
+    targets = (tool_cube(), patient_reference(), calibration_board())
+    return {
+        "format": "sulcus targets 1",
+        "unit": "mm",
+        "dictionary": dictionary_name(),
+        "targets": [{"name": target.name, "faces": [_listed(face) for face in target.faces]} for target in targets],
+        "nominal_tip_mm": {tool_cube().name: [0.0, 0.0, _mm(-TIP)]},
+    }
+
+
+def _listed(face: Face) -> dict:
+    return {
+        "name": face_name(face),
+        "columns": face.columns,
+        "rows": face.rows,
+        "square_mm": _mm(face.square),
+        "marker_mm": _mm(MARKER * face.square),
+        "ids": face.ids.tolist(),
+        "outline_mm": _mm(face.outline),
+        "corners_mm": _mm(face.corners),
+    }
+
+
+def _mm(metres: float | np.ndarray):
+    """Millimetres to the nanometre: a float, or lists of floats."""
+    return (np.round(1e3 * np.asarray(metres), 6) + 0.0).tolist()
+
+
+def _cube_page(target: Target) -> Page:
+    """The three faces so that they fold into a corner of the cube: +z above +x, and +y to the right of it."""
+    along_x, along_y, along_z = target.faces
+    wide, border = _mm(along_x.size[0] + 2.0 * BORDER), _mm(BORDER)
+    left, top = 57.0, 118.0
+    cells = ((along_z, left, top, 1), (along_x, left, top + wide, 0), (along_y, left + wide, top + wide, 0))
+    page, ink = _blank(A4)
+    placed = tuple(Placed(face, x + border, y + border, turns) for face, x, y, turns in cells)
+    for each, (face, x, y, _) in zip(placed, cells, strict=True):
+        _print(page, each)
+        _write(ink, face_name(face), x + 0.8, y + 0.4, TINY)
+    right, below, flap = left + wide, top + wide, 10.0
+    folds = [((left, below), (right, below)), ((right, below), (right, below + wide)), ((right, top), (right, below))]
+    for start, end in folds:
+        _line(ink, start, end, 1.0)
+    tab = [(right, top), (right + flap, top + flap), (right + flap, below - flap), (right, below - 1.0)]
+    around = [*tab, (right, below), (right + wide, below), (right + wide, below + wide), (left, below + wide)]
+    for start, end in zip([*around, (left, top)], [*around[1:], (left, top), (right, top)], strict=True):
+        _line(ink, start, end, 3.0)
+    _write(ink, "tab", right + 2.5, top + 0.5 * wide - 2.0, SMALL)
+    said = (
+        f"A cube of {wide:.0f} mm with three faces along +x, +y and +z; their names stand in their borders.",
+        *_sizes(target),
+        *PRINTING,
+        "Cut along the long dashes. Fold backwards along the short dashes: three faces meet at one corner.",
+        f"Glue the paper onto a stiff cube of {wide:.0f} mm, and the tab behind the upper border of +y.",
+        "Or cut the faces apart and glue each alone. Sides that touch here must touch on the cube,",
+        "and so must the upper side of +y and the side with the tab.",
+        "The shaft leaves the cube through the middle of the face opposite +z, at a right angle.",
+        f"The tool's tip is nominally {_mm(TIP):.0f} mm from the middle of the cube, before calibration.",
+    )
+    return _finished(target, page, ink, placed, said, ((20.0, top), (55.0, top + 2.0 * wide + 20.0)))
+
+
+def _plate_page(target: Target) -> Page:
+    """One face with its border, to be cut out."""
+    (face,) = target.faces
+    wide, border = _mm(face.size[0] + 2.0 * BORDER), _mm(BORDER)
+    left, top = 0.5 * (A4[0] - wide), 110.0
+    page, ink = _blank(A4)
+    placed = Placed(face, left + border, top + border)
+    _print(page, placed)
+    corners = [(left, top), (left + wide, top), (left + wide, top + wide), (left, top + wide)]
+    for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
+        _line(ink, start, end, 3.0)
+    said = (
+        f"A plate of {_mm(face.size[0]):.0f} mm, {wide:.0f} mm with its border.",
+        *_sizes(target),
+        *PRINTING,
+        "Cut along the dashes, and glue the paper onto a stiff, flat plate.",
+        "Fix the plate beside the opening, so that it cannot move against the skull.",
+        "Its frame has its origin in the upper left corner of the squares: x right, y down, z into the plate.",
+    )
+    return _finished(target, page, ink, (placed,), said, ((20.0, top), (55.0, top + wide + 50.0)))
+
+
+def _board_page(target: Target) -> Page:
+    """The board across the page; nothing is cut."""
+    (face,) = target.faces
+    page, ink = _blank((A4[1], A4[0]))
+    placed = Placed(face, 0.5 * (A4[1] - _mm(face.size[0])) + 20.0, 7.0)
+    _print(page, placed)
+    said = (*_sizes(target), *PRINTING)
+    _write(ink, f"sulcus: {target.name}", 15.0, 176.0, LARGE)
+    _write(ink, "Glue it onto a stiff, flat plate: a bent board calibrates wrongly.", 60.5, 178.5, SMALL)
+    _paragraph(ink, said, 15.0, 183.0)
+    _ruler(ink, 15.0, 40.0, down=True)
+    _ruler(ink, 180.0, 192.0, down=False)
+    return Page(target.name, _pixels(page), (placed,))
+
+
+def _finished(
+    target: Target,
+    page: Image.Image,
+    ink: ImageDraw.ImageDraw,
+    placed: tuple[Placed, ...],
+    said: Sequence[str],
+    rulers: tuple[tuple[float, float], tuple[float, float]],
+) -> Page:
+    """An upright page with its title, its text, and the rulers that go down and right from two places."""
+    _write(ink, f"sulcus: {target.name}", 15.0, 14.0, LARGE)
+    _paragraph(ink, said, 15.0, 25.0)
+    _ruler(ink, *rulers[0], down=True)
+    _ruler(ink, *rulers[1], down=False)
+    return Page(target.name, _pixels(page), placed)
+
+
+def _sizes(target: Target) -> tuple[str, str]:
+    """What is on the faces, in words."""
+    face, ids = target.faces[0], np.concatenate([each.ids for each in target.faces])
+    return (
+        f"Each face has {face.columns} x {face.rows} squares of {_mm(face.square):g} mm, "
+        f"and markers of {_mm(MARKER * face.square):g} mm.",
+        f"The markers are numbers {ids.min()} to {ids.max()} of OpenCV's {dictionary_name()}.",
+    )
+
+
+def _blank(size: tuple[float, float]) -> tuple[Image.Image, ImageDraw.ImageDraw]:
+    """White paper of (width, height) [mm], and what draws on it."""
+    page = Image.new("1", (_px(size[0]), _px(size[1])), 1)
+    return page, ImageDraw.Draw(page)
+
+
+def _print(page: Image.Image, placed: Placed) -> None:
+    picture = np.rot90(placed.face.picture(_px(_mm(placed.face.square))), -placed.turns)
+    page.paste(Image.fromarray(np.ascontiguousarray(picture)), (_px(placed.left), _px(placed.top)))
+
+
+def _write(ink: ImageDraw.ImageDraw, text: str, left: float, top: float, size: float) -> None:
+    ink.text((_px(left), _px(top)), text, fill=0, font=ImageFont.load_default(_px(size)))
+
+
+def _paragraph(ink: ImageDraw.ImageDraw, lines: Sequence[str], left: float, top: float) -> None:
+    for number, line in enumerate(lines):
+        _write(ink, line, left, top + LINE * number, SMALL)
+
+
+def _line(ink: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[float, float], dash: float = 0.0) -> None:
+    """A line between places [mm], of dashes and gaps of such a length; 0: without gaps."""
+    start_, end_ = np.array(start), np.array(end)
+    pieces = max(2 * round(np.hypot(*(end_ - start_)) / (2.0 * dash)) + 1, 1) if dash else 1
+    at = start_ + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end_ - start_)
+    for one, other in zip(at[:-1:2], at[1::2], strict=True):
+        ink.line([*map(_px, one), *map(_px, other)], fill=0, width=_px(THIN))
+
+
+def _ruler(ink: ImageDraw.ImageDraw, left: float, top: float, down: bool) -> None:
+    """A ruler with a mark every 10 mm, from a place to the right or down."""
+    along, across = (
+        (np.array([0.0, 1.0]), np.array([1.0, 0.0])) if down else (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    )
+    origin = np.array([left, top])
+    _bar(ink, origin, origin + RULER * along)
+    for at in np.arange(0.0, RULER + 1.0, 10.0):
+        ends = at in (0.0, 0.5 * RULER, RULER)
+        mark = origin + at * along
+        _bar(ink, mark, mark + (5.0 if ends else 3.0) * across)
+        if ends:
+            x, y = mark + (6.0 * across - 1.8 * along if down else 5.5 * across - 1.0 * along)
+            _write(ink, f"{at:.0f}" if at < RULER else f"{at:.0f} mm", x, y, SMALL)
+
+
+def _bar(ink: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> None:
+    """A line along a side of the page, whose middle is exact: `THIN` is a multiple of two pixels."""
+    half = _px(THIN) // 2
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    ink.rectangle([_px(low[0]) - half, _px(low[1]) - half, _px(high[0]) + half - 1, _px(high[1]) + half - 1], fill=0)
+
+
+def _px(mm: float) -> int:
+    return round(mm * PER_MM)
+
+
+def _pixels(page: Image.Image) -> np.ndarray:
+    return np.asarray(page.convert("L"))
+
+
+def _saved(pages: Sequence[Page], form: str, **how: object) -> bytes:
+    """Pages as a file of Pillow's: one picture, or several in one file."""
+    first, *others = [Image.fromarray(page.pixels).convert("1", dither=Image.Dither.NONE) for page in pages]
+    more = {"save_all": True, "append_images": others} if others else {}
+    file = io.BytesIO()
+    first.save(file, form, **more, **how)
+    return file.getvalue()

@@ -1,0 +1,51 @@
+"""`sulcus markers`: the pages to print for tracking, and the list of what is on them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from .outputs import add_force, claimed
+
+KIND, LIST = "a page of `sulcus markers`", "a list of `sulcus markers`"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for markers.pdf, a PNG of each page, and targets.json with all corners [mm]",
+    )
+    add_force(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Returns 0 when all files are written.
+
+    Raises
+    ------
+    InputError
+        Files of those names that `sulcus markers` did not write, or a folder that cannot be written to.
+    """
+    from ar.tracking.pages import DPI, listed_targets, pdf_bytes, png_bytes, printed_pages
+    from sim.runtime.atomic_files import written_whole
+
+    pages = printed_pages()
+    pictures = [claimed(args.out / f"{page.name}.png", ".png", KIND, args.force) for page in pages]
+    book = claimed(args.out / "markers.pdf", ".pdf", KIND, args.force)
+    table = claimed(args.out / "targets.json", ".json", LIST, args.force)
+    contents = {
+        book: pdf_bytes(pages),
+        **{path: png_bytes(page) for path, page in zip(pictures, pages, strict=True)},
+        table: (json.dumps(listed_targets(), indent=1) + "\n").encode(),
+    }
+    for path, content in contents.items():
+        with written_whole(path, path.suffix) as partial:
+            partial.write_bytes(content)
+    print(f"{book}: {len(pages)} pages of A4, also as PNG of {DPI:.0f} dpi; what is on them: {table}")
+    print("Print at 100 %, then measure the rulers: each must be 100 mm long.")
+    return 0
