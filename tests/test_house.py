@@ -57,7 +57,7 @@ OWNERS = {
     "nilearn": {"sim/bodies/template.py"},
     "onnx": {"surrogate/onnx_export/export.py", "surrogate/onnx_export/graph.py"},
     "pyamg": {"sim/linalg/amg.py"},
-    "PIL": {"ar/tracking/pages.py"},
+    "PIL": {"ar/tracking/pages.py", "ar/tracking/pictures.py"},
     "nibabel": {"sim/bodies/intensity.py", "sim/bodies/nifti.py"},
 }
 """Libraries that nobody else imports."""

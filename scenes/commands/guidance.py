@@ -63,7 +63,16 @@ next: sulcus collect press --out press.h5, for depth, segmentation and forces to
 next: read it by h5py; its attributes give units and frames""",
     "markers": """example:
   sulcus markers --out markers
-next: print markers/markers.pdf at 100 %, measure its rulers, and glue the pages onto stiff, flat plates""",
+next: print markers/markers.pdf at 100 %, measure its rulers, glue; then film the board for sulcus calibrate""",
+    "calibrate": """examples:
+  sulcus calibrate board.mp4 --out camera.yaml
+  sulcus calibrate pictures --size 1280x960 --out camera.yaml --json
+  sulcus calibrate --pivot poses.csv
+  sulcus calibrate --hand-eye tool.csv camera.csv
+
+columns of poses: time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw, from the body to its tracker; others are passed over
+
+next: look at the rms and the standard deviations; a good camera has less than 0.3 px""",
     "sensitivity": """example:
   sulcus sensitivity --count 8 --out sensitivity.csv
 next: open the table in a spreadsheet""",

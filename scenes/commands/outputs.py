@@ -203,6 +203,8 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "a record of `sulcus bench all`": _is_record,
     "a picture of sulcus": _is_picture,
     "a film of `sulcus render`": _is_film,
+    "a calibration of `sulcus calibrate`": _begins(b"sulcus calibrate"),
+    "a covariance of `sulcus calibrate`": _begins(b'"format": "sulcus intrinsics'),
     "a page of `sulcus markers`": _is_printed,
     "a list of `sulcus markers`": _begins(b'"format": "sulcus targets'),
 }

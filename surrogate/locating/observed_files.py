@@ -42,8 +42,12 @@ def _points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarra
     return 1e-3 * np.column_stack([columns[name] for name in names])
 
 
-def read_columns(path: str | Path, allowed: set[tuple[str, ...]], empty: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+def read_columns(
+    path: str | Path, allowed: set[tuple[str, ...]], empty: tuple[str, ...] = (), others: bool = False
+) -> dict[str, np.ndarray]:
     """Columns of a table by name, whose header is one of those allowed; in some columns cells may be `empty`: NaN.
+
+    With `others`, further columns are passed over, whatever they hold.
 
     Raises
     ------
@@ -63,21 +67,24 @@ def read_columns(path: str | Path, allowed: set[tuple[str, ...]], empty: tuple[s
     if not rows:
         raise InputError(f"{path}: is empty: give a table with the header {known}.")
     header = tuple(cell.strip().lower() for cell in rows[0])
-    if set(header) not in map(set, allowed) or len(set(header)) < len(header):
+    wanted = set().union(*allowed).intersection(header) if others else set(header)
+    if wanted not in map(set, allowed) or len(set(header)) < len(header):
         raise InputError(
             f"{path}: its first line is {','.join(rows[0])[:80]!r}: give the header {known}, with commas between."
         )
-    values = np.empty((len(rows) - 1, len(header)))
+    names = [name for name in header if name in wanted]
+    values = np.empty((len(rows) - 1, len(names)))
     for number, row in enumerate(rows[1:], start=2):
         try:
+            cells = [cell for name, cell in zip(header, row, strict=True) if name in wanted]
             values[number - 2] = [
                 float(cell) if cell.strip() or name not in empty else np.nan
-                for name, cell in zip(header, row, strict=True)
+                for name, cell in zip(names, cells, strict=True)
             ]
         except ValueError as error:
             raise InputError(
                 f"{path}: row {number} is {','.join(row)[:80]!r}, not {len(header)} numbers: mend or remove it."
             ) from error
-        if not np.isfinite(values[number - 2][[bool(cell.strip()) for cell in row]]).all():
+        if not np.isfinite(values[number - 2][[bool(cell.strip()) for cell in cells]]).all():
             raise InputError(f"{path}: row {number} has a number that is not finite: remove it.")
-    return dict(zip(header, values.T, strict=True))
+    return dict(zip(names, values.T, strict=True))

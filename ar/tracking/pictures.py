@@ -1,0 +1,114 @@
+"""Pictures of one camera, grey, out of a folder or a video that comes from outside."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from ..calibration import LARGEST_SIDE
+
+# Pictures that are looked at, spread evenly over those that there are.
+MOST_PICTURES = 300
+# Pixels of a picture, and bytes of its file.
+MOST_PIXELS, MOST_BYTES = 64_000_000, 256_000_000
+SUFFIXES = (".png", ".jpg", ".jpeg")
+# Of a video that does not say how long it is, one frame in so many.
+STEP = 5
+TOO_LARGE = "has more pixels than a camera gives. Write it smaller."
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """A picture.
+
+    Parameters
+    ----------
+    name
+        Of its file, or the number of its frame.
+    grey
+        (H, W) uint8.
+    """
+
+    name: str
+    grey: np.ndarray
+
+
+def pictures_of(path: Path) -> Iterator[Named]:
+    """At most `MOST_PICTURES` of the PNG and JPEG files of a folder, or of the frames of a video, in their order.
+
+    Raises
+    ------
+    ValueError
+        No such file, a folder without pictures, what is no video or picture, or a picture that is too large.
+    """
+    if path.is_dir():
+        return _in_folder(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file. Give a video, or a folder of PNG or JPEG pictures.")
+    return _in_video(path)
+
+
+def _in_folder(folder: Path) -> Iterator[Named]:
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    if not files:
+        raise ValueError(f"{folder}: holds no pictures. Give a folder of PNG or JPEG pictures.")
+    for index in _spread(len(files)):
+        yield Named(files[index].name, _read(files[index]))
+
+
+def _read(path: Path) -> np.ndarray:
+    """A picture as it was stored: not turned as its file may say, since the lens is not."""
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{path}: is larger than {MOST_BYTES / 1e6:.0f} MB. Remove it, or write it smaller.")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path, formats=("PNG", "JPEG")) as picture:
+                _demand_size(path, *picture.size)
+                if picture.mode.startswith("I"):  # of 16 bits
+                    return (np.asarray(picture) >> 8).astype(np.uint8)
+                return np.asarray(picture.convert("L"))
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        raise ValueError(f"{path}: {TOO_LARGE}") from error
+    except (OSError, SyntaxError) as error:
+        raise ValueError(f"{path}: is no picture that can be read. Remove it, or write it anew.") from error
+
+
+def _in_video(path: Path) -> Iterator[Named]:
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if not video.isOpened() or min(width, height) < 1:
+            raise ValueError(
+                f"{path}: is no video that can be read. Give a video, or a folder of PNG or JPEG pictures."
+            )
+        _demand_size(path, width, height)
+        # What a file says of its length may be wrong: it ends where it ends.
+        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        step = -(-count // MOST_PICTURES) if count > 0 else STEP
+        number = given = 0
+        while given < MOST_PICTURES and video.grab():
+            if number % step == 0:
+                good, frame = video.retrieve()
+                if good:
+                    given += 1
+                    yield Named(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
+            number += 1
+    finally:
+        video.release()
+
+
+def _spread(count: int) -> list[int]:
+    """At most `MOST_PICTURES` of so many numbers, evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, MOST_PICTURES)).round().astype(int)).tolist()
+
+
+def _demand_size(path: Path, width: int, height: int) -> None:
+    if max(width, height) > LARGEST_SIDE or width * height > MOST_PIXELS:
+        raise ValueError(f"{path}: {TOO_LARGE}")

@@ -1,0 +1,214 @@
+"""`sulcus calibrate`: a camera by the board, a tool's tip by pivoting, or how two tracked bodies lie together."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+import numpy as np
+
+from sim.errors import InputError
+
+from .json_line import json_line
+from .outputs import add_force, claimed
+
+KIND, TABLE = "a calibration of `sulcus calibrate`", "a covariance of `sulcus calibrate`"
+MOST_VIEWS = 40
+# The share of the picture that corners should cover.
+WANTED_COVER = 0.6
+# Seconds by which the times of two files of poses may differ.
+SAME_TIME = 1e-3
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "pictures",
+        nargs="?",
+        type=Path,
+        metavar="VIDEO|FOLDER",
+        help="of the board that `sulcus markers` prints: a video, or a folder of PNG or JPEG pictures",
+    )
+    parser.add_argument(
+        "--pivot",
+        type=Path,
+        metavar="POSES.csv",
+        help="find a tool's tip from its poses while the tip stays in one place; columns as below",
+    )
+    parser.add_argument(
+        "--hand-eye",
+        type=Path,
+        nargs=2,
+        metavar=("A.csv", "B.csv"),
+        help="find how body B lies in body A, from poses of both at the same times; columns as below",
+    )
+    parser.add_argument("--out", metavar="K.yaml", help="the camera; K.json beside it holds its covariance")
+    parser.add_argument("--size", metavar="WxH", help="refuse pictures of another size, such as 1280x960")
+    parser.add_argument("--json", action="store_true", help="print one JSON line, with covariances, in place of words")
+    add_force(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Returns 0 when what was asked for is found.
+
+    Raises
+    ------
+    InputError
+        Nothing, or two things to calibrate; files that cannot be read or written; and what determines no answer.
+    """
+    asked = [each for each in (args.pictures, args.pivot, args.hand_eye) if each is not None]
+    if len(asked) != 1:
+        raise InputError("give one of a video or a folder of pictures, --pivot POSES.csv, or --hand-eye A.csv B.csv.")
+    if args.pictures is not None:
+        return _camera(args)
+    if args.out or args.size:
+        raise InputError("--out and --size belong to pictures of the board: leave them out, and take --json.")
+    return _tip(args) if args.pivot is not None else _bodies(args)
+
+
+def _camera(args: argparse.Namespace) -> int:
+    """The camera, from pictures of the board."""
+    from ar.tracking.board_views import chosen
+    from ar.tracking.intrinsics import calibrated
+    from ar.tracking.targets import calibration_board
+
+    from ..script.board_pictures import seen_views
+    from ..script.calibration_file import SUFFIXES, write_calibration
+
+    if not args.out:
+        raise InputError("give --out K.yaml for the camera.")
+    suffix = Path(args.out).suffix
+    out = claimed(args.out, suffix if suffix in SUFFIXES else ".yaml", KIND, args.force, [args.pictures])
+    table = claimed(out.with_suffix(".json"), ".json", TABLE, args.force, [args.pictures])
+    size = None if args.size is None else _size(args.size)
+    face = calibration_board().faces[0]
+    seen = seen_views(args.pictures, face, size)
+    try:
+        found = calibrated(
+            chosen(seen.views, face, MOST_VIEWS), seen.width, seen.height, f"sulcus calibrate: {out.stem}"
+        )
+    except ValueError as error:
+        raise InputError(f"{args.pictures}: {error}") from error
+    report = {
+        "format": "sulcus intrinsics 1",
+        "pictures": str(args.pictures),
+        "looked_at": seen.looked_at,
+        "seen": len(seen.views),
+        "used": found.used,
+        "left_out": found.left_out,
+        "covered": found.covered,
+        **_camera_figures(found),
+    }
+    write_calibration(out, found.calibration)
+    _write_json(table, report)
+    if args.json:
+        print(json_line(report))
+        return 0
+    print(f"{seen.looked_at} pictures, the board in {len(seen.views)}, {len(found.used)} views used")
+    if found.left_out:
+        print(f"left out, for they fit badly: {', '.join(found.left_out)}")
+    print(f"rms {found.rms:.3f} px; corners covered {100.0 * found.covered:.0f} % of the picture")
+    for name, value, deviation in zip(report["parameters"], found.values, found.deviations, strict=True):
+        print(f"{name} {value:.6g} +- {deviation:.2g}{' px' if name[0] in 'fc' else ''}")
+    if found.covered < WANTED_COVER:
+        print(
+            f"Less than {100.0 * WANTED_COVER:.0f} % is covered: the lens is not known well outside. Add views there."
+        )
+    print(f"written: {out}, with its covariance in {table}")
+    return 0
+
+
+def _camera_figures(found) -> dict:
+    from ar.tracking.intrinsics import PARAMETERS
+
+    return {
+        "rms_px": found.rms,
+        "image_width": found.calibration.width,
+        "image_height": found.calibration.height,
+        "parameters": PARAMETERS,
+        "values": found.values.tolist(),
+        "standard_deviations": found.deviations.tolist(),
+        "covariance": found.covariance.tolist(),
+    }
+
+
+def _write_json(path: Path, report: dict) -> None:
+    from sim.runtime.atomic_files import written_whole
+
+    with written_whole(path, ".json") as partial:
+        partial.write_text(json_line(report) + "\n", encoding="utf-8")
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Width and height of a picture, such as 1280x960."""
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if found is None:
+        raise InputError(f"--size {text!r} is no size: give width and height [pixel], such as 1280x960.")
+    return int(found[1]), int(found[2])
+
+
+def _tip(args: argparse.Namespace) -> int:
+    """A tool's tip, from its poses while it pivots."""
+    from ar.tracking.pivot import pivoted
+
+    from ..script.pose_file import read_poses
+
+    _, poses = read_poses(args.pivot)
+    try:
+        found = pivoted(poses)
+    except ValueError as error:
+        raise InputError(f"{args.pivot}: {error}") from error
+    deviations = 1e3 * np.sqrt(np.diag(found.covariance))
+    if args.json:
+        report = {
+            "tip_mm": (1e3 * found.tip).tolist(),
+            "centre_mm": (1e3 * found.centre).tolist(),
+            "covariance_mm2": (1e6 * found.covariance).tolist(),
+            "rms_mm": 1e3 * found.rms,
+            "tilt_degrees": float(np.degrees(found.tilt)),
+        }
+        print(json_line(report))
+        return 0
+    print(f"tip in the tool's frame: {_said(1e3 * found.tip, deviations[:3])} mm")
+    print(f"it stood at {_said(1e3 * found.centre, deviations[3:])} mm")
+    print(
+        f"rms {1e3 * found.rms:.3f} mm; all directions in the tool turned by {np.degrees(found.tilt):.0f} degrees (rms)"
+    )
+    return 0
+
+
+def _said(values: np.ndarray, deviations: np.ndarray) -> str:
+    return ", ".join(f"{value:.3f} +- {off:.2g}" for value, off in zip(values, deviations, strict=True))
+
+
+def _bodies(args: argparse.Namespace) -> int:
+    """How one body lies in another, from poses of both."""
+    from ar.tracking.hand_eye import hand_eye
+
+    from ..script.pose_file import read_poses
+
+    one, other = args.hand_eye
+    (times, first), (again, second) = read_poses(one), read_poses(other)
+    if len(times) != len(again) or np.abs(times - again).max(initial=0.0) > SAME_TIME:
+        raise InputError(f"{one} and {other} have rows at different times: keep those that both have, in one order.")
+    try:
+        found = hand_eye(first, second)
+    except ValueError as error:
+        raise InputError(f"{one} and {other}: {error}") from error
+    if args.json:
+        report = {
+            "rotation": found.X[:3, :3].tolist(),
+            "shift_mm": (1e3 * found.X[:3, 3]).tolist(),
+            "rms_degrees": float(np.degrees(found.turn)),
+            "rms_mm": 1e3 * found.shift,
+            "motions": found.motions,
+            "spread_degrees": float(np.degrees(found.spread)),
+        }
+        print(json_line(report))
+        return 0
+    print("X, where x_A = X x_B [mm]:")
+    for row in found.X[:3] * [1.0, 1.0, 1.0, 1e3]:
+        print("  " + "".join(f"{value:12.6f}" for value in row[:3]) + f"{row[3]:12.3f}")
+    print(f"rms {np.degrees(found.turn):.3f} degrees and {1e3 * found.shift:.3f} mm over {found.motions} motions")
+    return 0

@@ -1,0 +1,187 @@
+"""`sulcus calibrate`: what it finds in files, what it writes, and what it refuses by name."""
+
+import json
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from board_scenes import HEIGHT, WIDTH, K, picture, poses
+from scipy.spatial.transform import Rotation
+
+from ar.screen import write_video
+from scenes.cli import main
+from scenes.script.calibration_file import read_calibration
+from scenes.script.pose_file import read_poses
+from sim.errors import InputError
+
+HEAD = "time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw"
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return [picture(T) for T in poses(10)]
+
+
+@pytest.fixture(scope="module")
+def folder(pictures, tmp_path_factory):
+    """Pictures as PNG and JPEG, one of 16 bits, one without the board, and a file that is none."""
+    folder = tmp_path_factory.mktemp("pictures")
+    for number, grey in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{number:02d}.{'jpg' if number % 2 else 'png'}"), grey)
+    cv2.imwrite(str(folder / "02.png"), pictures[2].astype(np.uint16) * 256)
+    cv2.imwrite(str(folder / "empty.PNG"), np.full_like(pictures[0], 120))
+    (folder / "notes.txt").write_text("no picture")
+    return folder
+
+
+def refused(words, capsys):
+    """The sentence with which a command is refused."""
+    assert main(["calibrate", *map(str, words)]) == 2
+    out, error = capsys.readouterr()
+    (line,) = error.splitlines()
+    assert line.startswith("sulcus calibrate: ") and line.endswith(".") and not out
+    return line
+
+
+def test_a_folder_of_pictures_gives_the_camera_and_its_covariance(folder, tmp_path, capsys):
+    out = tmp_path / "new" / "camera.yaml"
+    assert main(["calibrate", str(folder), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "11 pictures, the board in 10, 10 views used" in said and "rms 0." in said and "\nfx 5" in said
+    found = read_calibration(out)
+    assert found.name == "sulcus calibrate: camera" and (found.width, found.height) == (WIDTH, HEIGHT)
+    np.testing.assert_allclose(found.K, K, atol=2.5)
+    report = json.loads(out.with_suffix(".json").read_text())
+    assert report["parameters"] == ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"]
+    np.testing.assert_allclose(report["values"], [*found.focal, *found.principal, *found.lens.coefficients[:5]])
+    covariance = np.array(report["covariance"])
+    assert covariance.shape == (9, 9) and np.linalg.eigvalsh(covariance).min() > 0.0
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), report["standard_deviations"])
+    # Again: what it wrote itself it replaces, and says what it wrote.
+    assert main(["calibrate", str(folder), "--out", str(out), "--size", f"{WIDTH}x{HEIGHT}", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report == json.loads(out.with_suffix(".json").read_text()) and 0.3 < report["covered"] < 1.0
+    assert len(report["used"]) == 10 and report["left_out"] == [] and report["looked_at"] == 11
+
+
+def test_a_video_gives_the_same_camera(pictures, tmp_path, capsys):
+    film = tmp_path / "board.mp4"
+    write_video(film, (np.repeat(grey[..., None], 3, axis=2) for grey in pictures), 10.0)
+    assert main(["calibrate", str(film), "--out", str(tmp_path / "camera.yml"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["looked_at"] == 10 and report["used"][0] == "frame 0"
+    assert np.abs(read_calibration(tmp_path / "camera.yml").K - K).max() < 6.0
+
+
+def test_pictures_that_are_no_views_of_the_board_are_refused(folder, pictures, tmp_path, capsys):
+    out = ["--out", tmp_path / "camera.yaml"]
+    assert "none.mp4: no such file. Give a video" in refused([tmp_path / "none.mp4", *out], capsys)
+    assert "holds no pictures. Give a folder" in refused([tmp_path, *out], capsys)
+    (tmp_path / "text.mp4").write_text("no film")
+    assert "text.mp4: is no video that can be read. Give" in refused([tmp_path / "text.mp4", *out], capsys)
+    assert "640 x 480 pixels, but 1280 x 960 was stated" in refused([folder, *out, "--size", "1280x960"], capsys)
+    assert "--size '640' is no size" in refused([folder, *out, "--size", "640"], capsys)
+    some = tmp_path / "some"
+    some.mkdir()
+    cv2.imwrite(str(some / "a.png"), np.full_like(pictures[0], 120))
+    assert "the board is in none of 1 pictures: print it" in refused([some, *out], capsys)
+    for number in range(3):
+        cv2.imwrite(str(some / f"b{number}.png"), pictures[number])
+    assert "3 sharp views show the board, but 8 are needed" in refused([some, *out], capsys)
+    cv2.imwrite(str(some / "c.png"), pictures[0][:400])
+    assert "c.png has 640 x 400 pixels, but a.png has 640 x 480" in refused([some, *out], capsys)
+    (some / "c.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
+    assert "c.png: is no picture that can be read. Remove it" in refused([some, *out], capsys)
+    huge = bytearray(cv2.imencode(".png", pictures[0][:8, :8])[1].tobytes())
+    for width, height in ((60_000, 60_000), (12_000, 9_000), (9_000, 8_000), (20_000, 10)):  # what the header says
+        huge[16:24] = width.to_bytes(4, "big") + height.to_bytes(4, "big")
+        huge[29:33] = zlib.crc32(huge[12:29]).to_bytes(4, "big")
+        (some / "c.png").write_bytes(huge)
+        assert "c.png: has more pixels than a camera gives" in refused([some, *out], capsys)
+    assert not list(tmp_path.glob("camera*"))
+
+
+def test_files_of_others_are_kept(folder, tmp_path, capsys):
+    for name in ("camera.yaml", "camera.json"):
+        mine = tmp_path / name
+        mine.write_text("image_width: 3")
+        assert f"{name}: exists, and is not recognised" in refused([folder, "--out", tmp_path / "camera.yaml"], capsys)
+        assert [path.read_text() for path in tmp_path.iterdir()] == ["image_width: 3"]
+        mine.unlink()
+    assert "give a name that ends so" in refused([folder, "--out", tmp_path / "camera.txt"], capsys)
+    assert "give --out K.yaml" in refused([folder], capsys)
+
+
+def test_one_thing_is_calibrated_at_a_time(folder, tmp_path, capsys):
+    assert "give one of" in refused([], capsys)
+    assert "give one of" in refused([folder, "--pivot", tmp_path / "a.csv", "--out", "k.yaml"], capsys)
+    assert "--out and --size belong" in refused(["--pivot", tmp_path / "a.csv", "--out", "k.yaml"], capsys)
+
+
+def write_poses(path, turns, places, head=HEAD, more=""):
+    """A file of poses: turns, and places (n, 3) [m]."""
+    rows = np.column_stack([0.1 * np.arange(len(places)), 1e3 * np.asarray(places), turns.as_quat()])
+    text = "\n".join(",".join(map(repr, row.tolist())) + more for row in rows)
+    path.write_text(f"{head}\n{text}\n")
+    return path
+
+
+def turned(count, seed=0):
+    return Rotation.from_rotvec(0.5 * np.random.default_rng(seed).normal(size=(count, 3)))
+
+
+def test_a_tip_is_found_from_a_file(tmp_path, capsys):
+    turns, tip = turned(20), np.array([0.001, 0.002, -0.15])
+    path = write_poses(tmp_path / "poses.csv", turns, [0.1, 0.2, 0.3] - turns.apply(tip), f"{HEAD},note", ",good")
+    assert main(["calibrate", "--pivot", str(path)]) == 0
+    assert "tip in the tool's frame: 1.000 +-" in capsys.readouterr().out
+    assert main(["calibrate", "--pivot", str(path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(report["tip_mm"], 1e3 * tip, atol=1e-6)
+    np.testing.assert_allclose(report["centre_mm"], [100.0, 200.0, 300.0], atol=1e-6)
+    assert np.shape(report["covariance_mm2"]) == (6, 6) and report["rms_mm"] < 1e-6
+    few = write_poses(tmp_path / "few.csv", turned(5), np.zeros((5, 3)))
+    assert "few.csv: 5 poses are too few" in refused(["--pivot", few], capsys)
+
+
+def test_two_bodies_are_found_from_two_files(tmp_path, capsys):
+    turns, places = turned(20), np.random.default_rng(1).normal(size=(20, 3))
+    X = Rotation.from_rotvec([0.3, -0.5, 0.9])
+    shift = np.array([0.05, -0.02, 0.12])
+    one = write_poses(tmp_path / "one.csv", turns, places)
+    other = write_poses(tmp_path / "other.csv", turns * X, places + turns.apply(shift))
+    assert main(["calibrate", "--hand-eye", str(one), str(other)]) == 0
+    assert "X, where x_A = X x_B" in capsys.readouterr().out
+    assert main(["calibrate", "--hand-eye", str(one), str(other), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(report["rotation"], X.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(report["shift_mm"], 1e3 * shift, atol=1e-6)
+    short = write_poses(tmp_path / "short.csv", turned(19), np.zeros((19, 3)))
+    assert "have rows at different times" in refused(["--hand-eye", one, short], capsys)
+    still = write_poses(tmp_path / "still.csv", turned(1) * Rotation.identity(20), np.zeros((20, 3)))
+    assert "still.csv: 0 motions turn the bodies" in refused(["--hand-eye", one, still], capsys)
+
+
+def test_poses_are_read_in_metres_and_wrong_ones_are_refused(tmp_path):
+    path = write_poses(tmp_path / "poses.csv", turned(3), [[0.1, 0.2, 0.3]] * 3)
+    times, found = read_poses(path)
+    np.testing.assert_allclose(times, [0.0, 0.1, 0.2])
+    np.testing.assert_allclose(found[:, :3, 3], [[0.1, 0.2, 0.3]] * 3)
+    np.testing.assert_allclose(found[:, :3, :3], turned(3).as_matrix(), atol=1e-12)
+    good = "0,1,2,3,0,0,0,1\n"
+    for text, reason in (
+        (f"{HEAD[7:]}\n{good[2:]}", "give the header time_s,x_mm"),
+        (f"{HEAD},qw\n", "give the header"),
+        (f"{HEAD}\n{good}{good}", "row 3 is not later than the row before"),
+        (f"{HEAD}\n{good[:-2]}2\n", "row 2 has a quaternion of length 2: give qx"),
+        (f"{HEAD}\n{good[:-2]}0\n", "row 2 has a quaternion of length 0"),
+        (f"{HEAD}\n0,1,2,nan,0,0,0,1\n", "row 2 has a number that is not finite"),
+        (f"{HEAD}\n0,1,2,1e6,0,0,0,1\n", "row 2 is farther than 100 m"),
+        (f"{HEAD}\n0,1,2\n", "row 2 is '0,1,2', not 8 numbers"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=reason):
+            read_poses(path)
+    with pytest.raises(InputError, match="no such file"):
+        read_poses(tmp_path / "none.csv")
