@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -33,10 +34,13 @@ class Named:
         Of its file, or the number of its frame.
     grey
         (H, W) uint8.
+    time
+        As a video says [s]; of a file 0.
     """
 
     name: str
     grey: np.ndarray
+    time: float = 0.0
 
 
 def pictures_of(path: Path) -> Iterator[Named]:
@@ -48,18 +52,31 @@ def pictures_of(path: Path) -> Iterator[Named]:
         No such file, a folder without pictures, what is no video or picture, or a picture that is too large.
     """
     if path.is_dir():
-        return _in_folder(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file. Give a video, or a folder of PNG or JPEG pictures.")
-    return _in_video(path)
+        files = _files(path)
+        return (Named(files[index].name, _read(files[index])) for index in _spread(len(files)))
+    return islice(_in_video(path, None), MOST_PICTURES)
 
 
-def _in_folder(folder: Path) -> Iterator[Named]:
+def film_of(path: Path, rate: float) -> Iterator[Named]:
+    """Every picture of a video, or of a folder in the order of names, with its time [s].
+
+    Of a folder `rate` is how many there are in a second; a video says its own times.
+
+    Raises
+    ------
+    ValueError
+        As `pictures_of`.
+    """
+    if path.is_dir():
+        return (Named(file.name, _read(file), number / rate) for number, file in enumerate(_files(path)))
+    return _in_video(path, 1)
+
+
+def _files(folder: Path) -> list[Path]:
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     if not files:
         raise ValueError(f"{folder}: holds no pictures. Give a folder of PNG or JPEG pictures.")
-    for index in _spread(len(files)):
-        yield Named(files[index].name, _read(files[index]))
+    return files
 
 
 def _read(path: Path) -> np.ndarray:
@@ -80,7 +97,10 @@ def _read(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: is no picture that can be read. Remove it, or write it anew.") from error
 
 
-def _in_video(path: Path) -> Iterator[Named]:
+def _in_video(path: Path, step: int | None) -> Iterator[Named]:
+    """One in `step` frames of a video; None: so many that there are `MOST_PICTURES`."""
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file. Give a video, or a folder of PNG or JPEG pictures.")
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
@@ -91,14 +111,14 @@ def _in_video(path: Path) -> Iterator[Named]:
         _demand_size(path, width, height)
         # What a file says of its length may be wrong: it ends where it ends.
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        step = -(-count // MOST_PICTURES) if count > 0 else STEP
-        number = given = 0
-        while given < MOST_PICTURES and video.grab():
-            if number % step == 0:
+        every = step or (-(-count // MOST_PICTURES) if count > 0 else STEP)
+        number = 0
+        while video.grab():
+            if number % every == 0:
+                time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
                 good, frame = video.retrieve()
                 if good:
-                    given += 1
-                    yield Named(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
+                    yield Named(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), time)
             number += 1
     finally:
         video.release()

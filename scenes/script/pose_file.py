@@ -1,15 +1,23 @@
-"""Poses of a tracked body as a CSV file: seconds, millimetres and unit quaternions."""
+"""Poses of a tracked body as a CSV file: seconds, millimetres and unit quaternions. Rows where it is lost are blank."""
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from ar.tracking.pose import Pose, Verdict
 from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
 from surrogate.locating.observed_files import read_columns
 
 TIME, PLACE, TURN = "time_s", ("x_mm", "y_mm", "z_mm"), ("qx", "qy", "qz", "qw")
+TIP, TIP_DEVIATION = ("tip_x_mm", "tip_y_mm", "tip_z_mm"), "tip_off_mm"
+COVARIANCE = tuple(f"cov_{row}{column}" for row in range(6) for column in range(row, 6))
 # By how much a quaternion's length may differ from 1, and a place be from the origin [m].
 ROUNDED, FARTHEST = 0.01, 100.0
 
@@ -17,7 +25,8 @@ ROUNDED, FARTHEST = 0.01, 100.0
 def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,) [s] and poses (n, 4, 4) [m] of a file with the columns time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw.
 
-    A pose leads from the body to the tracker: x_tracker = T x_body. Further columns are passed over.
+    A pose leads from the body to the tracker: x_tracker = T x_body. Further columns are passed over, and so are rows
+    without a pose.
 
     Raises
     ------
@@ -25,7 +34,11 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         A file that is missing or no such table, times that do not ascend, quaternions that are not of length 1, or
         places farther than 100 m.
     """
-    columns = read_columns(path, {(TIME, *PLACE, *TURN)}, others=True)
+    columns = read_columns(path, {(TIME, *PLACE, *TURN)}, (*PLACE, *TURN), others=True)
+    blank = np.isnan([columns[name] for name in (*PLACE, *TURN)])
+    odd = np.flatnonzero(blank.any(axis=0) & ~blank.all(axis=0))
+    if len(odd):
+        raise InputError(f"{path}: row {odd[0] + 2} has a part of a pose: fill it in, or leave all of it blank.")
     times = columns[TIME]
     back = np.flatnonzero(np.diff(times) <= 0.0)
     if len(back):
@@ -36,25 +49,56 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(
             f"{path}: row {far[0] + 2} is farther than {FARTHEST:.0f} m from the tracker: give millimetres."
         )
-    turns = np.column_stack([columns[name] for name in TURN])
+    turns, kept = np.column_stack([columns[name] for name in TURN]), ~blank.any(axis=0)
     lengths = np.linalg.norm(turns, axis=1)
-    odd = np.flatnonzero(~(np.abs(lengths - 1.0) <= ROUNDED))
+    odd = np.flatnonzero(kept & ~(np.abs(lengths - 1.0) <= ROUNDED))
     if len(odd):
         raise InputError(
             f"{path}: row {odd[0] + 2} has a quaternion of length {lengths[odd[0]]:.3g}: give qx,qy,qz,qw of length 1."
         )
-    poses = np.tile(np.eye(4), (len(times), 1, 1))
-    poses[:, :3, :3] = _rotations(turns / lengths[:, None])
-    poses[:, :3, 3] = places
-    return times, poses
+    poses = np.tile(np.eye(4), (int(kept.sum()), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(turns[kept]).as_matrix()
+    poses[:, :3, 3] = places[kept]
+    return times[kept], poses
 
 
-def _rotations(turns: np.ndarray) -> np.ndarray:
-    """Rotations (n, 3, 3) of unit quaternions (n, 4), scalars last."""
-    x, y, z, w = turns.T
-    rows = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+@dataclass(frozen=True, eq=False)
+class TrackedRow:
+    """One picture: its time [s], what is known of the body, its pose if that is certain, and what it took [s]."""
+
+    time: float
+    verdict: Verdict
+    pose: Pose | None
+    seconds: float
+
+
+def write_poses(path: Path, rows: Iterable[TrackedRow], tip: np.ndarray) -> None:
+    """Write a row for each picture, which appear all or not at all; those without a pose have blanks.
+
+    `tip` (3,) [m] is the place of the tool's tip in its own frame. The covariance is of x, y, z [mm] and a small turn
+    about the body's origin in the axes of the frame [rad]: the upper triangle, row by row.
+    """
+    with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow((TIME, "state", *PLACE, *TURN, *TIP, TIP_DEVIATION, *COVARIANCE, "corners", "residual_px", "ms"))
+        for row in rows:
+            end = f"{1e3 * row.seconds:.2f}"
+            cells = [""] * (len(PLACE) + len(TURN) + len(TIP) + 1 + len(COVARIANCE) + 2)
+            if row.pose is not None:
+                cells = [*_of_pose(row.pose, tip), str(row.pose.corners), f"{row.pose.residual:.3f}"]
+            table.writerow((f"{row.time:.6f}", row.verdict.name.lower(), *cells, end))
+
+
+def _of_pose(pose: Pose, tip: np.ndarray) -> list[str]:
+    """Place, turn, tip and how far off it is (root mean square), and covariance."""
+    T = pose.T_camera_target
+    at, spread = pose.point(tip)
+    units = np.repeat([1e3, 1.0], 3)
+    covariance = (pose.covariance * units * units[:, None])[np.triu_indices(6)]
+    return [
+        *(f"{each:.4f}" for each in 1e3 * T[:3, 3]),
+        *(f"{each:.8f}" for each in Rotation.from_matrix(T[:3, :3]).as_quat()),
+        *(f"{each:.4f}" for each in 1e3 * at),
+        f"{1e3 * np.sqrt(np.trace(spread)):.4f}",
+        *(f"{each:.4g}" for each in covariance),
     ]
-    return np.moveaxis(np.array(rows), 2, 0)

@@ -1,0 +1,81 @@
+"""`sulcus track`: where the tool and the patient's reference are in every picture of a calibrated camera."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from sim.errors import InputError
+
+from .json_line import json_line
+from .outputs import add_force, claimed
+
+KIND = "poses of `sulcus track`"
+# What may be followed, and in whose frame.
+BODIES, FRAMES = ("tool", "patient", "board"), ("camera", "patient")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "pictures", type=Path, metavar="VIDEO|FOLDER", help="a video, or a folder of PNG or JPEG pictures by name"
+    )
+    parser.add_argument("--camera", required=True, metavar="K.yaml", help="the camera, from `sulcus calibrate`")
+    parser.add_argument("--out", required=True, metavar="POSES.csv", help="a row for each picture")
+    parser.add_argument("--body", choices=BODIES, default="tool", help="what is followed (default %(default)s)")
+    parser.add_argument(
+        "--frame", choices=FRAMES, default="camera",
+        help="whose frame the poses are in; patient: the reference must be seen, too (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tip", type=float, nargs=3, metavar=("X", "Y", "Z"),
+        help="the tool's tip in the frame of its cube [mm], from `sulcus calibrate --pivot` (default 0 0 -150)",
+    )  # fmt: skip
+    parser.add_argument("--rate", type=float, default=30.0, help="pictures a second, of a folder (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+    add_force(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Returns 0 when every picture was looked at; 1 if the body was certain in none.
+
+    Raises
+    ------
+    InputError
+        Pictures or a camera that cannot be read, pictures of another size than the camera's, a rate that is not above
+        0, a body in its own frame.
+    """
+    from ar.tracking.targets import TIP
+
+    from ..script.calibration_file import read_calibration
+    from ..script.followed import followed
+    from ..script.pose_file import write_poses
+
+    if not 0.0 < args.rate < np.inf:
+        raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
+    if args.body == args.frame:
+        raise InputError(f"the {args.body} is at rest in its own frame: choose --frame camera, or another --body.")
+    out = claimed(args.out, ".csv", KIND, args.force, [args.pictures, Path(args.camera)])
+    tip = np.array([0.0, 0.0, -TIP]) if args.tip is None else 1e-3 * np.array(args.tip)
+    if not np.isfinite(tip).all():
+        raise InputError("--tip has a number that is not finite: give three numbers in millimetres.")
+    calibration, begun = read_calibration(args.camera), time.perf_counter()
+    rows = list(followed(args.pictures, calibration, args.body, args.frame, args.rate))
+    seconds = time.perf_counter() - begun
+    write_poses(out, rows, tip)
+    counts = Counter(row.verdict for row in rows)
+    good = sum(row.pose is not None for row in rows)
+    middle = 1e3 * float(np.median([row.seconds for row in rows]))
+    if args.json:
+        said = {verdict.name.lower(): count for verdict, count in counts.items()}
+        print(json_line({"out": str(out), "pictures": len(rows), "states": said, "ms": middle, "seconds": seconds}))
+    else:
+        print(f"{len(rows)} pictures of the {args.body}, {middle:.1f} ms each (median):")
+        for verdict, count in counts.most_common():
+            print(f"  {100.0 * count / len(rows):5.1f} %  {verdict.value}")
+        print(f"written: {out}, in the {args.frame}'s frame")
+    return 0 if good else 1

@@ -1,0 +1,55 @@
+"""One body followed through a film, in the camera's frame or beside the patient's reference."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ar.calibration import Calibration
+from ar.tracking.pictures import film_of
+from ar.tracking.pose import Pose, Verdict
+from ar.tracking.targets import calibration_board, patient_reference, tool_cube
+from ar.tracking.track import Tracked, Tracker
+from sim.errors import InputError
+from sim.runtime.outside_files import read_as
+
+from .pose_file import TrackedRow
+
+GIVE = "Give a video, or a folder of PNG or JPEG pictures."
+
+
+def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
+    """A row for each picture: of `body` (tool, patient, board) in the `frame` of the camera or the patient.
+
+    Raises
+    ------
+    InputError
+        What cannot be read, and pictures of another size than the camera was calibrated at.
+    """
+    targets = {each.name: each for each in (tool_cube(), patient_reference(), calibration_board())}
+    wanted = [body] if frame == "camera" else [body, frame]
+    tracker = Tracker(calibration.camera(np.eye(4)), tuple(targets[name] for name in wanted))
+    state: Tracked | None = None
+    with read_as(path, "a film", GIVE):
+        try:
+            for picture in film_of(path, rate):
+                begun = time.perf_counter()
+                state = tracker.track(picture.grey, state)
+                verdict, pose = _known(state, wanted)
+                yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+    if state is None:
+        raise InputError(f"{path}: holds no picture. {GIVE}")
+
+
+def _known(state: Tracked, wanted: list[str]) -> tuple[Verdict, Pose | None]:
+    """The pose of the first target, beside the second if there are two; else what is known of the one that lacks."""
+    for name in wanted:
+        if name not in state.poses:
+            return state.verdicts[name], None
+    pose, *others = (state.poses[name] for name in wanted)
+    return Verdict.GOOD, pose.seen_from(others[0]) if others else pose
