@@ -8,14 +8,17 @@ import pytest
 from board_scenes import CAMERA, FACE, HEIGHT, WIDTH, K, picture, poses, views
 
 from ar.tracking.board_views import chosen, covered, directions, find_board
+from ar.tracking.detection import Detector
 from ar.tracking.intrinsics import calibrated
+from ar.tracking.targets import calibration_board
 
+BOARD = Detector([calibration_board()])
 TRUTH = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *CAMERA.lens.coefficients[:5]])
 
 
 def test_a_camera_is_found_from_pictures():
     places = poses(12)
-    found = [find_board(FACE, str(number), picture(T)) for number, T in enumerate(places)]
+    found = [find_board(BOARD, str(number), picture(T)) for number, T in enumerate(places)]
     assert all(found) and min(len(view.pixels) for view in found) > 20
     camera = calibrated(found, WIDTH, HEIGHT, "mine")
     assert camera.rms < 0.12 and not camera.left_out and camera.used == tuple(map(str, range(12)))
@@ -103,24 +106,24 @@ def test_sharp_views_that_differ_are_chosen():
 
 def test_blur_is_seen_in_whichever_direction():
     plain = picture(poses(1, tilt=0.0)[0])
-    sharp = find_board(FACE, "sharp", plain).sharpness
+    sharp = find_board(BOARD, "sharp", plain).sharpness
     for size in ((5, 1), (1, 5)):
-        assert find_board(FACE, "moved", cv2.blur(plain, size)).sharpness < 0.6 * sharp
-    dark = find_board(FACE, "dark", (0.3 * plain).astype(np.uint8)).sharpness
+        assert find_board(BOARD, "moved", cv2.blur(plain, size)).sharpness < 0.6 * sharp
+    dark = find_board(BOARD, "dark", (0.3 * plain).astype(np.uint8)).sharpness
     assert dark == pytest.approx(sharp, rel=0.1)
 
 
 def test_the_board_is_not_seen_where_there_is_too_little_of_it():
     plain = picture(poses(12)[3])
-    assert find_board(FACE, "grey", np.full_like(plain, 120)) is None
-    assert find_board(FACE, "noise", np.random.default_rng(0).integers(0, 256, plain.shape, np.uint8)) is None
+    assert find_board(BOARD, "grey", np.full_like(plain, 120)) is None
+    assert find_board(BOARD, "noise", np.random.default_rng(0).integers(0, 256, plain.shape, np.uint8)) is None
     frontal = picture(poses(1, tilt=0.0)[0])
-    whole = find_board(FACE, "whole", frontal)
+    whole = find_board(BOARD, "whole", frontal)
     heights = [whole.pixels[whole.points[:, 1] == row, 1].mean() for row in np.unique(whole.points[:, 1])]
     for rows in (2, 3):  # all below is hidden
         hidden = frontal.copy()
         hidden[int(0.1 * heights[rows - 1] + 0.9 * heights[rows]) :] = 120
-        view = find_board(FACE, "hidden", hidden)
+        view = find_board(BOARD, "hidden", hidden)
         assert view is None if rows == 2 else len(view.pixels) == 3 * (FACE.columns - 1)
 
 

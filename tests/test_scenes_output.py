@@ -9,11 +9,14 @@ import pytest
 from boxes import base_held, top_forces
 from boxes import box as cube
 
+from ar.calibration import Calibration
 from ar.screen import signature, write_film, write_png
+from ar.tracking.pages import Page, listed_targets, png_bytes
 from scenes.bench.figure_record import Origin, record_of, write_record
 from scenes.cli import main
 from scenes.commands.companion_files import demand_no_strangers, remove_data, strangers
 from scenes.commands.outputs import KINDS, claimed, claimed_frames, recognised
+from scenes.script.calibration_file import write_calibration
 from sim.bodies.intensity import Intensity, sidecar, write_intensity
 from sim.bodies.meshfile import read_mesh, write_anatomy, write_mesh
 from sim.errors import InputError
@@ -106,6 +109,12 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
     picture = np.zeros((8, 8, 3), np.uint8)
     write_png(tmp_path / "picture.png", picture)
     write_film(tmp_path / "film.gif", [picture, picture])
+    (tmp_path / "page.png").write_bytes(png_bytes(Page("small", picture[..., 0], ())))
+    (tmp_path / "targets.json").write_text(json.dumps(listed_targets(), indent=1))
+    write_calibration(
+        tmp_path / "camera.yaml", Calibration((9.0, 9.0), (4.0, 4.0), 8, 8, name="sulcus calibrate: camera")
+    )
+    (tmp_path / "camera.json").write_text('{"format": "sulcus intrinsics 1"}')
     (tmp_path / "text.txt").write_text("my own")
     expected = {
         "an anatomy of sulcus": "anatomy.vtu",
@@ -124,6 +133,10 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         "a record of `sulcus bench all`": "bench.json",
         "a picture of sulcus": "picture.png",
         "a film of `sulcus render`": "film.gif",
+        "a page of `sulcus markers`": "page.png",
+        "a list of `sulcus markers`": "targets.json",
+        "a calibration of `sulcus calibrate`": "camera.yaml",
+        "a covariance of `sulcus calibrate`": "camera.json",
     }
     assert set(expected) == set(KINDS)
     for kind, name in expected.items():

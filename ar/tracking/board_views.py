@@ -9,6 +9,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from .detection import Detector
 from .targets import Face
 
 # Corners that a view needs, and how many rows and columns of the board they stand in at least.
@@ -50,25 +51,19 @@ class View:
         return found @ shift
 
 
-def find_board(face: Face, name: str, grey: np.ndarray) -> View | None:
-    """The board in a picture (H, W) uint8; None where too few of its corners are seen, or all in one or two rows.
+def find_board(detector: Detector, name: str, grey: np.ndarray) -> View | None:
+    """The board that a detector is for, in a picture (H, W) uint8.
 
-    Markers are found once, the corners between them are interpolated, then refined.
+    None where too few of its corners are seen, or all in one or two rows.
     """
-    detector = cv2.aruco.ArucoDetector(face.board.getDictionary())
-    corners, ids, _ = detector.detectMarkers(grey)
-    if ids is None:
+    (board,) = detector.targets
+    seen = detector.seen(grey).get(board.name)
+    if seen is None or len(seen.points) < FEWEST_CORNERS:
         return None
-    between = cv2.aruco.CharucoDetector(face.board)
-    found, numbers, *_ = between.detectBoard(grey, markerCorners=corners, markerIds=ids)
-    if found is None or numbers is None:
+    lines = np.rint(seen.points[:, :2] / board.faces[0].square)
+    if min(len(np.unique(lines[:, axis])) for axis in (0, 1)) < FEWEST_LINES:
         return None
-    numbers, pixels = np.asarray(numbers, np.int64).ravel(), np.asarray(found, np.float64).reshape(-1, 2)
-    rows, columns = numbers // (face.columns - 1), numbers % (face.columns - 1)
-    if len(numbers) < FEWEST_CORNERS or min(len(set(rows)), len(set(columns))) < FEWEST_LINES:
-        return None
-    points = np.asarray(face.board.getChessboardCorners(), np.float64).reshape(-1, 3)[numbers]
-    view = View(name, points, pixels, _sharpness(grey, pixels))
+    view = View(name, seen.points, seen.pixels, _sharpness(grey, seen.pixels))
     return view if np.isfinite(view.homography).all() and np.linalg.matrix_rank(view.homography) == 3 else None
 
 

@@ -84,7 +84,7 @@ def face_name(face: Face) -> str:
 def png_bytes(page: Page) -> bytes:
     """A page as PNG of one bit a pixel, which says how many there are in a metre."""
     said = PngInfo()
-    said.add_text("Software", MAKER)
+    said.add_text("Source", MAKER)
     return _saved([page], "PNG", dpi=(DPI, DPI), pnginfo=said)
 
 

@@ -82,11 +82,11 @@ def _camera(args: argparse.Namespace) -> int:
     out = claimed(args.out, suffix if suffix in SUFFIXES else ".yaml", KIND, args.force, [args.pictures])
     table = claimed(out.with_suffix(".json"), ".json", TABLE, args.force, [args.pictures])
     size = None if args.size is None else _size(args.size)
-    face = calibration_board().faces[0]
-    seen = seen_views(args.pictures, face, size)
+    board = calibration_board()
+    seen = seen_views(args.pictures, board, size)
     try:
         found = calibrated(
-            chosen(seen.views, face, MOST_VIEWS), seen.width, seen.height, f"sulcus calibrate: {out.stem}"
+            chosen(seen.views, board.faces[0], MOST_VIEWS), seen.width, seen.height, f"sulcus calibrate: {out.stem}"
         )
     except ValueError as error:
         raise InputError(f"{args.pictures}: {error}") from error

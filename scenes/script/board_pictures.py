@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ar.tracking.board_views import View, find_board
+from ar.tracking.detection import Detector
 from ar.tracking.pictures import pictures_of
-from ar.tracking.targets import Face
+from ar.tracking.targets import Target
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
@@ -34,7 +35,7 @@ class Seen:
     looked_at: int
 
 
-def seen_views(path: Path, face: Face, size: tuple[int, int] | None = None) -> Seen:
+def seen_views(path: Path, board: Target, size: tuple[int, int] | None = None) -> Seen:
     """The board in each picture of a folder or a video; `size` is the width and height that they must have.
 
     Raises
@@ -42,7 +43,7 @@ def seen_views(path: Path, face: Face, size: tuple[int, int] | None = None) -> S
     InputError
         What cannot be read, pictures of different sizes or of another one than stated, or a board that is not seen.
     """
-    views, count, first = [], 0, ""
+    views, count, first, detector = [], 0, "", Detector([board])
     with read_as(path, "pictures of a board", GIVE):
         try:
             for picture in pictures_of(path):
@@ -55,7 +56,7 @@ def seen_views(path: Path, face: Face, size: tuple[int, int] | None = None) -> S
                         "calibrate with pictures of one size, which is that of later use."
                     )
                 size, first = found, first or f"{picture.name} has"
-                view = find_board(face, picture.name, picture.grey)
+                view = find_board(detector, picture.name, picture.grey)
                 views += [] if view is None else [view]
         except ValueError as error:
             raise InputError(str(error)) from error
