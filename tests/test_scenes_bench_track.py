@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from scenes.bench.track_study import AWAY, LEANING, TIP, TURNED, Shot, _between, _pivoted, _row, _spread, trial_camera
+from scenes.bench.track_study import AWAY, LEANING, TIP, TURNED, Shot, between, pivoted, row_of, spread, trial_camera
 from scenes.cli import main
 
 
@@ -17,38 +17,38 @@ def shot(tip, off=None, deviation=1e-3, markers=30.0):
 
 def test_a_row_counts_what_was_found_where_it_could_be_and_what_was_wrong():
     shots = [shot([0, 0, 0], [1e-3, 0, 0]), shot([0, 0, 0], [0, 2e-3, 0]), shot([0, 0, 0]), shot([0, 0, 0], markers=10)]
-    row = _row("trial", shots, lambda certain: np.array([np.linalg.norm(each.found - each.tip) for each in certain]))
+    row = row_of("trial", shots, lambda certain: np.array([np.linalg.norm(each.found - each.tip) for each in certain]))
     assert (row.pictures, row.median, row.most) == (4, pytest.approx(1.5), pytest.approx(2.0))
     assert row.certain == pytest.approx(100.0 * 2 / 3) and row.wrong == 0 and row.held == 100.0
-    bad = _row("trial", [*shots, shot([0, 0, 0], [0, 0, 6e-3])], lambda certain: np.zeros(len(certain)))
+    bad = row_of("trial", [*shots, shot([0, 0, 0], [0, 0, 6e-3])], lambda certain: np.zeros(len(certain)))
     assert bad.wrong == 1 and bad.held == pytest.approx(100.0 * 2 / 3) and bad.milliseconds == pytest.approx(10.0)
 
 
 def test_a_common_error_does_not_count_between_points():
     shots = [shot([k * 0.01, 0.0, 0.0], [1e-3, 1e-3, 0.0]) for k in range(4)]
-    np.testing.assert_allclose(_between(shots), 0.0, atol=1e-12)
+    np.testing.assert_allclose(between(shots), 0.0, atol=1e-12)
     shots.append(shot([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
-    assert _between(shots)[-1] > 0.9e-3
+    assert between(shots)[-1] > 0.9e-3
 
 
 def test_poses_are_those_of_the_protocols():
     """All in view and within the turns; where one point is touched the tip is there in every pose."""
-    camera, spread = trial_camera(), list(_spread(40, 0))
-    middle = np.mean([T[:3, 3] for T in spread], axis=0)
+    camera, evenly = trial_camera(), list(spread(40, 0))
+    middle = np.mean([T[:3, 3] for T in evenly], axis=0)
     np.testing.assert_allclose(middle, [0.0, 0.0, AWAY], atol=0.01)
-    pixels = camera.project(np.array([T[:3, 3] for T in spread]))[0]
+    pixels = camera.project(np.array([T[:3, 3] for T in evenly]))[0]
     assert (pixels > 0.0).all() and (pixels < [camera.width, camera.height]).all()
-    once, often = (np.array(list(_pivoted(20, 0, point))) for point in (np.zeros(3), None))
+    once, often = (np.array(list(pivoted(20, 0, point))) for point in (np.zeros(3), None))
     tips = once[:, :3, :3] @ [0.0, 0.0, -TIP] + once[:, :3, 3]
     np.testing.assert_allclose(tips, tips[:1].repeat(20, axis=0), atol=1e-12)
     assert np.ptp(often[:, :3, :3] @ [0.0, 0.0, -TIP] + often[:, :3, 3], axis=0).min() > 0.03
-    for poses, most in ((spread, TURNED), (once, LEANING)):
-        cosine = [0.5 * (np.trace(T[:3, :3] @ spread_of(poses).T) - 1.0) for T in poses]
+    for poses, most in ((evenly, TURNED), (once, LEANING)):
+        cosine = [0.5 * (np.trace(T[:3, :3] @ first_turn(poses).T) - 1.0) for T in poses]
         assert np.degrees(np.arccos(min(cosine))) <= 2.0 * most
-    assert not np.allclose(list(_spread(5, 1)), spread[:5])
+    assert not np.allclose(list(spread(5, 1)), evenly[:5])
 
 
-def spread_of(poses):
+def first_turn(poses):
     """The first rotation (3, 3)."""
     return poses[0][:3, :3]
 

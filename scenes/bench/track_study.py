@@ -10,8 +10,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, qmc
 
@@ -82,9 +82,9 @@ def trial_camera() -> Camera:
 def studied(count: int, seed: int = 0, progress: Callable[[int, int], object] = lambda done, total: None) -> list[Row]:
     """All protocols, of `count` pictures each."""
     plans = {
-        "FMAC: all six freedoms": (_spread(count, seed), _off),
-        "F2554: one point": (_pivoted(count, seed, np.zeros(3)), _from_mean),
-        "F2554: between points": (_pivoted(count, seed, None), _between),
+        "FMAC: all six freedoms": (spread(count, seed), _off),
+        "F2554: one point": (pivoted(count, seed, np.zeros(3)), _from_mean),
+        "F2554: between points": (pivoted(count, seed, None), between),
     }
     rows, done, total = [], 0, count * len(plans)
     for name, (poses, measure) in plans.items():
@@ -93,11 +93,12 @@ def studied(count: int, seed: int = 0, progress: Callable[[int, int], object] = 
             shots.append(shot)
             done += 1
             progress(done, total)
-        rows.append(_row(name, shots, measure))
+        rows.append(row_of(name, shots, measure))
     return rows
 
 
-def _row(name: str, shots: list[Shot], measure: Callable[[list[Shot]], np.ndarray]) -> Row:
+def row_of(name: str, shots: list[Shot], measure: Callable[[list[Shot]], np.ndarray]) -> Row:
+    """A protocol's row, whose errors (n,) [m] are measured on the certain ones of its pictures."""
     certain = [shot for shot in shots if shot.found is not None]
     fair = [shot for shot in shots if shot.markers >= SEEN]
     error = 1e3 * measure(certain)
@@ -135,14 +136,14 @@ def _from_mean(shots: list[Shot]) -> np.ndarray:
     return np.linalg.norm(found - found.mean(axis=0), axis=1)
 
 
-def _between(shots: list[Shot]) -> np.ndarray:
+def between(shots: list[Shot]) -> np.ndarray:
     """By how much distances between points, each and the next, are off (n - 1,) [m]."""
     found, true = (np.array([getattr(shot, name) for shot in shots]) for name in ("found", "tip"))
     lengths = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in (found, true)]
     return np.abs(lengths[0] - lengths[1])
 
 
-def _spread(count: int, seed: int) -> Iterator[np.ndarray]:
+def spread(count: int, seed: int) -> Iterator[np.ndarray]:
     """Poses (4, 4) of the cube, evenly over its volume and its turns."""
     for u in _numbers(count, seed):
         axis = _direction(u[0], u[1])
@@ -156,7 +157,7 @@ def _numbers(count: int, seed: int) -> np.ndarray:
     return qmc.Halton(6, scramble=False).fast_forward(1 + seed * count).random(count)
 
 
-def _pivoted(count: int, seed: int, point: np.ndarray | None) -> Iterator[np.ndarray]:
+def pivoted(count: int, seed: int, point: np.ndarray | None) -> Iterator[np.ndarray]:
     """Poses (4, 4) of the cube, the tip on a point (3,) [m] beside the middle of the volume, or on one of many."""
     for u in _numbers(count, seed):
         axis = _direction(u[0], u[1])
@@ -189,7 +190,7 @@ def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[Shot]:
     tracker = Tracker(camera, (cube,))
     for T in poses:
         sharp = drawn(np.full((HEIGHT, WIDTH), 120, np.uint8), camera, [(cube, T)])
-        blurred = cv2.GaussianBlur(sharp.astype(np.float32), (0, 0), BLUR)
+        blurred = gaussian_filter(sharp.astype(np.float32), BLUR)
         picture = np.clip(blurred + rng.normal(0.0, NOISE, blurred.shape), 0.0, 255.0).astype(np.uint8)
         first = tracker.track(picture)
         begun = time.perf_counter()

@@ -64,9 +64,8 @@ next: read it by h5py; its attributes give units and frames""",
     "markers": """example:
   sulcus markers --out markers
 next: print markers/markers.pdf at 100 %, measure its rulers, glue; then film the board for sulcus calibrate""",
-    "track": """examples:
-  sulcus track film.mp4 --camera camera.yaml --out tool.csv
-  sulcus track film.mp4 --camera camera.yaml --frame patient --tip 0.1 -0.2 -149.8 --out tool.csv
+    "track": """example:
+  sulcus track film.mp4 --camera camera.yaml --frame patient --out tool.csv
 next: sulcus calibrate --pivot tool.csv, where the film shows the tool pivoting""",
     "calibrate": """examples:
   sulcus calibrate board.mp4 --out camera.yaml
