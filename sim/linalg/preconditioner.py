@@ -60,7 +60,7 @@ def choose_preconditioner(
     Raises
     ------
     InputError
-        A free rest stiffness that is singular.
+        A free rest stiffness that is singular, or a device with too little memory.
     """
     device, constraint = problem.device, problem.constraint
     if constraint.basis().nnz == 0:
@@ -81,7 +81,14 @@ def choose_preconditioner(
             return TwoLevel(coarse, fine, device, name, settings.smoother)
         return _solver(problem.rest_curvature(step), constraint, space.nodes, device, settings)
     except RuntimeError as error:
-        raise InputError(f"the stiffness at rest cannot be factorised ({error}): is every part held?") from error
+        raise InputError(why_none(error, device.name)) from error
+
+
+def why_none(error: RuntimeError, device: str) -> str:
+    """Why there is no factor, as a person reads it: a device without memory, or a body that is not held."""
+    if "allocate" in str(error):
+        return f"{device} has too little free memory for this mesh: end what else runs there, or choose --device cpu."
+    return f"the stiffness at rest cannot be factorised ({error}): is every part held?"
 
 
 def name_of(preconditioner: Preconditioner) -> str:
