@@ -138,6 +138,19 @@ def tool_from_text(text: str) -> BuiltIn:
     raise InputError(f"{text[:60]!r} is no tool: give one of {', '.join(kinds)} with its sizes in metres.")
 
 
+def named(tool: Tool) -> str:
+    """What a person calls a tool, with its sizes in millimetres; one of your own by its `repr`."""
+    match tool:
+        case Ball(radius):
+            return f"a ball of {1e3 * radius:g} mm"
+        case Capsule(radius, length):
+            return f"a rod of {1e3 * radius:g} mm radius and {1e3 * length:g} mm length"
+        case Spatula(width, length, edge):
+            return f"a blade of {1e3 * width:g} x {1e3 * length:g} mm, its edge of {1e3 * edge:g} mm"
+        case _:
+            return repr(tool)
+
+
 def check_tool(effect: str, tool: object) -> None:
     """Refuse what tissue cannot touch.
 

@@ -142,6 +142,14 @@ def test_a_small_locator_has_no_result_of_every_vertex(files, body, tmp_path, ca
     words = ["locate", str(folder / "box.vtu"), str(folder / "vessels.csv"), "--locator", str(path)]
     assert main([*words, "--out", str(tmp_path / "out.vtu")]) == 2
     assert "is small" in capsys.readouterr().err and not (tmp_path / "out.vtu").exists()
+    assert main(words) == 2
+    assert "give --out RESULT.vtu, or --json for the tumour alone" in capsys.readouterr().err
+    assert main([*words, "--json"]) == 0  # for which it is enough
+    alone = json.loads(capsys.readouterr().out)
+    whole = [*words[:-1], str(folder / "box.locator.npz"), "--json", "--out", str(tmp_path / "out.vtu")]
+    assert main(whole) == 0
+    both = json.loads(capsys.readouterr().out)
+    assert alone["out"] is None and alone["centroid_mm"] == pytest.approx(both["centroid_mm"], abs=1e-6)
 
 
 def test_a_locator_is_made_beside_its_anatomy(files, body, tmp_path, capsys, monkeypatch):

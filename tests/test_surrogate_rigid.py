@@ -20,7 +20,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Retracted, Touching
 from sim.material import BRAIN, Material, tissue_to_json
-from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to, foremost, tool_from_text
+from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to, foremost, named, tool_from_text
 from surrogate.data.cortex_patch import barycentric_lattice, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import Basis, core_features, tool_features
@@ -64,6 +64,7 @@ def upright(box: Anatomy, tool: BuiltIn, depth: float) -> Loads:
 def test_a_tool_is_read_from_what_it_prints_as_and_nothing_else_is() -> None:
     for tool in (Ball(7e-3), ROD_OF_4, SMALL_BLADE):
         assert tool_from_text(repr(tool)) == tool
+    assert named(ROD_OF_4) == "a rod of 2 mm radius and 20 mm length"
     for text in ("", "Ball", "Ball(7e-3)", "Ball(radius=x)", "Ball(radius=-1.0)", "print(radius=1.0)"):
         with pytest.raises(InputError, match="is no tool"):
             tool_from_text(text)
@@ -274,7 +275,8 @@ def test_models_of_blades_play_retraction_on_tissue_that_does_not_relax(model: L
     known = replace(model, tool=blade, training={"effects": repr(effects), "tissue": tissue})
     laid = (Elasticity(), Held(), Retraction(blade))
     assert refusal(known, laid) is None
-    assert "the tools here are" in str(refusal(known, (Elasticity(), Held(), Retraction(Spatula(9e-3, 12e-3, 1e-3)))))
+    other = str(refusal(known, (Elasticity(), Held(), Retraction(Spatula(9e-3, 12e-3, 1e-3)))))
+    assert "a blade of 8 x 12 mm, its edge of 1.5 mm, and here is a blade of 9 x 12 mm, its edge of 1 mm" in other
     relaxing = find_scene("retract").effects[0]
     assert "it learned from the tissue" in str(refusal(known, (relaxing, Held(), Retraction(blade))))
 
@@ -286,5 +288,6 @@ def test_the_command_presses_rods_and_blades(tmp_path: Path, box: Anatomy, capsy
     assert main([*wanted, "--capsule", "2", "20"]) == 0
     found = read_dataset(out)
     assert found.tool == ROD_OF_4 and found.good.all()
-    assert main([*wanted, "--blade", "8", "12", "-1.5", "--force"]) == 2
-    assert "Spatula.edge is -0.0015 m: give a positive number" in capsys.readouterr().err
+    for sizes in (["--blade", "8", "12", "-1.5"], ["--capsule", "0.004", "0.02"], ["--ball", "700"]):
+        assert main([*wanted, *sizes, "--force"]) == 2
+        assert f"{' '.join(sizes)}: sizes are in millimetres: give 0.1 to 200 each" in capsys.readouterr().err

@@ -34,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps([asdict(row) for row in rows]))
     else:
+        print("Drawn pictures, not filmed ones: bent paper, motion blur and a wrong calibration come on top.")
         print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
         for row in rows:
             cells = (row.median, row.p95, row.most)

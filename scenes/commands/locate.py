@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.arguments import at_least
+from sim.errors import InputError
 
 from .json_line import json_line
 from .locator import located_by
@@ -42,7 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "rotation in proportion (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--out", required=True, metavar="RESULT.vtu", help="mean motion, deviation and covariance of every vertex"
+        "--out",
+        metavar="RESULT.vtu",
+        help="mean motion, deviation and covariance of every vertex. With --json it may be left out: then a small "
+        "locator is enough",
     )
     parser.add_argument(
         "--locator",
@@ -72,21 +76,28 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.locating.observation import placed
     from surrogate.locating.observed_files import read_observation
 
-    out = claimed(args.out, ".vtu", "a result of `sulcus locate`", args.force, [args.anatomy])
+    if args.out is None and not args.json:
+        raise InputError("give --out RESULT.vtu, or --json for the tumour alone.")
+    out = (
+        None
+        if args.out is None
+        else claimed(args.out, ".vtu", "a result of `sulcus locate`", args.force, [args.anatomy])
+    )
     at_least("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
     observation = replace(read_observation(args.observed, args.tool), rigid=1e-3 * args.rigid)
     placed(anatomy, observation)  # what cannot be placed need not wait for a locator
-    found = located_by(args, anatomy).locate(observation)
-    every = np.arange(len(anatomy.mesh.nodes))
-    covariance = found.covariance(every)
-    fields = {
-        "displacement": found.at(every),
-        "deviation": np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0)),
-        "covariance": covariance[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
-    }
-    write_mesh(out, anatomy.mesh, fields)
+    found = located_by(args, anatomy, small=out is None).locate(observation)
+    if out is not None:
+        every = np.arange(len(anatomy.mesh.nodes))
+        covariance = found.covariance(every)
+        fields = {
+            "displacement": found.at(every),
+            "deviation": np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0)),
+            "covariance": covariance[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
+        }
+        write_mesh(out, anatomy.mesh, fields)
     if observation.rest is not None:
         motions = np.linalg.norm(observation.now - observation.rest, axis=1)
         if 0.0 < np.median(motions) < UNSEEN:
@@ -95,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _numbers(found: Location, points: int, out: Path) -> dict[str, object]:
+def _numbers(found: Location, points: int, out: Path | None) -> dict[str, object]:
     return {
         "centroid_mm": (1e3 * found.centroid).tolist(),
         "covariance_mm2": (1e6 * found.centroid_covariance).tolist(),
@@ -110,11 +121,11 @@ def _numbers(found: Location, points: int, out: Path) -> dict[str, object]:
         "calibrated": found.calibrated,
         "milliseconds": 1e3 * found.seconds,
         "of": "the tumour, as far as the causes that were tried go; not of a model",
-        "out": str(out),
+        "out": None if out is None else str(out),
     }
 
 
-def _sentences(found: Location, out: Path) -> str:
+def _sentences(found: Location, out: Path | None) -> str:
     x, y, z = (round(value, 1) + 0.0 for value in 1e3 * found.centroid)  # a zero has no sign
     sure = "With a probability of 95 %" if found.calibrated else "At a guess"
     lines = [

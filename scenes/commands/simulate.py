@@ -39,6 +39,9 @@ from .interrupt import INTERRUPTED
 from .outputs import add_force, claimed
 from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
 
+# Sizes [mm] of tools that press on a brain.
+SMALLEST_MM, LARGEST_MM = 0.1, 200.0
+
 DATA = "a data set of `sulcus simulate`"
 
 
@@ -148,7 +151,19 @@ def _drawn(args: argparse.Namespace, anatomy: Anatomy) -> tuple[BuiltIn | None, 
 
 
 def _asked(args: argparse.Namespace) -> BuiltIn | None:
-    """The tool that the options name, if they name one."""
+    """The tool that the options name, if they name one.
+
+    Raises
+    ------
+    InputError
+        A size in millimetres that no such tool has.
+    """
+    for name, sizes in (("ball", [args.ball]), ("capsule", args.capsule), ("blade", args.blade)):
+        if sizes and sizes[0] is not None and not all(SMALLEST_MM <= size <= LARGEST_MM for size in sizes):
+            raise InputError(
+                f"--{name} {' '.join(f'{size:g}' for size in sizes)}: sizes are in millimetres: give "
+                f"{SMALLEST_MM:g} to {LARGEST_MM:g} each."
+            )
     if args.ball is not None:
         return Ball(1e-3 * args.ball)
     if args.capsule is not None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, Retracted, Touching
-from sim.tools import Ball, BuiltIn, Capsule, Core, core_of, extent_of
+from sim.tools import Ball, BuiltIn, Capsule, Core, core_of, extent_of, named
 
 from .cortex_patch import Patch
 from .tool_loads import across
@@ -49,7 +49,7 @@ def posed(loads: Loads, tool: BuiltIn) -> np.ndarray:
     if retracted is None:
         names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
         raise InputError(
-            f"the loads have the causes {names}, but this model was trained on the poses of one {tool}: give "
+            f"the loads have the causes {names}, but this model was trained on the poses of {named(tool)}: give "
             "`Touching` of one tool alone, or ask the finite elements."
         )
     pose = retracted.pose.copy()

@@ -23,6 +23,8 @@ SHALLOW, DEEP = 0.05, 0.9
 ROD, BLADE, LEAN = 2.0, 2.0 / 3.0, np.radians(20.0)
 # A tool comes down until it is so near [m], in so many steps at most; triangles are seen at so many rows of points.
 TOUCHES, STEPS, ROWS = 1e-6, 200, 4
+# However small a tool is, the surface is looked at within three times this [m].
+AROUND = 10e-3
 
 
 def tool_of(preset: str) -> Ball:
@@ -112,7 +114,7 @@ def _lowered(
     pose = np.tile(np.eye(4), (len(point), 1, 1, 1))
     pose[:, 0, :3, :3] = rotation
     for here, start, shaft, deep in zip(pose[:, 0], point, rotation[:, :, 2], depth, strict=True):
-        near = surface[tree.query_ball_point(start, 3.0 * reach)]
+        near = surface[tree.query_ball_point(start, 3.0 * max(reach, AROUND))]
         here[:3, 3] = start + reach * shaft
         for _ in range(STEPS):
             room = float(distances_to(tool, here, near).min())

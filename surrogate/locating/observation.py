@@ -24,7 +24,7 @@ NEAR, FAR = 6e-3, 12e-3
 # Farther than this no tip touches the cortex [m], however it has moved; points nearer than that are one place [m].
 FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
 # Motions [m] beyond which no brain goes, and rigid errors that no tracker has.
-LONGEST_MOTION, FARTHEST_OFF = 0.05, 0.02
+LONGEST_MOTION, FARTHEST_OFF = 0.025, 0.02
 # Points of a cloud that are looked at together, and at most.
 TOGETHER, MOST = 128, 400
 
@@ -80,7 +80,7 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
         if motion > LONGEST_MOTION:
             raise InputError(
                 f"half of the points move by more than {1e3 * motion:.0f} mm, which no brain does: give motions in "
-                "millimetres, rather than new positions."
+                "millimetres, rather than centimetres or new positions."
             )
     for number, away in enumerate(_off_surface(anatomy, observation.tips), start=1):
         if away > FARTHEST_TIP:

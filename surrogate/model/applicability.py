@@ -20,7 +20,7 @@ from sim.effects import (
     ToolForce,
 )
 from sim.material import tissue_from_json
-from sim.tools import Tool
+from sim.tools import Tool, named
 
 from .learned import Learned
 
@@ -59,8 +59,8 @@ def refusal(model: Learned, effects: Iterable[Effect], element: str | None = Non
     if model.tool is not None:
         here = tuple(tool for effect in effects for tool in _moved(effect))
         if here != (model.tool,):
-            tools = ", ".join(map(repr, here)) or "none"
-            return f"it was trained on the poses of one {model.tool}, and the tools here are {tools}"
+            tools = " and ".join(map(named, here)) or "none that is moved"
+            return f"it was trained on the poses of {named(model.tool)}, and here is {tools}"
         asked = asked - {Retraction.__name__} | {ToolContact.__name__}
     elif ToolForce.__name__ not in asked:
         others = ", ".join(sorted(asked - trained))
