@@ -42,7 +42,7 @@ theatre = Names(models={"linear"}, best=lambda scene: "linear", usual=lambda sce
 sys.modules["ar.overlay"] = Names(load_kernels=lambda: None)
 sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
 sys.modules["scenes.play.page"] = Names(Demo=Demo)
-scene = Names(name="none", made_of=lambda tissue, element: scene)
+scene = Names(name="none", viewpoint=None, made_of=lambda tissue, element: scene)
 sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",))
 sys.modules["scenes.play.deformers"] = Names(open_theatre=lambda *words: theatre)
 from scenes.commands.demo import add_arguments, run

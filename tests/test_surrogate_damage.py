@@ -188,10 +188,10 @@ class TestFinished:
             with pytest.raises(InputError, match=r"`anatomy/nodes` declares more than such a file holds"):
                 stored(file, "anatomy/nodes", "f", None, 10_000)
 
-    def test_a_ball_has_a_radius(self, whole):
+    def test_a_tool_is_one(self, whole):
         data = read_dataset(whole)
         for radius in ("abc", "-1", "nan"):
-            with pytest.raises(InputError, match="ball has the radius"):
+            with pytest.raises(InputError, match=r"data.h5: 'Ball\(radius=.*' is no tool: .* damaged: simulate anew"):
                 replace(data, provenance={**data.provenance, "ball": radius})
 
     def test_files_of_the_version_before_are_read_if_they_were_finished(self, tmp_path, pretender, loads, whole):

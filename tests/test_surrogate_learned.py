@@ -172,7 +172,7 @@ def test_how_bounds_hold_in_the_discs_left_out_is_reported_of_a_model_that_knows
             error = np.linalg.norm(answer - truth[rows], axis=2).max(axis=1)
             return missed(model, open_patch(data.anatomy), loads.of(Pushed), error)
 
-        near, held, alone = seen(beside), [], []
+        near, held, alone, stated = seen(beside), [], [], trained.models[name].left_out
         for disc in range(len(split.centres)):
             here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
             bounds = bound_by(near, TUMOUR, growth_by(near, seen(others), TUMOUR))
@@ -180,8 +180,8 @@ def test_how_bounds_hold_in_the_discs_left_out_is_reported_of_a_model_that_knows
             answer = bounded.deform(asked, at=data.anatomy.tumour_nodes)
             held.append(seen(here).error <= answer.bound)
             off, moved = np.linalg.norm([answer.displacement - truth[here], truth[here]], axis=3).mean(axis=2)
-            alone.append([off / moved, Guarded(bounded, bounded).unsure(answer)])
-        (share, solved), stated = np.concatenate(alone, axis=1), trained.models[name].left_out
+            alone.append([off / moved, Guarded(bounded, bounded, stated.limit).unsure(answer)])
+        share, solved = np.concatenate(alone, axis=1)
         assert (stated.mean, stated.solved) == pytest.approx((share.mean(), solved.mean())) and solved.any()
         assert stated.guarded == pytest.approx((share * (1.0 - solved)).mean())
         found, held = trained.left_out[name], np.concatenate(held, axis=1)

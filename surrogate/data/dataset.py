@@ -99,7 +99,10 @@ class Dataset:
                 f"{self.path}: {numbered(wrong)} of `answers` converged, but to a residual that is no number: it is "
                 "damaged. Simulate anew."
             )
-        _ = self.tool  # a text that is none is refused at once
+        try:
+            _ = self.tool
+        except InputError as error:
+            raise InputError(f"{self.path}: {error} It is damaged: simulate anew.") from error
 
     @cached_property
     def tool(self) -> BuiltIn | None:
