@@ -42,16 +42,6 @@ def test_nothing_of_held_out_loads_reaches_an_envelope(trained, scored, data):
     assert all(np.array_equal(value, vars(again)[name]) for name, value in vars(scored.envelope).items())
 
 
-def test_few_loads_state_how_far_a_model_is_off_by_the_bound_that_all_have(trained):
-    """Where none are calibrated there, that of the worst vertex stands for each load."""
-    model = trained.models["linear"]
-    known = model.left_out
-    assert known is not None and not trained.left_out
-    assert known.mean == pytest.approx(trained.scores[0].mean_percent / 100.0, rel=1e-6)
-    assert known.guarded <= 0.01
-    assert (known.limit < model.bound and known.solved == 1.0) or known.limit >= model.bound
-
-
 def test_unit_responses_inside_the_discs_are_given_and_counted(trained, data, box):
     """Linear tissue is known everywhere: the table answers weak loads in the discs exactly, and the row says so."""
     inside = int(trained.split.covers(open_patch(box).points).sum())

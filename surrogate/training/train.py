@@ -215,10 +215,6 @@ def train(
                 alone = left_out_of(distance, motion[split.test], bound[0][0], far[0].extrapolated)
                 models[name] = replace(models[name], left_out=alone)
                 promised = bound[-1] if exerted is not None else None
-        else:  # who has no bound for each load has one for all
-            whole = np.full(len(test), models[name].bound)
-            alone = left_out_of(distance, motion[split.test], whole, far[0].extrapolated)
-            models[name] = replace(models[name], left_out=alone)
         if exerted is not None:
             force[name] = force_score(far[-1].error, exerted[split.test], promised)
         if apart.any():
