@@ -64,6 +64,11 @@ class Camera:
         return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
 
     @property
+    def distortion(self) -> np.ndarray:
+        """(8,) coefficients of the lens in OpenCV's order: zeros without one."""
+        return np.zeros(8) if self.lens is None else self.lens.coefficients
+
+    @property
     def vertical_fov(self) -> float:
         """Angle between the upper and the lower border [rad]; exact without lens, if the principal point is centred."""
         return float(2.0 * np.arctan(0.5 * self.height / self.K[1, 1]))
@@ -219,6 +224,5 @@ def project_cv2(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Pixels (N, 2) of world points (N, 3) [m] by `cv2.projectPoints`: the independent check on `Camera.project`."""
     rotation = cv2.Rodrigues(camera.T_camera_world[:3, :3])[0]
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 1, 3)
-    coefficients = None if camera.lens is None else camera.lens.coefficients
-    pixels, _ = cv2.projectPoints(points, rotation, camera.T_camera_world[:3, 3], camera.K, coefficients)
+    pixels, _ = cv2.projectPoints(points, rotation, camera.T_camera_world[:3, 3], camera.K, camera.distortion)
     return pixels.reshape(-1, 2)

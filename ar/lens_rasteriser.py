@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from .parallel import forward_kernel
-from .triangle import beyond, edge
+from .triangle import box_of, edge, first_row
 from .unbent import Unbent
 
 
@@ -57,11 +57,7 @@ def draw_through_lens(
     volume = wp.dot(normal, a)
     if volume == wp.float64(0.0):
         return
-    far = wp.float64(1.0e30)
-    box = wp.vec4d(far, far, -far, -far)
-    box = beyond(a, b, near, box)
-    box = beyond(b, c, near, box)
-    box = beyond(c, a, near, box)
+    box = box_of(a, b, c, near)
     held = box_through_lens(picture, wp.vec2d(box[0], box[1]), wp.vec2d(box[2], box[3]), through)
     first = wp.max(held[1], begin)
     stop = wp.min(held[3] + 1, end)
@@ -72,11 +68,7 @@ def draw_through_lens(
     ea = edge(b, c, t[1], t[2]) * side
     eb = edge(c, a, t[2], t[0]) * side
     ec = edge(a, b, t[0], t[1]) * side
-    # The first row from `first` on that is this part's.
-    ahead = (begin + part - first) % parts
-    if ahead < 0:
-        ahead += parts
-    for row in range(first + ahead, stop, parts):
+    for row in range(first_row(first, begin, part, parts), stop, parts):
         for column in range(held[0], held[2] + 1):
             at = through.pixels[picture, row, column]
             p = wp.vec3d(at[0], at[1], wp.float64(1.0))

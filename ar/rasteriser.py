@@ -21,7 +21,7 @@ import warp as wp
 from .camera import Camera
 from .lens_rasteriser import keep_nearest_through_lens
 from .parallel import forward_kernel, in_bands, launch_in_bands, load, run_length
-from .triangle import beyond, edge, weights_of
+from .triangle import box_of, edge, first_row, weights_of
 from .unbent import Unbent, pixel_at, unbent
 
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
@@ -235,11 +235,7 @@ def draw_triangle(
     volume = wp.dot(normal, a)
     if volume == wp.float64(0.0):
         return
-    far = wp.float64(1.0e30)
-    box = wp.vec4d(far, far, -far, -far)
-    box = beyond(a, b, near, box)
-    box = beyond(b, c, near, box)
-    box = beyond(c, a, near, box)
+    box = box_of(a, b, c, near)
     # Rounding must not push a pixel out that lies on the box.
     slack = wp.vec2d(wp.float64(1.0e-6))
     low = wp.vec2d(box[0], box[1]) - slack
@@ -255,12 +251,7 @@ def draw_triangle(
     ea = edge(b, c, t[1], t[2]) * side
     eb = edge(c, a, t[2], t[0]) * side
     ec = edge(a, b, t[0], t[1]) * side
-    # The first row from `first` on that is this part's.
-    ahead = (begin + part - first) % parts
-    if ahead < 0:
-        ahead += parts
-    first += ahead
-    for row in range(first, stop, parts):
+    for row in range(first_row(first, begin, part, parts), stop, parts):
         v = wp.float64(row)
         ra = ea[1] * v + ea[2]
         rb = eb[1] * v + eb[2]

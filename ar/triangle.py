@@ -45,3 +45,22 @@ def beyond(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d) -> wp.vec4
     if (a[2] < near) != (b[2] < near):
         box = around(a + (b - a) * ((near - a[2]) / (b[2] - a[2])), box)
     return box
+
+
+@wp.func
+def box_of(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, near: wp.float64) -> wp.vec4d:
+    """The pixel box (u min, v min, u max, v max) of the part of a triangle that lies beyond the near plane."""
+    far = wp.float64(1.0e30)
+    box = wp.vec4d(far, far, -far, -far)
+    box = beyond(a, b, near, box)
+    box = beyond(b, c, near, box)
+    return beyond(c, a, near, box)
+
+
+@wp.func
+def first_row(first: wp.int32, begin: wp.int32, part: wp.int32, parts: wp.int32) -> wp.int32:
+    """The first row from `first` on that is a part's, which has every `parts`-th from `begin` on."""
+    ahead = (begin + part - first) % parts
+    if ahead < 0:
+        ahead += parts
+    return first + ahead

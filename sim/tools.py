@@ -138,6 +138,19 @@ def tool_from_text(text: str) -> BuiltIn:
     raise InputError(f"{text[:60]!r} is no tool: give one of {', '.join(kinds)} with its sizes in metres.")
 
 
+def stated_tool(text: str | None, ball: object) -> BuiltIn | None:
+    """The tool that a file states by its `repr`, or one of an earlier version by a `ball`'s radius [m]; None: neither.
+
+    Raises
+    ------
+    InputError
+        As `tool_from_text`.
+    """
+    if text is None and ball is None:
+        return None
+    return tool_from_text(f"Ball(radius={ball})" if text is None else text)
+
+
 def named(tool: Tool) -> str:
     """What a person calls a tool, with its sizes in millimetres; one of your own by its `repr`."""
     match tool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
+from ..camera import Camera
 from .targets import MARKERS, Target
 
 Window = tuple[slice, slice]
@@ -98,6 +99,23 @@ class Detector:
                 pixels.append(np.asarray(found, np.float64).reshape(-1, 2))
                 on.append(np.full(len(rows), number))
         return Corners(np.concatenate(points), np.concatenate(pixels), np.concatenate(on))
+
+
+def window_round(camera: Camera, points: np.ndarray, share: float, least: float) -> Window | None:
+    """Rows and columns round points (n, 3) [m] in a camera's frame; None: they are out of view.
+
+    It goes beyond them by a `share` of what they cover, and by `least` pixels at least. The camera is at the world's
+    origin.
+    """
+    pixels = camera.project(points)[0]
+    pixels = pixels[~np.isnan(pixels).any(axis=1)]
+    if not len(pixels):
+        return None
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    wide, limits = np.maximum(share * (high - low), least), [camera.width, camera.height]
+    left, top = np.clip(low - wide, 0, limits).astype(int).tolist()
+    right, bottom = np.clip(high + wide + 1.0, 0, limits).astype(int).tolist()
+    return None if left >= right or top >= bottom else (slice(top, bottom), slice(left, right))
 
 
 def _markers(

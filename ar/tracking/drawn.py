@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from ..camera import Camera
+from .detection import window_round
 from .targets import BORDER, Face, Target
 
 # Texture pixels along a square, and how many samples of the picture lie along a pixel.
 TEXTURE, SAMPLES = 48, 4
+# Pixels round a face that are looked at: its edges are straight without a lens only.
+MARGIN = 3.0
 # What paper reflects: black ink, white paper.
 INK, PAPER = 25.0, 225.0
 
@@ -30,23 +34,25 @@ def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, n
     targets
         With T_world_target (4, 4) each.
     """
-    out, nearest = np.repeat(picture[None].astype(np.float32), SAMPLES**2, axis=0), {}
+    own = replace(camera, T_camera_world=np.eye(4))
+    out = np.repeat(picture[None].astype(np.float32), SAMPLES**2, axis=0)
+    nearest = np.full(out.shape, np.inf)
     for target, T_world_target in targets:
         for face in target.faces:
             T = camera.T_camera_world @ T_world_target @ face.T_target_face
-            where = _window(camera, face, T) if T[:3, 2] @ T[:3, 3] > 0.0 else None  # not if seen from behind
-            if where is None:
+            where = window_round(own, _edge(face) @ T[:3, :3].T + T[:3, 3], 0.0, MARGIN)
+            if where is None or T[:3, 2] @ T[:3, 3] <= 0.0:  # or seen from behind
                 continue
             printed = face.picture(TEXTURE)
             for sample, shift in enumerate(_shifts()):
-                deep = nearest.setdefault(sample, np.full(picture.shape, np.inf))
                 columns, rows = (np.arange(part.start, part.stop) for part in where[::-1])
-                rays = _rays(camera, np.stack(np.meshgrid(columns + shift[0], rows + shift[1]), axis=-1))
+                pixels = np.stack(np.meshgrid(columns + shift[0], rows + shift[1]), axis=-1)
+                rays = own.unproject(pixels, np.ones(pixels.shape[:-1]))
                 depth = (T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2])
                 grey = _grey(face, printed, (rays * depth[..., None] - T[:3, 3]) @ T[:3, :2])
-                front = ~np.isnan(grey) & (depth > 0.0) & (depth < deep[where])
+                front = ~np.isnan(grey) & (depth > 0.0) & (depth < nearest[sample][where])
                 out[sample][where] = np.where(front, grey, out[sample][where])
-                deep[where] = np.where(front, depth, deep[where])
+                nearest[sample][where] = np.where(front, depth, nearest[sample][where])
     return np.clip(np.rint(out.mean(axis=0)), 0.0, 255.0).astype(np.uint8)
 
 
@@ -56,29 +62,11 @@ def _shifts() -> np.ndarray:
     return np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
 
 
-def _rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Directions (..., 3) in the camera frame of pixels (..., 2), at depth 1."""
-    world = camera.unproject(pixels, np.ones(pixels.shape[:-1]))
-    return camera.in_frame(world)
-
-
-def _window(camera: Camera, face: Face, T_camera_face: np.ndarray) -> tuple[slice, slice] | None:
-    """Rows and columns that a face may cover, a border of pixels round it; None: it is out of view."""
-    corners = (np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * (0.5 * face.size + BORDER)) + (
-        0.5 * face.size
-    )
+def _edge(face: Face) -> np.ndarray:
+    """Places (n, 3) [m] along the edge of a face's border, in its own frame."""
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * (0.5 * face.size + BORDER)
     edge = np.concatenate([np.linspace(a, b, 9) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
-    points = np.column_stack([edge, np.zeros(len(edge))]) @ T_camera_face[:3, :3].T + T_camera_face[:3, 3]
-    world = (points - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
-    seen = camera.project(world)[0]
-    seen = seen[~np.isnan(seen).any(axis=1)]
-    if not len(seen):
-        return None
-    low = np.floor(seen.min(axis=0)).astype(int) - 2
-    high = np.ceil(seen.max(axis=0)).astype(int) + 3
-    left, top = np.clip(low, 0, [camera.width, camera.height])
-    right, bottom = np.clip(high, 0, [camera.width, camera.height])
-    return None if left >= right or top >= bottom else (slice(top, bottom), slice(left, right))
+    return np.column_stack([edge + 0.5 * face.size, np.zeros(len(edge))])
 
 
 def _grey(face: Face, printed: np.ndarray, on_face: np.ndarray) -> np.ndarray:

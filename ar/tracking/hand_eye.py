@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .rigid import angles_of, cross_matrices
+
 FEWEST_POSES = 4
 # Motions turn by such angles [rad]: of smaller ones the axis is unsure, and near half a turn its sign is.
 LEAST_TURN, MOST_TURN = np.radians(8.0), np.radians(170.0)
@@ -68,8 +70,7 @@ def hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
         )
     X = _solved(a, a_dual, b, b_dual)
     left, right = A @ X, X @ B
-    cosines = 0.5 * (np.einsum("nij,nij->n", left[:, :3, :3], right[:, :3, :3]) - 1.0)
-    turns = np.arccos(np.clip(cosines, -1.0, 1.0))
+    turns = angles_of(left[:, :3, :3] @ right[:, :3, :3].transpose(0, 2, 1))
     shifts = np.linalg.norm(left[:, :3, 3] - right[:, :3, 3], axis=1)
     return HandEye(X, _rms(turns), _rms(shifts), len(A), spread)
 
@@ -79,7 +80,7 @@ def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndar
     kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), MOST_POSES)).round().astype(int))
     start, end = np.triu_indices(len(kept), 1)
     A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
-    angles = np.array([np.arccos(np.clip(0.5 * (np.trace(M[:, :3, :3], 0, 1, 2) - 1.0), -1.0, 1.0)) for M in (A, B)])
+    angles = np.array([angles_of(M[:, :3, :3]) for M in (A, B)])
     good = np.flatnonzero((angles.min(axis=0) > LEAST_TURN) & (angles.max(axis=0) < MOST_TURN))
     if len(good) < FEWEST_POSES:
         raise ValueError(
@@ -116,9 +117,9 @@ def _solved(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray
     rows = np.zeros((len(a), 6, 8))
     for place, one, other in ((0, a, b), (3, a_dual, b_dual)):
         rows[:, place : place + 3, 0] = (one - other)[:, 1:]
-        rows[:, place : place + 3, 1:4] = _cross((one + other)[:, 1:])
+        rows[:, place : place + 3, 1:4] = cross_matrices((one + other)[:, 1:])
     rows[:, 3:, 4] = (a - b)[:, 1:]
-    rows[:, 3:, 5:] = _cross((a + b)[:, 1:])
+    rows[:, 3:, 5:] = cross_matrices((a + b)[:, 1:])
     one, other = np.linalg.svd(rows.reshape(-1, 8), full_matrices=False)[2][-2:]
     u, v, w, z = one[:4], one[4:], other[:4], other[4:]
     # (k u + m w, k v + m z) is a unit dual quaternion: its parts are at right angles, and the real one has length 1.
@@ -134,16 +135,9 @@ def _solved(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray
     real, dual = reals[best] / lengths[best], duals[best] / lengths[best]
     X = np.eye(4)
     x, y = real[0], real[1:]
-    X[:3, :3] = (x * x - y @ y) * np.eye(3) + 2.0 * np.outer(y, y) + 2.0 * x * _cross(y[None])[0]
+    X[:3, :3] = (x * x - y @ y) * np.eye(3) + 2.0 * np.outer(y, y) + 2.0 * x * cross_matrices(y[None])[0]
     X[:3, 3] = 2.0 * _product(dual, real * [1.0, -1.0, -1.0, -1.0])[1:]
     return X
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """Matrices (n, 3, 3) of the cross products by vectors (n, 3)."""
-    x, y, z = vectors.T
-    nothing = np.zeros_like(x)
-    return np.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing], axis=1).reshape(-1, 3, 3)
 
 
 def _rms(values: np.ndarray) -> float:

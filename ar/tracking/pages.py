@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 
-from .targets import BORDER, MARKER, MARKERS, TIP, Face, Target, calibration_board, patient_reference, tool_cube
+from .targets import BORDER, MARKER, MARKERS, TIP, Face, Target, all_targets, tool_cube
 
 # Pixels in a millimetre: each module of each marker takes a whole number of them.
 PER_MM = 20
@@ -71,7 +71,8 @@ class Page:
 
 def printed_pages() -> tuple[Page, ...]:
     """The pages of the tool's cube, the patient's reference and the calibration board."""
-    return _cube_page(tool_cube()), _plate_page(patient_reference()), _board_page(calibration_board())
+    cube, plate, board = all_targets()
+    return _cube_page(cube), _plate_page(plate), _board_page(board)
 
 
 def face_name(face: Face) -> str:
@@ -110,12 +111,13 @@ def listed_targets() -> dict:
     Corners are the inner ones of the chessboard in OpenCV's order, row by row as the face is seen. The outline is that
     of the squares, clockwise from the upper left.
     """
-    targets = (tool_cube(), patient_reference(), calibration_board())
     return {
         "format": "sulcus targets 1",
         "unit": "mm",
         "dictionary": dictionary_name(),
-        "targets": [{"name": target.name, "faces": [_listed(face) for face in target.faces]} for target in targets],
+        "targets": [
+            {"name": target.name, "faces": [_listed(face) for face in target.faces]} for target in all_targets()
+        ],
         "nominal_tip_mm": {tool_cube().name: [0.0, 0.0, _mm(-TIP)]},
     }
 

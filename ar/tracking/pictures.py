@@ -21,6 +21,7 @@ MOST_PIXELS, MOST_BYTES = 64_000_000, 256_000_000
 SUFFIXES = (".png", ".jpg", ".jpeg")
 # Of a video that does not say how long it is, one frame in so many.
 STEP = 5
+GIVE = "Give a video, or a folder of PNG or JPEG pictures."
 TOO_LARGE = "has more pixels than a camera gives. Write it smaller."
 
 
@@ -100,14 +101,12 @@ def _read(path: Path) -> np.ndarray:
 def _in_video(path: Path, step: int | None) -> Iterator[Named]:
     """One in `step` frames of a video; None: so many that there are `MOST_PICTURES`."""
     if not path.is_file():
-        raise ValueError(f"{path}: no such file. Give a video, or a folder of PNG or JPEG pictures.")
+        raise ValueError(f"{path}: no such file. {GIVE}")
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not video.isOpened() or min(width, height) < 1:
-            raise ValueError(
-                f"{path}: is no video that can be read. Give a video, or a folder of PNG or JPEG pictures."
-            )
+            raise ValueError(f"{path}: is no video that can be read. {GIVE}")
         _demand_size(path, width, height)
         # What a file says of its length may be wrong: it ends where it ends.
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))

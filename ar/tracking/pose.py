@@ -10,6 +10,7 @@ import numpy as np
 
 from ..camera import Camera
 from .detection import Corners
+from .rigid import angles_of, cross_matrices
 from .targets import Target
 
 # Corners that a pose needs at least; residuals are believed to be no smaller, and no larger, than these [pixel].
@@ -55,7 +56,7 @@ class Pose:
         into, away = other.T_camera_target[:3, :3].T, self.T_camera_target[:3, 3] - other.T_camera_target[:3, 3]
         none = np.zeros((3, 3))
         own = np.block([[into, none], [none, into]])
-        theirs = np.block([[-into, into @ _cross(away)], [none, -into]])
+        theirs = np.block([[-into, into @ cross_matrices(away)], [none, -into]])
         covariance = own @ self.covariance @ own.T + theirs @ other.covariance @ theirs.T
         T = np.linalg.inv(other.T_camera_target) @ self.T_camera_target
         return Pose(T, covariance, max(self.residual, other.residual), min(self.corners, other.corners))
@@ -63,7 +64,7 @@ class Pose:
     def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A place of the target (3,) [m] in the camera's frame (3,) [m], and its covariance (3, 3) [m^2]."""
         arm = self.T_camera_target[:3, :3] @ place
-        slope = np.hstack([np.eye(3), -_cross(arm)])
+        slope = np.hstack([np.eye(3), -cross_matrices(arm)])
         return arm + self.T_camera_target[:3, 3], slope @ self.covariance @ slope.T
 
 
@@ -107,7 +108,6 @@ def pose_of(
 
 def _fits(camera: Camera, target: Target, corners: Corners) -> list[tuple[np.ndarray, float]]:
     """Poses (4, 4) that may be, and their squared distances of all corners [pixel^2]."""
-    bent = np.zeros(8) if camera.lens is None else camera.lens.coefficients
     out = []
     for number in np.unique(corners.face):
         rows = corners.face == number
@@ -116,20 +116,20 @@ def _fits(camera: Camera, target: Target, corners: Corners) -> list[tuple[np.nda
         T_face = target.faces[number].T_target_face
         flat = (corners.points[rows] - T_face[:3, 3]) @ T_face[:3, :3]
         flat[:, 2] = 0.0
-        found = cv2.solvePnPGeneric(flat, corners.pixels[rows], camera.K, bent, flags=cv2.SOLVEPNP_IPPE)
+        found = cv2.solvePnPGeneric(flat, corners.pixels[rows], camera.K, camera.distortion, flags=cv2.SOLVEPNP_IPPE)
         for turn, shift in zip(found[1], found[2], strict=True):
             T = _rigid(turn, shift) @ np.linalg.inv(T_face)
             if np.isfinite(T).all():
-                fit = _refined(camera, bent, corners, T)
+                fit = _refined(camera, corners, T)
                 out += [fit] if _faces_camera(target, corners, fit[0]) else []
     return out
 
 
-def _refined(camera: Camera, bent: np.ndarray, corners: Corners, T: np.ndarray) -> tuple[np.ndarray, float]:
+def _refined(camera: Camera, corners: Corners, T: np.ndarray) -> tuple[np.ndarray, float]:
     """A pose fitted to all corners from T (4, 4) on, and the sum of squares [pixel^2]."""
     turn, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3].reshape(3, 1).copy()
-    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, camera.K, bent, turn, shift)
-    pixels = cv2.projectPoints(corners.points, turn, shift, camera.K, bent)[0].reshape(-1, 2)
+    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, camera.K, camera.distortion, turn, shift)
+    pixels = cv2.projectPoints(corners.points, turn, shift, camera.K, camera.distortion)[0].reshape(-1, 2)
     return _rigid(turn, shift), float(np.square(pixels - corners.pixels).sum())
 
 
@@ -145,10 +145,9 @@ def _faces_camera(target: Target, corners: Corners, T: np.ndarray) -> bool:
 def _inverse_normal(camera: Camera, T: np.ndarray, points: np.ndarray) -> np.ndarray:
     """The covariance (6, 6) that corners of unit variance give."""
     arm = points @ T[:3, :3].T
-    bent = np.zeros(8) if camera.lens is None else camera.lens.coefficients
-    slopes = cv2.projectPoints(arm + T[:3, 3], np.zeros(3), np.zeros(3), camera.K, bent)[1][:, 3:6]
+    slopes = cv2.projectPoints(arm + T[:3, 3], np.zeros(3), np.zeros(3), camera.K, camera.distortion)[1][:, 3:6]
     by_place = slopes.reshape(-1, 2, 3)
-    J = np.concatenate([by_place, -by_place @ _cross(arm)], axis=2).reshape(-1, 6)
+    J = np.concatenate([by_place, -by_place @ cross_matrices(arm)], axis=2).reshape(-1, 6)
     return np.linalg.inv(J.T @ J)
 
 
@@ -158,17 +157,9 @@ def _rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return T
 
 
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """Matrices (..., 3, 3) of the cross product with vectors (..., 3) from the left."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    none = np.zeros_like(x)
-    return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*vectors.shape, 3)
-
-
 def _turn(one: np.ndarray, other: np.ndarray) -> float:
     """The angle [rad] between two poses."""
-    cosine = 0.5 * (np.trace(one[:3, :3] @ other[:3, :3].T) - 1.0)
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return float(angles_of(one[:3, :3] @ other[:3, :3].T))
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:

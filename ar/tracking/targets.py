@@ -129,3 +129,8 @@ def patient_reference() -> Target:
 def calibration_board() -> Target:
     """A board of 9 x 7 squares of 24 mm, which fits A4; its frame is the face's own."""
     return Target("board", (Face(9, 7, 24e-3, 48, np.eye(4)),))
+
+
+def all_targets() -> tuple[Target, Target, Target]:
+    """The tool's cube, the patient's reference and the calibration board."""
+    return tool_cube(), patient_reference(), calibration_board()

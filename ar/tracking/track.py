@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..camera import Camera
-from .detection import Corners, Detector, Window
+from .detection import Corners, Detector, window_round
 from .pose import FEWEST, Pose, Verdict, pose_of
 from .targets import Target
 
@@ -57,6 +57,7 @@ class Tracker:
     _detector: Detector = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "camera", replace(self.camera, T_camera_world=np.eye(4)))
         object.__setattr__(self, "_detector", Detector(self.targets))
 
     def track(self, grey: np.ndarray, before: Tracked | None = None) -> Tracked:
@@ -89,7 +90,8 @@ class Tracker:
         found: dict[str, Corners] = {}
         for target in self.targets:
             if target.name in last:
-                window = self._window(target, last[target.name][0])
+                T, outline = last[target.name][0], np.concatenate([face.outline for face in target.faces])
+                window = window_round(self.camera, outline @ T[:3, :3].T + T[:3, 3], AROUND, MARGIN)
                 seen = None if window is None else self._detector.seen_in(target, grey, window)
                 found |= {target.name: seen} if seen is not None and len(seen.points) >= FEWEST else {}
         missing = [target.name for target in self.targets if target.name not in found]
@@ -97,19 +99,3 @@ class Tracker:
         if missing and (just_left or number % SEARCHED == 0):
             found |= self._detector.seen(grey, missing)
         return found
-
-    def _window(self, target: Target, T_camera_target: np.ndarray) -> Window | None:
-        """Rows and columns round a target at a pose; None: it is out of view."""
-        points = np.concatenate([face.outline for face in target.faces])
-        at = points @ T_camera_target[:3, :3].T + T_camera_target[:3, 3]
-        world = (at - self.camera.T_camera_world[:3, 3]) @ self.camera.T_camera_world[:3, :3]
-        pixels = self.camera.project(world)[0]
-        pixels = pixels[~np.isnan(pixels).any(axis=1)]
-        if not len(pixels):
-            return None
-        low, high = pixels.min(axis=0), pixels.max(axis=0)
-        wide = np.maximum(AROUND * (high - low), MARGIN)
-        limits = [self.camera.width, self.camera.height]
-        left, top = np.clip(low - wide, 0, limits).astype(int).tolist()
-        right, bottom = np.clip(high + wide + 1.0, 0, limits).astype(int).tolist()
-        return None if left >= right or top >= bottom else (slice(top, bottom), slice(left, right))

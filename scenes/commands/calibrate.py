@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 
 import numpy as np
 
 from sim.errors import InputError
 
+from .camera_options import size
 from .json_line import json_line
 from .outputs import add_force, claimed
 
@@ -142,10 +142,11 @@ def _write_json(path: Path, report: dict) -> None:
 
 def _size(text: str) -> tuple[int, int]:
     """Width and height of a picture, such as 1280x960."""
-    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
-    if found is None:
-        raise InputError(f"--size {text!r} is no size: give width and height [pixel], such as 1280x960.")
-    return int(found[1]), int(found[2])
+    try:
+        return size(text)
+    except argparse.ArgumentTypeError as error:
+        message = f"--size {text!r} is no size: give width and height [pixel], such as 1280x960."
+        raise InputError(message) from error
 
 
 def _tip(args: argparse.Namespace) -> int:

@@ -7,12 +7,10 @@ from pathlib import Path
 
 from ar.tracking.board_views import View, find_board
 from ar.tracking.detection import Detector
-from ar.tracking.pictures import pictures_of
+from ar.tracking.pictures import GIVE, pictures_of
 from ar.tracking.targets import Target
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
-
-GIVE = "Give a video, or a folder of PNG or JPEG pictures."
 
 
 @dataclass(frozen=True)

@@ -9,16 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from ar.calibration import Calibration
-from ar.tracking.pictures import film_of
+from ar.tracking.pictures import GIVE, film_of
 from ar.tracking.pose import Pose, Verdict
-from ar.tracking.targets import calibration_board, patient_reference, tool_cube
+from ar.tracking.targets import all_targets
 from ar.tracking.track import Tracked, Tracker
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
 from .pose_file import TrackedRow
-
-GIVE = "Give a video, or a folder of PNG or JPEG pictures."
 
 
 def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
@@ -29,7 +27,7 @@ def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: 
     InputError
         What cannot be read, and pictures of another size than the camera was calibrated at.
     """
-    targets = {each.name: each for each in (tool_cube(), patient_reference(), calibration_board())}
+    targets = {each.name: each for each in all_targets()}
     wanted = [body] if frame == "camera" else [body, frame]
     tracker = Tracker(calibration.camera(np.eye(4)), tuple(targets[name] for name in wanted))
     state: Tracked | None = None

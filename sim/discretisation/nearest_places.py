@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..runtime.device import find_device, forward_kernel
+from ..runtime.device import Device, forward_kernel
 from .footprint import on_triangle
 
 # How often a place on a triangle and the nearest one of a core that is no point take turns.
@@ -46,13 +46,13 @@ class Placed:
         A place of one takes turns with the nearest of the other, with momentum (Beck, Teboulle 2009, "A fast iterative
         shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2:183-202, equations 4.1 to 4.3).
         """
-        count, device = len(corners), find_device("cpu", "float64")
+        count = len(corners)
         found = Near(np.empty((count, 3)), np.empty(count), np.empty((count, 3)))
         kinds = (wp.vec3d, wp.float64, wp.vec3d)
         out = [wp.array(each, dtype=kind, device="cpu", copy=False) for each, kind in zip(found, kinds, strict=True)]
         known = wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device="cpu", copy=False)
         stands = [wp.vec3d(*self.middle), wp.mat33d(*self.axes.ravel()), wp.vec3d(*self.half)]
-        device.launch(_nearest, (count,), [known, *stands, TURNS if self.half.any() else 1], out)
+        Device("cpu", "float64").launch(_nearest, (count,), [known, *stands, TURNS if self.half.any() else 1], out)
         return found
 
     def distances(self, corners: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -25,7 +25,7 @@ from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushe
 from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
 from sim.runtime.outside_files import path_of, read_as
-from sim.tools import BuiltIn, tool_from_text
+from sim.tools import BuiltIn, stated_tool
 
 from .answer_rows import checksums, numbered, row_type
 from .cortex_patch import open_patch
@@ -107,9 +107,7 @@ class Dataset:
     @cached_property
     def tool(self) -> BuiltIn | None:
         """The tool whose poses the loads are; None: they are pushes."""
-        older = self.provenance.get("ball")
-        text = self.provenance.get("shape", None if older is None else f"Ball(radius={older})")
-        return None if text is None else tool_from_text(text)
+        return stated_tool(self.provenance.get("shape"), self.provenance.get("ball"))
 
     @property
     def good(self) -> np.ndarray:

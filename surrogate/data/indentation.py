@@ -15,7 +15,7 @@ from sim.loads import Loads, Pushed, Retracted, Touching
 from sim.tools import Ball, BuiltIn, Capsule, Core, core_of, extent_of, named
 
 from .cortex_patch import Patch
-from .tool_loads import across
+from .tool_loads import axes_about
 
 # A foot so near to the surface [m] has the surface's normal.
 ON_IT = 1e-6
@@ -82,7 +82,7 @@ def indented(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     force = np.maximum(deepest, 0.0)[:, None] * direction
     axes = pose[:, :3, :3]
     if isinstance(tool, Capsule):  # which is round: however it is turned about its shaft, it is the same
-        axes = np.stack([*across(axes[:, :, 2]), axes[:, :, 2]], axis=2)
+        axes = axes_about(axes[:, :, 2])
     middle = pose[:, :3, 3] + pose[:, :3, :3] @ core.centre
     wide = np.full(len(pose), core.radius if isinstance(tool, Capsule) else extent_of(tool))
     return Indented(point, force, wide, axes, middle - point - force)

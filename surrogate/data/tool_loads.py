@@ -122,7 +122,7 @@ def refused_share(preset: str) -> float:
     middles = (np.arange(LATTICE) + 0.5) / LATTICE
     first, second = (axis.ravel() for axis in np.meshgrid(middles, middles))
     shares = [
-        1.0 - tool.admits(np.exp(_between(np.log(tool.force), first)), _between(tool.footprint, second)).mean()
+        1.0 - tool.admits(np.exp(between(np.log(tool.force), first)), between(tool.footprint, second)).mean()
         for tool in tools
     ]
     return float(np.mean(shares)) if shares else 0.0
@@ -167,10 +167,8 @@ def _drawn_of(tool: Tool, patch: Patch, key: int, block: range, rows: np.ndarray
         if not len(waiting):
             return out[rows]
         uniform = _uniform(key, attempt, block)[waiting]
-        footprint = _between(tool.footprint, uniform[:, 0])
-        force = (
-            _between(tool.force, uniform[:, 1]) if tool.even else np.exp(_between(np.log(tool.force), uniform[:, 1]))
-        )
+        footprint = between(tool.footprint, uniform[:, 0])
+        force = between(tool.force, uniform[:, 1]) if tool.even else np.exp(between(np.log(tool.force), uniform[:, 1]))
         fits = np.flatnonzero(tool.admits(force, footprint))
         point, normal = patch.place(uniform[fits, 2:5])
         inside = patch.rim_distance(point) >= footprint[fits]
@@ -184,7 +182,8 @@ def _drawn_of(tool: Tool, patch: Patch, key: int, block: range, rows: np.ndarray
     )
 
 
-def _between(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
+def between(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """Between two ends, by uniform numbers (n,) in [0, 1)."""
     return ends[0] + (ends[1] - ends[0]) * uniform
 
 
@@ -202,6 +201,11 @@ def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(axis, first)
+
+
+def axes_about(shaft: np.ndarray) -> np.ndarray:
+    """Rotations (n, 3, 3) whose z are unit vectors `shaft` (n, 3), turned about them in some way."""
+    return np.stack([*across(shaft), shaft], axis=2)
 
 
 POSITIONS, DIRECTIONS, MAGNITUDES = 11, 30, np.linspace(0.10, 1.05, 20)

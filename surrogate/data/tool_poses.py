@@ -13,7 +13,7 @@ from sim.loads import Loads, Pushed, Touching
 from sim.tools import Ball, BuiltIn, Capsule, Spatula, core_of, distances_to, extent_of
 
 from .cortex_patch import Patch, barycentric_lattice, open_patch
-from .tool_loads import TOOLS, across, draw, drawn_of
+from .tool_loads import TOOLS, across, axes_about, between, draw, drawn_of
 
 # What a ball may stand for.
 ROUND = ("palpation", "bipolar", "dissector")
@@ -65,7 +65,7 @@ def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: Built
     if isinstance(tool, Ball):
         (pushed,) = draw(preset, anatomy, count, seed).every(Pushed)
         direction = pushed.force / np.linalg.norm(pushed.force, axis=1, keepdims=True)
-        depth = _between(SHALLOW * tool.radius, min(DEEP * tool.radius, TOOLS[preset].depth), source.random(count))
+        depth = between((SHALLOW * tool.radius, min(DEEP * tool.radius, TOOLS[preset].depth)), source.random(count))
         return Loads((poses_at(tool, pushed.point, patch.normal_near(pushed.point), depth[:, None] * direction),))
     if isinstance(tool, Capsule):
         room, deepest, cone = tool.radius, ROD * tool.radius, TOOLS[preset].cone
@@ -74,7 +74,7 @@ def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: Built
     kind = replace(TOOLS[preset], name=type(tool).__name__, footprint=(room, room), cone=cone)
     point, direction = drawn_of(kind, patch, count, seed)
     share = source.random((count, 2))
-    depth = _between(SHALLOW * core_of(tool).radius, min(deepest, TOOLS[preset].depth), share[:, 0])
+    depth = between((SHALLOW * core_of(tool).radius, min(deepest, TOOLS[preset].depth)), share[:, 0])
     rotation = _turned(-direction, 2.0 * np.pi * share[:, 1])
     return Loads((_lowered(tool, patch, point, rotation, depth),))
 
@@ -85,12 +85,8 @@ def poses_at(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarr
     pose = np.zeros((len(point), 1, 4, 4))
     pose[:, 0, 3, 3] = 1.0
     pose[:, 0, :3, 3] = point + motion - ball.radius * (normal + shaft)
-    pose[:, 0, :3, :3] = np.stack([*across(shaft), shaft], axis=2)
+    pose[:, 0, :3, :3] = axes_about(shaft)
     return Touching(pose)
-
-
-def _between(least: float, most: float, share: np.ndarray) -> np.ndarray:
-    return least + (most - least) * share
 
 
 def _turned(shaft: np.ndarray, angle: np.ndarray) -> np.ndarray:

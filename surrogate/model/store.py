@@ -16,7 +16,7 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import digest_of
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import path_of, read_as
-from sim.tools import BuiltIn, tool_from_text
+from sim.tools import stated_tool
 
 from ..data.encode import Basis
 from ..regressors.ann import Ann
@@ -221,13 +221,6 @@ def _rebuilt_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.nda
     return TipModel(correction, _rebuilt_bound(description["bound"], arrays, reach))
 
 
-def _rebuilt_tool(description: dict[str, Any]) -> BuiltIn | None:
-    """The tool whose poses a model answers; older files have a ball's radius alone."""
-    older = description.get("ball")
-    text = description.get("tool", None if older is None else f"Ball(radius={older})")
-    return None if text is None else tool_from_text(text)
-
-
 def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
     return None if bound is None else {name: put(array) for name, array in vars(bound).items()}
 
@@ -257,7 +250,7 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         _rebuilt_bound(description["bounds"], arrays, envelope["reach"]),
         description["training"],
         # Older files do not have these.
-        _rebuilt_tool(description),
+        stated_tool(description.get("tool"), description.get("ball")),
         _rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
         None if (stated := description.get("left_out")) is None else LeftOut(**stated),
         _rebuilt_force(description.get("force"), arrays, envelope["reach"]),

@@ -14,7 +14,7 @@ from sim.tools import Ball
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS, Basis
 from ..data.indentation import Indented
-from ..data.tool_loads import across
+from ..data.tool_loads import axes_about
 from ..regressors.rigid_contact import Contact
 from .conformal import LEVELS, Bound
 from .learned import Learned, Part
@@ -102,7 +102,7 @@ def _probe(encoder: str, model: Learned) -> np.ndarray:
     depth, wide = envelope.force[1], envelope.footprint[1]
     pushed = Pushed(envelope.points[:1].astype(float), depth * inward[None], np.array([wide]))
     if model.tool is not None and not isinstance(model.tool, Ball):
-        axes = np.stack([*across(-inward[None]), -inward[None]], axis=2)
+        axes = axes_about(-inward[None])
         pushed = Indented(pushed.point, pushed.force, pushed.footprint, axes, -wide * inward[None])
     return ENCODERS[encoder](open_patch(model.anatomy), pushed)
 

@@ -197,7 +197,7 @@ class Contact:
         around, wide = self._rounds
         reach = REACH * radius
         far = wide + reach + np.linalg.norm(stations[0].half)
-        ends = [stations[0], stations[len(stations) // 2], stations[-1]] if len(stations) > 1 else stations
+        ends = [stations[k] for k in sorted({0, len(stations) // 2, len(stations) - 1})]
         some = np.flatnonzero(np.any([np.linalg.norm(around - each.middle, axis=1) < far for each in ends], axis=0))
         corners = self.points[self.triangles[some]]
         near = np.any([each.nearest(corners).distance < reach for each in ends], axis=0)
