@@ -38,6 +38,7 @@ COMMANDS = {
     "markers": "write the pages to print: markers of tool and patient, and the board that calibrates cameras",
     "track": "follow the tool and the patient's reference through a film: poses, covariances, and where they are lost",
     "calibrate": "find a camera's intrinsics, a tool's tip, or how two tracked bodies lie together, and how surely",
+    "register": "find how a scan lies beside the patient's reference, from points that were touched, and how surely",
     "sensitivity": "measure how the tumour's motion changes with tissue, skull, tool and element, one at a time",
     "uncertainty": "measure how far a scene's tumour may be from where it is in a patient, and what of that is whose",
     "bench": "measure what each stage costs, what each element is worth, how robust and how fast the solver is",

@@ -12,11 +12,13 @@ from boxes import box as cube
 from ar.calibration import Calibration
 from ar.screen import signature, write_film, write_png
 from ar.tracking.pages import Page, listed_targets, png_bytes
+from ar.tracking.registration import Registration
 from scenes.bench.figure_record import Origin, record_of, write_record
 from scenes.cli import main
 from scenes.commands.companion_files import demand_no_strangers, remove_data, strangers
 from scenes.commands.outputs import KINDS, claimed, claimed_frames, recognised
 from scenes.script.calibration_file import write_calibration
+from scenes.script.registration_file import write_registration
 from sim.bodies.intensity import Intensity, sidecar, write_intensity
 from sim.bodies.meshfile import read_mesh, write_anatomy, write_mesh
 from sim.errors import InputError
@@ -115,6 +117,7 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         tmp_path / "camera.yaml", Calibration((9.0, 9.0), (4.0, 4.0), 8, 8, name="sulcus calibrate: camera")
     )
     (tmp_path / "camera.json").write_text('{"format": "sulcus intrinsics 1"}')
+    write_registration(tmp_path / "registered.json", Registration(np.eye(4), np.eye(6), np.zeros(3), 1e-3, 6))
     (tmp_path / "text.txt").write_text("my own")
     expected = {
         "an anatomy of sulcus": "anatomy.vtu",
@@ -137,6 +140,7 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         "a list of `sulcus markers`": "targets.json",
         "a calibration of `sulcus calibrate`": "camera.yaml",
         "a covariance of `sulcus calibrate`": "camera.json",
+        "a registration of `sulcus register`": "registered.json",
     }
     assert set(expected) == set(KINDS)
     for kind, name in expected.items():

@@ -76,6 +76,13 @@ next: sulcus calibrate --pivot tool.csv, where the film shows the tool pivoting"
 columns of poses: time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw, from the body to its tracker; others are passed over
 
 next: look at the rms and the standard deviations; a good camera has less than 0.3 px""",
+    "register": """examples:
+  sulcus register touched.csv --anatomy patient.vtu --out registration.json
+  sulcus register touched.csv --anatomy patient.vtu --surface traced.csv --out registration.json
+
+px,py,pz in touched.csv: the tip's place beside the patient's reference, from sulcus track
+
+next: look at the error at the tumour; with 5 mm, touch more points, all round the head""",
     "sensitivity": """example:
   sulcus sensitivity --count 8 --out sensitivity.csv
 next: open the table in a spreadsheet""",

@@ -205,6 +205,7 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "a film of `sulcus render`": _is_film,
     "a calibration of `sulcus calibrate`": _begins(b"sulcus calibrate"),
     "a covariance of `sulcus calibrate`": _begins(b'"format": "sulcus intrinsics'),
+    "a registration of `sulcus register`": _begins(b'"format": "sulcus registration'),
     "a page of `sulcus markers`": _is_printed,
     "a list of `sulcus markers`": _begins(b'"format": "sulcus targets'),
 }

@@ -166,7 +166,7 @@ class Locator:
         return Location(
             prior,
             found,
-            _radius(found.covariance(prior.middle[:, None])[0]),
+            radius_of(found.covariance(prior.middle[:, None])[0]),
             outliers,
             found.outliers[found.outliers >= count] - count,
             was_tried(self.tried, found.evidence),
@@ -181,7 +181,7 @@ def telling_nodes(anatomy: Anatomy) -> np.ndarray:
     return np.union1d(mesh.tets[at_cortex], anatomy.tumour_nodes)
 
 
-def _radius(covariance: np.ndarray) -> float:
+def radius_of(covariance: np.ndarray) -> float:
     """How far [m] 95 in 100 draws of a Gaussian of some covariance (3, 3) [m^2] are from its mean, at most."""
     drawn = _normal() @ np.linalg.cholesky(covariance).T
     return float(np.quantile(np.sqrt((drawn**2).sum(axis=1)), 0.95))

@@ -1,0 +1,195 @@
+"""How the scan lies in the frame of the patient's reference: from pairs of points and a surface, with its error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, f
+
+from .rigid import cross_matrices
+
+FEWEST_PAIRS, FEWEST_SURFACE = 3, 20
+# Nobody touches a point more exactly [m]; pairs that fit no better than this fit no rigid motion [m].
+LEAST, MOST = 0.1e-3, 5e-3
+# Shares: the least spread of points beside the largest, and by how much two sets of points may differ in size.
+FLATTEST, RESIZED = 0.05, 0.1
+# A pair is called wrong if the others fit so many times better without it. So is a frame beside its mirror image.
+CLEARLY = 4.0
+# Rounds of Gauss-Newton on a surface, and the change at which they end [m], [rad].
+ROUNDS, SMALL = 50, 1e-9
+LEVEL = 0.95
+
+Nearest = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Takes points of the scan (n, 3) [m] to the surface's nearest places (n, 3) [m] and unit normals (n, 3) there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """How the scan lies in the frame of the patient's reference.
+
+    Parameters
+    ----------
+    T_patient_scan
+        (4, 4) [m]: takes a place in the scan, RAS, to the frame of the reference.
+    covariance
+        (6, 6) of a shift in the reference's frame [m], and of a small turn about `centre` in its axes [rad]. It is
+        widened for few points, so that the ellipsoid of 95 % by chi^2 holds as often as it says.
+    centre
+        (3,) [m]: the middle of the points, in the scan.
+    rms
+        Root mean square distance [m] that is left between the pairs.
+    pairs, surface
+        How many points of each kind there are.
+    """
+
+    T_patient_scan: np.ndarray
+    covariance: np.ndarray
+    centre: np.ndarray
+    rms: float
+    pairs: int
+    surface: int = 0
+
+    def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A place in the scan (3,) [m] in the reference's frame (3,) [m], and its covariance (3, 3) [m^2]."""
+        T = self.T_patient_scan
+        slope = np.hstack([np.eye(3), -cross_matrices(T[:3, :3] @ (place - self.centre))])
+        return T[:3, :3] @ place + T[:3, 3], slope @ self.covariance @ slope.T
+
+
+def registered(scan: np.ndarray, patient: np.ndarray) -> Registration:
+    """The rigid motion that takes points of the scan (n, 3) [m] to where they are in the reference's frame (n, 3) [m].
+
+    Least squares (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A
+    4:629-642). The covariance is that of the linear problem, as in Fitzpatrick, West, Maurer (1998), "Predicting error
+    in rigid-body point-based registration", IEEE Trans. Med. Imaging 17:694-702.
+
+    Raises
+    ------
+    ValueError
+        Fewer than three pairs, points on a line, or two sets of different size. A mirrored set, a pair that fits far
+        worse than the others, or pairs that fit no rigid motion.
+    """
+    _demand_shape(scan, patient)
+    T, off = _fitted(scan, patient)
+    _demand_fit(scan, patient, off)
+    centre = scan.mean(axis=0)
+    freedom = 3 * len(scan) - 6
+    J = _slopes(T, scan, centre) / _scatter(off, freedom)
+    return Registration(T, _widened(J.T @ J, freedom), centre, _rms(off), len(scan))
+
+
+def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Nearest) -> Registration:
+    """As `registered`, with points `seen` on a surface of the scan (m, 3) [m], in the reference's frame, besides.
+
+    Pairs (n, 3) and distances from the surface's tangent planes (Chen, Medioni 1992, "Object modelling by registration
+    of multiple range images") are weighed by their own scatter. A surface that moved since the scan misleads it.
+
+    Raises
+    ------
+    ValueError
+        As `registered`; too few points, or points that stay farther than 5 mm from the surface (root mean square).
+    """
+    if len(seen) < FEWEST_SURFACE:
+        raise ValueError(f"{len(seen)} points of the surface are too few: trace {FEWEST_SURFACE} or more.")
+    start = registered(scan, patient)
+    T, centre = start.T_patient_scan, start.centre
+    freedom = 3 * len(scan) - 6
+    touched = _scatter(scan @ T[:3, :3].T + T[:3, 3] - patient, freedom)
+    normal, off, away = np.eye(6), np.zeros((1, 3)), np.zeros(1)
+    for _ in range(ROUNDS):
+        off = scan @ T[:3, :3].T + T[:3, 3] - patient
+        place, outward = nearest((seen - T[:3, 3]) @ T[:3, :3])
+        turned = outward @ T[:3, :3].T
+        away = np.einsum("ni,ni->n", turned, place @ T[:3, :3].T + T[:3, 3] - seen)
+        traced = _scatter(away, len(seen))
+        J = _slopes(T, scan, centre) / touched
+        K = np.einsum("ni,nij->nj", turned, _slopes(T, place, centre).reshape(-1, 3, 6)) / traced
+        normal = J.T @ J + K.T @ K
+        step = -np.linalg.solve(normal, J.T @ off.ravel() / touched + K.T @ away / traced)
+        T = _moved(T, step, centre)
+        if np.abs(step).max() < SMALL:
+            break
+    if not max(_rms(off), _rms(away[:, None])) <= MOST:
+        raise ValueError(
+            f"the points stay {1e3 * _rms(away[:, None]):.1f} mm (rms) from the surface, and the pairs "
+            f"{1e3 * _rms(off):.1f} mm: trace the surface that the scan shows, before it moves."
+        )
+    return Registration(T, _widened(normal, freedom + len(seen)), centre, _rms(off), len(scan), len(seen))
+
+
+def _demand_shape(scan: np.ndarray, patient: np.ndarray) -> None:
+    """Refuse points that determine no rigid motion."""
+    if len(scan) < FEWEST_PAIRS:
+        raise ValueError(f"{len(scan)} pairs are too few: touch {FEWEST_PAIRS} points or more, better six.")
+    sizes = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (scan, patient)]
+    for what, size in zip(("scan", "patient"), sizes, strict=True):
+        if not size[1] > FLATTEST * size[0]:
+            raise ValueError(f"the points of the {what} lie on a line: choose some that lie apart from it.")
+    ratio = float(np.linalg.norm(sizes[1]) / np.linalg.norm(sizes[0]))
+    if abs(np.log(ratio)) > RESIZED:
+        raise ValueError(
+            f"the patient's points are {ratio:.3g} times as far apart as the scan's: give both in millimetres."
+        )
+
+
+def _demand_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
+    """Refuse a mirrored set, one wrong pair among good ones, and pairs that do not fit."""
+    rms = _rms(off)
+    mirrored = _rms(_fitted(scan * [-1.0, 1.0, 1.0], patient)[1])
+    if CLEARLY * max(mirrored, LEAST) < rms:
+        raise ValueError("the scan's points fit their mirror image only: one frame is left-handed; give both in RAS.")
+    if len(scan) > FEWEST_PAIRS + 1:
+        others = [_rms(_fitted(*(np.delete(p, row, axis=0) for p in (scan, patient)))[1]) for row in range(len(scan))]
+        row = int(np.argmin(others))
+        if rms > MOST / 2 and CLEARLY * max(others[row], LEAST) < rms:
+            raise ValueError(
+                f"pair {row + 1} fits far worse than the others, which are {1e3 * others[row]:.1f} mm off without it: "
+                "touch it again, or leave it out."
+            )
+    if not rms <= MOST:
+        raise ValueError(
+            f"the pairs stay {1e3 * rms:.1f} mm apart (rms), and up to {1e3 * MOST:.0f} are taken: see whether "
+            "each row names the same place twice."
+        )
+
+
+def _fitted(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """T_patient_scan (4, 4), and what is left (n, 3) [m]."""
+    middle, there = scan.mean(axis=0), patient.mean(axis=0)
+    T = np.eye(4)
+    u, _, v = np.linalg.svd((patient - there).T @ (scan - middle))
+    T[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    T[:3, 3] = there - T[:3, :3] @ middle
+    return T, scan @ T[:3, :3].T + T[:3, 3] - patient
+
+
+def _slopes(T: np.ndarray, scan: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """(3 n, 6): how places of the scan (n, 3) move in the reference's frame by a shift, and a turn about the centre."""
+    arms = (scan - centre) @ T[:3, :3].T
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(scan), 3, 3)), -cross_matrices(arms)], axis=2).reshape(-1, 6)
+
+
+def _moved(T: np.ndarray, step: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """T (4, 4) after a shift and a turn about the centre, `step` (6,)."""
+    out = np.eye(4)
+    out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
+    out[:3, 3] = T[:3, :3] @ centre + T[:3, 3] + step[:3] - out[:3, :3] @ centre
+    return out
+
+
+def _widened(normal: np.ndarray, freedom: int) -> np.ndarray:
+    """The covariance (6, 6) of a normal matrix, widened as the scatter in it is known from a few numbers only."""
+    inverse = 3.0 * f.ppf(LEVEL, 3, freedom) / chi2.ppf(LEVEL, 3) * np.linalg.inv(normal)
+    return 0.5 * (inverse + inverse.T)
+
+
+def _scatter(off: np.ndarray, freedom: int) -> float:
+    """The deviation along one axis [m] that residuals have, `LEAST` at least."""
+    return max(float(np.sqrt((off**2).sum() / freedom)), LEAST)
+
+
+def _rms(off: np.ndarray) -> float:
+    return float(np.sqrt((off**2).sum(axis=1).mean()))

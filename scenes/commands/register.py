@@ -1,0 +1,105 @@
+"""`sulcus register`: how a scan lies beside the patient's reference, from points that were touched, and how surely."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.errors import InputError
+
+from .json_line import json_line
+from .outputs import add_force, claimed
+
+if TYPE_CHECKING:
+    from ar.tracking.registration import Nearest, Registration
+    from sim.anatomy import Anatomy
+
+KIND = "a registration of `sulcus register`"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "pairs", type=Path, metavar="PAIRS.csv",
+        help="columns x,y,z,px,py,pz [mm]: a place in the scan, RAS, and where the tool's tip touched it, in the frame "
+        "of the patient's reference",
+    )  # fmt: skip
+    parser.add_argument("--out", required=True, metavar="R.json", help="the registration")
+    parser.add_argument("--anatomy", type=Path, metavar="P.vtu", help="tells the error at the tumour of this anatomy")
+    parser.add_argument(
+        "--surface", type=Path, metavar="CLOUD.csv",
+        help="columns px,py,pz [mm]: places traced on the brain's surface of --anatomy, in the reference's frame",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="one JSON line instead of sentences")
+    add_force(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Returns 0 when the registration is written.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read or written, a surface without anatomy, or points that determine no registration.
+    """
+    from ar.tracking.registration import refined, registered
+    from sim import read_anatomy
+    from surrogate.locating.observed_files import read_columns
+
+    from ..script.registration_file import as_stored, write_registration
+
+    if args.surface is not None and args.anatomy is None:
+        raise InputError("--surface is traced on an anatomy: give it by --anatomy.")
+    out = claimed(args.out, ".json", KIND, args.force, [args.pairs, args.surface])
+    columns = read_columns(args.pairs, {("x", "y", "z", "px", "py", "pz")})
+    scan, patient = (1e-3 * np.column_stack([columns[name] for name in names]) for names in ("xyz", ("px", "py", "pz")))
+    anatomy = None if args.anatomy is None else read_anatomy(args.anatomy)
+    source = args.pairs if args.surface is None else f"{args.pairs}, {args.surface}"
+    try:
+        if args.surface is None or anatomy is None:
+            found = registered(scan, patient)
+        else:
+            traced = read_columns(args.surface, {("px", "py", "pz")})
+            seen = 1e-3 * np.column_stack([traced[name] for name in ("px", "py", "pz")])
+            found = refined(scan, patient, seen, _nearest_on(anatomy))
+    except ValueError as error:
+        raise InputError(f"{source}: {error}") from error
+    write_registration(out, found)
+    target = None if anatomy is None else _error_at_tumour(found, anatomy)
+    if args.json:
+        figures = {} if target is None else {"tumour_p95_mm": 1e3 * target[1], "along_mm": target[0].tolist()}
+        print(json_line({"out": str(out), **as_stored(found), **figures}))
+        return 0
+    print(f"{found.pairs} pairs fit to {1e3 * found.rms:.2f} mm (rms); that is not yet the error at the tumour")
+    if target is not None:
+        print(f"the tumour's middle is within {1e3 * target[1]:.1f} mm in the patient's frame (95 %), by these points")
+    print(f"written: {out}")
+    return 0
+
+
+def _nearest_on(anatomy: Anatomy) -> Nearest:
+    """The nearest place on the surface of the brain, and its normal."""
+    from sim.geometry.closest_point import closest
+
+    corners = anatomy.mesh.nodes[anatomy.mesh.surface]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = closest(points, corners)
+        return found.point, normals[found.triangle]
+
+    return nearest
+
+
+def _error_at_tumour(found: Registration, anatomy: Anatomy) -> tuple[np.ndarray, float]:
+    """Deviations (3,) [mm] along the reference's axes at the tumour's middle, and the radius [m] that 95 % stay in."""
+    from surrogate.locating.locator import radius_of
+
+    if not len(anatomy.tumour_nodes):
+        raise InputError("the anatomy has no tumour: leave out --anatomy, or give one with a tumour.")
+    _, covariance = found.point(anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0))
+    return 1e3 * np.sqrt(np.diag(covariance)), radius_of(covariance)

@@ -1,0 +1,95 @@
+"""How a scan lies in the frame of the patient's reference, as a JSON file: millimetres, radians."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ar.tracking.registration import Registration
+from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
+from sim.runtime.outside_files import path_of, read_as
+
+FORMAT = "sulcus registration 1"
+WANTED = "Make one by `sulcus register`."
+# A file of more bytes is none of ours; a rotation's columns are so exactly of length 1, and at right angles.
+LARGEST, RIGID = 1 << 16, 1e-4
+# A covariance's eigenvalues may be below 0 by this share of the largest, by rounding.
+ROUNDING = 1e-9
+_UNITS = np.repeat([1e3, 1.0], 3)
+
+
+def read_registration(path: str | Path) -> Registration:
+    """The registration in a file of `sulcus register`.
+
+    `T_patient_scan_mm` (4 x 4) takes a place in the scan, RAS, to the frame of the patient's reference. `covariance`
+    (6 x 6) is of a shift [mm] in that frame, and of a small turn [rad] about `centre_mm`, a place in the scan.
+
+    Raises
+    ------
+    InputError
+        No such file, another format, a transform that is not rigid, or a covariance that is none.
+    """
+    path = path_of(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file. {WANTED}")
+    with read_as(path, "a registration", WANTED):
+        if path.stat().st_size > LARGEST:
+            raise InputError(f"is larger than a registration. {WANTED}")
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        if stored.get("format") != FORMAT:
+            raise InputError(f"its format is not {FORMAT!r}. {WANTED}")
+        T, covariance, centre = (
+            np.array(stored[name], float) for name in ("T_patient_scan_mm", "covariance", "centre_mm")
+        )
+        if T.shape != (4, 4) or covariance.shape != (6, 6) or centre.shape != (3,):
+            raise InputError("its numbers have other shapes than 4 x 4, 6 x 6 and 3.")
+        T[:3, 3], centre, covariance = 1e-3 * T[:3, 3], 1e-3 * centre, covariance / np.outer(_UNITS, _UNITS)
+        _demand_rigid(T)
+        _demand_covariance(covariance)
+        if not np.isfinite(centre).all():
+            raise InputError("its centre is not finite.")
+        counts = int(stored["pairs"]), int(stored["surface"])
+        return Registration(T, covariance, centre, 1e-3 * float(stored["rms_mm"]), *counts)
+
+
+def _demand_rigid(T: np.ndarray) -> None:
+    off = np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max()
+    if not (off < RIGID and np.linalg.det(T[:3, :3]) > 0.0 and np.isfinite(T).all() and (T[3] == [0, 0, 0, 1]).all()):
+        raise InputError("T_patient_scan_mm is no rigid motion: rows of a rotation, and a shift in millimetres.")
+
+
+def _demand_covariance(covariance: np.ndarray) -> None:
+    finite = np.isfinite(covariance).all()
+    values = np.linalg.eigvalsh(covariance) if finite else np.array([-1.0])
+    if not finite or not np.allclose(covariance, covariance.T) or values[0] < -ROUNDING * max(values[-1], 0.0):
+        raise InputError("covariance is no covariance: it is symmetric, finite, and nowhere negative.")
+
+
+def as_stored(registration: Registration) -> dict[str, object]:
+    """What a file holds of a registration."""
+    T = registration.T_patient_scan.copy()
+    T[:3, 3] *= 1e3
+    return {
+        "format": FORMAT,
+        "T_patient_scan_mm": T.tolist(),
+        "covariance": (registration.covariance * np.outer(_UNITS, _UNITS)).tolist(),
+        "centre_mm": (1e3 * registration.centre).tolist(),
+        "rms_mm": 1e3 * registration.rms,
+        "pairs": registration.pairs,
+        "surface": registration.surface,
+    }
+
+
+def write_registration(path: str | Path, registration: Registration) -> None:
+    """Write a registration, .json; it appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be written, or a name of another ending.
+    """
+    with written_whole(path_of(path), ".json") as partial:
+        partial.write_text(json.dumps(as_stored(registration), indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,125 @@
+"""Registration of a scan to the patient's reference: exact without noise, as sure as it says, and refused by name."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from ar.tracking.registration import refined, registered
+from scenes.cli import main
+from scenes.script.registration_file import read_registration, write_registration
+from scenes.script.shipped_files import template_path
+from sim.errors import InputError
+
+SCAN = 1e-3 * np.array(
+    [[70.0, 20, 30], [-65, 30, 25], [0, 95, 20], [30, 60, 80], [-40, 10, 90], [5, -80, 60], [50, -50, 70]]
+)
+TUMOUR = np.array([0.03, 0.01, 0.05])
+TRUE = np.eye(4)
+TRUE[:3, :3], TRUE[:3, 3] = Rotation.from_rotvec([0.4, -0.8, 1.9]).as_matrix(), [0.12, -0.05, 0.3]
+CURVED = 0.08
+
+
+def moved(points, T=TRUE):
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def on_ellipsoid(points):
+    """The nearest places on a surface and normals there: along the ray from the middle, which is near enough."""
+    shape = np.array([1.0, 1.2, 0.8]) * CURVED
+    place = points / np.linalg.norm(points / shape, axis=1, keepdims=True)
+    normal = place / shape**2
+    return place, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def held(found):
+    at, covariance = found.point(TUMOUR)
+    away = at - moved(TUMOUR)
+    return away @ np.linalg.solve(covariance, away) <= chi2.ppf(0.95, 3)
+
+
+def test_a_registration_is_exact_without_noise():
+    found = registered(SCAN, moved(SCAN))
+    np.testing.assert_allclose(found.T_patient_scan, TRUE, atol=1e-12)
+    assert found.rms < 1e-12 and found.pairs == 7
+
+
+@pytest.mark.parametrize("count", [3, 4, 7])
+def test_its_ellipsoid_holds_the_tumour_as_often_as_it_says(count):
+    rng = np.random.default_rng(count)
+    some = [registered(SCAN[:count], moved(SCAN[:count]) + 7e-4 * rng.normal(size=(count, 3))) for _ in range(400)]
+    assert 0.925 < np.mean([held(each) for each in some]) < 0.98
+
+
+def test_a_traced_surface_makes_it_surer_and_it_still_holds():
+    rng, alone, both = np.random.default_rng(1), [], []
+    towards = rng.normal(size=(60, 3)) * [0.4, 0.4, 0.2] + [0.3, 0.2, 0.8]
+    surface = moved(on_ellipsoid(towards)[0])
+    for _ in range(60):
+        patient = moved(SCAN[:4]) + 1e-3 * rng.normal(size=(4, 3))
+        seen = surface + 3e-4 * rng.normal(size=surface.shape)
+        alone.append(registered(SCAN[:4], patient))
+        both.append(refined(SCAN[:4], patient, seen, on_ellipsoid))
+    off = [[np.linalg.norm(each.point(TUMOUR)[0] - moved(TUMOUR)) for each in some] for some in (alone, both)]
+    assert np.median(off[1]) < 0.8 * np.median(off[0])
+    assert np.mean([held(each) for each in both]) > 0.88
+
+
+def test_what_determines_no_registration_is_refused():
+    patient, line = moved(SCAN), SCAN[:1] + np.linspace(0.0, 1.0, 5)[:, None] * [0.1, 0.02, 0.0]
+    with pytest.raises(ValueError, match="2 pairs are too few"):
+        registered(SCAN[:2], patient[:2])
+    with pytest.raises(ValueError, match="points of the scan lie on a line"):
+        registered(line, moved(line))
+    with pytest.raises(ValueError, match=r"1e\+03 times as far apart .*millimetres"):
+        registered(1e-3 * SCAN, patient)
+    with pytest.raises(ValueError, match="mirror image only"):
+        registered(SCAN * [1.0, 1.0, -1.0], patient)
+    wrong = patient.copy()
+    wrong[4] += [0.0, 0.03, 0.0]
+    with pytest.raises(ValueError, match="pair 5 fits far worse"):
+        registered(SCAN, wrong)
+    with pytest.raises(ValueError, match=r"stay .* apart"):
+        registered(SCAN, patient[::-1])
+    with pytest.raises(ValueError, match="3 points of the surface are too few"):
+        refined(SCAN, patient, patient[:3], on_ellipsoid)
+    with pytest.raises(ValueError, match=r"stay .* from the surface"):
+        refined(
+            SCAN, patient, moved(2.0 * on_ellipsoid(np.random.default_rng(0).normal(size=(50, 3)))[0]), on_ellipsoid
+        )
+
+
+def test_a_file_gives_back_what_was_written_and_damage_is_named(tmp_path):
+    path, rng = tmp_path / "r.json", np.random.default_rng(0)
+    found = registered(SCAN, moved(SCAN) + 1e-3 * rng.normal(size=SCAN.shape))
+    write_registration(path, found)
+    again = read_registration(path)
+    for name in ("T_patient_scan", "covariance", "centre"):
+        np.testing.assert_allclose(getattr(again, name), getattr(found, name), rtol=1e-12, atol=1e-15)
+    stored = json.loads(path.read_text())
+    mirrored = np.array(stored["T_patient_scan_mm"]) * [1, 1, -1, 1]
+    for change, words in (
+        ({"T_patient_scan_mm": mirrored.tolist()}, "no rigid motion"),
+        ({"covariance": (-np.eye(6)).tolist()}, "no covariance"),
+        ({"centre_mm": [0, 0]}, "other shapes"),
+        ({"format": "mine"}, "format is not"),
+    ):
+        path.write_text(json.dumps(stored | change))
+        with pytest.raises(InputError, match=words) as caught:
+            read_registration(path)
+        assert str(caught.value).startswith(str(path))
+
+
+def test_the_command_writes_it_and_tells_the_error_at_the_tumour(tmp_path, capsys):
+    pairs, out = tmp_path / "pairs.csv", tmp_path / "r.json"
+    rng = np.random.default_rng(0)
+    table = 1e3 * np.hstack([SCAN, moved(SCAN) + 5e-4 * rng.normal(size=SCAN.shape)])
+    np.savetxt(pairs, table, delimiter=",", header="x,y,z,px,py,pz", comments="")
+    assert main(["register", str(pairs), "--out", str(out), "--anatomy", str(template_path()), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert 0.1 < said["tumour_p95_mm"] < 5.0 and said["rms_mm"] < 1.0
+    np.testing.assert_allclose(read_registration(out).T_patient_scan, TRUE, atol=5e-3)
+    assert main(["register", str(pairs), "--out", str(out), "--surface", str(pairs)]) == 2
+    assert "give it by --anatomy" in capsys.readouterr().err
