@@ -41,6 +41,7 @@ COMMANDS = {
     "register": "find how a scan lies beside the patient's reference, from points that were touched, and how surely",
     "sensitivity": "measure how the tumour's motion changes with tissue, skull, tool and element, one at a time",
     "uncertainty": "measure how far a scene's tumour may be from where it is in a patient, and what of that is whose",
+    "budget": "tell how many millimetres to believe of an overlay on a tracked camera, and what takes most of them",
     "bench": "measure what each stage costs, what each element is worth, how robust and how fast the solver is",
     "report": "measure what accuracy costs in time, for every deformer, as a page",
     "check": "play scenes without display, and fail where a picture is farther off than its stated bounds",
@@ -48,7 +49,19 @@ COMMANDS = {
 
 # Commands that make or read models, whose learners may be a user's own.
 MAKING = ("train", "patient")
-READING = ("judge", "export", "scenes", "effects", "demo", "render", "collect", "sensitivity", "uncertainty", "check")
+READING = (
+    "judge",
+    "export",
+    "scenes",
+    "effects",
+    "demo",
+    "render",
+    "collect",
+    "sensitivity",
+    "uncertainty",
+    "budget",
+    "check",
+)
 
 # Commands with commands of their own; the first is meant where none is named.
 INNER = {"bench": tuple(BENCHES)}

@@ -83,6 +83,10 @@ next: look at the rms and the standard deviations; a good camera has less than 0
 px,py,pz in touched.csv: the tip's place beside the patient's reference, from sulcus track
 
 next: look at the error at the tumour; with 5 mm, touch more points, all round the head""",
+    "budget": """examples:
+  sulcus budget press
+  sulcus budget press --camera camera.yaml --intrinsics camera.json --registration registration.json --twins 20 --json
+next: mend the largest; touching more points by sulcus register often is that""",
     "sensitivity": """example:
   sulcus sensitivity --count 8 --out sensitivity.csv
 next: open the table in a spreadsheet""",

@@ -1,0 +1,275 @@
+"""How many millimetres to believe of an overlay on a tracked camera, and who is to blame: a Monte Carlo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ar.calibration import Calibration
+from ar.camera import Camera
+from ar.tracking.pose import pose_of
+from ar.tracking.registration import Registration
+from ar.tracking.targets import patient_reference
+from sim.errors import InputError
+from surrogate.locating.calibration import RADIUS_SQUARED
+
+from ..script.priors import MESH, OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION, Draw
+from ..script.site import Site
+from ..script.uncertainty import SURROGATE
+from ..script.viewpoint import Viewpoint
+from .tracking_errors import CORNER, changed, corners_in
+from .uncertainty import Motions, off_by
+
+CALIBRATION, MARKERS, LATENCY, PARAMETERS = "calibration", "markers", "latency x motion", "tissue, skull, tool's place"
+TECHNICAL = (CALIBRATION, MARKERS, LATENCY, SURROGATE, MESH)
+"""What the system itself is off by."""
+CLINICAL = (*TECHNICAL, REGISTRATION, SEGMENTATION, PARAMETERS)
+"""With what nobody measures of the patient."""
+LEVEL = 0.95
+# How many calibrations are drawn.
+CALIBRATIONS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Filmed:
+    """A scene at one moment, as a tracked camera films it.
+
+    Parameters
+    ----------
+    site, viewpoint
+        The open cortex, and the camera with its calibration and path.
+    duration
+        Of the scene [s], from which moments of the camera's path are drawn.
+    T_scan_patient
+        (4, 4) of the patient's reference.
+    covariance
+        (9, 9) of the calibration.
+    time
+        Of the moment [s].
+    rest, field, normals
+        (n, 3) [m]: the tumour's surface in the scan, how it moves, and its outward normals after that.
+    velocity
+        (n, 3) [m/s] of the surface.
+    bodies, draws
+        How it moves in other bodies (b, n, 3) [m], and what they are.
+    surrogate
+        The bound [m] that a trained model states, 0 for finite elements.
+    registration
+        As it was measured; None: the published shift stands for it.
+    corner, latency, clock
+        What a corner is off by [pixel], and times of pictures and poses [s], as standard deviations. The picture that
+        is drawn on is by `latency` later [s] than the one that was tracked.
+    """
+
+    site: Site
+    viewpoint: Viewpoint
+    duration: float
+    T_scan_patient: np.ndarray
+    covariance: np.ndarray
+    time: float
+    rest: np.ndarray
+    field: np.ndarray
+    normals: np.ndarray
+    velocity: np.ndarray
+    bodies: np.ndarray
+    draws: Sequence[Draw]
+    surrogate: float = 0.0
+    registration: Registration | None = None
+    corner: float = CORNER
+    latency: float = 0.0
+    clock: float = 5e-3
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """Of the camera.
+
+        Raises
+        ------
+        InputError
+            A viewpoint without one.
+        """
+        if self.viewpoint.calibration is None:
+            raise InputError("a camera that is tracked has a calibration: give the viewpoint one.")
+        return self.viewpoint.calibration
+
+    @cached_property
+    def believed(self) -> tuple[Calibration, ...]:
+        """Calibrations as they may have been found; to make one takes far longer than to use it."""
+        scale = np.sqrt(np.diag(self.covariance))
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
+        steps = np.random.default_rng(0).standard_normal((CALIBRATIONS, 9)) * np.sqrt(values.clip(0.0))
+        return tuple(changed(self.calibration, step) for step in scale * (steps @ vectors.T))
+
+    @cached_property
+    def off(self) -> np.ndarray:
+        """What the scene's own field is off by from the bodies' (b, n, 3) [m], their meshes apart."""
+        return self.bodies - self.field
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """What an overlay is off by in S samples: across the line of sight and along it [m], and in pixels.
+
+    Parameters
+    ----------
+    across, along, pixels
+        (S,) of the tumour's middle.
+    worst
+        (S,) [m]: of the point of its surface that is farthest off, in all directions.
+    """
+
+    across: np.ndarray
+    along: np.ndarray
+    pixels: np.ndarray
+    worst: np.ndarray
+
+    @property
+    def middle(self) -> np.ndarray:
+        """(S,) [m]: how far off the middle is in all directions."""
+        return np.hypot(self.across, self.along)
+
+
+def errors_of(filmed: Filmed, contributors: Sequence[str], count: int, seed: int = 0) -> Errors:
+    """What contributors, all others being exact, put an overlay off by, in so many samples.
+
+    The same seed draws the same numbers whoever contributes.
+
+    Raises
+    ------
+    InputError
+        A reference that the camera does not see.
+    """
+    rows = [_compared(*sample) for sample in _samples(filmed, frozenset(contributors), count, seed)]
+    return Errors(*np.array(rows).T)
+
+
+def _samples(
+    filmed: Filmed, contributors: frozenset[str], count: int, seed: int
+) -> Iterator[tuple[Camera, Camera, np.ndarray, np.ndarray]]:
+    """The true and the believed camera, the tumour's surface as it is, and as it is drawn (n, 3) [m]."""
+    target = patient_reference()
+    corners = sum(len(face.corners) for face in target.faces)
+
+    def of(name: str, value: np.ndarray) -> np.ndarray:
+        return value if name in contributors else np.zeros_like(value)
+
+    for number in range(count):
+        random = np.random.default_rng([seed, number])
+        time, body = random.uniform(0.0, filmed.duration), int(random.integers(len(filmed.bodies)))
+        late = float(of(LATENCY, np.array(filmed.latency + filmed.clock * random.standard_normal())))
+        drawn = int(random.integers(CALIBRATIONS))
+        taken = filmed.believed[drawn] if CALIBRATION in contributors else filmed.calibration
+        off = of(MARKERS, filmed.corner * random.standard_normal((corners, 2)))
+        aside = of(SURROGATE, filmed.surrogate / np.sqrt(RADIUS_SQUARED) * random.standard_normal(3))
+        shift = of(REGISTRATION, _shift(filmed, random.standard_normal(6)))
+        wide = of(SEGMENTATION, OF_SEGMENTATION.range[1] * random.standard_normal(1))
+        mesh = of(MESH, np.array(filmed.draws[body].mesh))
+        true = filmed.viewpoint.camera(filmed.site, time)
+        then = filmed.viewpoint.camera(filmed.site, time - late) if late else true
+        believed = taken.camera(then.T_camera_world)
+        if taken is not filmed.calibration or off.any():
+            found = corners_in(then, target, filmed.T_scan_patient, off)
+            known = then.T_camera_world @ filmed.T_scan_patient
+            _, pose = pose_of(believed, target, found, known)
+            if pose is None:
+                raise InputError("the camera does not see the patient's reference: take a path that keeps it in sight.")
+            believed = taken.camera(pose.T_camera_target @ np.linalg.inv(filmed.T_scan_patient))
+        motion = filmed.field + (filmed.off[body] if PARAMETERS in contributors else 0.0)
+        surface = filmed.rest + (1.0 + mesh) * motion
+        shown = filmed.rest + filmed.field - late * filmed.velocity + aside + wide * filmed.normals
+        yield true, believed, surface, shown + _registered(filmed, shift, shown)
+
+
+def _shift(filmed: Filmed, numbers: np.ndarray) -> np.ndarray:
+    """An error of registration (6,): a shift [m] and a turn [rad] in the frame of the patient's reference."""
+    if filmed.registration is None:
+        return np.append(OF_REGISTRATION.range[1] * numbers[:3], np.zeros(3))
+    scale = np.repeat([1.0, 0.1], 3)  # so that metres and radians are alike
+    root = np.linalg.cholesky(filmed.registration.covariance / np.outer(scale, scale) + 1e-18 * np.eye(6))
+    return scale * (root @ numbers)
+
+
+def _registered(filmed: Filmed, error: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """By how much places (n, 3) [m] in the scan move by an error of registration (6,)."""
+    if filmed.registration is None:
+        return np.broadcast_to(error[:3], points.shape)
+    R = filmed.T_scan_patient[:3, :3]
+    shift, turn = R @ error[:3], Rotation.from_rotvec(R @ error[3:])
+    arm = points - filmed.registration.centre
+    return turn.apply(arm) - arm + shift
+
+
+def _compared(
+    true: Camera, believed: Camera, surface: np.ndarray, shown: np.ndarray
+) -> tuple[float, float, float, float]:
+    """What is drawn beside what is there: the middle across the line of sight, along it, in pixels; the worst point."""
+    here, there = (np.vstack([points.mean(axis=0), points]) for points in (surface, shown))
+    pixels, depth = true.project(here)
+    drawn, farther = believed.project(there)
+    away = np.linalg.norm(drawn - pixels, axis=1)
+    # One pixel at the depth of the place: across the line of sight.
+    across = away * depth / np.sqrt(true.K[0, 0] * true.K[1, 1])
+    along = farther - depth
+    worst = float(np.hypot(across, along)[1:].max())
+    return float(across[0]), float(along[0]), float(away[0]), worst
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """The errors of an overlay: of each contributor alone, and of `TECHNICAL` and `CLINICAL` ones together.
+
+    `held` is the share of twins' samples within the band, where there are twins.
+    """
+
+    alone: dict[str, Errors]
+    technical: Errors
+    clinical: Errors
+    held: float | None = None
+
+    @property
+    def band(self) -> float:
+        """With a probability of 95 % no point of the tumour's surface is farther off [m]."""
+        return float(np.quantile(self.clinical.worst, LEVEL))
+
+    def largest(self, what: Literal["middle", "worst"]) -> str:
+        """The contributor that alone puts the middle, or the worst point, off the most in 95 of 100 samples."""
+        return max(self.alone, key=lambda name: float(np.quantile(getattr(self.alone[name], what), LEVEL)))
+
+
+def budgeted(
+    filmed: Filmed,
+    count: int,
+    seed: int = 0,
+    twins: Filmed | None = None,
+    progress: Callable[[Sequence[str]], Iterable[str]] = iter,
+) -> Budget:
+    """The budget from so many samples; `twins`, of other bodies, are held against its band with other numbers."""
+    alone = {name: errors_of(filmed, [name], count, seed) for name in progress(CLINICAL)}
+    technical, clinical = (errors_of(filmed, names, count, seed) for names in (TECHNICAL, CLINICAL))
+    budget = Budget(alone, technical, clinical)
+    if twins is None:
+        return budget
+    fresh = errors_of(twins, CLINICAL, count, seed + 1).worst
+    return replace(budget, held=float((fresh <= budget.band).mean()))
+
+
+def moment_of(still: Motions, answers: Sequence[tuple[np.ndarray, ...]], draws: Sequence[Draw]) -> int:
+    """The moment of a scene at which its bodies differ the most."""
+    sizes = []
+    for number, here in enumerate(still.fields):
+        off = off_by(np.stack([answer[number] for answer in answers]), here, draws)
+        sizes.append(float(np.linalg.norm(off, axis=2).max(axis=1).mean()))
+    return int(np.argmax(sizes))
+
+
+def velocity_at(still: Motions, number: int) -> np.ndarray:
+    """How fast the tumour's surface moves (n, 3) [m/s] on the way to a moment; 0 where tissue was cut meanwhile."""
+    before, here = still.fields[max(number - 1, 0)], still.fields[number]
+    if number == 0 or before.shape != here.shape:
+        return np.zeros_like(here)
+    return (here - before) / (still.times[number] - still.times[number - 1])

@@ -1,0 +1,267 @@
+"""`sulcus budget`: how many millimetres to believe of an overlay on a tracked camera, and what takes most of them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from sim.arguments import at_least
+from sim.errors import InputError
+from sim.runtime.outside_files import read_as
+
+from .camera_options import add_camera, filmed
+from .demo import add_bodies, scene_asked
+from .json_line import json_line
+from .tissue_options import add_element_argument, add_tissue_arguments
+
+if TYPE_CHECKING:
+    from ar.calibration import Calibration
+
+    from ..bench.error_budget import Budget, Errors, Filmed
+    from ..play.deformers import Theatre
+    from ..script.priors import Draw
+    from ..script.scene import Scene
+
+    Bodies = list[tuple[Draw, tuple[np.ndarray, ...]]]
+
+FEWEST, FEWEST_SAMPLES = 8, 200
+# Mean errors of overlays as published: a headset in 20 patients (10.3171/2025.5.JNS243160), and 35 studies [mm].
+PUBLISHED = (2.2, 2.5)
+NOTE = """
+"across" and "along" the line of sight are of the tumour's middle, "worst" of its worst surface point, 95 in 100 samples
+are below. "technical" is what camera, tracking, times and model are off by; "clinical" has also what nobody measures.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
+    add_bodies(parser)
+    add_tissue_arguments(parser)
+    add_element_argument(parser)
+    add_camera(parser)
+    parser.set_defaults(path="hand-held")
+    parser.add_argument(
+        "--intrinsics", type=Path, metavar="K.json",
+        help="covariance of --camera, written beside it by `sulcus calibrate` (default: of 24 good views of the board)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--registration", type=Path, metavar="R.json",
+        help="from `sulcus register` (default: a published 1.56 mm along each axis)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--corner-px", type=float, default=0.1, help="what a marker's corner is off by [pixel] (default %(default)s)"
+    )
+    parser.add_argument(
+        "--latency-ms", type=float, default=0.0,
+        help="how much later the picture drawn on is than the one that was tracked (default %(default)s: the same)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--clock-ms", type=float, default=5.0, help="what times of pictures and poses are off by (default %(default)s)"
+    )
+    parser.add_argument(
+        "--draws", type=int, default=24, help=f"bodies to solve, {FEWEST} or more (default %(default)s)"
+    )
+    parser.add_argument("--samples", type=int, default=1000, help="errors to draw (default %(default)s)")
+    parser.add_argument(
+        "--twins", type=int, default=0, help="try the band on so many other bodies (default %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default %(default)s)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for the finite elements")
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve bodies, draw errors, and say what each contributor is worth. Returns 0.
+
+    Raises
+    ------
+    InputError
+        What cannot be read, numbers out of range, or a scene that cannot be solved.
+    """
+    from ..bench.error_budget import Filmed, budgeted, moment_of, velocity_at
+    from ..bench.uncertainty import nominal, parts
+    from ..play.deformers import open_theatre
+    from ..play.stage import Stage
+    from ..script.reference_place import reference_beside
+    from ..script.registration_file import read_registration
+
+    at_least("--draws", args.draws, FEWEST)
+    at_least("--samples", args.samples, FEWEST_SAMPLES)
+    at_least("--twins", args.twins, 0)
+    for name, value in (
+        ("--corner-px", args.corner_px),
+        ("--latency-ms", args.latency_ms),
+        ("--clock-ms", args.clock_ms),
+    ):
+        if not 0.0 <= value < 1e4:
+            raise InputError(f"{name} {value:g}: give a number that is not below 0.")
+    theatre = open_theatre(args.anatomy, args.model, args.device)
+    scene = _seen(args)
+    calibration, site = scene.viewpoint.calibration, theatre.site
+    assert calibration is not None
+    known = _known(args, calibration)
+    registration = None if args.registration is None else read_registration(args.registration)
+    still = nominal(theatre, scene)
+    bodies = _bodies(args, theatre, scene, args.draws, args.seed)
+    number = moment_of(still, [answer for _, answer in bodies], [draw for draw, _ in bodies])
+    time = still.times[number]
+    filmed = Filmed(
+        site, scene.viewpoint, scene.duration, reference_beside(site, scene.viewpoint.camera(site)), known, time,
+        Stage(scene, site).at(scene.loads(site, scene.path(time), time)).tumour_at_rest.vertices,
+        still.fields[number], still.normals[number], velocity_at(still, number), *_at(bodies, number),
+        _promised(theatre, scene, time), registration, args.corner_px, 1e-3 * args.latency_ms, 1e-3 * args.clock_ms,
+    )  # fmt: skip
+    twins = None
+    if args.twins:
+        others, draws = _at(_bodies(args, theatre, scene, args.twins, args.seed + 1), number)
+        twins = replace(filmed, bodies=others, draws=draws)
+    bar = partial(tqdm, unit="part", desc="errors", leave=False, file=sys.stderr)
+    found = budgeted(filmed, args.samples, args.seed, twins, bar)
+    report = _flat(args, filmed, found, parts(filmed.bodies, filmed.field, filmed.draws, scene))
+    print(json_line(report) if args.json else "\n".join(_lines(report)))
+    return 0
+
+
+def _seen(args: argparse.Namespace) -> Scene:
+    """The scene as a calibrated camera films it.
+
+    Raises
+    ------
+    InputError
+        A scene whose tumour is found by what is seen, or a camera that zooms.
+    """
+    from ..script.reference_place import VIEW, filming
+
+    scene = scene_asked(args, args.scene)
+    if scene.sight is not None:
+        raise InputError(
+            f"the scene {scene.name} finds its tumour by what is seen, and says its error: choose another."
+        )
+    if args.path == "microscope":
+        raise InputError("--path microscope zooms, and a tracked camera has one calibration: choose another path.")
+    scene = filmed(args, replace(scene, viewpoint=VIEW))
+    calibration = scene.viewpoint.calibration
+    assert calibration is not None
+    path = scene.viewpoint.path
+    return replace(scene, viewpoint=replace(filming(calibration), path=path))
+
+
+def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
+    """The covariance (9, 9) of the camera's intrinsics.
+
+    Raises
+    ------
+    InputError
+        A file that is missing, no such covariance, or of another camera.
+    """
+    from ..bench.tracking_errors import usual_covariance
+
+    path = args.intrinsics
+    if path is None:
+        return usual_covariance(calibration)
+    if args.camera is None:
+        raise InputError("--intrinsics belongs to a camera: give it by --camera.")
+    wanted = "Give the K.json that `sulcus calibrate` wrote beside the camera."
+    with read_as(path, "a covariance of intrinsics", wanted):
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        covariance, values = np.array(stored["covariance"], float), np.array(stored["values"], float)
+        if covariance.shape != (9, 9) or not np.isfinite(covariance).all() or not (np.diag(covariance) > 0.0).all():
+            raise InputError(f"its covariance is none of nine parameters. {wanted}")
+        if not np.allclose(values[:4], [*calibration.focal, *calibration.principal], rtol=1e-3):
+            raise InputError(f"is of another camera, or of another size of its pictures, than --camera. {wanted}")
+    return covariance
+
+
+def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int, seed: int) -> Bodies:
+    """So many bodies drawn from priors, and how the tumour's surface moves in each; those without equilibrium are out.
+
+    Raises
+    ------
+    InputError
+        Too few have one.
+    """
+    from ..bench.uncertainty import LEAST, ensemble
+    from ..script.priors import drawn
+
+    draws = drawn(count, seed)
+    bar = tqdm(ensemble(theatre, scene, draws), total=count, unit="body", desc=scene.name, leave=False, file=sys.stderr)
+    sound = [(draw, answer) for draw, answer in zip(draws, bar, strict=True) if answer is not None]
+    if len(sound) < LEAST * count:
+        raise InputError(f"of {count} bodies {len(sound)} have an equilibrium in the scene {scene.name}: too few.")
+    return sound
+
+
+def _at(bodies: Bodies, number: int) -> tuple[np.ndarray, list[Draw]]:
+    """How the tumour's surface moves in each body at a moment (b, n, 3) [m], and the bodies."""
+    return np.stack([answer[number] for _, answer in bodies]), [draw for draw, _ in bodies]
+
+
+def _promised(theatre: Theatre, scene: Scene, time: float) -> float:
+    """The bound [m] of the model that plays a scene, at a time [s]; 0 where finite elements do."""
+    player = theatre.player(theatre.usual(scene), scene)
+    number = int(np.abs(scene.times - time).argmin())
+    return player.draw(number, time, scene.path(time)).model_error or 0.0
+
+
+def _flat(args: argparse.Namespace, filmed: Filmed, found: Budget, split: dict[str, float]) -> dict[str, Any]:
+    """All figures [mm, pixel]."""
+    from ..bench.error_budget import PARAMETERS
+
+    calibration, rows = filmed.calibration, found.alone | {"technical": found.technical, "clinical": found.clinical}
+    inside = {name: 1e3 * split[name] for name in sorted(split, key=lambda name: -split[name]) if name not in rows}
+    return {
+        "scene": args.scene, "time_s": filmed.time,
+        "moved_mm": 1e3 * float(np.linalg.norm(filmed.field, axis=1).mean()),
+        "camera": {
+            "width": calibration.width, "height": calibration.height, "focal_px": list(calibration.focal),
+            "distance_mm": 1e3 * filmed.viewpoint.distance, "path": args.path or "stays",
+        },
+        "latency_ms": args.latency_ms, "clock_ms": args.clock_ms, "corner_px": args.corner_px,
+        "samples": args.samples, "bodies": len(filmed.draws), "seed": args.seed,
+        "parts": {name: _figures(errors) for name, errors in rows.items()},
+        "inside": {PARAMETERS: inside}, "largest": {"middle": found.largest("middle"), "worst": found.largest("worst")},
+        "band_mm": 1e3 * found.band, "held_twins": found.held,
+        "published_mm": list(PUBLISHED),
+    }  # fmt: skip
+
+
+def _figures(errors: Errors) -> dict[str, dict[str, float]]:
+    """Medians and 95 in 100 of one row."""
+    columns = {
+        "across_mm": 1e3 * errors.across, "along_mm": 1e3 * np.abs(errors.along), "pixels": errors.pixels,
+        "middle_mm": 1e3 * errors.middle, "worst_mm": 1e3 * errors.worst,
+    }  # fmt: skip
+    quantiles = {name: np.quantile(values, [0.5, 0.95]).tolist() for name, values in columns.items()}
+    return {name: {"p50": low, "p95": high} for name, (low, high) in quantiles.items()}
+
+
+def _lines(report: dict[str, Any]) -> list[str]:
+    """The same in lines."""
+    camera = report["camera"]
+    lines = [
+        f"{report['scene']} at {report['time_s']:.1f} s, the tumour has moved by {report['moved_mm']:.2f} mm. "
+        f"Camera of {camera['width']} x {camera['height']}, {camera['distance_mm']:.0f} mm away, {camera['path']}.",
+        "",
+        f"{'p50, p95':<29}{'across [mm]':>14}{'along [mm]':>14}{'[pixel]':>14}{'worst point [mm]':>18}",
+    ]
+    for name, row in report["parts"].items():
+        cells = [f"{row[key]['p50']:6.2f} {row[key]['p95']:6.2f}" for key in ("across_mm", "along_mm", "pixels")]
+        lines.append(f"{name:<29}" + "".join(f"{cell:>14}" for cell in cells) + f"{row['worst_mm']['p95']:>18.2f}")
+    lines += [
+        NOTE,
+        f"Most of it: {report['largest']['middle']} for the middle, {report['largest']['worst']} for the worst point.",
+        f"In 95 of 100 samples no point is off by {report['band_mm']:.1f} mm.",
+    ]
+    if report["held_twins"] is not None:
+        lines.append(f"On other bodies, with other errors, that held for {report['held_twins']:.1%}.")
+    low, high = report["published_mm"]
+    return [*lines, f"Published errors of overlays, in the mean: {low:g} to {high:g} mm (docs/uncertainty.md)."]

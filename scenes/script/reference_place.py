@@ -1,0 +1,38 @@
+"""Where the patient's reference stands when a scene is filmed: beside the opening, turned towards the camera."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ar.calibration import Calibration
+from ar.camera import Camera
+from ar.lens import Lens
+from ar.tracking.targets import patient_reference
+
+from .site import Site
+from .viewpoint import Viewpoint
+
+USUAL = Calibration((1400.0, 1400.0), (620.0, 492.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film")
+"""The camera of a film that says nothing else."""
+VIEW = Viewpoint(distance=0.32).calibrated(USUAL)
+"""At arm's length: it sees the opening, the reference beside it and the tool's cube."""
+# The reference's middle from the site, to the right, up and outwards [m]; turned from the line of sight [degree].
+BESIDE, TURNED = (-0.078, 0.010, 0.022), (28.0, -24.0)
+
+
+def filming(calibration: Calibration, view: Viewpoint = VIEW) -> Viewpoint:
+    """A view by another camera, from where its picture shows as much as that of `view`."""
+    assert view.calibration is not None
+    shown = [each.focal[1] / each.height for each in (calibration, view.calibration)]
+    return Viewpoint(distance=view.distance * shown[0] / shown[1]).calibrated(calibration)
+
+
+def reference_beside(site: Site, camera: Camera) -> np.ndarray:
+    """T_scan_patient (4, 4) of the reference beside a site, as `camera` sees it from in front."""
+    right, up, outwards = BESIDE
+    middle = site.origin + right * site.right + up * site.up - outwards * site.axis
+    T = np.eye(4)
+    T[:3, :3] = camera.T_camera_world[:3, :3].T @ Rotation.from_euler("xy", TURNED, degrees=True).as_matrix()
+    T[:3, 3] = middle - T[:3, :3] @ [*(0.5 * patient_reference().faces[0].size), 0.0]
+    return T

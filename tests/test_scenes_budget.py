@@ -1,0 +1,132 @@
+"""What an overlay on a tracked camera is off by: each contributor against what it must be, and all together."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes.bench.error_budget import CLINICAL, LATENCY, MARKERS, MESH, TECHNICAL, Filmed, budgeted, errors_of
+from scenes.bench.tracking_errors import changed, usual_covariance
+from scenes.cli import main
+from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION, drawn
+from scenes.script.reference_place import USUAL, VIEW, reference_beside
+from scenes.script.site import site_of
+from scenes.script.uncertainty import SURROGATE
+from sim.bodies.meshfile import write_anatomy
+from sim.errors import InputError
+
+COUNT = 200
+SPEED = 0.05
+
+
+def sideways(camera, target, time):
+    """A camera that moves along its rows."""
+    return camera.moved(np.array([SPEED * time, 0.0, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def filmed(box):
+    site, rng = site_of(box), np.random.default_rng(0)
+    ball = rng.normal(size=(60, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    rest = site.origin + 0.015 * site.axis + 5e-3 * ball
+    bodies = 1e-3 * rng.normal(size=(100, 1, 3)) + np.zeros_like(rest)
+    return Filmed(
+        site, VIEW, 2.0, reference_beside(site, VIEW.camera(site)), usual_covariance(USUAL), 1.0, rest,
+        0.002 * site.axis + np.zeros_like(rest), ball, np.zeros_like(rest), bodies, drawn(100), 0.3e-3,
+    )  # fmt: skip
+
+
+def test_nothing_is_off_where_nobody_contributes(filmed):
+    none = errors_of(filmed, [], 20)
+    for values in (none.across, none.along, none.pixels, none.worst):
+        assert np.abs(values).max() < 1e-12
+
+
+def test_registration_segmentation_model_and_mesh_are_as_large_as_they_are_said_to_be(filmed):
+    moved = errors_of(filmed, [REGISTRATION], COUNT)
+    assert np.sqrt(np.mean(moved.middle**2)) == pytest.approx(np.sqrt(3.0) * OF_REGISTRATION.range[1], rel=0.1)
+    assert np.sqrt(np.mean(moved.along**2)) == pytest.approx(OF_REGISTRATION.range[1], rel=0.15)
+    wide = errors_of(filmed, [SEGMENTATION], COUNT)
+    assert np.quantile(wide.worst, 0.68) == pytest.approx(OF_SEGMENTATION.range[1], rel=0.15)
+    assert np.quantile(errors_of(filmed, [SURROGATE], COUNT).worst, 0.95) == pytest.approx(0.3e-3, rel=0.15)
+    off = np.abs([draw.mesh for draw in filmed.draws]).max()
+    assert errors_of(filmed, [MESH], COUNT).worst.max() == pytest.approx(0.002 * off, rel=0.02)
+
+
+def test_latency_costs_what_the_camera_moves_meanwhile(filmed):
+    moving = replace(filmed, viewpoint=replace(VIEW, path=sideways), latency=0.02, clock=0.0)
+    found = errors_of(moving, [LATENCY], 20)
+    np.testing.assert_allclose(found.across, 0.02 * SPEED, rtol=0.05)
+    assert errors_of(replace(moving, latency=0.0), [LATENCY], 20).worst.max() < 1e-12
+    assert errors_of(replace(filmed, latency=0.02), [LATENCY], 20).worst.max() == pytest.approx(0.0, abs=1e-3)
+
+
+def test_twice_the_noise_of_corners_puts_the_tumour_off_by_twice_as_much(filmed):
+    once, twice = (errors_of(replace(filmed, corner=noise), [MARKERS], COUNT).worst for noise in (0.1, 0.2))
+    assert np.median(twice) == pytest.approx(2.0 * np.median(once), rel=0.1)
+    # Sixteen corners 60 mm wide, 80 mm beside the tumour.
+    assert 0.05e-3 < np.median(once) < 0.5e-3
+
+
+def test_a_calibration_is_as_sure_as_one_of_pictures_and_wrong_ones_cost_more(filmed):
+    deviations = np.sqrt(np.diag(filmed.covariance))
+    assert (deviations[:4] > 0.05).all() and (deviations[:4] < 3.0).all()
+    assert changed(USUAL, np.arange(9.0)).focal == (1400.0, 1401.0)
+    worse = errors_of(replace(filmed, covariance=100.0 * filmed.covariance), TECHNICAL[:1], 50)
+    assert np.median(worse.worst) > 5.0 * np.median(errors_of(filmed, TECHNICAL[:1], 50).worst)
+
+
+def test_the_band_holds_for_twins_and_not_for_bodies_that_differ_more(filmed):
+    here, other = (
+        1e-3 * np.random.default_rng(seed).normal(size=(600, 1, 3)) + np.zeros_like(filmed.rest) for seed in (2, 3)
+    )
+    first, twins = (replace(filmed, bodies=bodies, draws=drawn(600)) for bodies in (here, other))
+    band = np.quantile(errors_of(first, CLINICAL, 600).worst, 0.95)
+    assert 0.92 < (errors_of(twins, CLINICAL, 600, 1).worst <= band).mean() < 0.98
+    assert (errors_of(replace(twins, bodies=6.0 * other), CLINICAL, 200, 1).worst <= band).mean() < 0.8
+
+
+def test_parts_add_up_in_quadrature_and_the_largest_is_named(filmed):
+    budget = budgeted(filmed, 100, twins=filmed)
+    technical, clinical = (np.median(each.middle) for each in (budget.technical, budget.clinical))
+    assert technical < clinical and set(budget.alone) == set(CLINICAL)
+    squares = sum(np.mean(budget.alone[name].middle ** 2) for name in TECHNICAL)
+    assert np.sqrt(np.mean(budget.technical.middle**2)) == pytest.approx(np.sqrt(squares), rel=0.2)
+    assert budget.largest("middle") == REGISTRATION and (budget.held or 0.0) > 0.8
+
+
+def test_a_reference_out_of_sight_is_said(filmed):
+    away = filmed.T_scan_patient.copy()
+    away[:3, 3] += 0.5
+    with pytest.raises(InputError, match="does not see the patient's reference"):
+        errors_of(replace(filmed, T_scan_patient=away), [MARKERS], 1)
+
+
+def test_the_command_names_every_part_and_refuses_bad_input(box, tmp_path, capsys):
+    body, own = tmp_path / "box.vtu", tmp_path / "brief.py"
+    write_anatomy(body, box)
+    own.write_text(
+        "from scenes import Scene, press\n"
+        "SCENE = Scene('brief', 'A short press.', press(0.25, rise=0.1, hold=0.0), duration=0.2)\n"
+    )
+    words = ["budget", str(own), "--anatomy", str(body), "--device", "cpu", "--draws", "8", "--samples", "200"]
+    assert main([*words, "--twins", "1", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert set(said["parts"]) == {*CLINICAL, "technical", "clinical"} and said["bodies"] == 8
+    assert said["parts"][SURROGATE]["worst_mm"]["p95"] == 0.0  # finite elements play
+    row = said["parts"]["clinical"]
+    assert row["across_mm"]["p50"] < row["across_mm"]["p95"] < row["worst_mm"]["p95"] == pytest.approx(said["band_mm"])
+    assert 0.0 <= said["held_twins"] <= 1.0
+    for more, why in (
+        (["--path", "microscope"], "zooms"),
+        (["--intrinsics", "k.json"], "give it by --camera"),
+        (["--registration", "none.json"], "no such file"),
+        (["--corner-px", "-1"], "--corner-px -1"),
+        (["--samples", "10"], "--samples"),
+    ):
+        assert main([*words, *more]) == 2
+        assert why in capsys.readouterr().err
+    assert main(["budget", "sag", *words[2:]]) == 2
+    assert "finds its tumour by what is seen" in capsys.readouterr().err
