@@ -37,6 +37,8 @@ COMMANDS = {
     "collect": "write a scene as one episode: pictures, depth, segmentation, forces, tumour",
     "markers": "write the pages to print: markers of tool and patient, and the board that calibrates cameras",
     "track": "follow the tool and the patient's reference through a film: poses, covariances, and where they are lost",
+    "film": "film a scene as a real camera would, with printed targets in view, and write down what is true of it",
+    "overlay": "draw where the tumour is into a film or what a camera sees, by the tracked reference and tool",
     "calibrate": "find a camera's intrinsics, a tool's tip, or how two tracked bodies lie together, and how surely",
     "register": "find how a scan lies beside the patient's reference, from points that were touched, and how surely",
     "sensitivity": "measure how the tumour's motion changes with tissue, skull, tool and element, one at a time",
@@ -50,18 +52,9 @@ COMMANDS = {
 # Commands that make or read models, whose learners may be a user's own.
 MAKING = ("train", "patient")
 READING = (
-    "judge",
-    "export",
-    "scenes",
-    "effects",
-    "demo",
-    "render",
-    "collect",
-    "sensitivity",
-    "uncertainty",
-    "budget",
-    "check",
-)
+    "judge", "export", "scenes", "effects", "demo", "render", "film", "overlay", "collect", "sensitivity",
+    "uncertainty", "budget", "check",
+)  # fmt: skip
 
 # Commands with commands of their own; the first is meant where none is named.
 INNER = {"bench": tuple(BENCHES)}

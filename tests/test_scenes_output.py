@@ -17,12 +17,16 @@ from scenes.bench.figure_record import Origin, record_of, write_record
 from scenes.cli import main
 from scenes.commands.companion_files import demand_no_strangers, remove_data, strangers
 from scenes.commands.outputs import KINDS, claimed, claimed_frames, recognised
+from scenes.play.overlay_rows import write_rows
 from scenes.script.calibration_file import write_calibration
+from scenes.script.film_truth import Truth, write_table, write_truth
 from scenes.script.registration_file import write_registration
+from scenes.script.tracked_tool import TrackedTool, write_tool
 from sim.bodies.intensity import Intensity, sidecar, write_intensity
 from sim.bodies.meshfile import read_mesh, write_anatomy, write_mesh
 from sim.errors import InputError
 from sim.runtime.atomic_files import check_output
+from sim.tools import Ball
 from surrogate.fitting.tissue import FittedTissue
 from surrogate.fitting.tissue_files import save_tissue
 
@@ -117,6 +121,13 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         tmp_path / "camera.yaml", Calibration((9.0, 9.0), (4.0, 4.0), 8, 8, name="sulcus calibrate: camera")
     )
     (tmp_path / "camera.json").write_text('{"format": "sulcus intrinsics 1"}')
+    write_calibration(tmp_path / "filmed.yaml", Calibration((9.0, 9.0), (4.0, 4.0), 8, 8, name="sulcus film: press"))
+    write_tool(tmp_path / "tool.json", TrackedTool(Ball(7e-3)))
+    one, place = np.eye(4)[None], np.zeros((1, 3))
+    truth = Truth("box", np.zeros(1), one, one, place[None])
+    write_truth(tmp_path / "truth.npz", truth)
+    write_table(tmp_path / "truth.csv", truth, place)
+    write_rows(tmp_path / "rows.csv", [], [], None)
     write_registration(tmp_path / "registered.json", Registration(np.eye(4), np.eye(6), np.zeros(3), 1e-3, 6))
     (tmp_path / "text.txt").write_text("my own")
     expected = {
@@ -141,6 +152,11 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         "a calibration of `sulcus calibrate`": "camera.yaml",
         "a covariance of `sulcus calibrate`": "camera.json",
         "a registration of `sulcus register`": "registered.json",
+        "a camera of `sulcus film`": "filmed.yaml",
+        "a tool of `sulcus film`": "tool.json",
+        "what is true of a film of `sulcus film`": "truth.npz",
+        "a table of `sulcus film`": "truth.csv",
+        "a table of `sulcus overlay`": "rows.csv",
     }
     assert set(expected) == set(KINDS)
     for kind, name in expected.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ INK, PAPER = 25.0, 225.0
 
 
 def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, np.ndarray]]) -> np.ndarray:
-    """A picture (H, W) uint8 with targets before it, seen sharply and evenly lit.
+    """A picture (H, W) or (H, W, 3) uint8 with targets before it, seen sharply and evenly lit.
 
     Every pixel is the mean of `SAMPLES`^2 rays, each followed through the lens to the face that it meets first.
 
@@ -35,25 +36,45 @@ def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, n
         With T_world_target (4, 4) each.
     """
     own = replace(camera, T_camera_world=np.eye(4))
-    out = np.repeat(picture[None].astype(np.float32), SAMPLES**2, axis=0)
-    nearest = np.full(out.shape, np.inf)
-    for target, T_world_target in targets:
-        for face in target.faces:
-            T = camera.T_camera_world @ T_world_target @ face.T_target_face
-            where = window_round(own, _edge(face) @ T[:3, :3].T + T[:3, 3], 0.0, MARGIN)
-            if where is None or T[:3, 2] @ T[:3, 3] <= 0.0:  # or seen from behind
-                continue
-            printed = face.picture(TEXTURE)
-            for sample, shift in enumerate(_shifts()):
-                columns, rows = (np.arange(part.start, part.stop) for part in where[::-1])
-                pixels = np.stack(np.meshgrid(columns + shift[0], rows + shift[1]), axis=-1)
-                rays = own.unproject(pixels, np.ones(pixels.shape[:-1]))
-                depth = (T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2])
-                grey = _grey(face, printed, (rays * depth[..., None] - T[:3, 3]) @ T[:3, :2])
-                front = ~np.isnan(grey) & (depth > 0.0) & (depth < nearest[sample][where])
-                out[sample][where] = np.where(front, grey, out[sample][where])
-                nearest[sample][where] = np.where(front, depth, nearest[sample][where])
-    return np.clip(np.rint(out.mean(axis=0)), 0.0, 255.0).astype(np.uint8)
+    placed = [
+        (face, camera.T_camera_world @ T_world_target @ face.T_target_face)
+        for target, T_world_target in targets
+        for face in target.faces
+    ]
+    windows = [(face, T, window_round(own, _edge(face) @ T[:3, :3].T + T[:3, 3], 0.0, MARGIN)) for face, T in placed]
+    seen = [(face, T, where) for face, T, where in windows if where is not None and T[:3, 2] @ T[:3, 3] > 0.0]
+    if not seen:
+        return picture.copy()
+    box = tuple(
+        slice(min(where[axis].start for *_, where in seen), max(where[axis].stop for *_, where in seen))
+        for axis in (0, 1)
+    )
+    straight, inverse = camera.straight[box], np.linalg.inv(camera.K)
+    by_row, by_column = (np.gradient(straight, axis=axis) for axis in (0, 1))
+    ink, cover = np.zeros(straight.shape[:2]), np.zeros(straight.shape[:2])
+    for shift in _shifts():
+        pixels = straight + shift[0] * by_column + shift[1] * by_row
+        nearest, grey = np.full(ink.shape, np.inf), np.full(ink.shape, np.nan)
+        for face, T, where in seen:
+            part = tuple(slice(a.start - b.start, a.stop - b.start) for a, b in zip(where, box, strict=True))
+            rays = np.concatenate([pixels[part], np.ones((*pixels[part].shape[:2], 1))], axis=-1) @ inverse.T
+            depth = (T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2])
+            here = _grey(face, _printed(face), (rays * depth[..., None] - T[:3, 3]) @ T[:3, :2])
+            front = ~np.isnan(here) & (depth > 0.0) & (depth < nearest[part])
+            grey[part], nearest[part] = np.where(front, here, grey[part]), np.where(front, depth, nearest[part])
+        ink, cover = ink + np.nan_to_num(grey), cover + ~np.isnan(grey)
+    behind = picture[box].astype(np.float64)
+    share, ink = 1.0 - cover / SAMPLES**2, ink / SAMPLES**2
+    if picture.ndim == 3:
+        share, ink = share[..., None], ink[..., None]
+    out = picture.copy()
+    out[box] = np.clip(np.rint(share * behind + ink), 0.0, 255.0).astype(np.uint8)
+    return out
+
+
+@lru_cache(maxsize=16)
+def _printed(face: Face) -> np.ndarray:
+    return face.picture(TEXTURE)
 
 
 def _shifts() -> np.ndarray:

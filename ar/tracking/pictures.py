@@ -1,4 +1,4 @@
-"""Pictures of one camera, grey, out of a folder or a video that comes from outside."""
+"""Pictures of one camera, grey, and in colour where asked for, out of a folder or a video that comes from outside."""
 
 from __future__ import annotations
 
@@ -37,11 +37,14 @@ class Named:
         (H, W) uint8.
     time
         As a video says [s]; of a file 0.
+    colour
+        (H, W, 3) uint8 sRGB, where it was asked for.
     """
 
     name: str
     grey: np.ndarray
     time: float = 0.0
+    colour: np.ndarray | None = None
 
 
 def pictures_of(path: Path) -> Iterator[Named]:
@@ -58,10 +61,10 @@ def pictures_of(path: Path) -> Iterator[Named]:
     return islice(_in_video(path, None), MOST_PICTURES)
 
 
-def film_of(path: Path, rate: float) -> Iterator[Named]:
+def film_of(path: Path, rate: float, colour: bool = False) -> Iterator[Named]:
     """Every picture of a video, or of a folder in the order of names, with its time [s].
 
-    Of a folder `rate` is how many there are in a second; a video says its own times.
+    Of a folder `rate` is how many there are in a second; a video says its own times. `colour` asks for that, too.
 
     Raises
     ------
@@ -69,8 +72,16 @@ def film_of(path: Path, rate: float) -> Iterator[Named]:
         As `pictures_of`.
     """
     if path.is_dir():
-        return (Named(file.name, _read(file), number / rate) for number, file in enumerate(_files(path)))
-    return _in_video(path, 1)
+        files = enumerate(_files(path))
+        if colour:
+            return (in_colour(file.name, _read(file, "RGB"), number / rate) for number, file in files)
+        return (Named(file.name, _read(file), number / rate) for number, file in files)
+    return _in_video(path, 1, colour)
+
+
+def in_colour(name: str, colour: np.ndarray, time: float) -> Named:
+    """A picture (H, W, 3) uint8 sRGB with its grey one."""
+    return Named(name, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), time, colour)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -80,8 +91,8 @@ def _files(folder: Path) -> list[Path]:
     return files
 
 
-def _read(path: Path) -> np.ndarray:
-    """A picture as it was stored: not turned as its file may say, since the lens is not."""
+def _read(path: Path, kind: str = "L") -> np.ndarray:
+    """A picture as it was stored, grey or RGB: not turned as its file may say, since the lens is not."""
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{path}: is larger than {MOST_BYTES / 1e6:.0f} MB. Remove it, or write it smaller.")
     try:
@@ -90,15 +101,16 @@ def _read(path: Path) -> np.ndarray:
             with Image.open(path, formats=("PNG", "JPEG")) as picture:
                 _demand_size(path, *picture.size)
                 if picture.mode.startswith("I"):  # of 16 bits
-                    return (np.asarray(picture) >> 8).astype(np.uint8)
-                return np.asarray(picture.convert("L"))
+                    grey = (np.asarray(picture) >> 8).astype(np.uint8)
+                    return grey if kind == "L" else np.repeat(grey[..., None], 3, axis=2)
+                return np.asarray(picture.convert(kind))
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         raise ValueError(f"{path}: {TOO_LARGE}") from error
     except (OSError, SyntaxError) as error:
         raise ValueError(f"{path}: is no picture that can be read. Remove it, or write it anew.") from error
 
 
-def _in_video(path: Path, step: int | None) -> Iterator[Named]:
+def _in_video(path: Path, step: int | None, colour: bool = False) -> Iterator[Named]:
     """One in `step` frames of a video; None: so many that there are `MOST_PICTURES`."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file. {GIVE}")
@@ -116,7 +128,9 @@ def _in_video(path: Path, step: int | None) -> Iterator[Named]:
             if number % every == 0:
                 time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
                 good, frame = video.retrieve()
-                if good:
+                if good and colour:
+                    yield in_colour(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), time)
+                elif good:
                     yield Named(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), time)
             number += 1
     finally:
@@ -131,3 +145,15 @@ def _spread(count: int) -> list[int]:
 def _demand_size(path: Path, width: int, height: int) -> None:
     if max(width, height) > LARGEST_SIDE or width * height > MOST_PIXELS:
         raise ValueError(f"{path}: {TOO_LARGE}")
+
+
+def rate_of(path: Path) -> float | None:
+    """Pictures a second of a video, as it says itself; None of a folder, and where it does not say."""
+    if not path.is_file():
+        return None
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        rate = float(video.get(cv2.CAP_PROP_FPS))
+        return rate if 0.0 < rate < np.inf else None
+    finally:
+        video.release()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # Named here too, so that a command's help waits for no scene to be imported.
 NAMES = "press, slide, draw, palpate, retract, brain_shift, resection, pulsation, sag, lost_force"
-PLAYING = ("demo", "render", "collect", "check", "effects")
+PLAYING = ("demo", "render", "film", "collect", "check", "effects")
 """Commands that take the scene to play."""
 
 EXAMPLES = {
@@ -67,6 +67,14 @@ next: print markers/markers.pdf at 100 %, measure its rulers, glue; then film th
     "track": """example:
   sulcus track film.mp4 --camera camera.yaml --frame patient --out tool.csv
 next: sulcus calibrate --pivot tool.csv, where the film shows the tool pivoting""",
+    "film": """examples:
+  sulcus film palpate --out film --path hand-held
+  sulcus film palpate --out film --trouble reference:1-1.5 --trouble bright:2.5-2.8
+next: sulcus overlay film/film.mp4 --camera film/camera.yaml --registration ..., as docs/overlay.md has it""",
+    "overlay": """examples:
+  sulcus overlay film.mp4 --camera K.yaml --registration R.json --tool T.json --out shown.mp4
+  sulcus overlay 0 --camera K.yaml --registration R.json --tool T.json
+next: look at the film that it wrote""",
     "calibrate": """examples:
   sulcus calibrate board.mp4 --out camera.yaml
   sulcus calibrate pictures --size 1280x960 --out camera.yaml --json

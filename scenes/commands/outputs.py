@@ -206,6 +206,11 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "a calibration of `sulcus calibrate`": _begins(b"sulcus calibrate"),
     "a covariance of `sulcus calibrate`": _begins(b'"format": "sulcus intrinsics'),
     "a registration of `sulcus register`": _begins(b'"format": "sulcus registration'),
+    "a camera of `sulcus film`": _begins(b"sulcus film"),
+    "a tool of `sulcus film`": _begins(b'"format": "sulcus tool'),
+    "what is true of a film of `sulcus film`": lambda path: str(model_header(path)["format"]).startswith("sulcus film"),
+    "a table of `sulcus film`": _begins(b"time_s,tumour_x_mm,"),
+    "a table of `sulcus overlay`": _begins(b"time_s,state,tumour_x_mm,"),
     "a page of `sulcus markers`": _is_printed,
     "a list of `sulcus markers`": _begins(b'"format": "sulcus targets'),
 }

@@ -9,13 +9,29 @@ from typing import Protocol
 import numpy as np
 import trimesh
 
-from sim.tools import Ball, Spatula, Tool, core_of
+from sim.tools import Ball, BuiltIn, Spatula, Tool, core_of
+
+# Radius of the shaft of a tool of which no more is known [m].
+SHAFT = 1.8e-3
 
 
 def sphere(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """A sphere of radius 1: vertices (n, 3), and triangles (m, 3), which point outwards."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     return np.asarray(ball.vertices), np.asarray(ball.faces)
+
+
+def shafted(shape: BuiltIn, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A tool of which the shape alone is known, on a straight shaft to `top` (3,) [m].
+
+    Vertices (n, 3) [m] in the tool's own frame, and triangles (m, 3).
+    """
+    core = core_of(shape)
+    ball = core.radius * sphere(3)[0]
+    head = trimesh.convex.convex_hull((core.corners[:, None] + ball).reshape(-1, 3))
+    shaft = trimesh.creation.cylinder(SHAFT, segment=[core.centre, top], sections=24)
+    both = head + shaft
+    return np.asarray(both.vertices), np.asarray(both.faces)
 
 
 class Instrument(Protocol):

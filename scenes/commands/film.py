@@ -1,0 +1,179 @@
+"""`sulcus film`: a scene as a real camera films it, with printed targets in view, and all that is true of it."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.arguments import at_least
+from sim.errors import InputError
+from sim.runtime.atomic_files import REMEDY, why
+
+from .camera_options import add_camera, filmed
+from .demo import add_theatre, scene_asked, theatre_asked
+from .json_line import json_line
+from .outputs import add_force, claimed, claimed_folder, claimed_frames
+
+if TYPE_CHECKING:
+    from ..play.filming import Shot
+    from ..play.player import Player
+    from ..script.scene import Scene
+
+# Named here too, so that a command's help waits for no picture to be drawn.
+TROUBLES = ("reference", "tool", "bright", "smear", "gap")
+# What signs the pictures of a folder.
+SIGNED = "film"
+# What is written, and how it is recognised.
+FILES = {
+    "camera.yaml": "a camera of `sulcus film`",
+    "registration.json": "a registration of `sulcus register`",
+    "tool.json": "a tool of `sulcus film`",
+    "truth.npz": "what is true of a film of `sulcus film`",
+    "truth.csv": "a table of `sulcus film`",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("scene", help="a built-in scene with a tool, see `sulcus scenes`, or MY_SCENE.py")
+    parser.add_argument(
+        "--out", required=True, type=Path, metavar="DIR",
+        help="folder for film.mp4, camera.yaml, registration.json, tool.json, truth.npz and truth.csv",
+    )  # fmt: skip
+    parser.add_argument("--every", type=int, default=1, help="film one frame in so many (default %(default)s)")
+    parser.add_argument("--seconds", type=float, help="film only so much of the scene [s]")
+    parser.add_argument("--png", action="store_true", help="write DIR/frames/*.png, without loss, in place of film.mp4")
+    parser.add_argument("--blur", type=float, default=0.5, metavar="PX", help="of the lens (default %(default)s)")
+    parser.add_argument("--noise", type=float, default=2.0, help="of each pixel, of 255 (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of noise and of --registered (default %(default)s)")
+    parser.add_argument(
+        "--trouble", type=trouble, action="append", default=[], metavar="KIND:FROM-TO",
+        help=f"what goes wrong between two times [s]: {', '.join(TROUBLES)}; may be given again",
+    )  # fmt: skip
+    parser.add_argument(
+        "--registered", type=float, nargs=2, default=(0.0, 0.0), metavar=("MM", "DEGREES"),
+        help="how far the registration is off at the opening: deviations along and about each axis (default 0 0)",
+    )  # fmt: skip
+    add_theatre(parser)
+    add_camera(parser)
+    add_force(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
+
+
+def trouble(text: str) -> tuple[str, float, float]:
+    """KIND:FROM-TO as a name and two times [s], for argparse."""
+    found = re.fullmatch(r"(\w+):([\d.]+)-([\d.]+)", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form KIND:FROM-TO, such as tool:1.0-1.5")
+    try:
+        return found[1], float(found[2]), float(found[3])
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} has times that are no numbers") from None
+
+
+def run(args: argparse.Namespace) -> int:
+    """Film and write. Returns 0.
+
+    Raises
+    ------
+    InputError
+        What cannot be read, written or filmed; numbers that are out of range.
+    """
+    from ..play.filming import Taking, Trouble, mounted, registered, shots_of
+    from ..script.calibration_file import write_calibration
+    from ..script.film_truth import Truth, write_table, write_truth
+    from ..script.registration_file import write_registration
+    from ..script.tracked_tool import write_tool
+
+    at_least("--every", args.every, 1)
+    for name, value in (
+        ("--blur", args.blur),
+        ("--noise", args.noise),
+        *(("--registered", x) for x in args.registered),
+    ):
+        if not 0.0 <= value < np.inf:
+            raise InputError(f"{name} {value:g}: give a number that is not below 0.")
+    shift, turn = args.registered
+    taking = Taking(args.blur, args.noise, tuple(Trouble(*each) for each in args.trouble), args.seed)
+    scene = _scene(args)
+    if all("gap" in taking.happening(time) for time in scene.times[:: args.every].tolist()):
+        raise InputError("no picture would be taken: give --seconds and --trouble that leave some.")
+    calibration = scene.viewpoint.calibration
+    assert calibration is not None
+    folder = claimed_folder(args.out, "film and its truth")
+    paths = {name: claimed(folder / name, Path(name).suffix, kind, args.force) for name, kind in FILES.items()}
+    theatre = theatre_asked(args)
+    player = theatre.player(args.deformer or "fem", scene)
+    mounts = mounted(player)
+    shots: list[Shot] = []
+    film = _write_film(args, shots_of(player, mounts, taking, args.every), shots, player)
+    write_calibration(paths["camera.yaml"], replace(calibration, name=f"sulcus film: {scene.name}"))
+    write_registration(paths["registration.json"], registered(player, mounts, shift, turn, args.seed))
+    write_tool(paths["tool.json"], mounts.tool)
+    truth = Truth(
+        player.site.anatomy.digest,
+        np.array([shot.time for shot in shots]),
+        np.stack([shot.T_camera_scan for shot in shots]),
+        np.stack([shot.T_scan_tool for shot in shots]),
+        np.stack([shot.displacement for shot in shots]),
+    )
+    write_truth(paths["truth.npz"], truth)
+    write_table(paths["truth.csv"], truth, player.stage.tumour_at_rest.vertices)
+    moved = 1e3 * float(np.linalg.norm(truth.displacement, axis=2).mean(axis=1).max())
+    report = {"scene": scene.name, "frames": len(shots), "film": str(film), "tumour_moves_mm": moved}
+    said = f"{len(shots)} pictures of {scene.name}, in which the tumour moves by up to {moved:.2f} mm: {film}"
+    print(json_line(report) if args.json else said)
+    return 0
+
+
+def _scene(args: argparse.Namespace) -> Scene:
+    """The scene as the camera sees it, from as far away as shows opening, reference and cube."""
+    from ..play.filming import USUAL, VIEW
+
+    if args.path == "microscope":
+        raise InputError("--path microscope zooms, and a film has one calibration: choose another path.")
+    scene = filmed(args, replace(scene_asked(args, args.scene), viewpoint=VIEW))
+    view = scene.viewpoint
+    assert view.calibration is not None
+    farther = (view.calibration.focal[1] / view.height) / (USUAL.focal[1] / USUAL.height)
+    duration = scene.duration if args.seconds is None else min(args.seconds, scene.duration)
+    return replace(scene, viewpoint=replace(view, distance=farther * view.distance), duration=duration)
+
+
+def _write_film(args: argparse.Namespace, taken: Iterator[Shot], shots: list[Shot], player: Player) -> Path:
+    """Write the pictures, and note what is true of each in `shots`; returns the film, or the folder of pictures."""
+    from tqdm import tqdm
+
+    from ar.screen import Film, write_film
+
+    def noted() -> Iterator[np.ndarray]:
+        total = len(range(0, len(player.scene.times), args.every))
+        for shot in tqdm(taken, total=total, unit="picture", file=sys.stderr):
+            shots.append(replace(shot, colour=shot.colour[:0]))
+            yield shot.colour
+
+    try:
+        if not args.png:
+            args.out.mkdir(parents=True, exist_ok=True)
+            film = claimed(args.out / "film.mp4", ".mp4", "a film of `sulcus render`", args.force)
+            write_film(film, noted(), player.scene.frames_per_second / args.every)
+            return film
+        frames = claimed_folder(args.out / "frames", "pictures")
+        claimed_frames(frames, SIGNED, args.force)
+        for path in frames.glob("frame_*.png"):
+            path.unlink()
+        screen = Film(frames, SIGNED)
+        for number, colour in enumerate(noted()):
+            screen.show(number, colour)
+        return frames
+    except OSError as error:
+        raise InputError(f"{args.out}: the film cannot be written ({why(error)}). {REMEDY}") from error
+    except ValueError as error:
+        raise InputError(str(error)) from error

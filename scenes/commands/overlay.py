@@ -1,0 +1,238 @@
+"""`sulcus overlay`: where the tumour is, drawn into a film or into what a camera sees."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.errors import InputError
+from sim.runtime.atomic_files import REMEDY, why
+
+from .demo import add_bodies
+from .json_line import json_line
+from .outputs import add_force, claimed
+from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
+
+if TYPE_CHECKING:
+    from ar.calibration import Calibration
+    from sim.deformation import Deformer
+    from sim.tools import BuiltIn
+
+    from ..play.deformers import Theatre
+    from ..play.overlay_follower import Follower
+    from ..play.overlay_picture import Painter
+    from ..play.overlay_run import Shown
+    from ..script.scene import Scene
+
+STYLES = ("window", "contour", "fill", "none")
+FILMS = (".mp4", ".gif", ".webp")
+REST = "rest"
+"""The deformer that lets the brain stay as in the scan."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "pictures", metavar="FILM|CAMERA", help="a video, a folder of PNG or JPEG pictures, or a camera's number"
+    )
+    parser.add_argument("--camera", required=True, metavar="K.yaml", help="the camera, from `sulcus calibrate`")
+    parser.add_argument("--registration", required=True, metavar="R.json", help="the scan's, from `sulcus register`")
+    parser.add_argument("--tool", metavar="TOOL.json", help="the tool with its cube (default: no tool is looked for)")
+    add_bodies(parser)
+    parser.add_argument(
+        "--deformer", metavar="NAME",
+        help="who says how the brain lies under the tool: a model of its poses, guarded, fem or rest. rest: as in the "
+        "scan. Default: the best model that knows the tool, else rest",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, metavar="FILM.mp4", help="the film with its overlay: .mp4, .gif or .webp")
+    parser.add_argument("--table", type=Path, metavar="ROWS.csv", help="a row for each picture: state, place, error")
+    parser.add_argument("--style", choices=STYLES, default="window", help="how it is drawn (default %(default)s)")
+    parser.add_argument("--rate", type=float, default=30.0, help="pictures a second, of a folder (default %(default)s)")
+    parser.add_argument(
+        "--live", action="store_true", help="play the film as a camera would: pictures that come too fast are lost"
+    )
+    parser.add_argument("--truth", metavar="TRUTH.npz", help="of `sulcus film`: says how far off the overlay is")
+    add_tissue_arguments(parser)
+    add_skull_argument(parser)
+    add_element_argument(parser)
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda, for finite elements and pictures")
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
+    add_force(parser)
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What a run is made of."""
+
+    calibration: Calibration
+    follower: Follower
+    painter: Painter
+    who: str
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw. Returns 0; 1 if the tumour is drawn as known in no picture.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read, written, or do not belong together; pictures of another size than the camera's.
+    """
+    from ..play.overlay_rows import write_rows
+    from ..play.overlay_truth import off, summary
+    from ..script.film_truth import read_truth
+
+    if not 0.0 < args.rate < np.inf:
+        raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
+    inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth]
+    out = None if args.out is None else _film_path(args.out, args.force, inputs)
+    table = (
+        None if args.table is None else claimed(args.table, ".csv", "a table of `sulcus overlay`", args.force, inputs)
+    )
+    parts = _parts(args)
+    stage = parts.painter.stage
+    truth = None
+    if args.truth is not None:
+        truth = read_truth(args.truth, stage.anatomy.digest, len(stage.tumour_vertices))
+    shown = _played(args, parts, out)
+    errors = [None if truth is None else off(each.known, truth, parts.calibration, stage) for each in shown]
+    if table is not None:
+        write_rows(table, shown, errors, stage)
+    report = _report(shown, parts.who)
+    if truth is not None:
+        report["off"] = summary([each.known for each in shown], errors)
+    report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
+    print(json_line(report) if args.json else _words(report))
+    return 0 if any(each.known.relied for each in shown) else 1
+
+
+def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path:
+    if path.suffix not in FILMS:
+        raise InputError(f"{path}: films are written as {', '.join(FILMS)}; give a name that ends so.")
+    return claimed(path, path.suffix, "a film of `sulcus render`", force, inputs)
+
+
+def _parts(args: argparse.Namespace) -> Parts:
+    """Read what the pictures are looked at with."""
+    from sim.accuracy import LIVE
+    from sim.runtime.device import find_device
+
+    from ..play.deformers import open_theatre
+    from ..play.overlay_follower import Follower
+    from ..play.overlay_picture import Painter
+    from ..play.tool_motion import ToolMotion
+    from ..script.calibration_file import read_calibration
+    from ..script.registration_file import read_registration
+    from ..script.tracked_tool import read_tool
+
+    calibration, registration = read_calibration(args.camera), read_registration(args.registration)
+    tool = None if args.tool is None else read_tool(args.tool)
+    theatre = open_theatre(args.anatomy, args.model, args.device)
+    scene = _scene(args, None if tool is None else tool.shape)
+    stage = theatre.stage(scene)
+    deformer, who = _deformer(args, theatre, scene, tool is not None)
+    motion = ToolMotion(stage, deformer)
+    device = find_device(args.device, LIVE.precision).name
+    follower = Follower(calibration, registration, tool, motion)
+    return Parts(calibration, follower, Painter(stage, tool, args.style, device), who)
+
+
+def _scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
+    """What acts on the brain: the tool, moved by pose, and the skull."""
+    from sim.effects import SKULLS, Elasticity, Held, ToolContact
+
+    from ..script.scene import Scene
+
+    touched = () if shape is None else (ToolContact((shape,)),)
+    effects = (Elasticity(tissue_of(args)), Held(), SKULLS[args.skull], *touched)
+    return Scene("overlay", "A real picture.", effects=effects, element=args.element)
+
+
+def _deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:
+    """Who says how the brain lies, and that in words."""
+    still = "nobody: the brain stays as in the scan"
+    if not tooled:
+        if args.deformer not in (None, REST):
+            raise InputError(f"--deformer {args.deformer} answers for a tool's poses: give --tool TOOL.json, too.")
+        return None, still
+    name = args.deformer
+    if name is None and not theatre.knowing(scene):
+        refused = next(iter(theatre.refusals(scene).values()), "there is none; give --model, or --deformer fem")
+        print(f"sulcus overlay: no model says how the brain moves: {refused}", file=sys.stderr)
+        name = REST
+    if name == REST:
+        return None, still
+    name = name or theatre.usual(scene)
+    return theatre.deformer(name, scene), theatre.described(name, scene)
+
+
+def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
+    """Draw all pictures, into a film if one is asked for; returns them without their colours."""
+    from ar.screen import write_film
+    from ar.tracking.pictures import GIVE, film_of, rate_of
+
+    from ..play.overlay_run import overlaid, timed
+
+    shown: list[Shown] = []
+
+    def pictures() -> Iterator[np.ndarray]:
+        film = timed(film_of(Path(args.pictures), args.rate, colour=True))
+        for each in overlaid(film, parts.follower, parts.painter, args.live):
+            shown.append(replace(each, colour=each.colour[:0]))
+            yield each.colour
+
+    try:
+        if out is None:
+            for _ in pictures():
+                pass
+        else:
+            write_film(out, pictures(), rate_of(Path(args.pictures)) or args.rate)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({why(error)}). {REMEDY}") from error
+    if not shown:
+        raise InputError(f"{args.pictures}: holds no picture. {GIVE}")
+    return shown
+
+
+def _report(shown: list[Shown], who: str) -> dict[str, object]:
+    """What a run was like, for machines."""
+    from ..play.overlay_run import latencies
+
+    count = len(shown)
+    states = Counter(each.known.state.value for each in shown)
+    return {
+        "pictures": count,
+        "motion_by": who,
+        "reference_seen_percent": 100.0 * sum(each.known.seen == each.known.time for each in shown) / count,
+        "tool_seen_percent": 100.0 * sum(each.known.T_scan_tool is not None for each in shown) / count,
+        "states": dict(states.most_common()),
+        "latency": latencies(shown),
+    }
+
+
+def _words(report: dict) -> str:
+    """The same for people."""
+    count, latency = report["pictures"], report["latency"]
+    lines = [f"{count} pictures; motion by {report['motion_by']}"]
+    lines += [f"  {100.0 * number / count:5.1f} %  {state}" for state, number in report["states"].items()]
+    lines.append(f"{latency['what']}: {latency['p50_ms']:.0f} ms (median), {latency['p95_ms']:.0f} ms (95 %)")
+    off = report.get("off")
+    if off and off["pictures"]:
+        lines += [
+            f"off, where it is drawn as known ({off['pictures']} pictures), median and 95 %:",
+            f"  outline {off['outline_px_p50']:.1f}, {off['outline_px_p95']:.1f} px; overlap {off['overlap_p50']:.3f}",
+            f"  middle {off['middle_mm_p50']:.2f}, {off['middle_mm_p95']:.2f} mm; worst point "
+            f"{off['worst_mm_p50']:.2f}, {off['worst_mm_p95']:.2f} mm across the view",
+            f"  the band of {off['band_mm_p50']:.2f} mm holds it in {off['held_percent']:.0f} %; wrong: {off['wrong']}",
+        ]
+    lines += [f"written: {report[name]}" for name in ("out", "table") if report[name]]
+    return "\n".join(lines)
