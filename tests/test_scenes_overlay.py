@@ -16,9 +16,11 @@ from ar.layer import Layer
 from ar.overlay import ink_of, silhouette
 from ar.real_picture import real_picture
 from ar.refind import of_ink, outline_gap
+from ar.tracking.live_camera import camera_pictures, newest
 from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
 from scenes.play.overlay_follower import HELD, Follower, State
+from scenes.play.overlay_page import OverlayPage
 from scenes.play.overlay_picture import Painter
 from scenes.play.overlay_run import Timed, aged, overlaid, paced, timed
 from scenes.play.overlay_truth import off, summary
@@ -242,3 +244,61 @@ def test_what_does_not_belong_together_is_refused(tmp_path, capsys):
     assert main(["overlay", str(blank), *GIVEN, "--device", "cpu"]) == 1  # nothing is known
     with pytest.raises(InputError, match="cannot be read as what is true of a film"):
         read_truth(tmp_path / "text.mp4", "", 0)
+
+
+class Plugged:
+    """A camera that gives a film's pictures, and then is unplugged."""
+
+    def __init__(self, count):
+        self.frames = [each.colour[..., ::-1] for each in islice(film_of(FILM / "film.mp4", 30.0, colour=True), count)]
+        self.released = False
+
+    def isOpened(self):
+        return True
+
+    def read(self):
+        return (True, self.frames.pop(0)) if self.frames else (False, None)
+
+    def release(self):
+        self.released = True
+
+
+def test_a_camera_that_is_unplugged_says_so_and_is_let_go():
+    camera, moments = Plugged(3), iter(range(9))
+    seen = []
+    with pytest.raises(ValueError, match="camera 0 gives no more pictures: plug it in again"):
+        for picture in camera_pictures(camera, "camera 0", lambda: next(moments)):
+            seen.append(picture)
+    assert [each.time for each in seen] == [0, 1, 2] and camera.released
+    assert seen[0].colour.shape == (720, 960, 3) and seen[0].grey.shape == (720, 960)
+
+
+def test_the_newest_picture_is_had_and_a_silence_is_said():
+    def slow():
+        yield from "abc"
+        time.sleep(0.15)
+        yield "d"
+        raise ValueError("unplugged")
+
+    found = newest(slow(), 0.05)
+    time.sleep(0.02)
+    assert next(found) == "c"  # a and b are lost
+    assert next(found) is None
+    with pytest.raises(ValueError, match="unplugged"):
+        for each in found:
+            assert each in ("d", None)
+
+
+def test_a_page_shows_what_a_camera_sees_and_dims_it_once_that_is_old(follower, stage):
+    page = OverlayPage(follower, Painter(stage, follower.tool), port=0)
+    picture = replace(next(iter(pictures())).picture, time=time.perf_counter())
+    try:
+        shown = page.run(iter([picture, None]))
+        assert len(shown) == 1 and shown[0].known.state is State.REST and shown[0].latency > 0.0
+        _, dimmed, said, _ = page.browser.wanted
+        assert "no picture for 0.2 s" in said and dimmed.mean() < 0.4 * picture.colour.mean()
+        with pytest.raises(ValueError, match="calibrate it at this size"):
+            page.run(iter([replace(picture, grey=picture.grey[::2])]), 0.1)
+        assert "what is shown is old" in page.browser.line.content or page.browser.newest
+    finally:
+        page.browser.close()

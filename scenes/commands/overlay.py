@@ -6,7 +6,9 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +18,7 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
 from .demo import add_bodies
+from .interrupt import until_ended
 from .json_line import json_line
 from .outputs import add_force, claimed
 from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
@@ -33,6 +36,9 @@ if TYPE_CHECKING:
 
 STYLES = ("window", "contour", "fill", "none")
 FILMS = (".mp4", ".gif", ".webp")
+TABLE = "a table of `sulcus overlay`"
+# Only this machine reaches a camera's page.
+HOST = "127.0.0.1"
 REST = "rest"
 """The deformer that lets the brain stay as in the scan."""
 
@@ -59,6 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--live", action="store_true", help="play the film as a camera would: pictures that come too fast are lost"
     )
     parser.add_argument("--truth", metavar="TRUTH.npz", help="of `sulcus film`: says how far off the overlay is")
+    parser.add_argument("--port", type=int, default=8080, help="of the page of a camera (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="end a camera's page after so long")
     add_tissue_arguments(parser)
     add_skull_argument(parser)
     add_element_argument(parser)
@@ -89,13 +97,13 @@ def run(args: argparse.Namespace) -> int:
     from ..play.overlay_truth import off, summary
     from ..script.film_truth import read_truth
 
+    if args.pictures.isdecimal() and not Path(args.pictures).exists():
+        return until_ended(partial(_served, args))
     if not 0.0 < args.rate < np.inf:
         raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
     inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth]
     out = None if args.out is None else _film_path(args.out, args.force, inputs)
-    table = (
-        None if args.table is None else claimed(args.table, ".csv", "a table of `sulcus overlay`", args.force, inputs)
-    )
+    table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, inputs)
     parts = _parts(args)
     stage = parts.painter.stage
     truth = None
@@ -113,6 +121,41 @@ def run(args: argparse.Namespace) -> int:
     return 0 if any(each.known.relied for each in shown) else 1
 
 
+def _served(args: argparse.Namespace, closing: ExitStack) -> int:
+    """Show what a camera sees on a page, until the time is over or a signal comes."""
+    from ar.browser import check_address
+    from ar.tracking.live_camera import camera_pictures, newest, opened
+
+    from ..play.overlay_follower import GAP
+    from ..play.overlay_page import OverlayPage
+    from ..play.overlay_rows import write_rows
+
+    if args.out is not None or args.truth is not None or args.live:
+        raise InputError("--out, --truth and --live belong to films: leave them out with a camera.")
+    if not args.seconds > 0.0:
+        raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
+    table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, [args.camera])
+    parts = _parts(args)
+    try:
+        check_address(HOST, args.port)
+        source = opened(int(args.pictures), parts.calibration.width, parts.calibration.height)
+        if not source.isOpened():
+            raise InputError(f"camera {args.pictures} cannot be opened: plug it in, and give its number.")
+        page = OverlayPage(parts.follower, parts.painter, HOST, args.port)
+        closing.callback(page.browser.close)
+        print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {parts.who}", flush=True)
+        shown = page.run(newest(camera_pictures(source, f"camera {args.pictures}"), GAP), args.seconds)
+    except (ValueError, OSError) as error:
+        raise InputError(str(error)) from error
+    if table is not None:
+        write_rows(table, shown, [None] * len(shown), parts.painter.stage)
+    if not shown:
+        return 1
+    report = _report(shown, parts.who) | {"out": None, "table": None if table is None else str(table)}
+    print(json_line(report) if args.json else _words(report))
+    return 0 if any(each.known.relied for each in shown) else 1
+
+
 def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path:
     if path.suffix not in FILMS:
         raise InputError(f"{path}: films are written as {', '.join(FILMS)}; give a name that ends so.")
@@ -121,6 +164,7 @@ def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path
 
 def _parts(args: argparse.Namespace) -> Parts:
     """Read what the pictures are looked at with."""
+    from ar.overlay import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
 
@@ -140,6 +184,7 @@ def _parts(args: argparse.Namespace) -> Parts:
     deformer, who = _deformer(args, theatre, scene, tool is not None)
     motion = ToolMotion(stage, deformer)
     device = find_device(args.device, LIVE.precision).name
+    load_kernels(device)
     follower = Follower(calibration, registration, tool, motion)
     return Parts(calibration, follower, Painter(stage, tool, args.style, device), who)
 

@@ -89,14 +89,31 @@ def overlaid(film: Iterator[Timed], follower: Follower, painter: Painter, live: 
     """
     known: Known | None = None
     for taken, begun in paced(film) if live else ((each, None) for each in film):
-        arrived, picture = clock.perf_counter(), taken.picture
-        assert picture.colour is not None
-        known = follower.step(picture.grey, picture.time, known)
-        drawn = known if begun is None else aged(known, clock.perf_counter() - begun - picture.time)
-        colour = painter.paint(picture.colour, drawn).colour
-        ready = clock.perf_counter()
-        latency = None if begun is None else ready - begun - picture.time
-        yield Shown(drawn, colour, ready - arrived, latency, taken.stamped)
+        shown = overlaid_one(taken, begun, known, follower, painter)
+        known = shown.known
+        yield shown
+
+
+def overlaid_one(
+    taken: Timed, begun: float | None, before: Known | None, follower: Follower, painter: Painter
+) -> Shown:
+    """One picture with its overlay, from what was known `before`.
+
+    `begun` is the moment [s] that the pictures' time 0 was, if they come as time goes on: one that is old is stale.
+
+    Raises
+    ------
+    ValueError
+        As `Follower.step`.
+    """
+    arrived, picture = clock.perf_counter(), taken.picture
+    assert picture.colour is not None
+    known = follower.step(picture.grey, picture.time, before)
+    drawn = known if begun is None else aged(known, clock.perf_counter() - begun - picture.time)
+    colour = painter.paint(picture.colour, drawn).colour
+    ready = clock.perf_counter()
+    latency = None if begun is None else ready - begun - picture.time
+    return Shown(drawn, colour, ready - arrived, latency, taken.stamped)
 
 
 def aged(known: Known, age: float) -> Known:
