@@ -16,10 +16,11 @@ from ar.tracking.targets import patient_reference, tool_cube
 from ar.tracking.track import Tracker
 from scenes.cli import main
 from scenes.play.deformers import AtRest
-from scenes.play.filming import USUAL, VIEW, Taking, Trouble, mounted, registered, shots_of
+from scenes.play.filming import Taking, Trouble, mounted, registered, shots_of
 from scenes.play.player import Player
 from scenes.script.calibration_file import write_calibration
 from scenes.script.film_truth import read_truth
+from scenes.script.reference_place import USUAL, VIEW
 from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
 from scenes.script.tracked_tool import TrackedTool, read_tool, write_tool

@@ -17,7 +17,7 @@ from sim.arguments import at_least
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-from .camera_options import add_camera, filmed
+from .camera_options import add_camera, filmed_with_targets
 from .demo import add_bodies, scene_asked
 from .json_line import json_line
 from .tissue_options import add_element_argument, add_tissue_arguments
@@ -139,20 +139,12 @@ def _seen(args: argparse.Namespace) -> Scene:
     InputError
         A scene whose tumour is found by what is seen, or a camera that zooms.
     """
-    from ..script.reference_place import VIEW, filming
-
     scene = scene_asked(args, args.scene)
     if scene.sight is not None:
         raise InputError(
             f"the scene {scene.name} finds its tumour by what is seen, and says its error: choose another."
         )
-    if args.path == "microscope":
-        raise InputError("--path microscope zooms, and a tracked camera has one calibration: choose another path.")
-    scene = filmed(args, replace(scene, viewpoint=VIEW))
-    calibration = scene.viewpoint.calibration
-    assert calibration is not None
-    path = scene.viewpoint.path
-    return replace(scene, viewpoint=replace(filming(calibration), path=path))
+    return filmed_with_targets(args, scene)
 
 
 def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:

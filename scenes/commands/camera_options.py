@@ -66,3 +66,19 @@ def filmed(args: argparse.Namespace, scene: Scene) -> Scene:
     if args.eye is not None:
         view = replace(view, eye=args.eye)
     return scene if view is scene.viewpoint else replace(scene, viewpoint=view)
+
+
+def filmed_with_targets(args: argparse.Namespace, scene: Scene) -> Scene:
+    """The scene as a tracked camera films it, from where it sees the opening, the reference and the tool's cube.
+
+    Raises
+    ------
+    InputError
+        As `filmed`; a camera that zooms.
+    """
+    from ..script.reference_place import VIEW, from_where_it_sees_all
+
+    if args.path == "microscope":
+        raise InputError("--path microscope zooms, and a tracked camera has one calibration: choose another path.")
+    scene = filmed(args, replace(scene, viewpoint=VIEW))
+    return replace(scene, viewpoint=from_where_it_sees_all(scene.viewpoint))

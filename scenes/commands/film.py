@@ -16,7 +16,7 @@ from sim.arguments import at_least
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, why
 
-from .camera_options import add_camera, filmed
+from .camera_options import add_camera, filmed_with_targets
 from .demo import add_theatre, scene_asked, theatre_asked
 from .json_line import json_line
 from .outputs import add_force, claimed, claimed_folder, claimed_frames
@@ -134,17 +134,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _scene(args: argparse.Namespace) -> Scene:
-    """The scene as the camera sees it, from as far away as shows opening, reference and cube."""
-    from ..play.filming import USUAL, VIEW
-
-    if args.path == "microscope":
-        raise InputError("--path microscope zooms, and a film has one calibration: choose another path.")
-    scene = filmed(args, replace(scene_asked(args, args.scene), viewpoint=VIEW))
-    view = scene.viewpoint
-    assert view.calibration is not None
-    farther = (view.calibration.focal[1] / view.height) / (USUAL.focal[1] / USUAL.height)
-    duration = scene.duration if args.seconds is None else min(args.seconds, scene.duration)
-    return replace(scene, viewpoint=replace(view, distance=farther * view.distance), duration=duration)
+    """The scene as the camera sees it, and no longer than is asked for."""
+    scene = filmed_with_targets(args, scene_asked(args, args.scene))
+    return scene if args.seconds is None else replace(scene, duration=min(args.seconds, scene.duration))
 
 
 def _write_film(args: argparse.Namespace, taken: Iterator[Shot], shots: list[Shot], player: Player) -> Path:

@@ -9,10 +9,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from ar.calibration import Calibration
 from ar.camera import Camera
 from ar.layer import Layer
-from ar.lens import Lens
 from ar.renderer import Renderer
 from ar.tracking.detection import window_round
 from ar.tracking.drawn import drawn
@@ -22,18 +20,13 @@ from ar.tracking.targets import Target, patient_reference, tool_cube
 from sim.errors import InputError
 from sim.tools import BuiltIn
 
+from ..script.reference_place import reference_beside
 from ..script.tracked_tool import TrackedTool
-from ..script.viewpoint import Viewpoint
 from .player import Player
 from .stage import TOOL, TOOL_COLOUR
 
-# A camera at arm's length that sees the opening, the reference beside it and the tool's cube.
-USUAL = Calibration((1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film")
-VIEW = Viewpoint(distance=0.32).calibrated(USUAL)
 # From the tool's tip up its shaft to the middle of its cube [m].
 MOUNT = 0.09
-# The reference's middle from the site, to the right, up and outwards [m]; turned from the line of sight [degree].
-BESIDE, TURNED = (-0.078, 0.010, 0.022), (28.0, -24.0)
 # Of a hand that covers a target; by what an over-exposed picture is brighter; pixels of a smear.
 HAND, BRIGHT, SMEAR = (196, 148, 128), 12.0, 41
 KINDS = {
@@ -133,13 +126,7 @@ def mounted(player: Player) -> Mounted:
     towards = pose[:3, :3].T @ (camera.centre - pose[:3, :3] @ T_tool_cube[:3, 3] - pose[:3, 3])
     turn = np.arctan2(towards[1], towards[0]) - 0.25 * np.pi  # the edge between the cube's sides comes to the front
     T_tool_cube[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
-    right, up, outwards = BESIDE
-    middle = site.origin + right * site.right + up * site.up - outwards * site.axis
-    rotation = camera.T_camera_world[:3, :3].T @ Rotation.from_euler("xy", TURNED, degrees=True).as_matrix()
-    T_scan_patient = np.eye(4)
-    T_scan_patient[:3, :3] = rotation
-    T_scan_patient[:3, 3] = middle - rotation @ [*(0.5 * patient_reference().faces[0].size), 0.0]
-    return Mounted(TrackedTool(shape, np.linalg.inv(T_tool_cube)), T_scan_patient)
+    return Mounted(TrackedTool(shape, np.linalg.inv(T_tool_cube)), reference_beside(site, camera))
 
 
 def registered(player: Player, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:

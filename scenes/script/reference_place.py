@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -13,7 +15,7 @@ from ar.tracking.targets import patient_reference
 from .site import Site
 from .viewpoint import Viewpoint
 
-USUAL = Calibration((1400.0, 1400.0), (620.0, 492.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film")
+USUAL = Calibration((1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film")
 """The camera of a film that says nothing else."""
 VIEW = Viewpoint(distance=0.32).calibrated(USUAL)
 """At arm's length: it sees the opening, the reference beside it and the tool's cube."""
@@ -21,11 +23,11 @@ VIEW = Viewpoint(distance=0.32).calibrated(USUAL)
 BESIDE, TURNED = (-0.078, 0.010, 0.022), (28.0, -24.0)
 
 
-def filming(calibration: Calibration, view: Viewpoint = VIEW) -> Viewpoint:
-    """A view by another camera, from where its picture shows as much as that of `view`."""
+def from_where_it_sees_all(view: Viewpoint) -> Viewpoint:
+    """The same camera, from where its picture shows as much as that of `VIEW` does."""
     assert view.calibration is not None
-    shown = [each.focal[1] / each.height for each in (calibration, view.calibration)]
-    return Viewpoint(distance=view.distance * shown[0] / shown[1]).calibrated(calibration)
+    longer = (view.calibration.focal[1] / view.height) / (USUAL.focal[1] / USUAL.height)
+    return replace(view, distance=longer * VIEW.distance)
 
 
 def reference_beside(site: Site, camera: Camera) -> np.ndarray:
