@@ -7,24 +7,26 @@ vertices alone. `ar.page_style` says where things are.
 
 from __future__ import annotations
 
-import socket
 import threading
+import time as clock
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import cv2
 import numpy as np
 import viser
 
-from .guard import LIMITS, Limits, bracketed, open_server
-from .page_parts import Body, Choice, Control, Deed, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
-from .page_sight import PICTURE, SAID, coded, sight
-from .page_style import NOTE, PAGE, STATUS, style
+from .guard import LIMITS, Limits, bracketed, check_address, open_server
+from .page_aside import BACK, ON, RECORD, SPACE, aside
+from .page_crowd import Crowd
+from .page_inputs import Inputs, noted
+from .page_parts import Body, Control, Deed, Fold, Note, Playback, Sign, Viewpoint
+from .page_recorder import Recorder
+from .page_scene import add_body, dress
+from .page_sight import ASIDE, PICTURE, SAID, coded, sight
+from .page_style import PAGE, STATUS, style
 
 # Behind all that is added later.
 LAST = 1e9
-# Width of the docked panel where a browser does not know the page's own rules [CSS pixel].
-PANEL = 676.0
 # Hosts that this machine reaches by the name localhost.
 EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")
 
@@ -70,7 +72,7 @@ class Browser:
         check_address(host, port)
         self.limits = limits
         self.server, self.token = open_server(host, port, title, limits)
-        self.dress(viewpoint, signs)
+        dress(self.server, viewpoint, signs)
         gui = self.server.gui
         gui.add_html(style(size[0] / size[1]))
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
@@ -84,14 +86,16 @@ class Browser:
         self.wanted: Shown = self.shown
         self.coded, self.sent = coded(blank), 0
         self.sight = gui.add_html(sight(0, self.coded, ""))
-        # What the newest message did, as the `changed` that it calls may ask.
-        self.deed: Deed | None = None
-        # The line that each visitor alone reads, by viser's identifier.
-        self.lines: dict[int, viser.GuiMarkdownHandle] = {}
+        gui.add_html(aside())
+        self.beside = gui.add_html("")
+        # What draws slices and the last seconds, if they are others than those that were sent; when they may be [s].
+        self.drawn: Callable[[], tuple[np.ndarray, str]] | None = None
+        self.due = 0.0
+        self.crowd, self.recorder = Crowd(self.server, self.text.order + 0.5), Recorder(self.server)
+        self.controls = Inputs(self.server, self.crowd)
         self.newest: dict[str, Callable[[], object]] = {}
         self.lock, self.sending = threading.Lock(), threading.Lock()
         self.meshes: dict[str, viser.MeshHandle] = {}
-        self.notes: dict[str, tuple[viser.GuiFolderHandle, viser.GuiHtmlHandle]] = {}
         self.folder: viser.GuiFolderHandle | None = None
         self.fill(bodies, playback, controls, title, words)
         self.closed = threading.Event()
@@ -112,7 +116,7 @@ class Browser:
         """
         with self.sending, self.server.atomic():
             with self.lock:
-                self.newest = {}
+                self.newest, self.drawn = {}, None
             for mesh in self.meshes.values():
                 mesh.remove()
             if self.folder is not None:
@@ -122,16 +126,25 @@ class Browser:
             self.words.content, self.line.content = held(PAGE, words), ""
             self.wanted, self.shown = (0, self.shown[1], "", 0), (0, self.shown[1], self.shown[2], 0)
             self.report("")
-            self.inputs: dict[str, viser.GuiInputHandle] = {}
-            self.notes = {}
+            self.controls.clear()
             self.folder = self.server.gui.add_folder(None)
             with self.folder:
                 self.add_playback(playback)
                 # Before the controls: a window of 1280 x 720 does not hold them all.
-                self.add_saver()
+                self.add_savers()
                 for control in controls:
-                    self.add_control(control)
-            self.meshes = {body.name: self.add_body(body) for body in bodies}
+                    self.controls.add(control)
+            self.meshes = {body.name: add_body(self.server, body) for body in bodies}
+
+    @property
+    def inputs(self) -> dict[str, viser.GuiInputHandle]:
+        """The controls by their labels."""
+        return self.controls.handles
+
+    @property
+    def deed(self) -> Deed | None:
+        """What the newest message did, as the `changed` that it calls may ask."""
+        return self.controls.deed
 
     @property
     def address(self) -> str:
@@ -148,7 +161,7 @@ class Browser:
     @property
     def here(self) -> set[int]:
         """Numbers of the visitors who look at the page now, from 1 in the order that they came."""
-        return {identifier + 1 for identifier in self.server.get_clients()}
+        return self.crowd.here
 
     def show(self, number: int, colour: np.ndarray, words: str, sought: int | None = None) -> None:
         """Show the picture (H, W, 3) uint8 of frame `number`, and its words in HTML.
@@ -175,13 +188,33 @@ class Browser:
             self.put_sight(self.coded, words)
         # Not oftener: a visitor may be moving it.
         if place != self.shown[3]:
-            self.assign(self.frame, place)
+            self.controls.assign(self.frame, place)
         self.shown = wanted
 
     def put_sight(self, code: str, words: str) -> None:
         """Send a `coded` picture and words, HTML, at once."""
         self.sent += 1
         self.sight.content = sight(self.sent, code, words)
+        self.recorder.take(code)
+
+    def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
+        """Show a picture (H, W, 3) uint8 of slices, and HTML of the last seconds, in tabs beside the 3-D view.
+
+        `drawn` makes them, on the page's own thread, as often as `Limits` allow: what comes between is left out.
+        """
+        with self.lock:
+            self.drawn = drawn
+
+    def send_beside(self) -> None:
+        """Draw and send the newest slices, where it is time."""
+        with self.lock:
+            drawn = self.drawn if clock.monotonic() >= self.due else None
+            if drawn is None:
+                return
+            self.drawn, self.due = None, clock.monotonic() + 1.0 / self.limits.asides
+        colour, words = drawn()
+        self.sent += 1
+        self.beside.content = sight(self.sent, coded(colour), words, ASIDE)
 
     def move(self, name: str, vertices: np.ndarray, triangles: np.ndarray | None = None) -> None:
         """Put the vertices (V, 3) [m] of a body in the 3-D view elsewhere; triangles (F, 3) where they are others."""
@@ -215,29 +248,26 @@ class Browser:
         self.note("button", send)
 
     def tell(self, line: Callable[[int], str]) -> None:
-        """Show each visitor a line of Markdown of its own under the report: `line` takes the visitor's number."""
+        """Show each visitor a line of Markdown of its own under the report: `line` takes the visitor's number.
+
+        Where several look, it is said besides who leads, and the others may ask to.
+        """
 
         def send() -> None:
-            clients = {} if self.closed.is_set() else self.server.get_clients()
-            self.lines = {identifier: text for identifier, text in self.lines.items() if identifier in clients}
-            for identifier, client in clients.items():
-                if identifier not in self.lines:
-                    self.lines[identifier] = client.gui.add_markdown("", order=self.text.order + 0.5)
-                content = line(identifier + 1)
-                if self.lines[identifier].content != content:
-                    self.lines[identifier].content = content
+            if not self.closed.is_set():
+                self.crowd.read(line)
 
         # There, no visitor leaves meanwhile.
         self.note("lines", lambda: self.server.get_event_loop().call_soon_threadsafe(send))
 
     def put(self, label: str, value: float | str) -> None:
         """Set a control without calling its `changed`, as when a script moves the tool."""
-        control = self.inputs[label]
-        self.note(f"control {label}", lambda: self.assign(control, value))
+        control = self.controls.handles[label]
+        self.note(f"control {label}", lambda: self.controls.assign(control, value))
 
     def write(self, label: str, words: str) -> None:
         """Put other words, HTML, into a note; without any it is not shown."""
-        folder, text = self.notes[label]
+        folder, text = self.controls.notes[label]
 
         def send() -> None:
             text.content, folder.visible = noted(words), bool(words)
@@ -264,131 +294,51 @@ class Browser:
                 with self.server.atomic():
                     for send in newest.values():
                         send()
-
-    def assign(self, control: viser.GuiInputHandle, value: float | str) -> None:
-        """Set a control on the thread that hears the visitors: another could overwrite what is not yet read."""
-
-        def put() -> None:
-            # The page may have been filled anew meanwhile.
-            if control is self.frame or control in self.inputs.values():
-                control.value = value
-
-        self.server.get_event_loop().call_soon_threadsafe(put)
-
-    def dress(self, viewpoint: Viewpoint, signs: Sequence[Sign]) -> None:
-        """Colours, light, signs, the panel's place and the first view of the 3-D scene."""
-        gui, scene = self.server.gui, self.server.scene
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
-        gui.main_panel.dock_left()
-        gui.main_panel.set_width(PANEL)
-        # Two soft lights from the first viewpoint's sides: the page's own four wash the colours out.
-        scene.configure_default_lights(enabled=False)
-        scene.add_light_ambient("/light/ambient", intensity=2.0)
-        across = np.cross(np.asarray(viewpoint.target) - viewpoint.eye, viewpoint.up)
-        for name, side, strength in (("left", -1.0, 2.2), ("right", 1.0, 1.0)):
-            place = np.asarray(viewpoint.eye) + side * across / np.linalg.norm(across)
-            scene.add_light_directional(f"/light/{name}", intensity=strength, position=tuple(place))
-        for sign in signs:
-            scene.add_label(f"/sign/{sign.word}", sign.word, position=np.asarray(sign.place), anchor="center-center")
-        start = self.server.initial_camera
-        start.position, start.look_at = tuple(viewpoint.eye), tuple(viewpoint.target)
-        start.up, start.fov = tuple(viewpoint.up), viewpoint.fov
+                self.send_beside()
 
     def add_playback(self, playback: Playback) -> None:
-        """A button that plays and pauses, and a slider over the frames."""
-        gui = self.server.gui
-        self.playing = True
-        self.button = button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+        """A button that plays and pauses, and a slider over the frames; keys do the same."""
+        gui, self.playing = self.server.gui, True
+        self.button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self.frame = gui.add_slider("frame", 0, max(playback.frames - 1, 1), 1, 0)
 
-        @button.on_click
-        def toggle(_: viser.GuiEvent) -> None:
+        def toggle(_: viser.ClientHandle | None = None) -> None:
             self.plays(not self.playing)
             playback.played(self.playing)
 
-        # The slider of a single frame has a second place: it must have a length.
-        self.hear(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
+        def step(by: int) -> None:
+            number = min(max(self.shown[0] + by, 0), playback.frames - 1)
+            self.plays(False)
+            playback.played(False)
+            playback.sought(number)
+            self.controls.assign(self.frame, number)
 
-    def add_saver(self) -> None:
-        """A button that downloads the picture as it is shown."""
+        self.controls.press(self.button, toggle)
+        # The slider of a single frame has a second place: it must have a length.
+        self.controls.hear(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
+        self.controls.command(SPACE, toggle)
+        self.controls.command(BACK, lambda _: step(-1))
+        self.controls.command(ON, lambda _: step(1))
+
+    def add_savers(self) -> None:
+        """Buttons that download the picture as it is shown, for everybody, and a film, for who leads."""
+        name = self.title.replace(":", "").replace(" ", "-")
         self.saver = self.server.gui.add_button("Save the picture", icon=viser.Icon.CAMERA, color="gray")
 
         @self.saver.on_click
         def save(event: viser.GuiEvent) -> None:
             if event.client is not None:
                 number, colour, *_ = self.shown
-                name = f"{self.title.replace(':', '').replace(' ', '-')}-{number}.png"
                 written = cv2.imencode(".png", np.ascontiguousarray(colour[..., ::-1]))[1]
-                event.client.send_file_download(name, written.tobytes(), save_immediately=True)
+                event.client.send_file_download(f"{name}-{number}.png", written.tobytes(), save_immediately=True)
 
-    def add_control(self, control: Control | Fold | Note) -> None:
-        """A slider, a list, a box to tick, a folder of them, or a folder of words."""
-        gui = self.server.gui
-        if isinstance(control, Note):
-            with gui.add_folder(control.label, expand_by_default=False, visible=bool(control.words)) as folder:
-                self.notes[control.label] = folder, gui.add_html(noted(control.words))
-            return
-        if isinstance(control, Fold):
-            with gui.add_folder(control.label, expand_by_default=False):
-                for inner in control.controls:
-                    self.add_control(inner)
-            return
-        words, hint = control.words or control.label, control.hint
-        match control:
-            case Toggle():
-                handle = gui.add_checkbox(words, control.start, hint=hint)
-            case Slider():
-                handle = gui.add_slider(words, control.low, control.high, control.step, control.start, hint=hint)
-            case Choice():
-                handle = gui.add_dropdown(words, control.options, initial_value=control.start, hint=hint)
-        self.inputs[control.label] = handle
-        self.hear(handle, control.changed)
+        def record(client: viser.ClientHandle) -> None:
+            self.recorder.toggle(client, self.coded)
 
-    def hear(self, control: viser.GuiInputHandle, changed: Callable[[Any], None]) -> None:
-        """Pass on what visitors set, on the thread that they are heard on, before anything else happens there."""
-
-        @control.on_update
-        async def update(event: viser.GuiEvent) -> None:
-            # The page's own updates come through here too, without a client.
-            if event.client is not None:
-                self.deed = Deed(event.client.client_id + 1, control.label)
-                changed(control.value)
-
-    def add_body(self, body: Body) -> viser.MeshHandle:
-        """A surface in the 3-D view, seen from both sides."""
-        return self.server.scene.add_mesh_simple(
-            f"/{body.name}",
-            np.asarray(body.vertices, np.float32),
-            np.asarray(body.triangles, np.uint32),
-            color=np.asarray(body.colour, np.float64),
-            opacity=None if body.opacity >= 1.0 else body.opacity,
-            wireframe=body.wireframe,
-            side="double",
-        )
+        self.controls.press(self.recorder.add_button(name), record)
+        self.controls.command(RECORD, record)
 
 
 def held(name: str, words: str) -> str:
     """An element of the page that the rules find by its name."""
     return f'<div id="{name}">{words}</div>'
-
-
-def noted(words: str) -> str:
-    """The words of a note, which the rules find by their class."""
-    return f'<div class="{NOTE}">{words}</div>'
-
-
-def check_address(host: str, port: int) -> None:
-    """Raise where no page can be served: viser would fail on a thread of its own, and its maker wait for ever.
-
-    Raises
-    ------
-    ValueError
-        A port outside 0 .. 65535.
-    OSError
-        A host that is not this machine.
-    """
-    if not 0 <= port <= 65535:
-        raise ValueError(f"{port} is no port: give 0 .. 65535.")
-    family = socket.getaddrinfo(host, None)[0][0]
-    with socket.create_server((host, 0), family=family):
-        pass

@@ -47,12 +47,15 @@ class Limits:
         Messages that one may send at once, and per second for long; viser's own page sends some 50 a second at most.
     sendings
         Times per second that the page sends what is new, at most.
+    asides
+        The same of slices and of the last seconds, which take longer to draw.
     """
 
     visitors: int = 32
     burst: float = 1000.0
     per_second: float = 200.0
     sendings: float = 15.0
+    asides: float = 2.5
 
 
 LIMITS = Limits()
@@ -176,18 +179,18 @@ class Brief(logging.Filter):
 
 @dataclass
 class Controls:
-    """What visitors can set, found by its identifier; nothing before viser's server stands."""
+    """What visitors can set or hit, found by its identifier; nothing before viser's server stands."""
 
     server: viser.ViserServer | None = None
 
     def __call__(self, identifier: str) -> object:
-        """Find a control of all visitors, or of one alone."""
+        """Find a control of all visitors, or of one alone, or a command."""
         if self.server is None:
             return None
         for gui in (self.server.gui, *(client.gui for client in self.server.get_clients().values())):
             if identifier in gui._gui_input_handle_from_uuid:
                 return gui._gui_input_handle_from_uuid[identifier]
-        return None
+        return self.server.gui._command_handle_from_uuid.get(identifier)
 
 
 def open_server(host: str, port: int, title: str, limits: Limits = LIMITS) -> tuple[viser.ViserServer, str | None]:
@@ -278,3 +281,20 @@ def cookie(port: int) -> str:
 def plain(text: str) -> str:
     """A header's text, of which websockets keeps bytes that are no characters."""
     return text.encode("ascii", "replace").decode()
+
+
+def check_address(host: str, port: int) -> None:
+    """Raise where no page can be served: viser would fail on a thread of its own, and its maker wait for ever.
+
+    Raises
+    ------
+    ValueError
+        A port outside 0 .. 65535.
+    OSError
+        A host that is not this machine.
+    """
+    if not 0 <= port <= 65535:
+        raise ValueError(f"{port} is no port: give 0 .. 65535.")
+    family = socket.getaddrinfo(host, None)[0][0]
+    with socket.create_server((host, 0), family=family):
+        pass

@@ -1,4 +1,4 @@
-"""What a visitor may say to the page: where its camera is, and a control's new value within that control's range.
+"""What a visitor may say to the page: where its camera is, a control's new value in its range, and which key was hit.
 
 Messages come from outside. What is passed on is written anew from what was checked: nothing else gets through.
 """
@@ -62,16 +62,22 @@ class Setting(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_u
     updates: Value
 
 
-DECODER = msgspec.msgpack.Decoder(Camera | Setting)
+class Command(msgspec.Struct, tag_field="type", tag="CommandTriggerMessage", forbid_unknown_fields=True):
+    """A key that a visitor hit, or its words in the list of commands, as viser's page says it."""
+
+    uuid: str
+
+
+DECODER = msgspec.msgpack.Decoder(Camera | Setting | Command)
 
 
 def checked(message: str | bytes, control: Callable[[str], object]) -> bytes:
-    """Return the message as it may be passed on; `control` finds what a visitor can set, by its identifier.
+    """Return the message as it may be passed on; `control` finds what a visitor can set or hit, by its identifier.
 
     Raises
     ------
     MessageError
-        Anything but a camera, or a value in the range of a control that is there.
+        Anything but a camera, a value in the range of a control that is there, or a command that is there.
     """
     if isinstance(message, str):
         raise MessageError("it is text", malformed=True)
@@ -83,6 +89,8 @@ def checked(message: str | bytes, control: Callable[[str], object]) -> bytes:
         raise MessageError("it cannot be read", malformed=True) from error
     if isinstance(said, Setting):
         said.updates.value = ranged(control(said.uuid), said.updates.value)
+    if isinstance(said, Command) and not isinstance(control(said.uuid), viser.CommandHandle):
+        raise MessageError("it is a command that is not there")
     return msgspec.msgpack.encode(said)
 
 

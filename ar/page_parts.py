@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -49,8 +50,18 @@ class Slider:
 
 
 @dataclass(frozen=True)
+class Key:
+    """A key of the keyboard: as JavaScript and as viser call it, what is shown for it, and what it does."""
+
+    name: str
+    hotkey: Literal["space", "arrowleft", "arrowright", "S", "R"]
+    shown: str
+    does: str
+
+
+@dataclass(frozen=True)
 class Choice:
-    """One of several names; the rest as in `Slider`."""
+    """One of several names; the rest as in `Slider`. A `key` takes the next one."""
 
     label: str
     options: tuple[str, ...]
@@ -58,6 +69,7 @@ class Choice:
     changed: Callable[[str], None]
     words: str = ""
     hint: str | None = None
+    key: Key | None = None
 
 
 @dataclass(frozen=True)

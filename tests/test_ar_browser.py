@@ -11,8 +11,10 @@ from visitor import Visitor, free_port, wait_for
 
 from ar.browser import Browser
 from ar.guard import LIMITS, Limits
+from ar.page_aside import STYLE
 from ar.page_parts import Body, Choice, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
-from ar.page_sight import PICTURE, SAID, coded
+from ar.page_recorder import RECORDS, STOPS
+from ar.page_sight import PICTURE, SAID, SLICES, coded
 from ar.page_style import NOTE, PAGE, STATUS, style
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
@@ -33,7 +35,7 @@ def open_page(heard: dict[str, list], port: int, host: str = "127.0.0.1", limits
         Viewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
         Playback(100, heard["play"].append, heard["frame"].append),
         [
-            Choice("deformer", ("FEM", "ANN"), "ANN", heard["deformer"].append),
+            Choice("deformer", ("FEM", "ANN"), "ANN", heard["deformer"].append, key=STYLE),
             Slider("force [N]", 0.0, 1.0, 0.01, 0.2, heard["force"].append),
         ],
         host=host,
@@ -143,12 +145,103 @@ def test_several_visitors_see_the_page_and_are_heard(page, heard):
     page.show(7, np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8), "")
     assert wait_for(lambda: wide.received > before[0] + 1000 and narrow.received > before[1] + 1000)
     wide.set(page.inputs["force [N]"], 0.4)
-    narrow.set(page.inputs["deformer"], "FEM")
-    narrow.set(page.frame, 31)
-    assert wait_for(lambda: heard["force"] == [0.4] and heard["deformer"] == ["FEM"] and heard["frame"] == [31])
+    assert wait_for(lambda: heard["force"] == [0.4])
     wide.wire.close()
     assert wait_for(lambda: page.visitors == 1)
+    narrow.set(page.inputs["deformer"], "FEM")
+    narrow.set(page.frame, 31)
+    assert wait_for(lambda: heard["deformer"] == ["FEM"] and heard["frame"] == [31])
     narrow.wire.close()
+
+
+def test_who_came_first_leads_and_what_others_set_is_put_back(page, heard):
+    """They may ask; who leads lets them, and the lead passes on when its owner leaves."""
+    first, second = Visitor(page, 1600), Visitor(page, 420)
+    page.tell(lambda visitor: f"number {visitor}")
+    assert wait_for(lambda: set(page.crowd.rows) == {0, 1} and page.crowd.rows[1].ask.visible)
+    leads, looks = (page.crowd.rows[number] for number in (0, 1))
+    assert "You lead" in leads.line.content and "(number 1) leads" in looks.line.content
+    assert "number 2" in looks.line.content and not leads.dim.content and "opacity" in looks.dim.content
+    second.set(page.inputs["force [N]"], 0.4)
+    second.set(page.button, True)
+    second.hit(page.controls.commands[0])
+    assert wait_for(lambda: second.updates and page.inputs["force [N]"].value == 0.2)
+    first.set(page.frame, 12)
+    assert wait_for(lambda: heard["frame"] == [12]) and heard["force"] == [] and heard["play"] == []
+    second.set(looks.ask, True)
+    page.tell(lambda visitor: "")
+    assert wait_for(lambda: page.crowd.lead.asking == (2,))
+    page.tell(lambda visitor: "")
+    assert wait_for(lambda: leads.give.visible and "Visitor 2 asks to lead" in leads.line.content)
+    assert not looks.ask.visible
+    first.set(leads.give, True)
+    assert wait_for(lambda: page.crowd.lead.leader == 2)
+    first.set(page.frame, 13)
+    second.set(page.frame, 14)
+    assert wait_for(lambda: heard["frame"] == [12, 14])
+    second.wire.close()
+    assert wait_for(lambda: page.visitors == 1)
+    first.set(page.frame, 15)
+    assert wait_for(lambda: heard["frame"] == [12, 14, 15])
+    first.wire.close()
+
+
+def test_keys_play_step_and_choose(heard):
+    page = open_page(heard, free_port())
+    visitor = Visitor(page, 1200)
+    assert wait_for(lambda: page.visitors == 1)
+    page.show(7, np.full((48, 64, 3), 7, np.uint8), "")
+    assert wait_for(lambda: page.shown[0] == 7)
+    keys = {command.hotkey: command for command in page.controls.commands}
+    for key, frames in (("arrowright", [8]), ("arrowleft", [8, 6])):
+        visitor.hit(keys[key])
+        assert wait_for(lambda frames=frames: heard["frame"] == frames)
+    assert heard["play"] == [False, False]
+    visitor.hit(keys["space"])
+    assert wait_for(lambda: heard["play"] == [False, False, True])
+    visitor.hit(keys["S"])
+    assert wait_for(lambda: heard["deformer"] == ["FEM"] and page.inputs["deformer"].value == "FEM")
+    visitor.wire.close()
+    page.close()
+
+
+def test_a_recording_is_one_whole_film_as_long_as_it_took(page, monkeypatch):
+    """Its owner gets it; nobody gets one whose owner has left."""
+    sent: list[tuple] = []
+    monkeypatch.setattr("viser.ClientHandle.send_file_download", lambda client, *file, **how: sent.append(file))
+    visitor, button = Visitor(page, 1200), page.recorder.button
+    assert wait_for(lambda: page.visitors == 1) and button is not None
+    visitor.set(button, True)
+    assert wait_for(lambda: button.label == STOPS)
+    for number in range(10):
+        page.show(number, np.full((48, 64, 3), 20 * number, np.uint8), "")
+        time.sleep(0.1)
+    visitor.set(button, True)
+    assert wait_for(lambda: len(sent) == 1 and button.label == RECORDS)
+    name, film = sent[0]
+    assert name == "sulcus.mp4" and b"ftyp" in film[:16]
+    visitor.set(button, True)
+    assert wait_for(lambda: page.recorder.recording is not None)
+    visitor.wire.close()
+    assert wait_for(lambda: page.visitors == 0)
+    page.show(3, np.full((48, 64, 3), 3, np.uint8), "")
+    assert wait_for(lambda: page.recorder.recording is None and button.label == RECORDS) and len(sent) == 1
+
+
+def test_slices_and_the_last_seconds_arrive_together_and_not_too_often(page):
+    drawn: list[int] = []
+
+    def draw(number: int) -> tuple[np.ndarray, str]:
+        drawn.append(number)
+        return np.full((20, 60, 3), number, np.uint8), f"seconds of {number}"
+
+    begun = time.monotonic()
+    for number in range(40):
+        page.show_beside(lambda number=number: draw(number))
+        time.sleep(0.02)
+    assert wait_for(lambda: "seconds of 39" in page.beside.content)
+    assert drawn[-1] == 39 and len(drawn) <= 2 + LIMITS.asides * (time.monotonic() - begun)
+    assert coded(np.full((20, 60, 3), 39, np.uint8)) in page.beside.content and SLICES in page.beside.content
 
 
 def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(heard):
@@ -265,8 +358,12 @@ def test_the_line_over_the_picture_leaves_the_words_at_its_head_in_sight():
 
 def test_a_note_is_there_while_it_has_words(page):
     page.fill([], Playback(30, print, print), [Note("how"), Note("why", "<p>known</p>")])
-    folder, text = page.notes["how"]
-    assert not folder.visible and page.notes["why"][0].visible and "<p>known</p>" in page.notes["why"][1].content
+    folder, text = page.controls.notes["how"]
+    assert (
+        not folder.visible
+        and page.controls.notes["why"][0].visible
+        and "<p>known</p>" in page.controls.notes["why"][1].content
+    )
     assert not folder.expand_by_default
     page.write("how", "<ul><li>first</ul>")
     assert wait_for(lambda: folder.visible and "<ul><li>first</ul>" in text.content)

@@ -17,8 +17,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from ar import guard
-from ar.browser import Browser, Choice, Playback, Slider, Toggle, Viewpoint
+from ar.browser import Browser
 from ar.messages import MessageError, checked
+from ar.page_parts import Choice, Playback, Slider, Toggle, Viewpoint
 
 PROTOCOL = [f"viser-v{viser.__version__}"]
 
@@ -329,8 +330,11 @@ class TestMessages:
         assert "Traceback" not in said and len(said.splitlines()) <= 1
 
     @pytest.mark.parametrize("shared", [{"burst": 50.0, "per_second": 20.0}], indirect=True)
-    def test_a_flood_ends_that_visit_alone(self, page, visitor):
+    def test_a_flood_ends_that_visit_alone(self, page):
         hostile, begun = Visitor(page, 1200), time.monotonic()
+        assert wait_for(lambda: page.visitors == 1)
+        visitor = Visitor(page, 1200)
+        assert wait_for(lambda: page.visitors == 2)
         with pytest.raises(ConnectionClosed):
             for number in range(100000):
                 hostile.set(page.frame, 50 + number % 2)

@@ -53,7 +53,8 @@ OWNERS = {
     "sklearn": {"surrogate/regressors/svr.py"},
     "trimesh": {"scenes/script/tool.py"},
     "meshio": {"sim/bodies/meshfile.py"},
-    "viser": {"ar/browser.py", "ar/guard.py", "ar/messages.py"},
+    "viser": {"ar/browser.py", "ar/guard.py", "ar/messages.py"}
+    | {f"ar/page_{part}.py" for part in ("crowd", "inputs", "recorder", "scene")},
     "nilearn": {"sim/bodies/template.py"},
     "onnx": {"surrogate/onnx_export/export.py", "surrogate/onnx_export/graph.py"},
     "pyamg": {"sim/linalg/amg.py"},

@@ -12,11 +12,13 @@ from visitor import Visitor, free_port, wait_for
 from ar.browser import Browser
 from ar.hud import FINE
 from ar.refind import stands
-from scenes.play.page import FEM_COLOUR, STALE_COLOUR, Demo, Moment
+from scenes.play.page import Demo
 from scenes.play.page_controls import PLAN
+from scenes.play.page_moment import Moment
 from scenes.play.page_referee import Referee
 from scenes.play.page_requests import HAND, SCRIPT, Wish
 from scenes.play.page_text import plan_words
+from scenes.play.page_view import FEM_COLOUR, STALE_COLOUR
 from scenes.script.tool_paths import Touch, press
 from sim.fem import Fem
 from surrogate.model.learned import Learned
@@ -103,7 +105,7 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
 
 def test_how_the_finite_elements_solve_a_load_can_be_read(demo, monkeypatch):
     """While a model answers and where they do; nothing where none have a plan."""
-    folder, text = demo.browser.notes[PLAN]
+    folder, text = demo.browser.controls.notes[PLAN]
     assert not folder.visible
     demo.wish.set(plays=False)
     assert wait_for(lambda: demo.run(0.3) and folder.visible)

@@ -3,7 +3,7 @@
 import threading
 
 import pytest
-from theatres import small, theatre_of
+from theatres import Silent, small, theatre_of
 from visitor import Visitor, free_port, wait_for
 
 from scenes.play.deformers import Theatre
@@ -23,21 +23,6 @@ def theatre(box):
 @pytest.fixture
 def scene():
     return small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
-
-
-class Silent:
-    """A referee that has nothing to say, and no finite elements to prepare."""
-
-    truth, failure, plan = None, None, ()
-
-    def __init__(self, theatre, scene, turn):
-        pass
-
-    def ask(self, number, touch):
-        pass
-
-    def close(self):
-        pass
 
 
 @pytest.fixture
@@ -93,9 +78,10 @@ def test_a_load_that_is_refused_is_said_on_the_page_which_goes_on(running, monke
     assert wait_for(lambda: running.browser.visitors == 2)
     one.set(running.browser.inputs["force [N]"], 0.35)
     assert wait_for(lambda: "error: this frame is left out (0.35 N is too much: push less.)" in report(running))
+    one.wire.close()
+    assert wait_for(lambda: running.browser.visitors == 1)
     other.set(running.browser.inputs["force [N]"], 0.21)
     assert wait_for(lambda: "force 0.21 N" in report(running))
-    one.wire.close()
     other.wire.close()
 
 
@@ -129,11 +115,15 @@ def test_each_visitor_reads_who_has_the_tool(running):
     assert wait_for(lambda: page.here == {1, 2})
 
     def read():
-        return [line.content for _, line in sorted(page.lines.items())]
+        return [row.line.content for _, row in sorted(page.crowd.rows.items())]
 
     assert wait_for(lambda: len(read()) == 2 and all("script moves the tool; 2 visitors" in line for line in read()))
     one.set(page.inputs["force [N]"], 0.31)
     assert wait_for(lambda: "**you hold the tool**" in read()[0] and "another visitor (number 1) holds" in read()[1])
+    other.set(page.crowd.rows[1].ask, True)
+    assert wait_for(lambda: page.crowd.rows[0].give.visible)
+    one.set(page.crowd.rows[0].give, True)
+    assert wait_for(lambda: "You lead" in read()[1])
     other.set(page.inputs["place up [mm]"], 3.0)
     assert wait_for(lambda: "another visitor (number 2) holds" in read()[0] and "**you hold" in read()[1])
     other.wire.close()

@@ -60,3 +60,7 @@ class Visitor:
 
     def set(self, handle: viser.GuiInputHandle, value: object) -> None:
         self.say(_messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
+
+    def hit(self, command: viser.CommandHandle) -> None:
+        """Hit a command's key."""
+        self.say(_messages.CommandTriggerMessage(command._impl.uuid))

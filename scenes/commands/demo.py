@@ -162,7 +162,7 @@ def run(args: argparse.Namespace) -> int:
     # One thread for all kernels of the first picture: each that compiles reads Warp's headers first, for two seconds.
     kernels = ThreadPoolExecutor(1, "kernels")
     kernels.submit(load_kernels)
-    from ar.browser import check_address
+    from ar.guard import check_address
 
     from .interrupt import until_ended
 

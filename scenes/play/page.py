@@ -7,13 +7,12 @@ import threading
 import time as clock
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html import escape
 
-import numpy as np
-
 from ar.browser import Browser
-from ar.hud import marked
+from ar.history import History
+from ar.overlay import Style
 from ar.page_parts import Playback
 from sim.errors import InputError
 from sim.loads import Loads
@@ -22,14 +21,25 @@ from surrogate.data.dataset import digest_of_loads
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
 from .deformers import AtRest, Theatre
+from .page_beside import lines_of, sample_of, slices_of
 from .page_cast import Cast
 from .page_controls import PLAN, clocked, controls
+from .page_moment import Moment
 from .page_referee import Referee, Truth
 from .page_requests import HAND, SCRIPT, Wish
 from .page_tally import Tally
 from .page_text import effect_words, pending_words, plan_words, report, words, work_words
-from .page_verdict import OWN, TRUTH, Judged, changed, judge, verdict_words
-from .page_view import FEM_COLOUR, STALE_COLOUR, bodies_of, signs_of, viewpoint_of
+from .page_verdict import OWN, TRUTH, changed, judge, verdict_words
+from .page_view import (
+    FEM_COLOUR,
+    STALE_COLOUR,
+    bodies_of,
+    move_bodies,
+    move_wire,
+    pictured,
+    signs_of,
+    viewpoint_of,
+)
 from .player import Frame, Player
 from .stage import Stage
 from .tool_holder import holding
@@ -41,29 +51,6 @@ RESTS = '<p class="stale">The body at rest, as in the scan. The first answer is 
 READING = 2.0
 FIRST = Touch(force=0.15, depth=2e-3)
 """What a hand holds that takes the tool."""
-
-
-@dataclass
-class Moment:
-    """What the page shows now: the wish, its answer, the frame, and what the finite elements said of it.
-
-    `goal` is the wish that the frame is on the way to, `asked` the one that it answers.
-    """
-
-    goal: tuple | None = None
-    asked: tuple | None = None
-    shown: Truth | None = None
-    rests: bool = False
-    style: str = ""
-    load: str = ""
-    frame: Frame | None = None
-    picture: np.ndarray | None = None
-    truth: Truth | None = None
-    own: Truth | None = None
-    by: tuple | None = None
-    judged: Judged | None = None
-    stale: bool | None = None
-    plan: tuple[str, ...] | None = None
 
 
 class Demo:
@@ -145,10 +132,9 @@ class Demo:
             clock.sleep(max(0.0, rest))
 
     def _tell(self) -> None:
-        """Tell each visitor who has the tool."""
-        if self.stage.scene.tool is not None:
-            holder, here = self.wish.holder, self.browser.here
-            self.browser.tell(lambda visitor: holding(visitor, holder, here))
+        """Tell each visitor who has the tool, and who leads."""
+        tool, holder, here = self.stage.scene.tool, self.wish.holder, self.browser.here
+        self.browser.tell(lambda visitor: "" if tool is None else holding(visitor, holder, here))
 
     def close(self) -> None:
         """Stop the page and the finite elements."""
@@ -170,23 +156,24 @@ class Demo:
     def _cast(self, scene: Scene, deformer: str) -> None:
         """Have a deformer play a scene."""
         self.cast, self.tally = Cast(self.theatre, scene, deformer, self.turn), Tally()
+        self.history = History(lines_of(scene))
         # The frame that is shown.
         self.reached: int | None = None
         self.wish = Wish(deformer, FIRST, scene.name, clocked=clocked(scene, self.theatre.site))
 
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""
-        old = self.cast, self.tally, self.wish
+        old = self.cast, self.tally, self.wish, self.history
         self.busy.on(f"preparing the scene {name}")
         try:
             scene = self.first if name == self.first.name else self.find(name)
             known = self.theatre.names(scene)
             deformer = self.wish.deformer if self.wish.deformer in known else self.theatre.usual(scene)
             self._cast(scene, deformer)
-            self.wish.set(style=old[-1].style)
+            self.wish.set(style=old[2].style, path=old[2].path, through=old[2].through)
             parts = self._parts(deformer)
         except InputError as error:
-            self.cast, self.tally, self.wish = old
+            self.cast, self.tally, self.wish, self.history = old
             self.wish.set(scene=self.stage.scene.name)
             self.browser.put("scene", self.stage.scene.name)
             self.browser.report(f'<p class="warn">{escape(str(error))}</p>')
@@ -204,7 +191,7 @@ class Demo:
         elif (found := self._found(now)) is not None:
             self._draw(now, found)
             return 1
-        if now.frame is not None and self.wish.style != now.style:
+        if now.frame is not None and self.wish.look != now.look:
             self._restyle(now)
         return 0
 
@@ -240,7 +227,7 @@ class Demo:
         stage = replace(self.stage, observer=None)  # there is no truth yet to be seen
         player = Player(stage, AtRest(stage.site.anatomy), self.wish.style)
         frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.touch(number))
-        self.show(frame, player)
+        move_bodies(self.browser, frame, player)
         self.browser.show(number, pictured(frame), RESTS)
         now.rests = True
 
@@ -248,14 +235,14 @@ class Demo:
         """Draw an answer, and have it judged by the finite elements unless it is theirs."""
         number, name, touch, off = self.asked
         fem = name == "fem" or bool(off)
-        player, style = self.cast.player("fem" if fem else name, off), self.wish.style
+        look = self.wish.look
+        player = self._seen(self.asked, look)
         hand = touch or player.touch(found.number)
         self.reached, now.goal, now.asked = found.number, self.asked, (found.number, name, touch, off)
-        now.style, now.shown, now.own = style, found, None
+        now.look, now.shown, now.own = look, found, None
         now.load = digest_of_loads(self._whole(found.number, touch) if off else found.loads)
-        now.frame = frame = replace(player, style=style).drawn(
-            found.number, hand, found.loads, found.deformation, found.seconds
-        )
+        now.frame = frame = player.drawn(found.number, hand, found.loads, found.deformation, found.seconds)
+        self.history.add(sample_of(frame, self.stage.scene, clock.monotonic()))
         if found.number == number:
             self._arrive()
         if fem and not off:
@@ -265,17 +252,28 @@ class Demo:
         if not off:
             self.tally.took(name, now.load, found.deformation.cost.total)
         now.picture = pictured(frame)
-        self.show(frame, player)
+        move_bodies(self.browser, frame, player)
+        self._beside(frame, player)
 
     def _restyle(self, now: Moment) -> None:
-        """Draw the same answer with another overlay."""
+        """Draw the same answer in another way."""
         assert now.frame is not None and now.asked is not None
-        _, name, _, off = now.asked
-        frame, now.style = now.frame, self.wish.style
-        player = replace(self.cast.player("fem" if off else name, off), style=now.style)
-        seconds = frame.seconds["deform"]
+        frame, now.look = now.frame, self.wish.look
+        player, seconds = self._seen(now.asked, now.look), frame.seconds["deform"]
         now.frame = player.drawn(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
         now.picture = pictured(now.frame)
+        self._beside(now.frame, player)
+
+    def _seen(self, asked: tuple, look: tuple[Style, str, str]) -> Player:
+        """Who plays what is asked, drawn in that way."""
+        _, name, _, off = asked
+        style, path, _ = look
+        return replace(self.cast.seen("fem" if off else name, off, path), style=style)
+
+    def _beside(self, frame: Frame, player: Player) -> None:
+        """Show slices of a frame, and what was read lately, when there is time for it."""
+        through, history = self.wish.through, self.history
+        self.browser.show_beside(lambda: (slices_of(frame, player, through), history.chart()))
 
     def _check(self, now: Moment) -> None:
         """Show what the finite elements say of what is shown, and whether it is of the same load."""
@@ -286,7 +284,7 @@ class Demo:
         fresh = truth is not None and digest_of_loads(truth.loads) == now.load
         if truth is not None and (truth is not now.truth or now.by != (name, off)):
             whole = self.cast.player(name)
-            self._wire(truth, whole)
+            move_wire(self.browser, self.stage, truth, whole)
             if not off:
                 now.judged = judge(truth, whole, name == "fem")
                 if now.judged.mean is not None:
@@ -355,26 +353,3 @@ class Demo:
     def _visitor(self) -> int | None:
         """Who set what is heard now."""
         return None if self.browser.deed is None else self.browser.deed.visitor
-
-    def show(self, frame: Frame, player: Player) -> None:
-        """Put the bodies of the 3-D view where a frame has them."""
-        positions = player.believed(frame)
-        stage = self.stage.at(frame.loads)
-        for layer in (stage.cortex(positions), stage.tumour(positions)):
-            self.browser.move(layer.name, layer.vertices, layer.triangles)
-        ellipsoid = None if frame.estimate is None else frame.estimate.ellipsoid()
-        if ellipsoid is not None:
-            self.browser.move(ellipsoid.name, ellipsoid.vertices)
-        tool = self.stage.scene.tool
-        if tool is not None and frame.pose is not None:
-            self.browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
-
-    def _wire(self, truth: Truth, player: Player) -> None:
-        """Show in the 3-D view where the finite elements, under all effects, have the tumour."""
-        seen = self.stage.at(truth.loads).tumour(player.positions(truth.deformation))
-        self.browser.move("finite elements", seen.vertices, seen.triangles)
-
-
-def pictured(frame: Frame) -> np.ndarray:
-    """A frame's picture (H, W, 3) uint8 with the patient's sides."""
-    return marked(frame.shown, frame.camera.T_camera_world[:3, :3], frame.taken)

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from sim.deformation import Deformation, Deformer
 
+from ..script.camera_paths import PATHS
 from ..script.scene import Scene
 from .deformers import GUARDED, Theatre
 from .effect_ablation import without
@@ -38,6 +39,7 @@ class Cast:
         # Not on a card: there, what is drawn while a solver's thread records a CUDA graph would be recorded with it.
         self.stages = {ALL: replace(theatre.stage(scene), device="cpu")}
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
+        self.filmed: dict[tuple[frozenset[str], str], Stage] = {}
         self.last: dict[str, Deformation] = {}
         self.solvers: dict[frozenset[str], Referee] = {}
         # The finite elements that are asked for what is shown next, and their question.
@@ -74,6 +76,16 @@ class Cast:
             uncertainty = self.theatre.uncertainty(stage.scene)
             self.players[name, off] = Player(stage, deformer, uncertainty=uncertainty)
         return self.players[name, off]
+
+    def seen(self, name: str, off: frozenset[str], path: str) -> Player:
+        """The same, with the camera on a path of that name; "" as the scene has it."""
+        player = self.player(name, off)
+        if not path:
+            return player
+        if (off, path) not in self.filmed:
+            view = replace(player.scene.viewpoint, path=PATHS[path](0) if path in PATHS else None)
+            self.filmed[off, path] = replace(player.stage, scene=replace(player.scene, viewpoint=view))
+        return replace(player, stage=self.filmed[off, path])
 
     def _trained(self, name: str, scene: Scene) -> Deformer:
         """A trained model. Finite elements behind it are made in turn, and on the CPU, for the reason of the stages."""

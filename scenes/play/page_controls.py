@@ -10,12 +10,15 @@ import numpy as np
 
 from ar.hud import bearings
 from ar.overlay import Style
+from ar.page_aside import STYLE
 from ar.page_parts import Choice, Fold, Note, Slider, Toggle
 from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
 
+from ..script.camera_paths import PATHS
 from ..script.scene import SCENES, Scene
 from ..script.site import Site
 from ..script.tool_paths import AIR
+from .page_beside import TIP, TUMOUR_MIDDLE
 from .page_requests import HAND, SCRIPT, Wish
 from .page_text import effect_words
 
@@ -23,6 +26,8 @@ STYLES = {"window": "outline and window", "contour": "outline", "fill": "outline
 """What a visitor calls the overlay's styles."""
 MOST_FORCE, MOST_DEPTH, MOST_TILT = 0.4, 8.0, 40.0
 """Ends of the sliders [N], [mm], [deg]."""
+STAYS = "stays"
+"""What a visitor calls a camera that does not move."""
 PLAN = "how the finite elements solve a load"
 """Label of the note that says which solvers they try."""
 HANDS = "A slider takes the tool in your hand; 'script' gives it back."
@@ -40,7 +45,12 @@ def controls(
 
     `give` takes who gets the tool, `take` numbers of its touch, as `Wish.hand` does.
     """
-    styles: dict[str, Style] = {STYLES[style]: style for style in get_args(Style)}
+    styles: dict[str, Style] = {STYLES.get(str(style), str(style)): style for style in get_args(Style)}
+    cameras = "as the scene has it", STAYS, *PATHS
+
+    def film(name: str) -> None:
+        wish.set(path="" if name == cameras[0] else name)
+
     shown = next(words for words, style in styles.items() if style == wish.style)
     switches = tuple(
         Toggle(effect, True, partial(wish.switch, effect), effect_words(effect), "what happens without it?")
@@ -57,11 +67,26 @@ def controls(
             "answered by",
             "fem: finite elements, solved anew; the others: models that were trained on them",
         ),
-        Choice("overlay", tuple(styles), shown, lambda words: wish.set(style=styles[words]), hint="how it is drawn"),
-        *([] if scene.tool is None else hand(scene, site, wish, give, take)),
+        Choice(
+            "overlay",
+            tuple(styles),
+            shown,
+            lambda words: wish.set(style=styles[words]),
+            hint="how it is drawn",
+            key=STYLE,
+        ),
+        Choice("camera", cameras, wish.path or cameras[0], film, hint="how the camera moves"),
+        *([] if scene.tool is None else [*hand(scene, site, wish, give, take), through(wish)]),
         *([Fold("more: switch parts of the physics off", switches)] if switches else []),
         Note(PLAN),
     ]
+
+
+def through(wish: Wish) -> Choice:
+    """Where the slices of the scan lie."""
+    places = TUMOUR_MIDDLE, TIP
+    hint = "where the slices of the scan lie, which a tab beside the 3-D view shows"
+    return Choice("slices", places, wish.through or places[0], lambda name: wish.set(through=name), hint=hint)
 
 
 def switched(scene: Scene, site: Site) -> list[str]:

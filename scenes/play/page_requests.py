@@ -16,6 +16,7 @@ SCRIPT, HAND = "script", "hand"
 class Wish:
     """What the visitors ask for, written by the page's threads and read by the loop, under its lock.
 
+    `path` is how the camera moves, by its name; "" as the scene has it. `through` is where slices lie.
     `clocked` says whether anything moves by itself under a hand that is still: otherwise a hand pauses the script.
     """
 
@@ -28,6 +29,8 @@ class Wish:
     number: int = 0
     off: frozenset[str] = frozenset()
     style: Style = "window"
+    path: str = ""
+    through: str = ""
     clocked: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -55,6 +58,12 @@ class Wish:
         """Switch an effect on or off."""
         with self.lock:
             self.off = self.off - {effect} if on else self.off | {effect}
+
+    @property
+    def look(self) -> tuple[Style, str, str]:
+        """How an answer is shown: the overlay's style, the camera's path, and where slices lie."""
+        with self.lock:
+            return self.style, self.path, self.through
 
     def now(self) -> tuple[int, str, Touch | None, frozenset[str]]:
         """Frame number, deformer, hand-set touch (None: the script's) and effects that are off."""

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from ar.browser import Browser
+from ar.hud import marked
 from ar.page_parts import Body, Sign, Viewpoint
 
 from ..script.site import Site
 from .observer import BALL, BALL_FACES, ELLIPSOID_COLOUR
+from .page_referee import Truth
+from .player import Frame, Player
 from .stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 
 FEM_COLOUR = TRUTH_COLOUR
@@ -52,3 +56,27 @@ def viewpoint_of(site: Site) -> Viewpoint:
     """Obliquely onto the open cortex."""
     eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
     return Viewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
+
+
+def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
+    """Put the bodies of the 3-D view where a frame has them."""
+    positions, tool = player.believed(frame), player.scene.tool
+    stage = player.stage.at(frame.loads)
+    for layer in (stage.cortex(positions), stage.tumour(positions)):
+        browser.move(layer.name, layer.vertices, layer.triangles)
+    ellipsoid = None if frame.estimate is None else frame.estimate.ellipsoid()
+    if ellipsoid is not None:
+        browser.move(ellipsoid.name, ellipsoid.vertices)
+    if tool is not None and frame.pose is not None:
+        browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
+
+
+def move_wire(browser: Browser, stage: Stage, truth: Truth, player: Player) -> None:
+    """Show where the finite elements, under all effects, have the tumour."""
+    seen = stage.at(truth.loads).tumour(player.positions(truth.deformation))
+    browser.move("finite elements", seen.vertices, seen.triangles)
+
+
+def pictured(frame: Frame) -> np.ndarray:
+    """A frame's picture (H, W, 3) uint8 with the patient's sides."""
+    return marked(frame.shown, frame.camera.T_camera_world[:3, :3], frame.taken)

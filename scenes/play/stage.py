@@ -182,10 +182,10 @@ class Stage:
         """Triangles (S, 3) of the mesh's surface that wear the scan."""
         vertices, triangles = np.unique(surface, return_inverse=True)
         at = self.anatomy.mesh.nodes[vertices]
-        return Cortex(vertices, triangles, at - READ_BELOW * vertex_normals(at, triangles), self._solid)
+        return Cortex(vertices, triangles, at - READ_BELOW * vertex_normals(at, triangles), self.scan)
 
     @cached_property
-    def _solid(self) -> Solid | None:
+    def scan(self) -> Solid | None:
         """The scan as a solid texture."""
         if self.intensity is None:
             return None

@@ -1,0 +1,126 @@
+"""What was read in the last seconds, as a small chart: lines over time, each with its error as a band."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from html import escape
+
+SPAN = 20.0
+"""So long a chart reaches back [s]."""
+# Of a chart, in units of its own: its width, a line's height, and what numbers at the left and words above take.
+WIDE, HIGH, LEFT, ABOVE, BELOW = 600.0, 105.0, 44.0, 20.0, 16.0
+# Samples that are kept, and that are drawn: a pixel or two apart.
+MOST, DRAWN = 1200, 240
+# Moments farther apart are not joined [s].
+PAUSE = 2.0
+
+
+@dataclass(frozen=True)
+class Line:
+    """What is read: its name, unit and colour; `whose` says in a few words what its error is of."""
+
+    name: str
+    unit: str
+    colour: str
+    whose: str = ""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What was read at a time [s]: a value of each line and its error, both in the line's unit; None: not known."""
+
+    time: float
+    values: tuple[float | None, ...]
+    errors: tuple[float | None, ...]
+
+
+@dataclass
+class History:
+    """The last samples of some lines. Those of more than `SPAN` before the newest are forgotten."""
+
+    lines: tuple[Line, ...]
+    samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MOST))
+
+    def add(self, sample: Sample) -> None:
+        """Note what was read now."""
+        self.samples.append(sample)
+        while self.samples[0].time < sample.time - SPAN:
+            self.samples.popleft()
+
+    def chart(self) -> str:
+        """All lines, one over the other, as an SVG element."""
+        kept = list(self.samples)
+        kept = kept[:: max(1, math.ceil(len(kept) / DRAWN))][:-1] + kept[-1:]
+        parts = [_plot(line, number, kept) for number, line in enumerate(self.lines)]
+        words = "; ".join(f"{line.name}: {_newest(kept, number)}" for number, line in enumerate(self.lines))
+        size = f"0 0 {WIDE:g} {HIGH * len(self.lines):g}"
+        return (
+            f'<svg viewBox="{size}" role="img" aria-label="{escape(f"The last {SPAN:g} seconds. {words}")}">'
+            f"{''.join(parts)}</svg>"
+        )
+
+
+def _newest(samples: Sequence[Sample], number: int) -> str:
+    value = samples[-1].values[number] if samples else None
+    return "not known" if value is None else f"{value:.2f}"
+
+
+def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
+    """One line with its scale; where its error is not known it is dotted, and where it is itself, there is none."""
+    known = [each for each in samples if each.values[number] is not None]
+    top, end = HIGH * number + ABOVE, samples[-1].time if samples else 0.0
+    room = HIGH - ABOVE - BELOW
+    ends = [(each.values[number] or 0.0, each.errors[number] or 0.0) for each in known]
+    high = ceiling(max((value + error for value, error in ends), default=0.0))
+
+    def at(time: float, value: float) -> str:
+        across = LEFT + (WIDE - LEFT - 6.0) * (1.0 - (end - time) / SPAN)
+        return f"{across:.1f},{top + room * (1.0 - min(max(value / high, 0.0), 1.0)):.1f}"
+
+    drawn = []
+    for piece in pieces(known, number):
+        if piece[-1].errors[number] is not None:
+            above = [at(each.time, (each.values[number] or 0.0) + (each.errors[number] or 0.0)) for each in piece]
+            below = [at(each.time, (each.values[number] or 0.0) - (each.errors[number] or 0.0)) for each in piece]
+            corners = " ".join([*above, *reversed(below)])
+            drawn.append(f'<polygon points="{corners}" fill="{line.colour}" fill-opacity="0.28"/>')
+        dotted = ' stroke-dasharray="2 3"' if piece[-1].errors[number] is None else ""
+        corners = " ".join(at(each.time, each.values[number] or 0.0) for each in piece)
+        drawn.append(f'<polyline points="{corners}" fill="none" stroke="{line.colour}" stroke-width="1.6"{dotted}/>')
+    said = f"{line.name} [{line.unit}]" + (f", {line.whose}" if line.whose else "")
+    scale = "".join(
+        f'<text x="{LEFT - 5:g}" y="{top + room * (1 - share) + 4:g}" text-anchor="end">{share * high:g}</text>'
+        f'<path d="M{LEFT:g} {top + room * (1 - share):g}H{WIDE - 6:g}" stroke="#666" stroke-width="0.6"/>'
+        for share in (0.0, 1.0)
+    )
+    times = "".join(
+        f'<text x="{LEFT + (WIDE - LEFT - 6) * share:g}" y="{top + room + 14:g}" text-anchor="{anchor}">{words}</text>'
+        for share, anchor, words in ((0.0, "start", f"{SPAN:g} s ago"), (0.5, "middle", "10 s"), (1.0, "end", "now"))
+    )
+    return f'<text x="{LEFT:g}" y="{top - 6:g}">{escape(said)}</text>{scale}{times}{"".join(drawn)}'
+
+
+def pieces(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
+    """Parts of a line that are joined, and of one kind: its error is known, or it is not."""
+    found: list[list[Sample]] = []
+    for each in samples:
+        last = found[-1][-1] if found else None
+        if last is not None and each.time - last.time < PAUSE:
+            if (last.errors[number] is None) == (each.errors[number] is None):
+                found[-1].append(each)
+                continue
+            found.append([last, each] if each.errors[number] is None else [each])
+            continue
+        found.append([each])
+    return found
+
+
+def ceiling(value: float) -> float:
+    """The end of a scale that holds a value: 1, 2 or 5 times a power of ten."""
+    if not value > 0.0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(power * step for step in (1.0, 2.0, 5.0, 10.0) if power * step >= value * (1.0 - 1e-9))

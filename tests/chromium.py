@@ -1,0 +1,117 @@
+"""A headless Chromium that a test drives over its DevTools protocol, with nothing but a web socket."""
+
+import base64
+import json
+import shutil
+import subprocess
+import tempfile
+import time
+import urllib.request
+from contextlib import suppress
+from pathlib import Path
+
+from websockets.sync.client import connect
+
+PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+"""Where the browser is; None where there is none."""
+
+
+class Chromium:
+    """One browser with one page at a time; `errors` are what the page's console said and threw since it was opened."""
+
+    def __init__(self) -> None:
+        assert PROGRAM is not None
+        self.folder = tempfile.TemporaryDirectory(prefix="chromium-")
+        self.process = subprocess.Popen(
+            [
+                PROGRAM, "--headless=new", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader",
+                "--enable-unsafe-swiftshader", "--no-first-run", "--disable-background-networking",
+                "--disable-dev-shm-usage", "--hide-scrollbars", "--remote-debugging-port=0",
+                f"--user-data-dir={self.folder.name}", "about:blank",
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        port = self._port()
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
+            page = next(each for each in json.load(answer) if each["type"] == "page")
+        self.wire = connect(page["webSocketDebuggerUrl"], max_size=None)
+        self.said, self.errors = 0, []
+        for domain in ("Page", "Runtime", "Log"):
+            self.ask(f"{domain}.enable")
+
+    def _port(self) -> int:
+        noted, until = Path(self.folder.name) / "DevToolsActivePort", time.monotonic() + 30.0
+        while time.monotonic() < until:
+            with suppress(OSError, ValueError, IndexError):
+                return int(noted.read_text().splitlines()[0])
+            time.sleep(0.05)
+        raise TimeoutError("the browser did not start")
+
+    def ask(self, method: str, **parameters: object) -> dict:
+        """Have the browser do something, and wait for its answer."""
+        self.said += 1
+        self.wire.send(json.dumps({"id": self.said, "method": method, "params": parameters}))
+        while True:
+            heard = json.loads(self.wire.recv(30.0))
+            self.note(heard)
+            if heard.get("id") == self.said:
+                assert "error" not in heard, heard
+                return heard["result"]
+
+    def note(self, heard: dict) -> None:
+        """Keep what the page complains of."""
+        said = heard.get("params", {})
+        match heard.get("method"):
+            case "Runtime.exceptionThrown":
+                self.errors.append(said["exceptionDetails"]["text"])
+            case "Runtime.consoleAPICalled" if said["type"] == "error":
+                self.errors.append(" ".join(str(each.get("value", each)) for each in said["args"]))
+            case "Log.entryAdded" if said["entry"]["level"] == "error":
+                self.errors.append(f"{said['entry']['text']} ({said['entry'].get('url', '')})")
+
+    def size(self, width: int, height: int) -> None:
+        """Give the window another size [CSS pixel]."""
+        self.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def open(self, address: str, width: int, height: int) -> None:
+        """Go to an address in a window of so many CSS pixels."""
+        self.errors.clear()
+        self.size(width, height)
+        self.ask("Page.navigate", url=address)
+
+    def value(self, script: str) -> object:
+        """What a JavaScript expression comes to; a promise is waited for."""
+        found = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
+    def wait(self, script: str, seconds: float = 20.0) -> bool:
+        """Wait until a JavaScript expression holds; whether it does."""
+        until = time.monotonic() + seconds
+        while not (holds := bool(self.value(f"!!({script})"))) and time.monotonic() < until:
+            time.sleep(0.05)
+        return holds
+
+    def press(self, key: str, code: str) -> None:
+        """Press and release a key, by its name and its place as JavaScript has them."""
+        text = {"text": key} if len(key) == 1 else {}
+        self.ask("Input.dispatchKeyEvent", type="keyDown", key=key, code=code, **text)
+        self.ask("Input.dispatchKeyEvent", type="keyUp", key=key, code=code)
+
+    def click(self, column: float, row: float) -> None:
+        """Click at a place [CSS pixel]."""
+        for what in ("mousePressed", "mouseReleased"):
+            self.ask("Input.dispatchMouseEvent", type=what, x=column, y=row, button="left", clickCount=1)
+
+    def shot(self) -> bytes:
+        """A picture of the window as PNG."""
+        return base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
+
+    def close(self) -> None:
+        """End the browser."""
+        self.wire.close()
+        self.process.terminate()
+        self.process.wait()
+        with suppress(OSError):
+            self.folder.cleanup()

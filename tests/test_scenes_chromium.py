@@ -1,0 +1,113 @@
+"""The page in a real browser: where things are at four sizes, in register with the server's picture, and its keys."""
+
+import threading
+
+import cv2
+import numpy as np
+import pytest
+from chromium import PROGRAM, Chromium
+from theatres import Silent, small, theatre_of
+from visitor import free_port, wait_for
+
+from ar.page_aside import HELP, TABS
+from ar.page_sight import HISTORY, PICTURE, SAID, SLICES
+from scenes.play.page import Demo
+from scenes.script.tool_paths import press
+
+SIZES = [(1600, 900), (1280, 720), (900, 900), (420, 900)]
+BOX = "(r => [r.left, r.top, r.right, r.bottom])({}.getBoundingClientRect())"
+LOADED = f"document.querySelector('#{PICTURE} img') && document.querySelector('#{SLICES} img')"
+FRAME = "document.querySelector('[aria-label=frame][role=slider]')"
+
+pytestmark = pytest.mark.skipif(PROGRAM is None, reason="there is no Chromium here")
+
+
+@pytest.fixture(scope="module")
+def demo(box):
+    """A page that has played up to frame 40 and is paused."""
+    scene = small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scenes.play.page_cast.Referee", Silent)
+        demo = Demo(theatre_of(box), scene, "linear", "127.0.0.1", free_port())
+        demo.wish.set(plays=False, number=40)
+        done = threading.Event()
+
+        def play():
+            while not done.is_set():
+                demo.run(0.3)
+
+        loop = threading.Thread(target=play)
+        loop.start()
+        assert wait_for(lambda: "Error of the tumour" in demo.browser.shown[2])
+        yield demo
+        done.set()
+        loop.join()
+        demo.close()
+
+
+@pytest.fixture(scope="module")
+def window(demo):
+    window = Chromium()
+    window.open(demo.browser.address, *SIZES[0])
+    assert window.wait(LOADED) and window.wait(FRAME)
+    yield window
+    window.close()
+
+
+def box_of(window, element):
+    return np.array(window.value(BOX.format(element)))
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+def test_the_page_fits_and_is_in_register(demo, window, size):
+    """Nothing is cut off or complained of, and both errors are in sight; the picture is the server's to a pixel."""
+    window.size(*size)
+    said = f"document.getElementById('{SAID}')"
+    assert window.wait(f"innerWidth == {size[0]} && {said}.innerText.includes('Error of the tumour')")
+    whole = "document.documentElement"
+    assert max(window.value(f"[{whole}.scrollWidth - innerWidth, {whole}.scrollHeight - innerHeight]")) <= 0
+    left, top, right, bottom = box_of(window, f"document.querySelector('#{PICTURE} img')")
+    assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1]
+    shown = cv2.imdecode(np.frombuffer(window.shot(), np.uint8), cv2.IMREAD_GRAYSCALE).astype(np.float64)
+    seen = shown[round(top) : round(bottom), round(left) : round(right)]
+    sent = cv2.cvtColor(demo.browser.shown[1], cv2.COLOR_RGB2GRAY).astype(np.float64)
+    sent = cv2.resize(sent, seen.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    shift, _ = cv2.phaseCorrelate(sent, seen, cv2.createHanningWindow(seen.shape[::-1], cv2.CV_64F))
+    assert max(map(abs, shift)) < 1.0
+    assert np.corrcoef(sent.ravel(), seen.ravel())[0, 1] > 0.98
+    room = box_of(window, said)
+    for words in ("Error of the model", "Error of the tumour"):
+        line = box_of(window, f"[...document.querySelectorAll('#{SAID} p')].find(p => p.innerText.includes('{words}'))")
+        assert line[1] >= room[1] and line[3] <= min(room[3], size[1]) and line[2] <= size[0], words
+    track = box_of(window, f"{FRAME}.closest('.mantine-Slider-root')")
+    assert track[2] - track[0] > 150.0 and track[2] <= size[0]
+    for number, place in ((1, SLICES), (2, HISTORY)):
+        window.value(f"document.getElementById('{TABS[number][1]}').click()")
+        part = box_of(window, f"document.querySelector('#{place}').firstElementChild")
+        assert part[0] >= 0 and part[2] <= size[0] and part[3] <= size[1] and part[2] - part[0] > 200.0
+    assert window.errors == []
+
+
+def test_keys_and_names(demo, window):
+    """Keys step, choose and open their list; a slider keeps its own; whatever can be set has a name."""
+    window.size(1280, 720)
+    demo.wish.set(plays=False, number=40)
+    assert wait_for(lambda: demo.browser.shown[0] == 40)
+    assert wait_for(lambda: window.value("document.querySelectorAll('[role=slider]:not([aria-label])').length") == 0)
+    window.press("ArrowRight", "ArrowRight")
+    assert wait_for(lambda: demo.wish.number == 41 and demo.browser.shown[0] == 41)
+    window.press("ArrowLeft", "ArrowLeft")
+    assert wait_for(lambda: demo.browser.shown[0] == 40)
+    before = demo.wish.style
+    window.press("s", "KeyS")
+    assert wait_for(lambda: demo.wish.style != before)
+    window.press("?", "Slash")
+    assert window.wait(f"document.getElementById('{HELP}').open")
+    window.value(f"document.querySelector('#{HELP} button').click()")
+    assert window.wait(f"!document.getElementById('{HELP}').open")
+    window.value("document.querySelector('[aria-label=\"force [N]\"][role=slider]').focus()")
+    window.press("ArrowRight", "ArrowRight")
+    assert wait_for(lambda: demo.wish.tool == "hand") and demo.wish.number == 40
+    window.press(" ", "Space")
+    assert wait_for(lambda: demo.wish.tool == "hand") and not demo.wish.plays
+    assert window.errors == []
