@@ -206,9 +206,9 @@ class Browser:
             self.drawn = drawn
 
     def send_beside(self) -> None:
-        """Draw and send the newest slices, where it is time."""
+        """Draw and send the newest slices, where it is time and somebody looks."""
         with self.lock:
-            drawn = self.drawn if clock.monotonic() >= self.due else None
+            drawn = self.drawn if clock.monotonic() >= self.due and self.visitors else None
             if drawn is None:
                 return
             self.drawn, self.due = None, clock.monotonic() + 1.0 / self.limits.asides

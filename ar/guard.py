@@ -55,7 +55,7 @@ class Limits:
     burst: float = 1000.0
     per_second: float = 200.0
     sendings: float = 15.0
-    asides: float = 2.5
+    asides: float = 2.0
 
 
 LIMITS = Limits()

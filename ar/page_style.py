@@ -20,7 +20,10 @@ PARTS = f"div:has(> div > #{SAID})"
 NOTES = ".mantine-Notifications-root"
 
 # For a visitor who looks on: what they could set is dimmed, and no pointer reaches it.
-DIMMED = ".mantine-Slider-root, .mantine-InputWrapper-root, .mantine-NumberInput-root, .mantine-Checkbox-root"
+DIMMED = (
+    ".mantine-Slider-root, .mantine-InputWrapper-root, .mantine-NumberInput-root, .mantine-Checkbox-root, "
+    "div:has(> button):has(+ div .mantine-Slider-root) > button, div:has(> button) + div:has(> button) > button"
+)
 LOOKS_ON = f"<style>{PARTS} :is({DIMMED}) {{ opacity: 0.45; pointer-events: none }}</style>"
 """Rules for a visitor who looks on while another leads."""
 

@@ -115,7 +115,7 @@ def view(plane: Plane, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.n
     if cut.tip is not None:
         mark(colour, plane, np.asarray(cut.tip), middle)
     label(colour, plane, middle)
-    write(colour, said_of(cut), (PAD, 4 * PAD + 6), FINE, ink)
+    write(colour, said_of(cut), (PAD, 4 * PAD + 6), FINE)
     colour[:, -1] = EDGE
     return colour
 

@@ -235,13 +235,18 @@ def test_slices_and_the_last_seconds_arrive_together_and_not_too_often(page):
         drawn.append(number)
         return np.full((20, 60, 3), number, np.uint8), f"seconds of {number}"
 
-    begun = time.monotonic()
+    page.show_beside(lambda: draw(1))
+    time.sleep(0.3)
+    assert not drawn  # nobody looks
+    visitor, begun = Visitor(page, 1200), time.monotonic()
+    assert wait_for(lambda: page.visitors == 1)
     for number in range(40):
         page.show_beside(lambda number=number: draw(number))
         time.sleep(0.02)
     assert wait_for(lambda: "seconds of 39" in page.beside.content)
     assert drawn[-1] == 39 and len(drawn) <= 2 + LIMITS.asides * (time.monotonic() - begun)
     assert coded(np.full((20, 60, 3), 39, np.uint8)) in page.beside.content and SLICES in page.beside.content
+    visitor.wire.close()
 
 
 def test_what_a_visitor_sets_is_heard_while_the_page_sets_the_same(heard):

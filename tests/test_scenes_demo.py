@@ -359,6 +359,11 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
     demo.wish.set(style="contour")
     demo.answer(moment)
     assert before is not None and (moment.picture != before).any() and asked == []
+    before = moment.picture
+    for path, moves in (("orbit", True), ("stays", False)):
+        demo.wish.set(path=path)
+        demo.answer(moment)
+        assert (moment.picture != before).any() == moves and asked == []
 
 
 def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):

@@ -9,6 +9,7 @@ from theatres import short, sinking, small, theatre_of
 
 from ar.page_parts import Choice, Fold, Slider
 from scenes.play.deformers import GUARDED, plan_of
+from scenes.play.page_beside import TIP, TUMOUR_MIDDLE, lines_of, sample_of, slices_of
 from scenes.play.page_controls import clocked, controls
 from scenes.play.page_referee import Truth
 from scenes.play.page_requests import Wish
@@ -177,6 +178,20 @@ class TestControls:
             seen.append(wish.style)
         assert seen[:3] == ["window", "contour", "fill"] and overlay.start == overlay.options[0]
 
+    def test_each_way_of_the_camera_and_each_place_of_the_slices_is_offered(self, theatre):
+        wish = Wish("fem", Touch())
+        found = {control.label: control for control in controls(short(), theatre.site, ("fem",), wish, print, print)}
+        camera, slices = found["camera"], found["slices"]
+        assert isinstance(camera, Choice) and isinstance(slices, Choice)
+        seen = []
+        for option in camera.options:
+            camera.changed(option)
+            seen.append(wish.path)
+        assert seen == ["", "stays", "hand-held", "microscope", "orbit"]
+        slices.changed(TIP)
+        assert wish.look == ("window", "orbit", TIP)
+        assert "slices" not in {each.label for each in controls(sinking(), theatre.site, ("fem",), wish, print, print)}
+
     def test_which_scenes_go_on_by_themselves(self, theatre):
         found = {name: clocked(find_scene(name), theatre.site) for name in ("press", "palpate", "retract", "pulsation")}
         assert found == {"press": False, "palpate": False, "retract": True, "pulsation": True}
@@ -230,6 +245,24 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
     tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
     assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
     assert verdict_words(found, stale=True, waits="").startswith('<p class="stale">of an earlier load: ')
+
+
+def test_the_chart_and_the_slices_are_of_the_frame_that_is_shown(theatre):
+    player = theatre.player("linear", short())
+    frame = player.draw(3, 0.1, Touch(force=0.25))
+    read = sample_of(replace(frame, distance=12e-3, distance_error=np.inf), player.scene, 5.0)
+    assert read.values == pytest.approx((12.0, 0.25)) and read.errors == (None, 0.0) and read.time == 5.0
+    assert sample_of(replace(frame, distance_error=2e-3), player.scene, 0.0).errors[0] == pytest.approx(2.0)
+    middle, tip = (slices_of(frame, player, place) for place in (TUMOUR_MIDDLE, TIP))
+    assert middle.shape == tip.shape and (middle != tip).any()
+    known = slices_of(replace(frame, tumour_error=TumourError(4e-3)), player, TUMOUR_MIDDLE)
+    doubtful = slices_of(replace(frame, tumour_error=TumourError(4e-3), doubt="why"), player, TUMOUR_MIDDLE)
+    green = [np.count_nonzero(each[..., 1] > each[..., 0] + 10.0) for each in (known, middle, doubtful)]
+    assert green[0] > 1.5 * green[1] > 0 == green[2]
+    still = theatre.player("fem", sinking())
+    assert [line.name for line in lines_of(still.scene)] == ["tumour moved"]
+    moved = sample_of(replace(frame, moved=3e-3, tumour_error=TumourError(4e-3)), still.scene, 0.0)
+    assert moved.values == (3.0,) and moved.errors == (4.0,)
 
 
 def test_the_page_reads_what_the_frame_holds(theatre):
