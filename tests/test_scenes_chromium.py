@@ -55,6 +55,8 @@ def window(demo):
 
 
 def box_of(window, element):
+    """Left, top, right and bottom of an element, once it is there: a narrow window lays the panel out anew."""
+    assert window.wait(element)
     return np.array(window.value(BOX.format(element)))
 
 
@@ -79,11 +81,11 @@ def test_the_page_fits_and_is_in_register(demo, window, size):
     for words in ("Error of the model", "Error of the tumour"):
         line = box_of(window, f"[...document.querySelectorAll('#{SAID} p')].find(p => p.innerText.includes('{words}'))")
         assert line[1] >= room[1] and line[3] <= min(room[3], size[1]) and line[2] <= size[0], words
-    track = box_of(window, f"{FRAME}.closest('.mantine-Slider-root')")
+    track = box_of(window, f"{FRAME}?.closest('.mantine-Slider-root')")
     assert track[2] - track[0] > 150.0 and track[2] <= size[0]
     for number, place in ((1, SLICES), (2, HISTORY)):
         window.value(f"document.getElementById('{TABS[number][1]}').click()")
-        part = box_of(window, f"document.querySelector('#{place}').firstElementChild")
+        part = box_of(window, f"document.querySelector('#{place} > *')")
         assert part[0] >= 0 and part[2] <= size[0] and part[3] <= size[1] and part[2] - part[0] > 200.0
     assert window.errors == []
 
