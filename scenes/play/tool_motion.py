@@ -16,6 +16,7 @@ from ..script.uncertainty import DEVIATIONS
 from .load_text import doubt_of
 from .stage import Stage
 
+UNBOUND = "the model states no error: do not rely on it"
 REFUSED = "the tool is farther inside the brain than the model knows: do not rely on it"
 
 
@@ -86,11 +87,13 @@ class ToolMotion:
         positions[answer.nodes] += answer.displacement[0]
         model = answering(self.deformer, answer)
         bound = 0.0 if model is None else float(answer.bound[0, 0])
+        if model is not None and not np.isfinite(bound):
+            bound, doubt = (model.bound, doubt) if np.isfinite(model.bound) else (0.0, doubt or UNBOUND)
         return Motion(
             positions,
             True,
             float(np.linalg.norm(moved, axis=1).mean()),
-            bound if np.isfinite(bound) else model.bound if model is not None else 0.0,
+            bound,
             float(np.linalg.norm(beyond - moved, axis=1).max()),
             doubt,
             answer,
