@@ -155,7 +155,7 @@ def test_a_camera_that_repeats_a_picture_or_stops_is_stale(follower):
     few = [each.picture for each in islice(pictures(), 2)]
     known = follower.step(few[0].grey, 0.0)
     assert follower.step(few[0].grey, 0.0, known).words.startswith("stale, the camera repeats a picture")
-    assert follower.step(few[1].grey, 0.5, known).state is State.STALE
+    assert follower.step(few[1].grey, 0.5, replace(known, interval=0.1)).state is State.STALE
     assert follower.step(few[1].grey, 0.1, known).state is State.REST
     old = aged(known, 0.5)
     assert old.state is State.STALE and "0.5 s old" in old.words and aged(known, 0.1) is known
@@ -171,6 +171,17 @@ def test_a_reference_that_was_never_seen_has_no_overlay(follower, stage):
     assert HELD == 0.2
     with pytest.raises(ValueError, match="calibrate it at this size"):
         follower.step(blank[::2, ::2, 0], 0.0)
+
+
+def test_a_slow_film_is_stale_where_its_own_pictures_are_missing(follower):
+    blank, known, states = np.full((720, 960), 120, np.uint8), None, []
+    first = next(iter(pictures())).picture.grey
+    for moment in (0.0, 0.3, 0.6, 0.9, 1.8, 2.1):
+        known = follower.step(first, moment, known)
+        states.append(known.state)
+    assert [each is State.STALE for each in states] == [False, False, False, False, True, False]
+    assert follower.step(blank, 2.4, known).state is State.NO_REFERENCE
+    assert follower.step(first, 1.5).interval == follower.step(first, 4.0, follower.step(first, 1.5)).interval == 1.0
 
 
 def test_a_film_that_plays_as_a_camera_loses_what_comes_too_fast():

@@ -23,6 +23,8 @@ from .tool_motion import Motion, ToolMotion
 
 # So long a picture's overlay stays where it was when the reference is lost, and so long pictures may be missing [s].
 HELD, GAP = 0.2, 0.2
+# A slow film's pictures may be apart by so many of its own intervals, which are no longer than this [s].
+MISSED, SLOWEST = 1.5, 1.0
 # A tumour whose place in the picture is not known this well is not to be relied on [m].
 LIMIT = 5e-3
 TOOL, PATIENT = tool_cube().name, patient_reference().name
@@ -64,6 +66,8 @@ class Known:
         The same by what it comes from [m].
     seen, felt
         When the reference, and the tool beside it, were seen last [s]; None: never.
+    interval
+        The shortest between two pictures so far [s].
     """
 
     time: float
@@ -78,6 +82,7 @@ class Known:
     parts: Mapping[str, float] = field(default_factory=dict)
     seen: float | None = None
     felt: float | None = None
+    interval: float = SLOWEST
 
     @property
     def relied(self) -> bool:
@@ -120,9 +125,18 @@ class Follower:
         ValueError
             As `Tracker.track`.
         """
+        known = self._looked(grey, time, before)
+        if before is None:
+            return known
+        apart = time - before.time
+        return replace(known, interval=min(before.interval, apart) if apart > 0.0 else before.interval)
+
+    def _looked(self, grey: np.ndarray, time: float, before: Known | None) -> Known:
+        """As `step`, whatever the intervals are."""
         apart = None if before is None else time - before.time
-        stale = apart is not None and not 0.0 < apart <= GAP
-        forgotten = before is None or (apart is not None and not 0.0 <= apart <= GAP)
+        longest = GAP if before is None else max(GAP, MISSED * before.interval)
+        stale = apart is not None and not 0.0 < apart <= longest
+        forgotten = before is None or (apart is not None and not 0.0 <= apart <= longest)
         tracked = self.tracker.track(grey, None if before is None or forgotten else before.tracked)
         reference = tracked.poses.get(PATIENT)
         if reference is None:
