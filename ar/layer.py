@@ -23,6 +23,8 @@ class Solid:
         (3,) multiplier at value 0.
     relief
         Height [m] by which value 1 stands above value 0: darker is deeper. Shading only; the surface stays.
+    height
+        (X, Y, Z) in [0, 1]: what stands so high, in place of `values`.
 
     Raises
     ------
@@ -34,6 +36,7 @@ class Solid:
     T_index_world: np.ndarray
     dark: tuple[float, float, float] = (0.0, 0.0, 0.0)
     relief: float = 0.0
+    height: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         values, T = np.asarray(self.values, np.float32), np.asarray(self.T_index_world, np.float64)
@@ -43,7 +46,9 @@ class Solid:
             raise ValueError(f"T_index_world is an affine (4, 4), not {T.shape}.")
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "T_index_world", T)
-        gradient = np.moveaxis(np.asarray(np.gradient(values)), 0, -1) @ T[:3, :3].astype(np.float32)
+        gradient = np.moveaxis(np.asarray(np.gradient(values if self.height is None else self.height)), 0, -1) @ T[
+            :3, :3
+        ].astype(np.float32)
         object.__setattr__(self, "texels", np.concatenate([values[..., None], gradient], axis=-1))
 
     # (X, Y, Z, 4) float32: value and its gradient in the world [1/m], made once.

@@ -1,0 +1,195 @@
+"""Depth from two eyes, and points that are followed: against the places that were drawn."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from test_ar_lens import SOME
+
+from ar.camera import Camera, look_at
+from ar.disparity import Cloud, StereoView, cloud, viewed
+from ar.layer import Layer, Solid
+from ar.point_flow import followed, supported
+from ar.rectified import Rectified, rectified
+from ar.renderer import Lamp, Picture, Renderer
+from ar.stereo import stereo_pair
+
+TARGET, REACH, FINE = np.array([0.04, 0.03, 0.02]), 15e-3, 6000.0
+LAMP = Lamp(TARGET + [0.05, 0.05, 0.3], TARGET, radius=0.06)
+
+
+def eyes(lens=SOME) -> tuple[Camera, Camera]:
+    """They look at the target from 0.3 m, slanting, with lenses that bend and axes that meet there."""
+    middle = look_at(TARGET + [0.0, -0.1, 0.28], TARGET, np.array([0.0, 1.0, 0.0]), np.radians(8.0), 320, 240)
+    return stereo_pair(replace(middle, lens=lens), working_distance=0.3)
+
+
+def bulge(texture: float = 1.0) -> Layer:
+    """A sheet of 50 mm that bulges by 4 mm, with a mottle of half a millimetre."""
+    across = np.linspace(-25e-3, 25e-3, 30)
+    x, y = (each.ravel() for each in np.meshgrid(across, across))
+    rest = np.stack([x, y, np.zeros_like(x)], axis=1)
+    sheet = TARGET + rest - np.outer((x**2 + y**2) / 0.15, [0.0, 0.0, 1.0])
+    corner = np.arange(900).reshape(30, 30)
+    a, b, c, d = (each.ravel() for each in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
+    mottle = gaussian_filter(np.random.default_rng(0).standard_normal((150, 150)), 1.3)
+    grey = np.clip(0.5 + texture * 0.2 * mottle / mottle.std(), 0.0, 1.0)
+    T = np.diag([3000.0, 3000.0, 1000.0, 1.0])
+    T[:2, 3] = 75.0
+    solid = Solid(np.repeat(grey[:, :, None], 2, axis=2), T)
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return Layer("sheet", 1, sheet, faces, (0.86, 0.6, 0.54), gloss=0.0, solid=solid, rest=rest)
+
+
+SHEET = bulge()
+RENDERER = Renderer([SHEET], LAMP, "cpu")
+
+
+def shot(pair: tuple[Camera, Camera], moved: np.ndarray | float = 0.0, renderer: Renderer = RENDERER) -> list[Picture]:
+    return [renderer.picture(eye, [SHEET.vertices + moved]) for eye in pair]
+
+
+def taken(picture: Picture, seed: int, darker: float = 1.0) -> np.ndarray:
+    """Its colours with a camera's noise."""
+    noisy = darker * picture.colour + 2.0 * np.random.default_rng(seed).standard_normal(picture.colour.shape)
+    return np.clip(noisy.round(), 0.0, 255.0).astype(np.uint8)
+
+
+def window_of(pair: tuple[Camera, Camera]) -> Rectified:
+    return rectified(*pair, tuple(TARGET.tolist()), REACH, FINE)
+
+
+def grid(size: int) -> np.ndarray:
+    at = np.arange(15.0, size - 15.0, 6.0)
+    return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+
+
+def off(found: Cloud, pixels: np.ndarray, geometry: Rectified, left: Camera, picture: Picture) -> np.ndarray:
+    """How far off depths are (k,) [m], by the depth that was drawn."""
+    here = geometry.points(pixels[found.which], np.zeros(len(found.which)))
+    at = left.project(here)[0].round().astype(int)
+    true = left.unproject(left.project(here)[0], picture.depth[at[:, 1], at[:, 0]].astype(float))
+    return (found.points - true) @ geometry.T_window_world[2, :3]
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return eyes()
+
+
+@pytest.fixture(scope="module")
+def geometry(pair):
+    return window_of(pair)
+
+
+@pytest.fixture(scope="module")
+def pictures(pair):
+    return shot(pair)
+
+
+@pytest.fixture(scope="module")
+def view(geometry, pictures) -> StereoView:
+    return viewed(geometry, *(taken(picture, seed) for seed, picture in enumerate(pictures)))
+
+
+def test_windows_show_what_cameras_with_lenses_see(pair, geometry):
+    columns, rows = np.meshgrid(np.arange(320, dtype=np.float32), np.arange(240, dtype=np.float32))
+    points = TARGET + 5e-3 * np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
+    pixels, disparity = geometry.place(points)
+    there = pixels - np.stack([disparity, np.zeros_like(disparity)], axis=1)
+    assert np.allclose(geometry.points(pixels, disparity), points, atol=1e-9)
+    assert np.abs(disparity).max() > 2.0 and geometry.size == 180
+    assert np.allclose(geometry.place(TARGET[None])[0], 89.5) and abs(geometry.place(TARGET[None])[1][0]) < 1e-9
+    for eye, where, number in zip(pair, (pixels, there), (0, 1), strict=True):
+        shown = [geometry.windows(each, each)[number] for each in (columns, rows)]
+        near = np.round(where).astype(int)
+        found = np.stack([each[near[:, 1], near[:, 0]] for each in shown], axis=1)
+        step = (where - near) * eye.K[0, 0] / geometry.focal
+        assert np.abs(found + step - eye.project(points)[0]).max() < 0.15
+
+
+@pytest.mark.parametrize("darker", [1.0, 0.85])
+def test_depths_are_as_far_off_as_is_said(pair, geometry, pictures, darker):
+    pixels = grid(geometry.size)
+    view = viewed(geometry, taken(pictures[0], 0), taken(pictures[1], 1, darker))
+    found = cloud(view, pixels)
+    error = off(found, pixels, geometry, pair[0], pictures[0])
+    assert len(found.which) > 0.9 * len(pixels)
+    assert np.sqrt((error**2).mean()) < 0.35e-3 and abs(error.mean()) < 0.1e-3
+    assert 0.4 < np.sqrt(((error / found.sigma) ** 2).mean()) < 1.6
+
+
+def test_glare_is_left_out(pair, geometry, pictures):
+    lit, random = [taken(picture, seed) for seed, picture in enumerate(pictures)], np.random.default_rng(3)
+    for picture in lit:
+        for column, row in random.integers((100, 60), (220, 180), (20, 2)).tolist():
+            picture[row - 1 : row + 2, column - 1 : column + 2] = 255
+    pixels = grid(geometry.size)
+    found = cloud(viewed(geometry, *lit), pixels)
+    assert 0.3 * len(pixels) < len(found.which) < 0.9 * len(pixels)
+    error = off(found, pixels, geometry, pair[0], pictures[0])
+    assert np.sqrt((error**2).mean()) < 0.6e-3 and np.median(np.abs(error)) < 0.25e-3
+
+
+def test_what_a_tool_hides_in_either_eye_is_no_point(geometry, pictures, view):
+    pixels, none = grid(geometry.size), np.zeros((240, 320), bool)
+    left, right = none.copy(), none.copy()
+    left[:, :140], right[:, 180:] = True, True
+    colours = [taken(picture, seed) for seed, picture in enumerate(pictures)]
+    found = cloud(viewed(geometry, *colours, (left, right)), pixels)
+    disparity = geometry.place(found.points)[1]
+    at = [pixels[found.which], pixels[found.which] - np.stack([disparity, np.zeros_like(disparity)], axis=1)]
+    assert len(found.which) > 20 and len(found.which) < 0.6 * len(cloud(view, pixels).which)
+    for mask, place in zip(geometry.windows(left.astype(np.uint8), right.astype(np.uint8)), at, strict=True):
+        column, row = place.round().astype(int).T
+        assert mask.any() and not mask[row, column].any()
+
+
+def test_light_alone_tells_no_depth(pair, geometry):
+    plain = Renderer([bulge(texture=0.0)], LAMP, "cpu")
+    view = viewed(geometry, *(taken(picture, seed) for seed, picture in enumerate(shot(pair, renderer=plain))))
+    assert not len(cloud(view, grid(geometry.size)).which)
+
+
+def test_other_cameras_and_blind_eyes_are_refused(pair, geometry, pictures):
+    left, right = (taken(picture, seed) for seed, picture in enumerate(pictures))
+    with pytest.raises(ValueError, match="the right eye sees nothing"):
+        viewed(geometry, left, np.zeros_like(right))
+    with pytest.raises(ValueError, match="which is which"):
+        window_of(pair[::-1])
+    with pytest.raises(ValueError, match="ahead of the eyes"):
+        rectified(*pair, tuple(2.0 * pair[0].centre - TARGET), REACH, FINE)
+    turned = pair[0], pair[1].perturbed(0.06, (1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="pixels apart: calibrate the pair again"):
+        cloud(viewed(window_of(turned), left, right), grid(geometry.size))
+
+
+def test_points_are_followed_over_many_pixels(pair, geometry, view):
+    """By 5 mm, 30 pixels, in each direction in turn: where they come to is found in three dimensions."""
+    pixels = grid(geometry.size)
+    known = cloud(view, pixels)
+    for seed, motion in enumerate(np.array([[5e-3, 0.0, 0.0], [-2e-3, 4e-3, -2e-3]]), start=5):
+        later = viewed(geometry, *(taken(picture, seed) for picture in shot(pair, motion)))
+        which, there = followed(view, later, pixels[known.which])
+        found = cloud(later, there)
+        moved = found.points - known.points[which[found.which]]
+        good = supported(found.points, moved)
+        assert good.sum() > 0.5 * len(known.which) and good.mean() > 0.9
+        error = np.linalg.norm(moved - motion, axis=1)[good]
+        assert np.median(error) < 0.25e-3 and np.quantile(error, 0.95) < 0.8e-3
+
+
+def test_nothing_is_followed_into_another_picture(geometry, view):
+    random = np.random.default_rng(0)
+    other = replace(view, left=random.integers(0, 255, view.left.shape, dtype=np.uint8))
+    which, there = followed(view, other, grid(geometry.size))
+    assert len(which) == len(there) < 3
+
+
+def test_a_motion_unlike_its_neighbours_has_no_support():
+    random = np.random.default_rng(0)
+    places, motions = random.uniform(0.0, 0.02, (60, 3)), 1e-4 * random.standard_normal((60, 3)) + 3e-3
+    motions[[4, 30]] += [2e-3, 0.0, 0.0]
+    assert np.flatnonzero(~supported(places, motions)).tolist() == [4, 30]
+    assert supported(places[:8], motions[:8]).all()  # too few to judge
