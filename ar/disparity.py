@@ -88,8 +88,8 @@ class StereoView:
 
     def at(self, pixels: np.ndarray, field: np.ndarray) -> np.ndarray:
         """Values (n,) of a field (size, size) at the pixels (n, 2) that are nearest; NaN or True beyond its border."""
-        here = np.round(pixels).astype(int)
-        inside = ((here >= 0) & (here < self.geometry.size)).all(axis=1)
+        here = np.nan_to_num(np.round(pixels).clip(-1.0, self.geometry.size), nan=-1.0).astype(int)
+        inside = np.all((here >= 0) & (here < self.geometry.size), axis=1)
         here = np.where(inside[:, None], here, 0)
         beyond = np.nan if field.dtype.kind == "f" else True
         return np.where(inside, field[here[:, 1], here[:, 0]], beyond)

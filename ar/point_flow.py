@@ -41,7 +41,7 @@ def supported(places: np.ndarray, motions: np.ndarray) -> np.ndarray:
     """(n,) bool: which motions (n, 3) [m] at places (n, 3) [m] are like those of their neighbours."""
     if len(places) <= NEIGHBOURS:
         return np.ones(len(places), bool)
-    near = motions[KDTree(places).query(places, NEIGHBOURS + 1)[1][:, 1:]]
+    near = motions[np.asarray(KDTree(places).query(places, NEIGHBOURS + 1)[1])[:, 1:]]
     middle = np.median(near, axis=1)
     spread = 1.4826 * np.median(np.linalg.norm(near - middle[:, None], axis=2), axis=1)
     return np.linalg.norm(motions - middle, axis=1) <= np.maximum(DEVIATIONS * spread, FREE)

@@ -9,7 +9,7 @@ from .script.debulking import Debulking
 from .script.head_posture import Lying
 from .script.scene import Bounds, Scene, find_scene
 from .script.shipped_files import template_path
-from .script.sight import Sight
+from .script.sight import Sight, StereoSight
 from .script.site import Site, site_of
 from .script.tool import Blade, Instrument, Probe
 from .script.tool_paths import Touch, draw, idle, lay, palpate, press, slide, wander
@@ -31,6 +31,7 @@ __all__ = [
     "Scene",
     "Sight",
     "Site",
+    "StereoSight",
     "Theatre",
     "Touch",
     "Viewpoint",

@@ -16,6 +16,7 @@ BENCHES = {
     "throughput": "how many loads a second the finite elements solve: one mesh, thousands of loads",
     "published": "how far the published learners are off, one force position left out at a time",
     "locate": "how much of a tumour's motion is found from points on the open cortex, by us and by rivals",
+    "microscope": "how far off the tumour is that is located from pictures of two eyes, and how long that takes",
     "fit": "how rightly tissue and skull of known patients are found from several frames",
     "track": "how far off a tool's tip is that a camera sees by its printed cube",
     "shortcuts": "how much time each shortcut of the solver saves on typical loads",

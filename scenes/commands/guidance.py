@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # Named here too, so that a command's help waits for no scene to be imported.
-NAMES = "press, slide, draw, palpate, retract, brain_shift, resection, pulsation, sag, lost_force"
+NAMES = "press, slide, draw, palpate, retract, brain_shift, resection, pulsation, sag, lost_force, microscope"
 PLAYING = ("demo", "render", "film", "collect", "check", "effects")
 """Commands that take the scene to play."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -30,11 +30,13 @@ from surrogate.model.store import load
 
 from ..script.scene import Scene
 from ..script.shipped_files import template_path
+from ..script.sight import Sight, StereoSight
 from ..script.site import Site, site_of
 from ..script.uncertainty import Uncertainty, mark_of, read_uncertainties, uncertainty_path
 from .observer import Observer
 from .player import Player
 from .stage import Stage
+from .stereo_observer import StereoObserver
 
 GUARDED = "guarded"
 """The name of the best model with finite elements behind it."""
@@ -92,9 +94,15 @@ class Theatre:
         InputError
             A scene with a sight, on an anatomy without a locator.
         """
-        observer = None if scene.sight is None else Observer(self.site, self.locator, scene.sight)
         device = find_device(self.device, LIVE.precision).name
-        return Stage(scene, self.site, self.intensity, device=device, observer=observer)
+        stage = Stage(scene, self.site, self.intensity, device=device)
+        match scene.sight:
+            case None:
+                return stage
+            case Sight():
+                return replace(stage, observer=Observer(self.site, self.locator, scene.sight))
+            case StereoSight():
+                return replace(stage, observer=StereoObserver(stage, self.locator, scene.sight))
 
     def refusals(self, scene: Scene) -> dict[str, str | None]:
         """Why each learnt model may not answer a scene, by name; None if it may.

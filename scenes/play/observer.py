@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -20,7 +22,7 @@ from surrogate.locating.locator import Location, Locator
 from surrogate.locating.observation import Observation
 from surrogate.locating.prior import middle_of
 
-from ..script.sight import Sight
+from ..script.sight import Sight, StereoSight
 from ..script.site import HOLE, Site
 from ..script.tool import sphere
 
@@ -32,6 +34,8 @@ ELLIPSOID_COLOUR = (0.34, 0.71, 0.97)
 ELLIPSOID = 5
 """Segmentation id of the ellipsoid's layer, which no picture holds."""
 BALL, BALL_FACES = sphere()
+NOTHING = Observation(np.zeros((0, 3)))
+"""What is seen where nothing is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +136,17 @@ class Estimate:
         return Layer("ellipsoid", ELLIPSOID, self.middle + self.motion + at, BALL_FACES, ELLIPSOID_COLOUR)
 
 
+class Sees(Protocol):
+    """What a stage asks where the tumour is by what is seen."""
+
+    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Estimate:
+        """What is said in a frame by its number, of a body at `positions` (V, 3) [m].
+
+        `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is seen.
+        """
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Observer:
     """Sees the points of a `Sight`, with its errors, and asks a locator. It knows no loads."""
@@ -145,15 +160,8 @@ class Observer:
 
         `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is seen.
         """
-        begun, anatomy = clock.perf_counter(), self.site.anatomy
-        observation, location, refusal = self.seen(number, positions, tool), None, ""
-        try:
-            location = self.locator.locate(observation)
-        except InputError as error:
-            refusal = str(error)
-        rest = anatomy.mesh.nodes
-        middle, true = middle_of(anatomy, np.stack([rest, positions - rest]))
-        return Estimate(anatomy, observation, location, refusal, middle, true, clock.perf_counter() - begun)
+        begun = clock.perf_counter()
+        return estimated(self.site.anatomy, self.locator, lambda: self.seen(number, positions, tool), positions, begun)
 
     def seen(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
         """What is seen in a frame; arguments as of `estimate`."""
@@ -163,18 +171,10 @@ class Observer:
         shown, tips = np.ones(len(now), bool), np.zeros((0, 3))
         if tool is not None:
             shown = KDTree(tool).query(now)[0] > HIDES
-            tips = self._touched(positions, tool)
+            tips = touched(self.site.anatomy, positions, tool)
             tips = self._as_a_whole(tips + sight.white * random.standard_normal(tips.shape))
         sigma = np.full(shown.sum(), np.hypot(sight.white, sight.smooth))
         return Observation(self._as_a_whole(now + off)[shown], self._at(self._rest)[shown], sigma, tips)
-
-    def _touched(self, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
-        """The place of the cortex (1, 3) [m] that a tool touches; (0, 3) where it is in the air."""
-        triangles = self.site.anatomy.open_surface
-        near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:CORNERS]]
-        place = closest(near, positions[triangles]).point
-        away = np.linalg.norm(place - near, axis=1)
-        return place[[away.argmin()]] if away.min() < TOUCHES else np.zeros((0, 3))
 
     @property
     def _rest(self) -> np.ndarray:
@@ -187,8 +187,7 @@ class Observer:
 
     def _as_a_whole(self, points: np.ndarray) -> np.ndarray:
         """Points (n, 3) [m] with the rigid error."""
-        turn, shift, middle = *self._rigid, self._at(self._rest).mean(axis=0)
-        return middle + Rotation.from_rotvec(turn).apply(points - middle) + shift
+        return self._rigid.moved(points, self._at(self._rest).mean(axis=0))
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
@@ -208,7 +207,50 @@ class Observer:
         return self.sight.smooth * smooth_root(at) @ random.standard_normal(at.shape)
 
     @cached_property
-    def _rigid(self) -> tuple[np.ndarray, np.ndarray]:
-        """The rigid error: a rotation vector (3,) [rad], and a translation (3,) [m]."""
-        turn, shift = np.random.default_rng([self.sight.seed, 0, 2]).standard_normal((2, 3))
-        return self.sight.turn * turn / np.linalg.norm(turn), self.sight.shift * shift / np.linalg.norm(shift)
+    def _rigid(self) -> RigidError:
+        return rigid_error(self.sight, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidError:
+    """By what all that is seen is off together: a rotation vector (3,) [rad], and a translation (3,) [m]."""
+
+    turn: np.ndarray
+    shift: np.ndarray
+
+    def moved(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
+        """Points (n, 3) [m] as they are seen, turned about a middle (3,) [m]."""
+        return middle + Rotation.from_rotvec(self.turn).apply(points - middle) + self.shift
+
+
+def rigid_error(sight: Sight | StereoSight, number: int) -> RigidError:
+    """One of the rigid errors of a sight, by number."""
+    turn, shift = np.random.default_rng([sight.seed, 0, number]).standard_normal((2, 3))
+    return RigidError(sight.turn * turn / np.linalg.norm(turn), sight.shift * shift / np.linalg.norm(shift))
+
+
+def touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
+    """The place of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches; (0, 3) where it is in the air."""
+    triangles = anatomy.open_surface
+    near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:CORNERS]]
+    place = closest(near, positions[triangles]).point
+    away = np.linalg.norm(place - near, axis=1)
+    return place[[away.argmin()]] if away.min() < TOUCHES else NOTHING.now
+
+
+def estimated(
+    anatomy: Anatomy, locator: Locator, see: Callable[[], Observation], positions: np.ndarray, begun: float
+) -> Estimate:
+    """What a locator says of what is seen, beside the truth at `positions` (V, 3) [m]; refused where either refuses.
+
+    `begun` is when what is timed began, by `time.perf_counter`.
+    """
+    observation, location, refusal = NOTHING, None, ""
+    try:
+        observation = see()
+        location = locator.locate(observation)
+    except InputError as error:
+        refusal = str(error)
+    seconds, rest = clock.perf_counter() - begun, anatomy.mesh.nodes
+    middle, true = middle_of(anatomy, np.stack([rest, positions - rest]))
+    return Estimate(anatomy, observation, location, refusal, middle, true, seconds)

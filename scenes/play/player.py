@@ -29,7 +29,7 @@ from ..script.tool_paths import Touch, lifted
 from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
 from .error_text import error_lines
 from .load_text import acting, doubt_of
-from .observer import Estimate, Observer
+from .observer import Estimate
 from .stage import CORTEX, TOOL, Stage
 from .tip_reading import reading
 
@@ -191,7 +191,8 @@ class Player:
         stage, camera = self.stage.at(loads), self.camera_at(float(loads.times[0]))
         picture = stage.picture(camera, positions, None if held is None else held.pose)
         rendered = clock.perf_counter()
-        estimate = None if stage.observer is None else self._estimate(stage.observer, number, positions, held)
+        corners = stage.corners(None if held is None else held.pose)
+        estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
         located = 0.0 if estimate is None else estimate.seconds
         tumour, rest = stage.tumour(_believed(positions, estimate)), stage.tumour_at_rest
         doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
@@ -223,13 +224,6 @@ class Player:
             float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()) if moved is None else moved[0],
             promised, error, doubt, tuple(head), remark, took, estimate,
         )  # fmt: skip
-
-    def _estimate(self, observer: Observer, number: int, positions: np.ndarray, held: HeldTool | None) -> Estimate:
-        """Where the tumour is by what is seen of a body at `positions` (V, 3) [m], and of the tool."""
-        if held is None or self.scene.tool is None:
-            return observer.estimate(number, positions)
-        corners = np.asarray(self.scene.tool.mesh.vertices) @ held.pose[:3, :3].T + held.pose[:3, 3]
-        return observer.estimate(number, positions, corners)
 
     def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
         """From the tip to the tumour, and how far off that may be as far as the deformer knows."""

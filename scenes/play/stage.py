@@ -17,8 +17,10 @@ from sim.effects import SkullContact
 from sim.loads import Loads, Resected
 
 from ..script.scene import Scene
+from ..script.sight import StereoSight
 from ..script.site import HOLE, Site
-from .observer import Observer
+from .observer import Sees
+from .vessels import with_vessels
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 """Segmentation ids."""
@@ -31,6 +33,8 @@ TOOL_COLOUR = (0.78, 0.80, 0.83)
 TUMOUR_COLOUR = (0.30, 0.95, 0.55)
 TRUTH_COLOUR = (0.95, 0.35, 0.75)
 """Of the tumour where the finite elements have it."""
+# What a scan's black leaves of the cortex's colour, and how much deeper it lies than white [m].
+DARK, RELIEF = (0.34, 0.10, 0.10), 1.5e-3
 # Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
 READ_BELOW = 2.0e-3
 # So far under the bone the cortex may come to light [m].
@@ -69,7 +73,7 @@ class Stage:
     intensity: Intensity | None = None
     left: Remains | None = None
     device: str = "cpu"
-    observer: Observer | None = None
+    observer: Sees | None = None
 
     @property
     def anatomy(self) -> Anatomy:
@@ -125,16 +129,28 @@ class Stage:
 
     def layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
         """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
+        return self._layers(positions, self.corners(pose))
+
+    def corners(self, pose: np.ndarray | None) -> np.ndarray | None:
+        """Corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
         if self.scene.tool is None or pose is None:
-            return [self.visible(positions), self._drape]
-        tool = self.scene.tool.mesh
-        at = np.asarray(tool.vertices) @ pose[:3, :3].T + pose[:3, 3]
-        probe = Layer("tool", TOOL, at, tool.faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
-        return [self.visible(positions), self._drape, probe]
+            return None
+        return np.asarray(self.scene.tool.mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
+
+    def _layers(self, positions: np.ndarray, corners: np.ndarray | None) -> list[Layer]:
+        seen = [self.visible(positions), self._drape]
+        if self.scene.tool is None or corners is None:
+            return seen
+        faces = self.scene.tool.mesh.faces
+        return [*seen, Layer("tool", TOOL, corners, faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)]
 
     def picture(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None) -> Picture:
         """What a camera sees of `layers`."""
-        layers = self.layers(positions, pose)
+        return self.shown(camera, positions, self.corners(pose))
+
+    def shown(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
+        """The same, of a tool by its corners (t, 3) [m]."""
+        layers = self._layers(positions, corners)
         count = len(layers)
         if count not in self._renderers:
             self._renderers[count] = Renderer(layers, self.lamp, self.device)
@@ -189,8 +205,11 @@ class Stage:
         """The scan as a solid texture."""
         if self.intensity is None:
             return None
+        sight = self.scene.sight
+        if isinstance(sight, StereoSight) and sight.vessels:
+            return with_vessels(self.intensity, self.site, sight.seed, DARK, RELIEF)
         values = self.intensity.values.astype(np.float32) / 255.0
-        return Solid(values, np.linalg.inv(self.intensity.affine), dark=(0.34, 0.10, 0.10), relief=1.5e-3)
+        return Solid(values, np.linalg.inv(self.intensity.affine), DARK, RELIEF)
 
     @cached_property
     def _drape(self) -> Layer:

@@ -33,7 +33,7 @@ from sim.runtime.user_script import error_text, run_script
 
 from .debulking import Debulking
 from .head_posture import Lie, supine
-from .sight import Sight
+from .sight import Sight, StereoSight
 from .site import Site
 from .tool import Instrument, Probe
 from .tool_paths import AIR, Path, Touch, idle
@@ -111,7 +111,7 @@ class Scene:
     tool: Instrument | None = PALPATION
     lying: Lie = supine
     surgery: Debulking | None = None
-    sight: Sight | None = None
+    sight: Sight | StereoSight | None = None
     viewpoint: Viewpoint = USUAL
     element: str | None = None
     accuracy: Accuracy = LIVE
@@ -233,6 +233,7 @@ def _resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
 
 SCENES = (
     "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag", "lost_force",
+    "microscope",
 )  # fmt: skip
 """The built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
 

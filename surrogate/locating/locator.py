@@ -18,8 +18,9 @@ from .observation import Observation, placed, placed_anew
 from .posterior import Posterior, conditioned
 from .prior import Prior
 
-# Rounds in which points without a place at rest look for it on the surface as it is believed to be.
-ROUNDS = 6
+# Rounds in which points without a place at rest look for it on the surface as it is believed to be. They end sooner
+# where what they find moves by less than this [m].
+ROUNDS, STEADY = 6, 0.1e-3
 # More points than this share are no outliers, and no cause of the ensemble moves what this is more surprised by.
 MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
 # A cause of a smaller share is not named.
@@ -156,7 +157,9 @@ class Locator:
             cortex, motion = np.unique(self.anatomy.open_surface), np.zeros_like(self.anatomy.mesh.nodes)
             for _ in range(ROUNDS):
                 motion[cortex] = np.tensordot(found.weight, prior.at(cortex), 1)
-                evidence = placed_anew(self.anatomy, observation, named, motion, found.bias_at)
+                before, evidence = evidence, placed_anew(self.anatomy, observation, named, motion, found.bias_at)
+                if np.abs(evidence.value - before.value).max() < STEADY:
+                    break
                 supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
                 found = conditioned(prior, evidence, tips[supported])
         off = np.setdiff1d(np.arange(count), named) if observation.rest is not None else np.zeros(0, int)

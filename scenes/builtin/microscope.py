@@ -1,0 +1,40 @@
+"""Under a microscope the brain sinks and a tool presses; its pictures alone tell where the tumour is now."""
+
+import numpy as np
+
+from sim.anatomy import TUMOUR_LABEL
+from sim.effects import Elasticity, Gravity, Held, Slide, ToolForce
+from sim.material import Material
+
+from ..script.head_posture import drained
+from ..script.scene import Bounds, Scene
+from ..script.sight import StereoSight
+from ..script.tool import Probe
+from ..script.tool_paths import Touch, press
+from ..script.viewpoint import Viewpoint
+
+# Softer than usual, with a stiffer tumour: the estimate is given neither.
+BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)
+TUMOUR = Material("neo-hookean", young=3200.0, poisson=0.45)
+
+# The tool waits in the air, and presses after the brain has sunk.
+PRESS = press(force=0.15, rise=0.8, hold=0.4, at=(-0.004, 0.008))
+
+
+def late(time: float) -> Touch:
+    """What the hand does at a time [s]."""
+    return PRESS(time - 2.0)
+
+
+SCENE = Scene(
+    "microscope",
+    __doc__ or "",
+    late,
+    tool=Probe(radius=4e-3),
+    duration=4.0,
+    effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity(), ToolForce()),
+    lying=drained(2.0, to=0.2),
+    sight=StereoSight(),
+    viewpoint=Viewpoint(distance=0.3, tilt=-0.4, fov=np.radians(9.0), width=800, height=600, eye="left"),
+    bounds=Bounds(overlap=0.7, error=3e-3, drawn=2.5, removed=0.5),
+)

@@ -1,0 +1,107 @@
+"""Who sees the open cortex in pairs of pictures alone, as a microscope takes them, and says where the tumour is."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from surrogate.locating.locator import Locator
+from surrogate.locating.observation import Observation
+
+from ..script.sight import StereoSight
+from .observer import NOTHING, Estimate, RigidError, estimated, rigid_error, touched
+from .stage import Stage
+from .stereo_update import First, Shot, cloud_of, first_of, points_of
+
+
+@dataclass(frozen=True, eq=False)
+class StereoObserver:
+    """Draws what both eyes see, with a camera's noise, and asks a locator from these pictures. It knows no loads.
+
+    `stage` is what is drawn.
+    """
+
+    stage: Stage
+    locator: Locator
+    sight: StereoSight
+
+    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Estimate:
+        """What is said in a frame by its number; arguments as of `Observer.estimate`. To draw pictures is not timed."""
+        shot, anatomy = self.shot(number, positions, tool), self.stage.site.anatomy
+        tips = NOTHING.now if tool is None else touched(anatomy, positions, tool)
+        _ = self._first_shot  # to draw it takes long
+        begun = clock.perf_counter()
+        return estimated(anatomy, self.locator, lambda: self.seen(shot, tips), positions, begun)
+
+    def seen(self, shot: Shot, tips: np.ndarray) -> Observation:
+        """What a pair shows, and where a tool touches, `tips` (k, 3) [m].
+
+        Raises
+        ------
+        InputError
+            As `points_of`, or `cloud_of` where points have no names; as `first_of`.
+        """
+        site, sight = self.stage.site, self.sight
+        if not sight.named:
+            return cloud_of(site, shot, sight.points, self._tracked(0), tips)
+        return points_of(site, self.first, shot, self._tracked(1), tips)
+
+    def shot(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Shot:
+        """What both eyes take in a frame, of a body at `positions` (V, 3) [m] and a tool's corners (t, 3) [m].
+
+        Number -1 is before the first frame.
+        """
+        scene = self.stage.scene
+        time = float(scene.times[min(max(number, 0), len(scene.times) - 1)])
+        left, right = (replace(scene.viewpoint, eye=eye).camera(self.stage.site, time) for eye in ("left", "right"))
+        pictures = [
+            self._noisy(stage.shown(camera, positions, tool).colour, number, eye)
+            for eye, (stage, camera) in enumerate(zip(self._stages, (left, right), strict=True))
+        ]
+        seen = None if tool is None or scene.tool is None else (tool, np.asarray(scene.tool.mesh.faces))
+        return Shot((left, right), (pictures[0], pictures[1]), seen)
+
+    @cached_property
+    def first(self) -> First:
+        """The first pair: of the brain as the scan has it.
+
+        Raises
+        ------
+        InputError
+            As `first_of`.
+        """
+        return first_of(self.stage.site, self._first_shot, self.sight.points, self._tracked(0))
+
+    @cached_property
+    def _first_shot(self) -> Shot:
+        return self.shot(-1, self.stage.site.anatomy.mesh.nodes)
+
+    @cached_property
+    def _stages(self) -> tuple[Stage, Stage]:
+        """One for each eye: a stage keeps what its last camera saw."""
+        return replace(self.stage), replace(self.stage)
+
+    def _noisy(self, picture: np.ndarray, number: int, eye: int) -> np.ndarray:
+        """A picture (H, W, 3) uint8 with the noise of an eye's camera; the right eye, 1, lacks light."""
+        random = np.random.default_rng([self.sight.seed, 2 + number, eye])
+        noise = self.sight.noise * random.standard_normal(picture.shape, np.float32)
+        lit = np.float32(1.0 - eye * self.sight.darker) * picture + noise
+        return np.clip(np.rint(lit), 0.0, 255.0).astype(np.uint8)
+
+    def _tracked(self, number: int) -> Tracked:
+        return Tracked(rigid_error(self.sight, 2 + number), self.stage.site.origin)
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """Where a tracked microscope has places: off by a rigid error about the middle (3,) [m] of an opening."""
+
+    error: RigidError
+    middle: np.ndarray
+
+    def __call__(self, places: np.ndarray) -> np.ndarray:
+        """Places (n, 3) [m] as they are seen."""
+        return self.error.moved(places, self.middle)

@@ -1,0 +1,177 @@
+"""From a pair of pictures to what is seen of the open cortex: points with their places in the scan, or a cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from ar.camera import Camera
+from ar.disparity import Cloud, StereoView, cloud, viewed
+from ar.overlay import silhouette
+from ar.point_flow import followed, supported
+from ar.rectified import rectified
+from sim.errors import InputError
+from sim.geometry.closest_point import closest
+from surrogate.locating.evidence import SIGMA, WHITE
+from surrogate.locating.observation import Observation
+
+from ..script.site import HOLE, Site
+
+# Pixels of a window to a metre of cortex, and how far it reaches from the middle of the opening, in its radii.
+FINENESS, WIDE = 6000.0, 1.05
+# Points are looked for so far from the drape [m]: it stands above the cortex, and each eye sees it elsewhere.
+OFF_DRAPE = 1.5e-3
+# Points of the first pair whose middle one lies farther off the scan's cortex are of other cameras [m].
+MISPLACED = 2.5e-3
+# A smaller share of the points that were looked for is no sight of the cortex.
+FEWEST = 0.3
+Rigid = Callable[[np.ndarray], np.ndarray]
+"""Takes places (n, 3) [m] to where a tracked microscope has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What both eyes of a microscope take at once.
+
+    Parameters
+    ----------
+    cameras, pictures
+        Of the left and the right eye; (H, W, 3) uint8 each.
+    tool
+        The surface of the tool in view, corners (t, 3) [m] and faces (f, 3), if there is one: its pose is known.
+    """
+
+    cameras: tuple[Camera, Camera]
+    pictures: tuple[np.ndarray, np.ndarray]
+    tool: tuple[np.ndarray, np.ndarray] | None = None
+
+    def seen(self, site: Site) -> StereoView:
+        """The windows about an opening.
+
+        Raises
+        ------
+        InputError
+            Eyes that are swapped, or one that sees nothing.
+        """
+        masks = None if self.tool is None else tuple(silhouette(camera, *self.tool) for camera in self.cameras)
+        target = cast(tuple[float, float, float], tuple(site.origin.tolist()))
+        try:
+            geometry = rectified(*self.cameras, target, WIDE * site.radius, FINENESS)
+            return viewed(geometry, *self.pictures, cast(tuple[np.ndarray, np.ndarray] | None, masks))
+        except ValueError as error:
+            raise InputError(str(error)) from error
+
+
+@dataclass(frozen=True, eq=False)
+class First:
+    """The first pair: what was seen, pixels (n, 2) of points, and where the scan has them (n, 3) [m]; `asked` for."""
+
+    view: StereoView
+    pixels: np.ndarray
+    rest: np.ndarray
+    asked: int
+
+
+def first_of(site: Site, shot: Shot, count: int, rigid: Rigid) -> First:
+    """The first pair, of a brain as the scan has it: so many points, each at the scan's nearest place.
+
+    Raises
+    ------
+    InputError
+        As `Shot.seen`; too few points; points off the scan's cortex.
+    """
+    view = shot.seen(site)
+    pixels = grid(site, view, count)
+    found = seen_points(site, view, pixels)
+    points = rigid(found.points)
+    rest, off = on_cortex(site, points)
+    if len(off) and np.median(off) > MISPLACED:
+        raise InputError(
+            f"the first pair of pictures shows a cortex {1e3 * np.median(off):.1f} mm off the scan's: check that eyes "
+            "are not swapped, or calibrate them again."
+        )
+    good = supported(rest, points - rest)
+    demand(int(good.sum()), len(pixels))
+    return First(view, pixels[found.which[good]], rest[good], len(pixels))
+
+
+def points_of(site: Site, first: First, shot: Shot, rigid: Rigid, tips: np.ndarray) -> Observation:
+    """Points of the first pair, where a later one shows them; `tips` (k, 3) [m], where a tool touches.
+
+    Raises
+    ------
+    InputError
+        As `Shot.seen`; too few points.
+    """
+    view = shot.seen(site)
+    which, there = followed(first.view, view, first.pixels)
+    found = seen_points(site, view, there)
+    now, rest = rigid(found.points), first.rest[which[found.which]]
+    good = supported(rest, now - rest)
+    demand(int(good.sum()), first.asked)
+    return Observation(now[good], rest[good], stated(found.sigma[good]), rigid(tips))
+
+
+def cloud_of(site: Site, shot: Shot, count: int, rigid: Rigid, tips: np.ndarray) -> Observation:
+    """So many points of the cortex without names, as one pair shows them; arguments and errors as of `points_of`."""
+    view = shot.seen(site)
+    pixels = grid(site, view, count)
+    found = seen_points(site, view, pixels)
+    points = rigid(found.points)
+    rest, _ = on_cortex(site, points)
+    good = supported(rest, points - rest)
+    demand(int(good.sum()), len(pixels))
+    return Observation(points[good], None, stated(found.sigma[good]), rigid(tips))
+
+
+def grid(site: Site, view: StereoView, count: int) -> np.ndarray:
+    """Pixels (n, 2) of the left window, about so many, that are even over the drape's hole."""
+    reach = HOLE * site.clearance - OFF_DRAPE
+    step = reach * np.sqrt(np.pi / count)
+    ticks = np.arange(-np.floor(reach / step), np.floor(reach / step) + 1) * step
+    x, y = (each.ravel() for each in np.meshgrid(ticks, ticks))
+    inside = np.hypot(x, y) < reach
+    places = site.origin + x[inside, None] * site.right + y[inside, None] * site.up
+    return view.geometry.place(places)[0]
+
+
+def seen_points(site: Site, view: StereoView, pixels: np.ndarray) -> Cloud:
+    """Of pixels (n, 2), those with a depth that lie within the drape's hole.
+
+    Raises
+    ------
+    InputError
+        Rows of the eyes that do not show the same.
+    """
+    try:
+        found = cloud(view, pixels)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    inside = site.across(found.points) < HOLE * site.clearance - OFF_DRAPE
+    return Cloud(found.which[inside], found.points[inside], found.sigma[inside])
+
+
+def on_cortex(site: Site, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The places of the scan's cortex nearest to points (n, 3) [m], and how far they are (n,) [m]."""
+    if not len(points):
+        return points, np.zeros(0)
+    anatomy = site.anatomy
+    place = closest(points, anatomy.mesh.nodes[anatomy.open_surface]).point
+    return place, np.linalg.norm(points - place, axis=1)
+
+
+def stated(sigma: np.ndarray) -> np.ndarray:
+    """Deviations (n,) [m] of errors that differ from point to point, as a locator takes them: with smooth ones."""
+    return sigma * (SIGMA / WHITE)
+
+
+def demand(count: int, asked: int) -> None:
+    """Raise InputError where too few points are seen of those that were looked for."""
+    if count < FEWEST * asked:
+        raise InputError(
+            f"both eyes see {count} of {asked} places of the cortex surely: check light, focus and texture, and what "
+            "hides it."
+        )

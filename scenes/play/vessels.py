@@ -1,0 +1,75 @@
+"""Vessels drawn on the open cortex: a microscope finds its points by them, and a scan of a millimetre shows none."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.ndimage import affine_transform, gaussian_filter
+from scipy.spatial import KDTree
+
+from ar.layer import Solid
+from sim.bodies.intensity import Intensity
+
+from ..script.site import Site
+
+# Voxels across and along the axis of the opening [m]; how far they go beyond it, above its middle and below it [m].
+FINE, ALONG = 0.2e-3, 1e-3
+BEYOND, ABOVE, BELOW = 10e-3, 5e-3, 14e-3
+# Trunks that come in at the border, the widest and the narrowest vessel, and the step of a path [m].
+TRUNKS, WIDEST, NARROWEST, STEP = 14, 0.8e-3, 0.2e-3, 0.2e-3
+# In each step: the chance of a branch, how far the way turns [rad], and the width that is left. A branch's width over
+# its parent's.
+BRANCHES, TURNS, LEFT, BRANCH = 0.05, 0.12, 0.998, 0.72
+# The share of the light that a vessel takes at most, and the mottle of vessels too fine to be drawn, of a length [m].
+DARK, MOTTLE, MOTTLED = 0.75, 0.12, 0.35e-3
+
+
+@lru_cache(maxsize=2)
+def with_vessels(intensity: Intensity, site: Site, seed: int, dark: tuple[float, float, float], relief: float) -> Solid:
+    """The scan round an opening as a solid texture with vessels upon it, which the seed draws.
+
+    They go with the tissue, and have no height. `dark` and `relief` as of `Solid`.
+    """
+    half = site.radius + BEYOND
+    across, along = np.arange(-half, half, FINE), np.arange(-ABOVE, BELOW, ALONG)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([FINE * site.right, FINE * site.up, ALONG * site.axis])
+    T[:3, 3] = site.origin + across[0] * (site.right + site.up) + along[0] * site.axis
+    inside = np.linalg.inv(intensity.affine) @ T
+    shape = len(across), len(across), len(along)
+    grey = intensity.values.astype(np.float32) / 255.0
+    scan = affine_transform(grey, inside, output_shape=shape, order=1, mode="nearest")
+    light = 1.0 - taken(across, np.random.default_rng([seed, 1])).astype(np.float32)
+    return Solid(scan * light[:, :, None], np.linalg.inv(T), dark, relief, height=scan)
+
+
+def taken(across: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Share of the light that vessels take, (n, n), at places `across` (n,) [m] from the middle, both ways."""
+    points, widths = paths(float(np.abs(across).max()), random)
+    here = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1)
+    away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * WIDEST)
+    width = np.append(widths, WIDEST)[nearest]
+    vessels = DARK * np.exp(-2.0 * (away / width) ** 2)
+    mottle = gaussian_filter(random.standard_normal(away.shape), MOTTLED / FINE)
+    return np.clip(vessels + (1.0 - vessels) * MOTTLE * mottle / mottle.std(), 0.0, 0.95)
+
+
+def paths(half: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points (k, 2) [m] of vessels that come in at the border of a square, wander and branch; their widths (k,) [m]."""
+    angles = 2.0 * np.pi * (np.arange(TRUNKS) + random.uniform(0.0, 0.7, TRUNKS)) / TRUNKS
+    rim = half * np.column_stack([np.cos(angles), np.sin(angles)])
+    ends = list(zip(rim, angles + np.pi, WIDEST * random.uniform(0.5, 1.0, TRUNKS), strict=True))
+    points, widths = [], []
+    while ends:
+        at, way, width = ends.pop()
+        while width > NARROWEST and np.abs(at).max() <= half:
+            points.append(at)
+            widths.append(width)
+            way = way + TURNS * random.standard_normal()
+            at, width = at + STEP * np.array([np.cos(way), np.sin(way)]), LEFT * width
+            if random.uniform() < BRANCHES:
+                side = random.choice([-1.0, 1.0])
+                ends.append((at, way + side * random.uniform(0.5, 1.2), BRANCH * width))
+                way, width = way - 0.2 * side, 0.95 * width
+    return np.array(points), np.array(widths)
