@@ -190,10 +190,10 @@ class Player:
         held = None if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
         stage, camera = self.stage.at(loads), self.camera_at(float(loads.times[0]))
         picture = stage.picture(camera, positions, None if held is None else held.pose)
-        rendered = clock.perf_counter()
         corners = stage.corners(None if held is None else held.pose)
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
-        located = 0.0 if estimate is None else estimate.seconds
+        # What an observer draws to see it is no part of the estimate.
+        seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds
         tumour, rest = stage.tumour(_believed(positions, estimate)), stage.tumour_at_rest
         doubt = doubt_of(deformation.outcome[0]) or (IN_BONE if held is not None and held.beyond > BLOCKED else "")
         doubt = doubt or (REFUSED if estimate is not None and estimate.location is None else "")
@@ -215,7 +215,7 @@ class Player:
         remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         annotate(over, number, remark)
-        spent = seconds, rendered - begun, clock.perf_counter() - rendered - located
+        spent = seconds, seen - begun - located, clock.perf_counter() - seen
         took = dict(zip(STAGES, spent, strict=True)) | ({} if estimate is None else {"locate": located})
         return Frame(
             number, float(loads.times[0]), touch, loads, deformation, camera,

@@ -45,6 +45,7 @@ class Location:
         Numbers of points, and of tips, from 0. They lie off the open cortex, or no other point supports them.
     calibrated
         Whether covariances were tried on observations like this: on so many points, and motions so far above errors.
+        They never were on clouds, whose points have no places at rest.
     seconds
         What this took, set-up apart.
     """
@@ -172,7 +173,7 @@ class Locator:
             radius_of(found.covariance(prior.middle[:, None])[0]),
             outliers,
             found.outliers[found.outliers >= count] - count,
-            was_tried(self.tried, found.evidence),
+            observation.rest is not None and was_tried(self.tried, found.evidence),
             time.perf_counter() - begun,
         )
 

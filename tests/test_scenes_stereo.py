@@ -1,0 +1,189 @@
+"""The open cortex seen by two eyes: points found in pictures, what is refused, and what an estimate is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from theatres import template_theatre
+
+from ar.overlay import silhouette
+from scenes.bench.stereo_study import row
+from scenes.cli import main
+from scenes.play.deformers import AtRest
+from scenes.play.player import REFUSED, Player
+from scenes.play.stereo_observer import StereoObserver
+from scenes.script.scene import find_scene
+from scenes.script.shipped_files import template_path
+from scenes.script.sight import StereoSight
+from sim.deformation import Outcome
+from sim.errors import InputError
+from sim.geometry.closest_point import closest
+from surrogate.locating.locator_files import locator_path
+
+EXACT = StereoSight(shift=0.0, turn=0.0)
+MICROSCOPE = find_scene("microscope")
+NONE = np.zeros((0, 3))
+
+
+def observer_of(sight: StereoSight = EXACT) -> StereoObserver:
+    """On few pixels."""
+    theatre = replace(template_theatre(), locator_file=locator_path(template_path()))
+    scene = replace(MICROSCOPE, viewpoint=replace(MICROSCOPE.viewpoint, width=400, height=300), sight=sight)
+    return theatre.stage(scene).observer
+
+
+@pytest.fixture(scope="module")
+def observer():
+    return observer_of()
+
+
+@pytest.fixture(scope="module")
+def rest(observer):
+    return observer.stage.site.anatomy.mesh.nodes
+
+
+@pytest.fixture(scope="module")
+def moved(observer, rest):
+    """The body 3 mm aside and 2 mm deeper, less at one side."""
+    site = observer.stage.site
+    share = 1.0 + 8.0 * (rest - site.origin) @ site.up
+    return rest + share[:, None] * (3e-3 * site.right + 2e-3 * site.axis)
+
+
+@pytest.fixture(scope="module")
+def shot(observer, moved):
+    return observer.shot(30, moved)
+
+
+@pytest.fixture(scope="module")
+def seen(observer, shot):
+    return observer.seen(shot, NONE)
+
+
+def truly(observer, moved, points):
+    """How material points (n, 3) [m] at rest moved."""
+    anatomy = observer.stage.site.anatomy
+    surface = anatomy.open_surface
+    place = closest(points, anatomy.mesh.nodes[surface])
+    return np.einsum("nc,nci->ni", place.weights, (moved - anatomy.mesh.nodes)[surface[place.triangle]])
+
+
+def test_points_move_as_the_cortex_did_within_their_errors(observer, moved, seen):
+    assert len(seen.now) > 60
+    off = seen.now - seen.rest - truly(observer, moved, seen.rest)
+    assert np.linalg.norm(off.mean(axis=0)) < 0.15e-3
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.4e-3
+    # What is stated holds smooth errors too.
+    assert 0.15 < np.sqrt(((off / seen.sigma[:, None]) ** 2).mean()) < 0.8
+
+
+def test_one_seed_gives_the_same_pictures_and_another_others(observer, moved, shot):
+    again = observer_of()
+    same, other = again.shot(30, moved), observer_of(replace(EXACT, seed=1)).shot(30, moved)
+    for one, two, three in zip(shot.pictures, same.pictures, other.pictures, strict=True):
+        assert np.array_equal(one, two) and np.abs(one.astype(float) - three).mean() > 2.0
+    assert not np.array_equal(observer.shot(31, moved).pictures[0], shot.pictures[0])
+    assert shot.pictures[1].mean() < 0.93 * shot.pictures[0].mean()
+
+
+def test_a_tracked_microscope_is_off_as_a_whole(observer, shot, seen):
+    off = observer_of(replace(EXACT, shift=1e-3, turn=np.radians(1.0))).seen(shot, NONE)
+    plain = observer_of(EXACT).seen(shot, NONE)
+    assert np.allclose(plain.now, seen.now)
+    common = len(off.now) == len(plain.now)
+    shift = off.now.mean(axis=0) - plain.now.mean(axis=0)
+    assert common and 0.5e-3 < np.linalg.norm(shift) < 1.5e-3
+    spread = [each - each.mean(axis=0) for each in (off.now, plain.now)]
+    turn, _ = np.linalg.lstsq(spread[1], spread[0], rcond=None)[:2]
+    assert np.linalg.norm(turn - np.eye(3), 2) == pytest.approx(np.radians(1.0), rel=0.3)
+
+
+def test_a_tool_hides_points_and_moves_none(observer, moved, seen):
+    site, scene = observer.stage.site, observer.stage.scene
+    inward, tip = site.axis, site.origin + 3e-3 * site.right - 2e-3 * site.axis
+    corners = observer.stage.corners(scene.tool.pose(tip, inward, site.right))
+    found = observer.seen(observer.shot(30, moved, corners), NONE)
+    assert 20 < len(found.now) < len(seen.now)
+    left = observer.shot(30, moved, corners).cameras[0]
+    hidden = silhouette(left, corners, np.asarray(scene.tool.mesh.faces))
+    column, row_ = left.project(found.now)[0].round().astype(int).T
+    assert hidden.any() and not hidden[row_, column].any()
+    off = found.now - found.rest - truly(observer, moved, found.rest)
+    assert np.quantile(np.linalg.norm(off, axis=1), 0.9) < 1.2e-3
+
+
+def test_without_names_points_are_a_cloud_on_the_moved_cortex(moved, shot):
+    observer = observer_of(replace(EXACT, named=False))
+    found = observer.seen(shot, NONE)
+    surface = observer.stage.site.anatomy.open_surface
+    off = np.linalg.norm(closest(found.now, moved[surface]).point - found.now, axis=1)
+    assert found.rest is None and len(found.now) > 60 and np.median(off) < 0.3e-3
+
+
+class TestRefusals:
+    def refusal(self, observer, shot):
+        with pytest.raises(InputError) as refused:
+            observer.seen(shot, NONE)
+        return str(refused.value)
+
+    def test_an_eye_that_is_dark(self, observer, shot):
+        dark = replace(shot, pictures=(shot.pictures[0], np.zeros_like(shot.pictures[1])))
+        assert "the right eye sees nothing" in self.refusal(observer, dark)
+
+    def test_swapped_eyes(self, observer, shot, rest):
+        assert "which is which" in self.refusal(observer, replace(shot, cameras=shot.cameras[::-1]))
+        swapped = observer_of()
+        first = swapped.shot(-1, rest)
+        vars(swapped)["_first_shot"] = replace(first, pictures=first.pictures[::-1])
+        said = self.refusal(swapped, replace(shot, pictures=shot.pictures[::-1]))
+        assert "off the scan's" in said or "places of the cortex" in said or "pixels apart" in said
+
+    def test_another_calibration(self, observer, shot, rest):
+        turned = shot.cameras[0], shot.cameras[1].perturbed(0.08, (1.0, 0.0, 0.0))
+        assert "calibrate the pair again" in self.refusal(observer, replace(shot, cameras=turned))
+        crossed = observer_of()
+        first = crossed.shot(-1, rest)
+        vars(crossed)["_first_shot"] = replace(first, cameras=(first.cameras[0], first.cameras[1].perturbed(0.1)))
+        assert "mm off the scan's" in self.refusal(crossed, shot)
+
+    def test_no_texture(self, observer, shot):
+        plain = observer_of(replace(EXACT, vessels=False))
+        assert "places of the cortex surely: check light" in self.refusal(plain, shot)
+
+    def test_a_cortex_that_is_hidden(self, observer, shot):
+        near, far = shot.cameras[0].centre, observer.stage.site.origin
+        middle = near + 0.3 * (far - near)
+        corners = middle + 0.1 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, -1.0, -1.0]])
+        faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
+        assert "both eyes see 0 of" in self.refusal(observer, replace(shot, tool=(corners, faces)))
+
+    def test_sights_that_cannot_be(self):
+        for wrong in ({"darker": 1.0}, {"points": 5}, {"noise": -1.0}, {"seed": -1}):
+            with pytest.raises(InputError):
+                StereoSight(**wrong)
+
+
+def test_the_tumour_is_located_from_pictures_and_a_blind_eye_is_drawn_as_refused(observer, moved):
+    found = observer.estimate(30, moved)
+    assert found.held and found.off < 0.6 * np.linalg.norm(found.true) and found.location.calibrated
+    stage = replace(observer.stage, observer=replace(observer, sight=replace(EXACT, darker=0.999)))
+    still = AtRest(stage.site.anatomy)
+    player = Player(stage, still)
+    answer = replace(still.deform(player.loads(0)), outcome=(Outcome.CONVERGED,))
+    frame = player.drawn(0, player.touch(0), player.loads(0), answer, 0.0)
+    assert frame.doubt == REFUSED and frame.estimate.location is None and not len(frame.estimate.observation.now)
+    assert "sees nothing" in frame.estimate.refusal and frame.moved == 0.0
+
+
+def test_a_study_sums_up_what_was_refused_too(observer, moved):
+    good, none = observer.estimate(30, moved), replace(observer, sight=replace(EXACT, darker=0.999)).estimate(3, moved)
+    found = row(4, [good, good, none])
+    assert (found.seed, found.frames, found.refused) == (4, 3, 1) and found.covered == float(good.held)
+    length = float(np.linalg.norm(good.true))
+    assert found.most_mm == pytest.approx(1e3 * length) and found.off_mm == pytest.approx(1e3 * good.off)
+    assert found.removed == pytest.approx(1.0 - (2.0 * good.off + length) / (3.0 * length))
+
+
+def test_the_bench_asks_for_a_scene_that_two_eyes_see(capsys):
+    assert main(["bench", "microscope", "--scene", "sag", "--device", "cpu"]) == 2
+    assert "no pair of eyes sees the scene sag" in capsys.readouterr().err
