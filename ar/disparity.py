@@ -193,7 +193,7 @@ def cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
         raise ValueError(f"rows of the eyes are {rows:.1f} pixels apart: calibrate the pair again.")
     matched &= (np.abs(down) < OFF_ROW) & ~view.at(there, view.hidden_right)
     steep = view.at(here, view.slope)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         sigma = np.hypot(ALIKE * MEAN_SIZE * apart.ravel() / np.sqrt(steep), LEAST_SIGMA)
     depth = view.geometry.depths(disparity)
     deviation = depth**2 / view.geometry.gauge * sigma

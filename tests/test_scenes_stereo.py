@@ -132,6 +132,8 @@ class TestRefusals:
 
     def test_swapped_eyes(self, observer, shot, rest):
         assert "which is which" in self.refusal(observer, replace(shot, cameras=shot.cameras[::-1]))
+        later = self.refusal(observer, replace(shot, pictures=shot.pictures[::-1]))
+        assert "check that eyes are not swapped" in later or "places of the cortex" in later
         swapped = observer_of()
         first = swapped.shot(-1, rest)
         vars(swapped)["_first_shot"] = replace(first, pictures=first.pictures[::-1])
@@ -141,6 +143,8 @@ class TestRefusals:
     def test_another_calibration(self, observer, shot, rest):
         turned = shot.cameras[0], shot.cameras[1].perturbed(0.08, (1.0, 0.0, 0.0))
         assert "calibrate the pair again" in self.refusal(observer, replace(shot, cameras=turned))
+        later = replace(shot, cameras=(shot.cameras[0], shot.cameras[1].perturbed(0.1)))
+        assert "round the opening seems to have moved" in self.refusal(observer, later)
         crossed = observer_of()
         first = crossed.shot(-1, rest)
         vars(crossed)["_first_shot"] = replace(first, cameras=(first.cameras[0], first.cameras[1].perturbed(0.1)))

@@ -26,8 +26,13 @@ FINENESS, WIDE = 6000.0, 1.05
 OFF_DRAPE = 1.5e-3
 # Points of the first pair whose middle one lies farther off the scan's cortex are of other cameras [m].
 MISPLACED = 2.5e-3
+# Motions are searched for up to about this [m]; if half of them seem larger, eyes were swapped.
+FARTHEST = 10e-3
 # A smaller share of the points that were looked for is no sight of the cortex.
 FEWEST = 0.3
+# What lies round the opening does not move: so many of its places are looked at, if they are enough, and a quarter of
+# them must seem to stay within this [m]. Others are at the edge of the drape, before what moves.
+AROUND, ENOUGH, STILL = 60, 15, 2e-3
 Rigid = Callable[[np.ndarray], np.ndarray]
 """Takes places (n, 3) [m] to where a tracked microscope has them."""
 
@@ -67,12 +72,24 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class First:
-    """The first pair: what was seen, pixels (n, 2) of points, and where the scan has them (n, 3) [m]; `asked` for."""
+    """The first pair.
+
+    Parameters
+    ----------
+    view
+        What was seen.
+    pixels, rest
+        Of points of the cortex (n, 2), and where the scan has them (n, 3) [m]. `asked` were looked for.
+    around, still
+        Pixels (m, 2) of what lies round the opening, and where it is (m, 3) [m].
+    """
 
     view: StereoView
     pixels: np.ndarray
     rest: np.ndarray
     asked: int
+    around: np.ndarray
+    still: np.ndarray
 
 
 def first_of(site: Site, shot: Shot, count: int, rigid: Rigid) -> First:
@@ -95,7 +112,8 @@ def first_of(site: Site, shot: Shot, count: int, rigid: Rigid) -> First:
         )
     good = supported(rest, points - rest)
     demand(int(good.sum()), len(pixels))
-    return First(view, pixels[found.which[good]], rest[good], len(pixels))
+    around, still = surroundings(site, view)
+    return First(view, pixels[found.which[good]], rest[good], len(pixels), around, rigid(still))
 
 
 def points_of(site: Site, first: First, shot: Shot, rigid: Rigid, tips: np.ndarray) -> Observation:
@@ -104,14 +122,21 @@ def points_of(site: Site, first: First, shot: Shot, rigid: Rigid, tips: np.ndarr
     Raises
     ------
     InputError
-        As `Shot.seen`; too few points.
+        As `Shot.seen`; too few points; surroundings that seem to move; motions larger than are searched for.
     """
     view = shot.seen(site)
+    demand_still(first, view, rigid)
     which, there = followed(first.view, view, first.pixels)
     found = seen_points(site, view, there)
     now, rest = rigid(found.points), first.rest[which[found.which]]
     good = supported(rest, now - rest)
     demand(int(good.sum()), first.asked)
+    motion = float(np.median(np.linalg.norm(now - rest, axis=1)))
+    if motion > FARTHEST:
+        raise InputError(
+            f"half of the points seem to have moved by {1e3 * motion:.0f} mm, farther than they are searched for: "
+            "check that eyes are not swapped, or begin with a new scan."
+        )
     return Observation(now[good], rest[good], stated(found.sigma[good]), rigid(tips))
 
 
@@ -152,6 +177,34 @@ def seen_points(site: Site, view: StereoView, pixels: np.ndarray) -> Cloud:
         raise InputError(str(error)) from error
     inside = site.across(found.points) < HOLE * site.clearance - OFF_DRAPE
     return Cloud(found.which[inside], found.points[inside], found.sigma[inside])
+
+
+def surroundings(site: Site, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (m, 2) of the left window that show what lies round the opening, and where that is (m, 3) [m]."""
+    ticks = np.linspace(0.0, view.geometry.size - 1.0, 40)
+    pixels = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+    found = cloud(view, pixels)
+    outside = np.flatnonzero(site.across(found.points) > HOLE * site.clearance)
+    some = outside[np.linspace(0, len(outside) - 1, min(AROUND, len(outside))).astype(int)]
+    return pixels[found.which[some]], found.points[some]
+
+
+def demand_still(first: First, view: StereoView, rigid: Rigid) -> None:
+    """Raise InputError where what lies round the opening seems to have moved since the first pair."""
+    which, there = followed(first.view, view, first.around)
+    try:
+        found = cloud(view, there)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    if len(found.which) < ENOUGH:
+        return
+    motion = np.linalg.norm(rigid(found.points) - first.still[which[found.which]], axis=1)
+    moved = float(np.quantile(motion, 0.25))
+    if moved > STILL:
+        raise InputError(
+            f"what lies round the opening seems to have moved by {1e3 * moved:.1f} mm: check that eyes are not "
+            "swapped, and calibrate and track the microscope again."
+        )
 
 
 def on_cortex(site: Site, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
