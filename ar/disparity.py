@@ -36,7 +36,6 @@ LEAST_SIGMA, ALIKE = 0.12, 2.0
 MEAN_SIZE = float(np.sqrt(0.5 * np.pi))
 # Glare: so bright [grey level], and of so little colour [share of the brightest]; its rim is hidden too [pixel].
 BRIGHT, COLOURLESS, RIM = 200, 0.12, 3
-WHITE = 250
 # What varies by less in its square, noise included, tells no depth: light that slides over it would [grey level].
 TEXTURE = 5.0
 # An eye whose window is darker sees nothing [grey level].
@@ -143,10 +142,10 @@ def viewed(
 
 
 def glare(window: np.ndarray) -> np.ndarray:
-    """(H, W) bool: what is bright without colour, or white, in a picture (H, W, 3) uint8."""
+    """(H, W) bool: what is bright without colour in a picture (H, W, 3) uint8."""
     red, green, blue = cv2.split(window)
     most, least = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
-    return (least >= WHITE) | ((most >= BRIGHT) & (most - least < COLOURLESS * most))
+    return (most >= BRIGHT) & (most - least < COLOURLESS * most)
 
 
 def grown(mask: np.ndarray, by: int) -> np.ndarray:

@@ -120,13 +120,25 @@ def test_depths_are_as_far_off_as_is_said(pair, geometry, pictures, darker):
     assert 0.4 < np.sqrt(((error / found.sigma) ** 2).mean()) < 1.6
 
 
+def test_noisier_pictures_are_stated_to_be_farther_off(geometry, pictures):
+    pixels, random = grid(geometry.size), np.random.default_rng(0)
+    sigma = []
+    for noise in (0.0, 10.0):
+        noisy = [picture.colour + noise * random.standard_normal(picture.colour.shape) for picture in pictures]
+        found = cloud(viewed(geometry, *(np.clip(each, 0.0, 255.0).astype(np.uint8) for each in noisy)), pixels)
+        sigma.append(np.median(found.sigma))
+    assert sigma[1] > 1.25 * sigma[0]
+
+
 def test_glare_is_left_out(pair, geometry, pictures):
     lit, random = [taken(picture, seed) for seed, picture in enumerate(pictures)], np.random.default_rng(3)
     for picture in lit:
         for column, row in random.integers((100, 60), (220, 180), (20, 2)).tolist():
             picture[row - 1 : row + 2, column - 1 : column + 2] = 255
-    pixels = grid(geometry.size)
-    found = cloud(viewed(geometry, *lit), pixels)
+    pixels, view = grid(geometry.size), viewed(geometry, *lit)
+    white = [window.min(axis=2) > 250 for window in geometry.windows(*lit)]
+    assert white[0].any() and view.hidden[white[0]].all() and view.hidden_right[white[1]].all()
+    found = cloud(view, pixels)
     assert 0.3 * len(pixels) < len(found.which) < 0.9 * len(pixels)
     error = off(found, pixels, geometry, pair[0], pictures[0])
     assert np.sqrt((error**2).mean()) < 0.6e-3 and np.median(np.abs(error)) < 0.25e-3
