@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Literal
@@ -17,6 +18,9 @@ WHITE = (244, 244, 240)
 # Scale of the lines at the foot of a picture, from one's baseline to the next [pixel], and the share of the picture's
 # width that they may have.
 FINE, ROW, NARROW = 0.45, 18, 0.25
+# Shares of the picture's width that a panel's lines may have, the first for which there is room, if need be in smaller
+# letters.
+PANEL_WIDTHS, SMALLER = (0.9, 0.5, 0.36, 0.27, 0.2), 0.85
 # Lines at the head begin so far down, under the letter of a side [pixel].
 HEAD = 34
 # Scale of the letters of the patient's sides.
@@ -43,6 +47,21 @@ def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5
     cv2.putText(colour, text, (column, row), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
 
 
+def haloed(sheet: np.ndarray, text: str, at: tuple[int, int], scale: float, ink: Sequence[float] = WHITE) -> None:
+    """Write one line of ASCII text with a dark halo at (column, row), its baseline's left end, in place.
+
+    sheet (h, w, 3) or (h, w, 4) uint8: colour, or colour times coverage, and coverage.
+    """
+    (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
+    column, row = at
+    box = np.s_[max(row - above - 4, 0) : row + below + 5, max(column - 4, 0) : column + width + 5]
+    halo = np.zeros(sheet.shape[:2], np.uint8)
+    cv2.putText(halo, text, at, FONT, scale, (255, 0, 0, 0), 1, cv2.LINE_AA)
+    share = cv2.dilate(halo[box], np.ones((3, 3), np.uint8))[..., None] / 255.0
+    sheet[box] = sheet[box] * (1.0 - share) + share * np.array([10.0, 12.0, 12.0, 255.0])[: sheet.shape[2]]
+    cv2.putText(sheet, text, at, FONT, scale, (*ink, 255.0), 1, cv2.LINE_AA)
+
+
 def lay(
     colour: np.ndarray,
     taken: np.ndarray,
@@ -52,6 +71,7 @@ def lay(
     ink: Sequence[float] = WHITE,
     needed: bool = False,
     sights: np.ndarray | None = None,
+    lines_there: np.ndarray | None = None,
 ) -> None:
     """Write lines of ASCII text at the free place nearest to a wish, and take that place; both arrays change in place.
 
@@ -66,6 +86,8 @@ def lay(
     sights
         (H, W) uint8: above 0 where words hide what should stay in sight, as a tool; they do where there is no other
         space.
+    lines_there
+        (H, W) uint8: above 0 where no words but lines are, which words that are `needed` may cover.
     """
     if not lines:
         return
@@ -74,6 +96,8 @@ def lay(
     size = max(width for (width, _), _ in sizes), above + below + ROW * (len(lines) - 1)
     place = None if sights is None else free_place(taken | sights, size, wish)
     place = place or free_place(taken, size, wish)
+    if place is None and needed and lines_there is not None:
+        place = free_place(taken & (1 - lines_there), size, wish)
     if place is None and needed:
         place = free_place(np.zeros_like(taken), size, wish) or (PAD, PAD)
     if place is None:
@@ -122,27 +146,63 @@ def rounded_up(value: float, digits: int) -> float:
 
 
 def panel(
-    colour: np.ndarray, lines: Sequence[str], corner: Corner = "top left", scale: float = 0.45, below: int = 0
+    colour: np.ndarray,
+    lines: Sequence[str],
+    corner: Corner = "top left",
+    scale: float = 0.45,
+    below: int = 0,
+    sights: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
     """The picture (H, W, 3) uint8 with lines of ASCII text on a dark translucent ground in one corner; a copy.
 
     One at the top begins `below` so many rows. Lines for which the picture is too low are left out.
 
-    Raises ValueError for an unknown corner.
+    Parameters
+    ----------
+    sights
+        Each (H, W) uint8, above 0 where the panel hides what should stay in sight. It stands as near to its corner as
+        the first of them lets it, broken into narrower lines where it takes that; in the corner where none does.
+
+    Raises
+    ------
+    ValueError
+        An unknown corner.
     """
     if corner not in Corner.__args__:
         raise ValueError(f"there is no corner {corner!r}: choose one of {', '.join(Corner.__args__)}.")
     out = colour.copy()
     if not lines:
         return out
-    lines = [part for line in lines for part in folded(line, out.shape[1] - 4 * PAD, scale)]
-    sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in lines]
+    height, width = out.shape[:2]
+    rooms = [share * width for share in PANEL_WIDTHS]
+    for sight, letters, room in itertools.product(sights, (scale, SMALLER * scale), rooms):
+        broken, size, step = _block(lines, room, letters)
+        wish = 0 if "left" in corner else width, PAD + below if "top" in corner else height
+        place = free_place(sight, size, wish)
+        if place is not None:
+            return _lettered(out, broken, place, size, step, letters)
+    broken, size, step = _block(lines, width - 4 * PAD, scale)
+    broken = broken[: max((height - below - 3 * PAD) // step, 1)]
+    broken, size, step = _block(broken, width - 4 * PAD, scale)
+    top = PAD + below if "top" in corner else max(height - size[1] - PAD, 0)
+    left = PAD if "left" in corner else max(width - size[0] - PAD, 0)
+    return _lettered(out, broken, (left, top), size, step, scale)
+
+
+def _block(lines: Sequence[str], room: float, scale: float) -> tuple[list[str], tuple[int, int], int]:
+    """Lines folded into so much room, the width and height of a panel of them, and from one to the next [pixel]."""
+    broken = [part for line in lines for part in folded(line, room, scale)]
+    sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in broken]
     step = max(height for _, height in sizes) + PAD
-    lines = lines[: max((out.shape[0] - below - 3 * PAD) // step, 1)]
-    height, width = step * len(lines) + PAD, max(width for width, _ in sizes[: len(lines)]) + 2 * PAD
-    top = PAD + below if "top" in corner else max(out.shape[0] - height - PAD, 0)
-    left = PAD if "left" in corner else max(out.shape[1] - width - PAD, 0)
-    ground = out[top : top + height, left : left + width]
+    return broken, (max(width for width, _ in sizes) + 2 * PAD, step * len(broken) + PAD), step
+
+
+def _lettered(
+    out: np.ndarray, lines: Sequence[str], at: tuple[int, int], size: tuple[int, int], step: int, scale: float
+) -> np.ndarray:
+    """The picture (H, W, 3) uint8 with lines on a dark ground whose upper left corner is at a column and row."""
+    left, top = at
+    ground = out[top : top + size[1], left : left + size[0]]
     ground[:] = ground * 0.35 + np.array([6.0, 9.0, 11.0])
     for number, line in enumerate(lines, start=1):
         write(out, line, (left + PAD, top + number * step), scale)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -27,6 +26,15 @@ STRAIGHT, SLANTED = wp.constant(0.955), wp.constant(1.3693)
 REACH = wp.constant(26)
 # Half the widths of the outline and of its dark rim, and how far from the edge neither is drawn [pixel].
 LINE, RIM, NEAR_EDGE = wp.constant(1.7), wp.constant(2.7), wp.constant(5.0)
+# The depth style's tint weakens by steps of so much depth [m] so often, from its strength at the surface to its least.
+STEP, STEPS = wp.constant(0.005), wp.constant(6)
+STRONGEST, FAINTEST = wp.constant(0.85), wp.constant(0.1)
+# What a layer is to the overlay: in front of it, or ground that nothing shines through.
+FRONT, SHUT = wp.constant(1), wp.constant(2)
+# What is done to the ground inside of the silhouette.
+SHINES, TINTED, DEEPENED = wp.constant(1), wp.constant(2), wp.constant(3)
+SHADES = {"window": SHINES, "fill": TINTED, "depth": DEEPENED}
+"""By style; none in others."""
 # The ink of the rims of lines.
 DARK = (10.0, 12.0, 12.0)
 DARK_INK = wp.constant(wp.vec3f(*DARK))
@@ -59,7 +67,7 @@ def overlaid(
     camera: Camera,
     hidden: Layer,
     seen: Seen,
-    occluders: Sequence[int],
+    roles: Roles,
     style: str,
     lines: Lines,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -73,19 +81,23 @@ def overlaid(
         Rows and columns of the picture in which to draw, and the camera of that part.
     hidden, seen
         The surface, and what that camera sees of it, on the same device.
-    occluders
-        Ids of the layers that stay as they are.
+    roles
+        What stays as it is, and what nothing shines through.
     style
-        "window" dims the ground round the silhouette, where the surface shines through; "fill" tints it.
+        "window" dims the ground round the silhouette, where the surface shines through; "fill" tints it; "depth" the
+        more the nearer the surface is to the ground.
     """
     device = str(drawn.colour.device)
     load(device, __name__)
     towards = vertex_normals(hidden.vertices, hidden.triangles) @ camera.T_camera_world[2, :3]
     looks = np.column_stack([towards, 255.0 * np.asarray(hidden.colour)])
+    front = wp.empty((0, 0), dtype=wp.uint8, device=device)
+    if roles.covered is not None:
+        front = wp.array(roles.covered.view(np.uint8), dtype=wp.uint8, device=device)
     inputs = [
         box[0].start, box[1].start, camera.width, seen.nearest[0], seen.points, seen.triangles, seen.unbent.pixels,
         from_edge(seen), wp.array(looks, dtype=wp.vec4f, device=device), drawn.depth[0], drawn.segmentation[0],
-        on_device(tuple(occluders), device), style == "window", style == "fill", lines.solid, wp.vec3f(lines.ink),
+        on_device(roles.front, roles.open, device), front, int(SHADES.get(style, 0)), lines.solid, wp.vec3f(lines.ink),
         sheet(lines.under, device), sheet(lines.above, device),
     ]  # fmt: skip
     ground = wp.clone(drawn.colour[0])
@@ -94,15 +106,44 @@ def overlaid(
     return ground.numpy(), taken.numpy()
 
 
-def covering(occluders: tuple[int, ...]) -> np.ndarray:
-    """(256,) uint8: 1 for the ids of layers that stay as they are."""
-    return np.isin(np.arange(256), occluders).astype(np.uint8)
+@dataclass(frozen=True, eq=False)
+class Roles:
+    """What the parts of a picture are to an overlay.
+
+    Parameters
+    ----------
+    front
+        Ids of the layers that stay as they are: tools.
+    open
+        Ids of those that the surface may shine through; None: all.
+    covered
+        (H, W) bool: what stays as it is besides, as a hand in a real picture; or None.
+    """
+
+    front: tuple[int, ...] = ()
+    open: tuple[int, ...] | None = None
+    covered: np.ndarray | None = None
+
+    def of(self, segmentation: np.ndarray, box: tuple[slice, slice] = np.s_[:, :]) -> np.ndarray:
+        """(h, w) uint8: `FRONT`, `SHUT` or 0 in a box of a picture's segmentation (H, W) uint8."""
+        found = cv2.LUT(segmentation[box], role_table(self.front, self.open))
+        if self.covered is not None:
+            found[self.covered[box]] = FRONT
+        return found
 
 
-@lru_cache(maxsize=4)
-def on_device(occluders: tuple[int, ...], device: str) -> wp.array:
+@lru_cache(maxsize=8)
+def role_table(front: tuple[int, ...], open_to: tuple[int, ...] | None) -> np.ndarray:
+    """(256,) uint8 by the id of a layer: `FRONT`, `SHUT` or 0."""
+    ids = np.arange(256)
+    shut = np.zeros(256, bool) if open_to is None else ~np.isin(ids, open_to)
+    return np.where(np.isin(ids, front), FRONT, np.where(shut, SHUT, 0)).astype(np.uint8)
+
+
+@lru_cache(maxsize=8)
+def on_device(front: tuple[int, ...], open_to: tuple[int, ...] | None, device: str) -> wp.array:
     """The same on a device: brought there once."""
-    return wp.array(covering(occluders), dtype=wp.uint8, device=device)
+    return wp.array(role_table(front, open_to), dtype=wp.uint8, device=device)
 
 
 def sheet(lines: np.ndarray | None, device: str) -> wp.array:
@@ -247,6 +288,13 @@ def shining(
     return 1.1 * (0.25 + 0.75 * wp.abs(look[0])) * wp.exp(-under / FADE) * wp.vec3f(look[1], look[2], look[3])
 
 
+@wp.func
+def strength(under: wp.float32) -> wp.float32:
+    """Of the depth style's tint, this far under the ground [m]."""
+    share = wp.clamp(wp.floor(under / STEP) / wp.float32(STEPS - 1), 0.0, 1.0)
+    return STRONGEST - (STRONGEST - FAINTEST) * share
+
+
 @forward_kernel
 def lay_over(
     begin: wp.int32,
@@ -263,9 +311,9 @@ def lay_over(
     looks: wp.array(dtype=wp.vec4f),
     depth: wp.array2d(dtype=wp.float32),
     segmentation: wp.array2d(dtype=wp.uint8),
-    covering: wp.array(dtype=wp.uint8),
-    shines: wp.bool,
-    tinted: wp.bool,
+    roles: wp.array(dtype=wp.uint8),
+    front: wp.array2d(dtype=wp.uint8),
+    shade: wp.int32,
     outlined: wp.bool,
     ink: wp.vec3f,
     under: wp.array(dtype=wp.vec4ub),
@@ -284,15 +332,20 @@ def lay_over(
         column = index - row * width
         y = top + row
         x = left + column
+        role = wp.int32(roles[wp.int32(segmentation[y, x])])
+        free = role != FRONT
+        if front.shape[0] > 0 and front[y, x] != wp.uint8(0):
+            free = False
+        through = role != SHUT
         key = nearest[row, column]
-        inside = key != NOTHING
+        inside = through and key != NOTHING
         window = wp.float32(0.0)
-        if shines:
+        if shade == SHINES and through:
             window = wp.where(inside, 1.0, wp.clamp(1.25 - 1.25 * away[row, column] / wp.float32(SURROUND), 0.0, 1.0))
         # Coverage by the outline's dark rim, and by its ink.
         rim = wp.float32(0.0)
         line = wp.float32(0.0)
-        if outlined and away[row, column] < NEAR_EDGE:
+        if outlined and through and away[row, column] < NEAR_EDGE:
             far = wp.abs(smooth_distance(row, column, away, nearest))
             rim = wp.clamp(RIM + 0.5 - far, 0.0, 1.0)
             line = wp.clamp(LINE + 0.5 - far, 0.0, 1.0)
@@ -303,19 +356,20 @@ def lay_over(
         if above.shape[0] > 0:
             high = above[index]
         lined = rim > 0.0 or low[3] > wp.uint8(0) or high[3] > wp.uint8(0)
-        free = covering[wp.int32(segmentation[y, x])] == wp.uint8(0)
         taken[row, column] = wp.uint8(wp.where(lined and free, 1, 0))
-        if free and (lined or window > 0.0 or (tinted and inside)):
+        if free and (lined or window > 0.0 or (shade > SHINES and inside)):
             was = ground[y, x]
             light = wp.vec3f(wp.float32(was[0]), wp.float32(was[1]), wp.float32(was[2]))
-            if shines:
+            if shade == SHINES:
                 light *= 1.0 - 0.62 * window * window * (3.0 - 2.0 * window)
                 if inside:
                     p = pixel_at(0, column, row, pixels)
                     light += shining(p, key, q, triangles, looks, depth[y, x])
             light = wp.min(light, wp.vec3f(255.0))
-            if tinted and inside:
+            if inside and shade == TINTED:
                 light = 0.55 * light + 0.45 * ink
+            if inside and shade == DEEPENED:
+                light += strength(depth_of(key) - depth[y, x]) * (ink - light)
             light = over(low, light)
             light = (1.0 - rim) * light + rim * DARK_INK
             light = (1.0 - line) * light + line * ink

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from ar.camera import look_at
+from ar.gauge import GAUGE, Gauge
 from ar.hud import FINE, HEAD, ROW, panel, write
 from ar.layer import Layer, Solid, vertex_normals
-from ar.overlay import BEFORE, DOUBTFUL, GAUGE, WARNING, Gauge, composite, doubt_lines, ink_of, iou, silhouette
+from ar.outlines import ink_of, iou, silhouette
+from ar.overlay import DOUBTFUL, WARNING, composite, doubt_lines
 from ar.refind import outline_gap, stands
 from ar.renderer import Lamp, lamp_beside, render
+from ar.traces import BEFORE
 
 CORTEX, TOOL, TUMOUR = 1, 2, 3
 EYE = np.array([0.0, -0.05, 0.25])

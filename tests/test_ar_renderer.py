@@ -10,12 +10,13 @@ from test_ar_raster import sphere
 
 from ar.camera import Camera, look_at
 from ar.layer import Layer, Solid, vertex_normals
-from ar.overlay import box_around, composite
+from ar.outlines import box_around
+from ar.overlay import composite
 from ar.rasteriser import NOTHING, empty_buffer, keep_nearest, seen
 from ar.raycast import raycast
 from ar.renderer import Lamp, Picture, Pictures, Renderer, as_light, render, tone_curve
 from ar.shade import BRIGHTEST
-from ar.window import FADE, SURROUND, Lines, chamfer, overlaid
+from ar.window import FADE, SURROUND, Lines, Roles, chamfer, overlaid
 
 FLOOR, BALL, EGG = 1, 2, 3
 LAMP = Lamp(np.array([-0.15, 0.1, 0.3]), np.zeros(3), 0.08)
@@ -185,7 +186,9 @@ def test_the_window_is_what_its_formula_says():
     assert box is not None
     part = here.cropped(*box)
     found = seen(part, hidden.vertices, hidden.triangles)
-    shown, taken = overlaid(picture.drawn, box, part, hidden, found, (), "window", Lines((0.0, 0.0, 0.0), solid=False))
+    shown, taken = overlaid(
+        picture.drawn, box, part, hidden, found, Roles(), "window", Lines((0.0, 0.0, 0.0), solid=False)
+    )
     away = cv2.distanceTransform((~cast.mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3) / float(SURROUND)
     window = np.clip(1.25 - 1.25 * away, 0.0, 1.0)[..., None]
     wanted = picture.colour * (1.0 - 0.62 * window**2 * (3.0 - 2.0 * window))
@@ -210,14 +213,14 @@ def test_the_outline_runs_along_the_edge():
     mask = found.mask.astype(np.uint8)
     edge = (mask - cv2.erode(mask, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))).astype(bool)
     near = cv2.dilate(edge.astype(np.uint8), np.ones((9, 9))).astype(bool)
-    shown, taken = overlaid(picture.drawn, box, part, hidden, found, (), "contour", Lines(ink))
+    shown, taken = overlaid(picture.drawn, box, part, hidden, found, Roles(), "contour", Lines(ink))
     inked = np.abs(shown[box].astype(int) - np.array(ink)).max(axis=-1) <= 2
     assert inked[edge].mean() > 0.99 and not taken[~near].any()
     np.testing.assert_array_equal(shown[box][taken == 0], picture.colour[box][taken == 0])
     rim = (taken > 0) & ~inked
     assert (rim & ~found.mask).sum() > 30 and (rim & found.mask).sum() > 30
     assert (shown[box][rim].max(axis=-1) <= picture.colour[box][rim].max(axis=-1) + 2).mean() > 0.6
-    same, free = overlaid(picture.drawn, box, part, hidden, found, (floor().id,), "contour", Lines(ink))
+    same, free = overlaid(picture.drawn, box, part, hidden, found, Roles((floor().id,)), "contour", Lines(ink))
     np.testing.assert_array_equal(same, picture.colour)
     assert not free.any()
 

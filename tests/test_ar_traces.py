@@ -9,9 +9,11 @@ import trimesh
 from ar.camera import Camera, look_at
 from ar.hud import FINE
 from ar.layer import Layer
-from ar.overlay import SEEN, Trace, composite, draw_points, ink_of, silhouette
+from ar.outlines import ink_of, silhouette
+from ar.overlay import SEEN, composite, draw_points
 from ar.refind import of_ink, outline_gap, stands
 from ar.renderer import Lamp, Picture, render
+from ar.traces import Trace
 
 
 def camera(width: int, height: int) -> Camera:

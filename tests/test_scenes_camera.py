@@ -11,7 +11,7 @@ from theatres import player, small, theatre_of
 from ar.calibration import Calibration
 from ar.camera import Camera, project_cv2
 from ar.lens import Lens
-from ar.overlay import ink_of, iou, silhouette
+from ar.outlines import ink_of, iou, silhouette
 from ar.refind import outline_gap
 from ar.screen import read_png
 from scenes.cli import main

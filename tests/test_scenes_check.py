@@ -15,14 +15,14 @@ from scenes.cli import main
 from scenes.play.checks import Figures, measure
 from scenes.play.player import annotate, gauged
 from scenes.play.reference import truth_of
-from scenes.play.stage import TOOL
+from scenes.play.stage import OPENING, TOOL
 from scenes.script.scene import SCENES, Bounds, find_scene
 from scenes.script.tool_paths import press
 from sim.deformation import Outcome
 
 GOOD = Figures(
-    overlap=0.99, error_mm=0.1, motion_mm=1.0, pixels=1e-9, drawn=0.5, printed=True, finite=True, answered=True,
-    in_step=True, leaked=0.0, bond=0.1, covered=0.95, removed=0.5,
+    overlap=0.99, error_mm=0.1, motion_mm=1.0, pixels=1e-9, drawn=0.5, printed=True, labelled=True, honest=True,
+    finite=True, answered=True, in_step=True, leaked=0.0, bond=0.1, covered=0.95, removed=0.5,
 )  # fmt: skip
 SENTENCES = {
     "overlap": (0.90, "overlap 0.9000 is below 0.95"),
@@ -31,6 +31,8 @@ SENTENCES = {
     "pixels": (0.01, "0.01 pixels off"),
     "drawn": (2.5, "the drawn outline is 2.5 pixels off, more than 2"),
     "printed": (False, "does not say its frame's number"),
+    "labelled": (False, "cut off, or far from the tip"),
+    "honest": (False, "as if it were seen"),
     "finite": (False, "not finite"),
     "answered": (False, "answer is not good"),
     "in_step": (False, "another moment"),
@@ -99,14 +101,14 @@ def test_what_was_not_perturbed_passes(play, frames, truth):
     assert figures.error_mm < 0.05 and figures.drawn < 1.5 and figures.printed
 
 
-def drawn(play, frame, positions, camera=None, tip=None):
+def drawn(play, frame, positions, camera=None, tip=None, opening=OPENING):
     """A frame whose picture was drawn from other positions, by another camera, or with another tip."""
     stage, at = play.stage, frame.tip if tip is None else tip
     tumour, rest = (stage.tumour(each) for each in (positions, play.site.anatomy.mesh.nodes))
     gauge = gauged(at, tumour)
     if tip is None:
         gauge = replace(gauge, read=frame.distance)
-    shown = composite(frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauge, before=rest)
+    shown = composite(frame.picture, camera or play.camera, tumour, (TOOL,), gauge=gauge, before=rest, opening=opening)
     annotate(shown, frame.number, frame.remark)
     return replace(frame, shown=shown.colour)
 
@@ -159,7 +161,7 @@ class TestThePictureItself:
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not say")
 
     def test_with_a_number_ten_times_too_large_it_fails(self, play, frames, truth, monkeypatch):
-        monkeypatch.setattr("ar.overlay.millimetres", lambda length, error=None: millimetres(10.0 * length, error))
+        monkeypatch.setattr("ar.gauge.millimetres", lambda length, error=None: millimetres(10.0 * length, error))
         wrong = drawn(play, frames[2], play.positions(frames[2].deformation))
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not say")
 

@@ -11,7 +11,8 @@ from theatres import PUSHING, on_template, player, put, short, small, template_t
 
 from ar.camera import project_cv2
 from ar.hud import FINE, NARROW, WHITE, folded
-from ar.overlay import WARNING, ink_of
+from ar.outlines import ink_of
+from ar.overlay import WARNING
 from ar.refind import stands
 from scenes.cli import main
 from scenes.play.deformers import model_path, open_theatre
@@ -168,8 +169,8 @@ def test_the_overlay_lies_where_the_tumour_is(play):
     changed = (frame.shown != frame.picture.colour).any(axis=2)
     corners = play.positions(frame.deformation)[play.site.anatomy.tumour_nodes]
     column, row = np.rint(project_cv2(play.camera, corners)).astype(int).T
-    seen = frame.picture.segmentation[row, column] != TOOL
-    assert seen.sum() > 20 and changed[row, column][seen].mean() > 0.97
+    seen = frame.picture.segmentation[row, column] == CORTEX
+    assert seen.sum() > 4 and changed[row, column][seen].mean() > 0.97
 
 
 def test_a_frame_finds_the_resting_tool_and_the_nearest_point_once(play, monkeypatch):
@@ -221,12 +222,13 @@ def test_the_label_is_drawn_above_the_picture(play):
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     plain = labelled(frame, "linear")
     assert plain.shape == frame.shown.shape
-    assert (plain != frame.shown).any() and (plain[-30:] == frame.shown[-30:]).all()
+    changed, tool = (plain != frame.shown).any(axis=2), frame.picture.segmentation == TOOL
+    assert changed.any() and tool.any() and not changed[tool].any()
 
 
 def test_the_label_tells_source_time_and_motion(play, monkeypatch):
     said = []
-    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines, below: said.extend(lines) or colour)
+    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     labelled(frame, "linear")
     assert said[0] == frame.deformation.source
@@ -235,7 +237,7 @@ def test_the_label_tells_source_time_and_motion(play, monkeypatch):
 
 def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
     shown = []
-    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines, below: shown.append(list(lines)) or colour)
+    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines, **more: shown.append(list(lines)) or colour)
     play = player(theatre, short(), "linear")
     for force in (0.2, 0.6):
         labelled(play.draw(0, 0.0, Touch(force=force)), "linear")

@@ -11,7 +11,7 @@ import pytest
 from theatres import player, put, small, theatre_of
 from visitor import free_port, wait_for
 
-from ar.overlay import silhouette
+from ar.outlines import silhouette
 from scenes.cli import main
 from scenes.play.episode import collect
 from scenes.play.load_text import acting

@@ -8,7 +8,7 @@ import pytest
 from locators import locator_of
 from theatres import SIGHTED, short, small
 
-from ar.overlay import ink_of
+from ar.outlines import ink_of
 from ar.refind import of_ink
 from scenes.cli import main
 from scenes.play.checks import measure, within
@@ -203,7 +203,7 @@ def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     assert np.array_equal(play.believed(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
     assert not of_ink(frame.shown, ink_of(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
     assert np.count_nonzero(of_ink(frame.shown, ink_of(TRUTH_COLOUR))) > 10
-    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines, below: said.extend(lines) or colour)
+    monkeypatch.setattr("scenes.play.player.panel", lambda colour, lines, **more: said.extend(lines) or colour)
     labelled(frame, "fem")
     assert any(line == f"estimate: refused, {found.refusal}" for line in said)
     assert "What is seen was refused" in report(frame, play.stage, "fem", "", (), 100)

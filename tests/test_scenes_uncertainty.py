@@ -290,13 +290,13 @@ class TestSaid:
         from scenes.play.player import composite
 
         monkeypatch.setattr(
-            "scenes.play.player.composite", lambda *given: drawn_with.append(given) or composite(*given)
+            "scenes.play.player.composite", lambda *given, **more: drawn_with.append(given) or composite(*given, **more)
         )
         frame = player.draw(3, 0.1, scene.path(0.1))
         assert frame.tumour_error.prior == pytest.approx(np.hypot(3e-3, frame.model_error))
         assert frame.model_error == frame.deformation.bound[0, 0]
         margin, gauge = drawn_with[0][5:7]
-        assert margin == frame.tumour_error.prior and gauge.error is None
+        assert margin == gauge.error == frame.tumour_error.prior
         assert list(frame.head) == error_lines(frame.model_error, frame.tumour_error, True)
         assert all(stands(frame.shown, line, FINE) for line in frame.head)
         # The panel of figures begins under them.

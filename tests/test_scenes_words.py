@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import ar.hud
-from ar.overlay import Style, outlines, silhouette
+from ar.outlines import outlines, silhouette
+from ar.styles import Style
 from scenes.play.deformers import open_theatre
 from scenes.play.page import pictured
 from scenes.play.player import Player, gauged

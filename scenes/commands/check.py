@@ -7,7 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, TextIO
 
 from sim.accuracy import TRAIN
@@ -16,6 +16,7 @@ from sim.errors import InputError
 
 from .camera_options import add_camera, filmed
 from .demo import add_theatre, deformer_name, playable, scene_asked, theatre_asked
+from .style_option import add_style
 
 if TYPE_CHECKING:
     from sim.deformation import Deformation
@@ -36,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_theatre(parser)
     add_camera(parser)
+    add_style(parser, without=("none",))  # there is an outline to be found
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
 
@@ -55,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
         name = deformer_name(args, theatre, scene)
-        player = theatre.player(name, scene)
+        player = replace(theatre.player(name, scene), style=args.style)
         print(f"{scene.name} by {theatre.described(name, scene)}", file=table)
         total = len(scene.times[:: args.every])
         with tqdm(total=2 * total, unit="frame", desc=scene.name, leave=False, file=sys.stderr) as bar:

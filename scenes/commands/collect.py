@@ -6,11 +6,13 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from .camera_options import add_camera, filmed
 from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
 from .outputs import add_force, claimed
+from .style_option import add_style
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, type=Path, help="the episode, .h5")
     add_theatre(parser)
     add_camera(parser)
+    add_style(parser)
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
@@ -33,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     out = claimed(args.out, ".h5", "an episode of `sulcus collect`", args.force, [args.anatomy, args.camera])
     theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
-    player = theatre.player(name, scene)
+    player = replace(theatre.player(name, scene), style=args.style)
     total = len(scene.times)
     with tqdm(total=2 * total, unit="frame", desc="drawn", file=sys.stderr) as bar:
 

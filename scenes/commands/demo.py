@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from sim.errors import InputError
 
 from .camera_options import add_camera, filmed
+from .style_option import add_style
 from .tissue_options import add_element_argument, add_tissue_arguments, tissue_asked
 
 if TYPE_CHECKING:
@@ -141,6 +142,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", nargs="?", default="press", help="a built-in scene or MY_SCENE.py (default press)")
     add_theatre(parser)
     add_camera(parser)
+    add_style(parser)
     parser.add_argument(
         "--host",
         default="127.0.0.1",
@@ -187,7 +189,7 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
     name = deformer_name(args, theatre, scene)
     anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:
-        demo = Demo(theatre, scene, name, args.host, args.port, anatomy, asked)
+        demo = Demo(theatre, scene, name, args.host, args.port, anatomy, asked, args.style)
     except UnguardedError as error:
         raise InputError(str(error)) from error
     closing.callback(demo.close)

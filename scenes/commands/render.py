@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from sim.runtime.atomic_files import REMEDY, why
 from .camera_options import add_camera, filmed
 from .demo import add_theatre, deformer_name, scene_asked, theatre_asked
 from .outputs import add_force, claimed, claimed_folder, claimed_frames
+from .style_option import add_style
 
 if TYPE_CHECKING:
     from ..play.deformers import Theatre
@@ -32,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plain", action="store_true", help="leave out the panel of figures")
     add_theatre(parser)
     add_camera(parser)
+    add_style(parser)
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
@@ -51,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         claimed(args.film, args.film.suffix, "a film of `sulcus render`", args.force, [args.camera])
     theatre = theatre_asked(args)
     name = deformer_name(args, theatre, scene)
-    player = theatre.player(name, scene)
+    player = replace(theatre.player(name, scene), style=args.style)
     run_of = _run(args, theatre, scene, name)
     others = claimed_frames(args.out, run_of, args.force)
     written, bad = [], 0
@@ -83,5 +86,5 @@ def _run(args: argparse.Namespace, theatre: Theatre, scene: Scene, name: str) ->
     model = theatre.models.get(name)
     about = scene.effects_on(theatre.anatomy), scene.element, scene.tool, scene.viewpoint, scene.accuracy
     trained = None if model is None else (model.bound, dict(model.training))
-    marks = repr((scene.name, name, theatre.anatomy.digest, about, trained, args.every, args.plain))
+    marks = repr((scene.name, name, theatre.anatomy.digest, about, trained, args.every, args.plain, args.style))
     return f"run {sha256(marks.encode()).hexdigest()[:16]}"

@@ -8,26 +8,17 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ar.camera import Camera, project_cv2
-from ar.hud import FINE, NARROW, WHITE, folded, millimetres
 from ar.layer import Layer
-from ar.overlay import DOUBTFUL, GAUGE, ink_of, iou, silhouette
-from ar.raycast import raycast
-from ar.refind import of_ink, outline_gap, stands
+from ar.outlines import iou, silhouette
 from sim.deformation import Deformation
 from surrogate.locating.prior import middle_of
-from surrogate.model.guarded import answering
 
 from ..script.scene import Bounds
-from .player import TRUE_STROKES, Frame, Player
-from .stage import TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
+from .picture_checks import beside_tip, drawn_off, honest, printed, silhouette_of, truth_off
+from .player import Frame, Player
 
-# Barycentric weights (q, 3) at which the tumour's triangles are sampled: corners, edges and insides.
-STEPS = 24
-SAMPLES = np.array([(i, j, STEPS - i - j) for i in range(STEPS + 1) for j in range(STEPS + 1 - i)]) / STEPS
-
-TRUE_INK = ink_of(TRUTH_COLOUR)
-NOWHERE = 0.0, np.inf, np.inf, np.inf
-"""How far off a tumour is whose place is no number: overlap, distance [m], distance in the picture [pixel]."""
+NOWHERE = 0.0, np.inf, np.inf, np.inf, False
+"""Of a tumour whose place is no number: overlap, distance [m], two in the picture [pixel], whether that is honest."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +37,11 @@ class Figures:
     drawn
         Distance between the outline in the picture itself, found again by its colour, and that of the finite elements'
         tumour by another renderer [pixel]. 95 in 100 of the outline's pixels are nearer.
-    printed
+    printed, labelled
         Whether the picture says the frame's number and the distance from tip to tumour, as they are computed here.
+        Whether that distance stands in it whole, near the tip.
+    honest
+        Whether what is not seen through cortex is drawn broken and unshaded, and the picture says what it lies under.
     finite, answered
         Whether every number and picture is finite, and every answer, drawn or by finite elements, a good one.
     doubt
@@ -71,6 +65,8 @@ class Figures:
     pixels: float
     drawn: float
     printed: bool
+    labelled: bool
+    honest: bool
     finite: bool
     answered: bool
     in_step: bool
@@ -88,6 +84,8 @@ class Figures:
             f"projection is {self.pixels:.3g} pixels off, more than {bounds.pixels:g}": self.pixels <= bounds.pixels,
             f"the drawn outline is {self.drawn:.1f} pixels off, more than {bounds.drawn:g}": self.drawn <= bounds.drawn,
             "a picture does not say its frame's number or the distance to the tumour": self.printed,
+            "the distance to the tumour is cut off, or far from the tip": self.labelled,
+            "what the drape or bone covers is drawn as if it were seen, or the picture does not say so": self.honest,
             "the tumour never moves: nothing was shown": self.motion_mm > 0.0,
             "a number is not finite": self.finite,
             f"an answer is not good: {self.doubt}": self.answered,
@@ -123,14 +121,16 @@ def measure(
         _miss(player, camera_at(frame.time), frame, truth, row) if finite[row] else NOWHERE
         for row, frame in enumerate(frames)
     ]
-    overlap, error, pixels, drawn = zip(*misses, strict=True)
+    overlap, error, pixels, drawn, honestly = zip(*misses, strict=True)
     return Figures(
         overlap=min(overlap),
         error_mm=1e3 * max(error),
         motion_mm=1e3 * float(max(moved)),
         pixels=max(pixels),
         drawn=max(drawn),
-        printed=all(good and _printed(player, frame) for good, frame in zip(finite, frames, strict=True)),
+        printed=all(good and printed(player, frame) for good, frame in zip(finite, frames, strict=True)),
+        labelled=all(good and beside_tip(player, frame) for good, frame in zip(finite, frames, strict=True)),
+        honest=all(honestly),
         finite=all(finite),
         answered=not doubts,
         in_step=all(
@@ -188,7 +188,10 @@ def _finite(frame: Frame) -> bool:
 
 
 def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
-    """Between a frame and the truth: overlap, mean distance [m], largest in the picture [pixel], and the outline's."""
+    """Between a frame and the truth: overlap, mean distance [m], largest in the picture [pixel], and the outline's.
+
+    Last, whether what is not seen through cortex is shown so.
+    """
     stage = player.stage.at(frame.loads)
     believed = player.believed(frame)
     shown = stage.tumour(believed)
@@ -200,57 +203,9 @@ def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row:
     ours = frame.camera.project(shown.vertices)[0]
     pixels = np.linalg.norm(ours - project_cv2(camera, shown.vertices), axis=1).max()
     mean = float(np.linalg.norm(off, axis=1).mean())
-    ink = ink_of(DOUBTFUL if frame.doubt else TUMOUR_COLOUR)
-    drawn = _drawn(camera, frame, true if frame.estimate is None else shown, ink)
+    mask = silhouette_of(camera, true if frame.estimate is None else shown)
+    drawn = drawn_off(frame, mask)
     if frame.estimate is not None:  # both are in the picture
-        drawn = max(drawn, _drawn(camera, frame, true, TRUE_INK))
+        drawn = max(drawn, truth_off(frame, silhouette_of(camera, true)))
     # Not a number: behind the camera.
-    return overlap, mean, np.inf if np.isnan(pixels) else float(pixels), drawn
-
-
-def _drawn(camera: Camera, frame: Frame, true: Layer, ink: tuple[float, float, float]) -> float:
-    """How far the outline of this ink in a frame's picture is from where a tumour should be [pixel]."""
-    mask = raycast(camera, true.vertices, true.triangles).mask
-    above = (frame.shown == np.asarray(WHITE, np.uint8)).all(axis=2) | (frame.picture.segmentation == TOOL)
-    if ink == TRUE_INK:  # the tumour's own outline is drawn over it
-        above |= of_ink(frame.shown, ink_of(TUMOUR_COLOUR))
-        return outline_gap(frame.shown, ink, mask, above, 2 * sum(TRUE_STROKES))
-    return outline_gap(frame.shown, ink, mask, above)
-
-
-def _printed(player: Player, frame: Frame) -> bool:
-    """Whether a picture says its frame's number, how far the tip is from the tumour, and what an estimate says."""
-    if not stands(frame.shown, f"frame {frame.number}", FINE) or not _estimate_printed(player, frame):
-        return False
-    if frame.tip is None:
-        return True
-    distance = _distance(player, frame, frame.tip)
-    # Samples are never nearer than the surface: by less than what is printed.
-    near = {millimetres(distance - off) for off in (0.0, 0.5e-4, 1e-4)}
-    return any(stands(frame.shown, text, GAUGE) for text in near)
-
-
-def _estimate_printed(player: Player, frame: Frame) -> bool:
-    """Whether a picture says how far the tumour moved, as is estimated, and how far off that is: as found here."""
-    found = frame.estimate
-    if found is None or found.location is None:
-        return True
-    anatomy, rest = player.site.anatomy, player.site.anatomy.mesh.nodes
-    true, moved = middle_of(
-        anatomy, np.stack([player.positions(frame.deformation) - rest, player.believed(frame) - rest])
-    )
-    off, length = float(np.linalg.norm(moved - true)), float(np.linalg.norm(moved))
-    lines = folded(frame.remark, NARROW * frame.shown.shape[1])
-    said = f"moved {millimetres(length, found.location.p95)}", *lines
-    return frame.remark.endswith(f"{1e3 * off:.1f} mm off") and all(stands(frame.shown, text, FINE) for text in said)
-
-
-def _distance(player: Player, frame: Frame, tip: np.ndarray) -> float:
-    """From tip to tumour [m] by samples of the drawn surfaces, with what the model knows it to be off by."""
-    positions = player.believed(frame)
-    corners = positions[player.stage.at(frame.loads).anatomy.tumour_surface]
-    apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", SAMPLES, corners) - tip, axis=2).min())
-    model = answering(player.deformer, frame.deformation)
-    if model is None:
-        return apart
-    return float(model.distance(frame.loads, frame.deformation, np.array([apart])).value[0])
+    return overlap, mean, np.inf if np.isnan(pixels) else float(pixels), drawn, honest(frame, mask)

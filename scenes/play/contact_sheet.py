@@ -36,7 +36,9 @@ def thumbnail(player: Player, name: str) -> Thumbnail:
     every = max(1, (len(player.scene.times) - 1) // (DRAWN - 1))
     frames = list(player.frames(every))
     best = max(frames, key=lambda frame: (_cuts(player, frame), frame.moved))
-    picture = panel(labelled(best, name), [player.scene.name], "top right", 0.9)
+    said = labelled(best, name)
+    taken = best.taken | (said != best.shown).any(axis=2).view(np.uint8)
+    picture = panel(said, [player.scene.name], "top right", 0.9, sights=[taken])
     return Thumbnail(shrunk(picture, *SIZE), _medians(frames[1:] or frames), 1e3 * max(frame.moved for frame in frames))
 
 

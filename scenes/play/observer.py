@@ -30,7 +30,7 @@ from ..script.tool import sphere
 TOUCHES, HIDES = 1e-3, 4e-3
 # Of a tool's corners so many that are nearest to those of the cortex are looked at, for where it touches.
 CORNERS = 32
-ELLIPSOID_COLOUR = (0.34, 0.71, 0.97)
+ELLIPSOID_COLOUR = (0.21, 0.30, 0.90)
 ELLIPSOID = 5
 """Segmentation id of the ellipsoid's layer, which no picture holds."""
 BALL, BALL_FACES = sphere()

@@ -14,6 +14,7 @@ from ar.browser import Browser
 from ar.history import History
 from ar.overlay import Style
 from ar.page_parts import Playback
+from ar.styles import Style
 from sim.errors import InputError
 from sim.loads import Loads
 from surrogate.data.dataset import digest_of_loads
@@ -65,11 +66,13 @@ class Demo:
         port: int,
         anatomy: str = "the default",
         find: Callable[[str], Scene] = find_scene,
+        style: Style = "window",
     ) -> None:
         """Open the page; `anatomy` is whose brain, in words, and `find` makes the scenes that visitors choose."""
         self.theatre, self.anatomy, self.first, self.find = theatre, anatomy, scene, find
         self.turn = threading.Lock()
         self._cast(scene, deformer)
+        self.wish.set(style=style)
         size, site = (scene.viewpoint.width, scene.viewpoint.height), theatre.site
         parts = self._parts(deformer)
         self.browser = Browser(

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import get_args
 
 import numpy as np
 
 from ar.hud import bearings
-from ar.overlay import Style
 from ar.page_aside import STYLE
 from ar.page_parts import Choice, Fold, Note, Slider, Toggle
+from ar.styles import STYLES, Style
 from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
 
 from ..script.camera_paths import PATHS
@@ -22,8 +21,6 @@ from .page_beside import TIP, TUMOUR_MIDDLE
 from .page_requests import HAND, SCRIPT, Wish
 from .page_text import effect_words
 
-STYLES = {"window": "outline and window", "contour": "outline", "fill": "outline and tint", "none": "none"}
-"""What a visitor calls the overlay's styles."""
 MOST_FORCE, MOST_DEPTH, MOST_TILT = 0.4, 8.0, 40.0
 """Ends of the sliders [N], [mm], [deg]."""
 STAYS = "stays"
@@ -45,7 +42,7 @@ def controls(
 
     `give` takes who gets the tool, `take` numbers of its touch, as `Wish.hand` does.
     """
-    styles: dict[str, Style] = {STYLES.get(str(style), str(style)): style for style in get_args(Style)}
+    styles: dict[str, Style] = {words: style for style, words in STYLES.items()}
     cameras = "as the scene has it", STAYS, *PATHS
 
     def film(name: str) -> None:

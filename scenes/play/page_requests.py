@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, field, replace
 
-from ar.overlay import Style
+from ar.styles import Style
 
 from ..script.tool_paths import Touch
 

@@ -20,10 +20,10 @@ from ..script.uncertainty import TumourError
 from .deformers import GUARDED, Theatre
 from .error_text import length
 from .load_text import acting
-from .observer import Estimate
+from .observer import ELLIPSOID_COLOUR, Estimate
 from .page_tally import Row
 from .player import Frame
-from .stage import Stage
+from .stage import TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 
 SEEN = (
     "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; "
@@ -67,17 +67,21 @@ def words(theatre: Theatre, scene: Scene, anatomy: str) -> str:
 def legend(scene: Scene) -> str:
     """What the lines mean, each beside a piece of it."""
     scan = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
+    now, true, ellipsoid = (_stroke(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
+    under = (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone")
     keys = [
-        ('stroke="#4cf28c" stroke-width="3"', "tumour now (predicted)"),
-        ('stroke="#4cf28c" stroke-width="1.5" stroke-dasharray="4 3"', "where it is, 95 of 100 times"),
+        (f'{now} stroke-width="3"', "tumour now (predicted)"),
+        under,
+        (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "where it is, 95 of 100 times"),
         scan,
-        ('stroke="#f259bf" stroke-width="1.5"', "finite elements (3-D view)"),
+        (f'{true} stroke-width="1.5"', "finite elements (3-D view)"),
     ]
     if scene.sight is not None:
         keys = [
-            ('stroke="#4cf28c" stroke-width="3"', "tumour now (estimate)"),
-            ('stroke="#f259bf" stroke-width="2" stroke-dasharray="8 3"', "tumour now (truth: finite elements)"),
-            ('stroke="#57b5f7" stroke-width="2" stroke-dasharray="5 3"', "its middle, with 95 % probability"),
+            (f'{now} stroke-width="3"', "tumour now (estimate)"),
+            under,
+            (f'{true} stroke-width="2" stroke-dasharray="8 3"', "tumour now (truth: finite elements)"),
+            (f'{ellipsoid} stroke-width="2" stroke-dasharray="5 3"', "its middle, with 95 % probability"),
             scan,
         ]
     if scene.tool is not None:
@@ -87,6 +91,11 @@ def legend(scene: Scene) -> str:
         for line, text in keys
     )
     return f'<div class="legend">{"".join(lines)}</div>'
+
+
+def _stroke(colour: Sequence[float]) -> str:
+    """A colour, sRGB in [0, 1], as a line has it in HTML."""
+    return 'stroke="#' + "".join(f"{round(255.0 * share):02x}" for share in colour) + '"'
 
 
 def about(theatre: Theatre, scene: Scene, anatomy: str) -> str:

@@ -10,14 +10,19 @@ from functools import cached_property
 import numpy as np
 
 from ar.camera import Camera
+from ar.gauge import Gauge
 from ar.hud import HEAD, NARROW, ROW, folded, lay, panel
 from ar.layer import Layer
-from ar.overlay import Gauge, Overlaid, Style, Trace, composite, draw_points
+from ar.legend import Names
+from ar.overlay import Overlaid, composite, draw_points
 from ar.renderer import Picture
+from ar.styles import Style
+from ar.traces import Trace
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
 from sim.geometry.ball_at_rest import resting_tip
 from sim.geometry.closest_point import closest
+from sim.geometry.surface import encloses
 from sim.loads import Loads
 from surrogate.model.guarded import answering
 from surrogate.model.learned import Learned
@@ -30,7 +35,7 @@ from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
 from .error_text import error_lines
 from .load_text import acting, doubt_of
 from .observer import Estimate
-from .stage import CORTEX, TOOL, Stage
+from .stage import CORTEX, DRAPE, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
 from .tip_reading import reading
 
 REFUSED = "what is seen was refused, and the scan is shown: do not rely on it"
@@ -200,7 +205,7 @@ class Player:
         gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
         promised = None if doubt else self._promised(deformation)
         error = NOT_KNOWN if doubt else self._tumour_error(touch, loads, promised or 0.0, estimate)
-        plain = None if gauge is None else replace(gauge, error=None)
+        shown = None if gauge is None else replace(gauge, error=error.bound)
         traces = () if estimate is None else traces_of(estimate, stage.truth(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
         band = 0.0 if estimate is not None else error.bound or 0.0
@@ -208,7 +213,8 @@ class Player:
         lines = error_lines(promised, error, trained, doubt, camera.width < FEW)
         head = [part for line in lines for part in folded(line, WIDE * camera.width)]
         over = composite(
-            picture, camera, tumour, (TOOL,), self.style, band, plain, rest, doubt, traces, moved, head
+            picture, camera, tumour, (TOOL,), self.style, band, shown, rest, doubt, traces, moved, head,
+            opening=OPENING, error=error.bound, names=names_of(estimate),
         )  # fmt: skip
         if estimate is not None and self.style != "none":
             draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
@@ -297,9 +303,17 @@ def traces_of(estimate: Estimate, truth: Layer) -> tuple[Trace, ...]:
     return Trace(ellipsoid, ELLIPSOID_STROKES, estimate.middle + estimate.motion), true
 
 
+def names_of(estimate: Estimate | None) -> Names:
+    """What the lines of a picture are called; an estimate that knows nothing has no ellipsoid."""
+    if estimate is None:
+        return PREDICTED_LINES
+    return ESTIMATED_LINES if estimate.location is not None else replace(ESTIMATED_LINES, traces=("truth",))
+
+
 def gauged(tip: np.ndarray, hidden: Layer) -> Gauge:
-    """From a tip (3,) [m] to the nearest point of a hidden surface."""
-    return Gauge(tip, closest(tip[None], hidden.vertices[hidden.triangles]).point[0])
+    """From a tip (3,) [m] to the nearest point of a hidden surface, and whether it is inside."""
+    corners = hidden.vertices[hidden.triangles]
+    return Gauge(tip, closest(tip[None], corners).point[0], inside=encloses(corners, tip))
 
 
 def annotate(over: Overlaid, number: int, remark: str) -> None:
@@ -320,4 +334,8 @@ def labelled(frame: Frame, name: str) -> np.ndarray:
         lines += [f"estimate: {frame.estimate.source}", f"lines: {LINES}"]
     if not frame.deformation.outcome[0].good:
         lines.append(frame.deformation.outcome[0].value)
-    return panel(frame.shown, lines, below=HEAD + ROW * len(frame.head))
+    seen = frame.picture.segmentation
+    sights = [frame.taken | hides.view(np.uint8) for hides in (seen != DRAPE, seen == TOOL)]
+    return panel(
+        frame.shown, lines, below=HEAD + ROW * len(frame.head), sights=[*sights, (seen == TOOL).view(np.uint8)]
+    )

@@ -9,7 +9,9 @@ import numpy as np
 
 from ar.camera import Camera
 from ar.layer import Layer, Solid, vertex_normals
+from ar.legend import Names
 from ar.renderer import Lamp, Picture, Renderer, lamp_beside
+from ar.styles import Opening
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity
 from sim.discretisation.resected_body import Remains, bodies
@@ -30,11 +32,17 @@ NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool"}
 CORTEX_COLOUR = (0.86, 0.60, 0.54)
 DRAPE_COLOUR = (0.16, 0.36, 0.42)
 TOOL_COLOUR = (0.78, 0.80, 0.83)
-TUMOUR_COLOUR = (0.30, 0.95, 0.55)
-TRUTH_COLOUR = (0.95, 0.35, 0.75)
+# Lines that eyes without red or green tell apart, and see on cortex and drape: tests/test_scenes_styles.py.
+TUMOUR_COLOUR = (0.20, 0.94, 0.42)
+TRUTH_COLOUR = (0.90, 0.35, 0.78)
 """Of the tumour where the finite elements have it."""
 # What a scan's black leaves of the cortex's colour, and how much deeper it lies than white [m].
 DARK, RELIEF = (0.34, 0.10, 0.10), 1.5e-3
+OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
+"""What the tumour is seen through, and what is said of the rest."""
+PREDICTED_LINES = Names("predicted tumour", "its error, 95 %", "in the scan")
+ESTIMATED_LINES = Names("estimated tumour", "", "in the scan", ("95 % of its middle", "truth"))
+"""What the lines are called in a picture, and in one of an estimate."""
 # Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
 READ_BELOW = 2.0e-3
 # So far under the bone the cortex may come to light [m].

@@ -8,7 +8,8 @@ import numpy as np
 
 from ar.camera import look_at
 from ar.hud import panel
-from ar.overlay import DASHED, composite, dash, outlines, silhouette
+from ar.outlines import dash, outlines, silhouette
+from ar.overlay import DASHED, composite
 from sim.bodies.intensity import read_intensity, sidecar
 from sim.geometry.ball_at_rest import resting_tip
 from sim.loads import Pushed

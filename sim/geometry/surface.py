@@ -70,6 +70,19 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.where(length > 0.0, length, 1.0)
 
 
+def encloses(corners: np.ndarray, point: np.ndarray) -> bool:
+    """Whether a closed surface of triangles with corners (S, 3, 3) [m] has a point (3,) [m] inside it.
+
+    By its winding number: the solid angles of all triangles add up to a whole turn or to none, whichever way they face.
+    """
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    x, y, z = (np.linalg.norm(arm, axis=1) for arm in (a, b, c))
+    volume = np.einsum("si,si->s", a, np.cross(b, c))
+    ab, bc, ca = (np.einsum("si,si->s", one, other) for one, other in ((a, b), (b, c), (c, a)))
+    half = np.arctan2(volume, x * y * z + ab * z + bc * x + ca * y)
+    return bool(abs(half.sum()) > np.pi)
+
+
 def edge_lengths(corners: np.ndarray) -> np.ndarray:
     """Of each edge (S, 3) [m] of triangles with corners (S, 3, 3) [m]."""
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)

@@ -1,0 +1,121 @@
+"""What the lines of an overlay are, in the picture's own corner; and the scale of its tint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from .hud import FONT, HEAD, WHITE, haloed
+from .outlines import OPAQUE
+from .places import CLEAR, PAD
+from .window import DARK, FAINTEST, STEP, STEPS, STRONGEST
+
+# Scale of its letters, length of a line's sample, and of the gap after it [pixel].
+SMALL, SAMPLE, AFTER = 0.4, 26, 6
+# Heights of a line of text and of a step of the tint's scale [pixel]; in a narrower picture there is neither.
+LEADING, TALL, LEAST = 16, 12, 480
+# The tint's scale is shown on ground of this colour.
+GROUND = (200.0, 150.0, 135.0)
+
+
+@dataclass(frozen=True)
+class Names:
+    """What a legend calls the lines of an overlay; those without a name are left out.
+
+    Parameters
+    ----------
+    now, margin, before
+        The hidden surface, the dashed line round it, and where it was before.
+    traces
+        Other surfaces, in the order in which they are given.
+    """
+
+    now: str = ""
+    margin: str = ""
+    before: str = ""
+    traces: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line's name, ink (3,) in 0 .. 255, strokes and gaps [pixel] (None: solid) and width [pixel]."""
+
+    name: str
+    ink: tuple[float, ...]
+    pattern: tuple[int, int] | None = None
+    width: int = 2
+
+
+@lru_cache(maxsize=16)
+def legend(entries: tuple[Entry, ...]) -> np.ndarray:
+    """A sheet (h, w, 4) uint8, colour times coverage and coverage: a sample of each line, and its name."""
+    wide = max(cv2.getTextSize(entry.name, FONT, SMALL, 1)[0][0] for entry in entries)
+    sheet = np.zeros((LEADING * len(entries), SAMPLE + AFTER + wide + 4, 4), np.uint8)
+    for number, entry in enumerate(entries):
+        row = LEADING * number + LEADING // 2
+        stroke, gap = entry.pattern or (SAMPLE, 0)
+        strokes = [(left, min(left + stroke, SAMPLE) - 1) for left in range(2, SAMPLE - 2, stroke + gap)]
+        for ink, width in ((DARK, entry.width + 2), (entry.ink, entry.width)):
+            for left, right in strokes:
+                cv2.line(sheet, (left, row), (right, row), (*ink, OPAQUE), width, cv2.LINE_AA)
+        haloed(sheet, entry.name, (SAMPLE + AFTER, row + 4), SMALL)
+    return sheet
+
+
+@lru_cache(maxsize=4)
+def depth_scale(ink: tuple[float, ...], caption: str) -> np.ndarray:
+    """A sheet (h, w, 4) uint8: the tint of the depth style from the ground down, with millimetres and a caption."""
+    lines = caption.split("\n")
+    wide = max(cv2.getTextSize(line, FONT, SMALL, 1)[0][0] for line in lines)
+    sheet = np.zeros((LEADING * len(lines) + STEPS * TALL + 10, wide + 4, 4), np.uint8)
+    for number, line in enumerate(lines):
+        haloed(sheet, line, (0, LEADING * number + 12), SMALL)
+    top = LEADING * len(lines) + 4
+    for step in range(STEPS):
+        tint = STRONGEST - (STRONGEST - FAINTEST) * step / (STEPS - 1)
+        row = top + step * TALL
+        sheet[row : row + TALL, 2:16, :3] = (1.0 - tint) * np.array(GROUND) + tint * np.array(ink)
+        sheet[row : row + TALL, 2:16, 3] = OPAQUE
+        if step % 2 == 0:
+            cv2.line(sheet, (16, row), (20, row), (*WHITE, OPAQUE), 1)
+            haloed(sheet, f"{1e3 * STEP * step:.0f}", (24, row + 4), SMALL)
+    return sheet
+
+
+def place_sheet(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, sights: np.ndarray) -> bool:
+    """Lay a sheet at the right of a picture, or else at its left, where nothing is in the way; whether there is room.
+
+    Parameters
+    ----------
+    colour, taken
+        The picture (H, W, 3) uint8; (H, W) uint8, above 0 where lines and words are. Both change in place.
+    sheet
+        (h, w, 4) uint8: colour times coverage, and coverage.
+    sights
+        (H, W) uint8: above 0 on what should stay in sight, as tools.
+    """
+    (height, width), (tall, wide) = taken.shape, sheet.shape[:2]
+    if width < LEAST:
+        return False
+    upper, lower = height // 2 - HEAD // 2, height // 2 + HEAD // 2  # letters of sides come between, and at both ends
+    rows = [row for row in (HEAD, upper - tall) if HEAD <= row <= upper - tall]
+    rows += [row for row in (lower, height - HEAD - tall) if lower <= row <= height - HEAD - tall]
+    for column in (width - PAD - wide, PAD):
+        for row in rows:
+            around = np.s_[row - CLEAR : row + tall + CLEAR, column - CLEAR : column + wide + CLEAR]
+            if not taken[around].any() and not sights[around].any():
+                paste(colour, taken, sheet, (column, row))
+                return True
+    return False
+
+
+def paste(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, at: tuple[int, int]) -> None:
+    """Lay a sheet (h, w, 4) uint8 over a picture (H, W, 3) uint8 at a column and a row, and take its place."""
+    column, row = at
+    box = np.s_[row : row + sheet.shape[0], column : column + sheet.shape[1]]
+    left = 1.0 - sheet[..., 3:] / np.float32(OPAQUE)
+    colour[box] = np.minimum(colour[box] * left + sheet[..., :3], 255.0)
+    taken[box] = 1

@@ -1,0 +1,155 @@
+"""What a frame's picture shows, found again from its pixels: outline, numbers, and what is not seen through cortex."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ar.camera import Camera
+from ar.gauge import GAUGE, gauge_words
+from ar.hud import FINE, NARROW, WHITE, folded, millimetres
+from ar.layer import Layer
+from ar.outlines import ink_of
+from ar.overlay import BROKEN, DOUBTFUL, HIDDEN, ground_lines
+from ar.raycast import raycast
+from ar.refind import changed_share, found_at, inked_share, of_ink, outline_gap, stands
+from ar.styles import NOTICED, WHOLE
+from sim.geometry.surface import encloses
+from surrogate.locating.prior import middle_of
+from surrogate.model.guarded import answering
+
+from .player import TRUE_STROKES, Frame, Player
+from .stage import OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
+
+# Barycentric weights (q, 3) at which the tumour's triangles are sampled: corners, edges and insides.
+STEPS = 24
+SAMPLES = np.array([(i, j, STEPS - i - j) for i in range(STEPS + 1) for j in range(STEPS + 1 - i)]) / STEPS
+
+# A share of the silhouette may be found off by so much.
+SLACK = 0.02
+# Of a broken outline's pixels this share has its ink; of ground that nothing shines through, so much may be changed.
+BROKEN_SHARES, CHANGED = (0.35, 0.88), 0.5
+# The soft ends of two strokes [pixel]: their ink is not the outline's.
+SOFT = 2
+# So far the number may stand from the tip, as a share of the picture's width.
+FAR = 0.3
+
+
+def silhouette_of(camera: Camera, layer: Layer) -> np.ndarray:
+    """(H, W) bool: the pixels that a surface covers, by the renderer that is not the picture's own."""
+    return raycast(camera, layer.vertices, layer.triangles).mask
+
+
+def drawn_off(frame: Frame, mask: np.ndarray) -> float:
+    """How far the outline in a frame's picture is from that of a silhouette (H, W) bool [pixel].
+
+    What is drawn broken, for closed ground covers it or it may not be relied on, may have gaps.
+    """
+    ink, shut = ink_of(DOUBTFUL if frame.doubt else TUMOUR_COLOUR), closed(frame)
+    above = _above(frame)
+    gap = BROKEN[1] + SOFT if frame.doubt else 0
+    return max(
+        outline_gap(frame.shown, ink, mask, above | shut, gap=gap),
+        outline_gap(frame.shown, ink, mask, above | ~shut, sum(HIDDEN), HIDDEN[1] + SOFT),
+    )
+
+
+def truth_off(frame: Frame, mask: np.ndarray) -> float:
+    """The same of the truth's outline, drawn beside an estimate's, whose own is drawn over it."""
+    above = _above(frame) | of_ink(frame.shown, ink_of(TUMOUR_COLOUR))
+    return outline_gap(frame.shown, ink_of(TRUTH_COLOUR), mask, above, 2 * sum(TRUE_STROKES))
+
+
+def _above(frame: Frame) -> np.ndarray:
+    """(H, W) bool: words and tools."""
+    return (frame.shown == np.asarray(WHITE, np.uint8)).all(axis=2) | (frame.picture.segmentation == TOOL)
+
+
+def closed(frame: Frame) -> np.ndarray:
+    """(H, W) bool: ground that the tumour is not seen through, and no tool."""
+    return ~np.isin(frame.picture.segmentation, (*OPENING.ids, TOOL))
+
+
+def honest(frame: Frame, mask: np.ndarray) -> bool:
+    """Whether a picture shows that a part of a silhouette (H, W) bool is not seen through cortex, where one is not.
+
+    There its outline is broken, nothing shines through, and the picture says what it lies under.
+    """
+    ink, shut = ink_of(DOUBTFUL if frame.doubt else TUMOUR_COLOUR), closed(frame)
+    least, most = BROKEN_SHARES
+    inked = inked_share(frame.shown, ink, mask, _above(frame) | ~shut)
+    changed = changed_share(frame.picture.colour, frame.shown, mask & shut)
+    return _said(frame, mask) and not (inked < least or inked > most or changed > CHANGED)  # NaN: none is there
+
+
+def _said(frame: Frame, mask: np.ndarray) -> bool:
+    seen = frame.picture.segmentation[mask & (frame.picture.segmentation != TOOL)]
+    layers, counts = (each.tolist() for each in np.unique(seen, return_counts=True))
+    share = float(np.isin(seen, OPENING.ids, invert=True).mean()) if len(seen) else 0.0
+    if share < NOTICED + SLACK:
+        return True
+    words = OPENING.said(dict(zip(layers, counts, strict=True))).removeprefix("partly ")
+    allowed = [words] * (share > WHOLE - SLACK) + [f"partly {words}"] * (share < WHOLE + SLACK)
+    return any(all(stands(frame.shown, line, FINE) for line in ground_lines(said)) for said in allowed)
+
+
+def printed(player: Player, frame: Frame) -> bool:
+    """Whether a picture says its frame's number, how far the tip is from the tumour, and what an estimate says."""
+    if not stands(frame.shown, f"frame {frame.number}", FINE) or not _estimate_printed(player, frame):
+        return False
+    return frame.tip is None or _number(player, frame, frame.tip) is not None
+
+
+def beside_tip(player: Player, frame: Frame) -> bool:
+    """Whether a picture has the distance whole, and near the tip, or near the border where the tip is out of sight."""
+    if frame.tip is None:
+        return True
+    (tip,), _ = frame.camera.project(frame.tip[None])
+    found = _number(player, frame, frame.tip)
+    if found is None or not np.isfinite(tip).all():
+        return found is not None
+    height, width = frame.shown.shape[:2]
+    tip = np.clip(tip, 0, (width - 1, height - 1))
+    away = tip - np.clip(tip, found[:2], found[2:])
+    return bool(np.linalg.norm(away) <= FAR * width)
+
+
+def _number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, int, int, int] | None:
+    """The box of the distance where it stands in a picture; None where it does not."""
+    corners = _corners(player, frame)
+    distance, inside = _distance(player, frame, corners, tip), encloses(corners, tip)
+    error = None if frame.doubt else frame.tumour_error.bound
+    for off in (0.0, 0.5e-4, 1e-4):  # samples are never nearer than the surface: by less than what is printed
+        text = gauge_words(distance - off, error, inside)
+        at = found_at(frame.shown, text, GAUGE)
+        if at is not None:
+            return at
+    return None
+
+
+def _estimate_printed(player: Player, frame: Frame) -> bool:
+    """Whether a picture says how far the tumour moved, as is estimated, and how far off that is: as found here."""
+    found = frame.estimate
+    if found is None or found.location is None:
+        return True
+    anatomy, rest = player.site.anatomy, player.site.anatomy.mesh.nodes
+    true, moved = middle_of(
+        anatomy, np.stack([player.positions(frame.deformation) - rest, player.believed(frame) - rest])
+    )
+    off, length = float(np.linalg.norm(moved - true)), float(np.linalg.norm(moved))
+    lines = folded(frame.remark, NARROW * frame.shown.shape[1])
+    said = f"moved {millimetres(length, found.location.p95)}", *lines
+    return frame.remark.endswith(f"{1e3 * off:.1f} mm off") and all(stands(frame.shown, text, FINE) for text in said)
+
+
+def _corners(player: Player, frame: Frame) -> np.ndarray:
+    """Corners (S, 3, 3) [m] of the tumour's triangles as they are drawn."""
+    return player.believed(frame)[player.stage.at(frame.loads).anatomy.tumour_surface]
+
+
+def _distance(player: Player, frame: Frame, corners: np.ndarray, tip: np.ndarray) -> float:
+    """From tip to tumour [m] by samples of the drawn surfaces, with what the model knows it to be off by."""
+    apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", SAMPLES, corners) - tip, axis=2).min())
+    model = answering(player.deformer, frame.deformation)
+    if model is None:
+        return apart
+    return float(model.distance(frame.loads, frame.deformation, np.array([apart])).value[0])

@@ -1,0 +1,224 @@
+"""Each style shows what it says: in register, under tools, broken where it is not seen through the opening."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from ar.camera import look_at
+from ar.cut import EMPTY, Plane, plane_through, profile, section
+from ar.distances import distance_of_seen, signed_distance, tree_of
+from ar.gauge import GAUGE, Gauge, gauge_words
+from ar.hud import FINE, WHITE, panel
+from ar.layer import Layer
+from ar.legend import Names
+from ar.outlines import ink_of, key_of, silhouette
+from ar.overlay import composite
+from ar.refind import found_at, of_ink, outline_gap, stands
+from ar.renderer import Lamp, render
+from ar.rings import RING, RINGS, draw_rings
+from ar.styles import STYLES, Opening
+from ar.window import SHUT, Roles
+
+CORTEX, TOOL, TUMOUR, DRAPE = 1, 2, 3, 4
+GREEN = (0.2, 0.94, 0.42)
+OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
+DRAWN = [style for style in STYLES if style != "none"]
+CAMERA = look_at(np.array([0.0, -0.05, 0.25]), np.zeros(3), np.array([0.0, 1.0, 0.0]), np.radians(25.0), 640, 480)
+
+
+def ball(name, layer, centre, radius, colour=GREEN):
+    made = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    return Layer(name, layer, made.vertices + np.array(centre), made.faces, colour)
+
+
+def sheet(name, layer, left, right, colour=(0.86, 0.60, 0.54)):
+    corners = np.array([[left, -0.09, 0.0], [right, -0.09, 0.0], [right, 0.09, 0.0], [left, 0.09, 0.0]])
+    return Layer(name, layer, corners, np.array([[0, 1, 2], [0, 2, 3]]), colour)
+
+
+def tumour(centre=(0.0, 0.0, -0.02), radius=0.012):
+    return ball("tumour", TUMOUR, centre, radius)
+
+
+def seen(edge=0.09, *more):
+    """Cortex as far as `edge` to the right, and drape beyond it."""
+    layers = [sheet("cortex", CORTEX, -0.09, edge)]
+    layers += [sheet("drape", DRAPE, edge, 0.1, (0.16, 0.36, 0.42))] * (edge < 0.09)
+    return render(CAMERA, [*layers, *more], Lamp(np.array([0.05, 0.0, 0.3]), np.zeros(3), 0.1))
+
+
+@pytest.mark.parametrize("style", DRAWN)
+def test_every_style_has_the_outline_in_register_and_a_band(style):
+    picture, at = seen(), tumour()
+    shown = composite(picture, CAMERA, at, style=style, opening=OPENING).colour
+    mask = silhouette(CAMERA, at.vertices, at.triangles)
+    words = (shown == np.asarray(WHITE, np.uint8)).all(axis=2)
+    others = words | of_ink(shown, RING)
+    assert outline_gap(shown, ink_of(GREEN), mask, others) < 1.5
+    assert outline_gap(shown, ink_of(GREEN), np.roll(mask, 5, axis=1), others) > 3.0
+    wide = composite(picture, CAMERA, at, style=style, opening=OPENING, margin=0.004).colour
+    outside = cv2.dilate(mask.astype(np.uint8), np.ones((15, 15))) == 0
+    assert 100 < (outside & (wide != shown).any(axis=2)).sum() < 2000
+    doubtful = composite(picture, CAMERA, at, style=style, opening=OPENING, doubt="do not rely on it").colour
+    assert not of_ink(doubtful, ink_of(GREEN)).any()
+
+
+@pytest.mark.parametrize("style", DRAWN)
+def test_tools_and_masks_stay_in_front_of_every_style(style):
+    probe = ball("tool", TOOL, (0.0, 0.0, 0.012), 0.01, (0.7, 0.7, 0.7))
+    picture = seen(0.09, probe)
+    gauge = Gauge(np.array([0.0, 0.0, 0.001]), np.array([0.0, 0.0, -0.008]))
+    hand = np.zeros(picture.segmentation.shape, bool)
+    hand[230:420, 250:300] = True
+    given = {"style": style, "margin": 0.002, "gauge": gauge, "opening": OPENING}
+    shown = composite(picture, CAMERA, tumour(), (TOOL,), covered=hand, **given).colour
+    tool = picture.segmentation == TOOL
+    assert np.array_equal(shown[tool | hand], picture.colour[tool | hand])
+    bare = composite(picture, CAMERA, tumour(), **given).colour
+    assert (bare[tool] != picture.colour[tool]).any() and (bare[hand] != picture.colour[hand]).any()
+
+
+@pytest.mark.parametrize("style", DRAWN)
+def test_under_the_drape_the_outline_is_broken_and_nothing_shines_through(style):
+    picture, at = seen(0.0), tumour()
+    shown = composite(picture, CAMERA, at, style=style, opening=OPENING).colour
+    mask, shut = silhouette(CAMERA, at.vertices, at.triangles), picture.segmentation == DRAPE
+    outline = np.zeros(mask.shape, np.uint8)
+    cv2.drawContours(outline, cv2.findContours(mask.astype(np.uint8), 0, 1)[0], -1, (1,))
+    inked = of_ink(shown, ink_of(GREEN)) & (outline > 0)
+    far = cv2.dilate(shut.astype(np.uint8), np.ones((9, 9))) == 0
+    assert 0.4 < inked[(outline > 0) & shut].mean() < 0.85 and inked[(outline > 0) & far].mean() > 0.95
+    within = cv2.erode((mask & shut).astype(np.uint8), np.ones((13, 13))) > 0
+    unchanged = (shown == picture.colour).all(axis=2)
+    assert unchanged[within].mean() > 0.6  # all but words
+    assert all(stands(shown, line, FINE) for line in ("partly under", "the drape"))
+    open_to_all = composite(picture, CAMERA, at, style=style).colour
+    assert (of_ink(open_to_all, ink_of(GREEN)) & (outline > 0))[(outline > 0) & shut].mean() > 0.95
+
+
+def test_what_is_said_of_the_ground():
+    assert OPENING.said({CORTEX: 95, DRAPE: 5}) == OPENING.said({}) == ""
+    assert OPENING.said({CORTEX: 50, DRAPE: 30, 7: 20}) == "partly under the drape"
+    assert OPENING.said({CORTEX: 50, DRAPE: 20, 7: 30}) == "partly seen through bone"
+    assert OPENING.said({DRAPE: 95, CORTEX: 5}) == "under the drape"
+
+
+def test_depth_is_the_stronger_the_nearer_and_has_a_scale():
+    picture = seen(0.0)
+    row, column = CAMERA.project(np.array([[-0.004, 0.0, -0.02]]))[0][0, ::-1].round().astype(int)
+    red = []
+    for depth in (0.015, 0.025, 0.04):
+        shown = composite(picture, CAMERA, tumour((0.0, 0.0, -depth), 0.01), style="depth", opening=OPENING, error=2e-3)
+        red.append(int(shown.colour[row, column, 0]))
+    assert red[0] < red[1] - 10 < red[2] - 20  # less of the cortex's red under more of the tint
+    changed = (
+        shown.colour
+        != composite(picture, CAMERA, tumour((0.0, 0.0, -0.04), 0.01), style="contour", opening=OPENING).colour
+    ).any(axis=2)
+    assert changed[:, 480:].sum() > 1000  # the scale, on the drape
+
+
+def test_rings_lie_where_the_distance_is_what_they_say():
+    picture, at = seen(), tumour((0.0, 0.0, -0.014))
+    whole, free = np.s_[0:480, 0:640], np.ones((480, 640), bool)
+    far = distance_of_seen(tree_of(at.vertices, at.triangles), CAMERA, whole, picture.drawn.depth[0], free, 18e-3)
+    sheet = np.zeros((480, 640, 4), np.uint8)
+    assert draw_rings(sheet, far, free) == ["5", "10", "15"]
+    rows, columns = np.nonzero(sheet[..., 3] == 255)
+    points = CAMERA.unproject(np.stack([columns, rows], axis=1).astype(float), picture.depth[rows, columns])
+    distance = np.linalg.norm(points - [0.0, 0.0, -0.014], axis=1) - 0.012
+    off = np.abs(distance[:, None] - np.array(RINGS)).min(axis=1)
+    assert len(off) > 1000 and np.percentile(off, 80) < 0.5e-3  # the others are of numbers
+    shown = composite(picture, CAMERA, at, style="rings").colour
+    assert (shown != composite(picture, CAMERA, at, style="contour").colour).any(axis=2).sum() > 1000
+
+
+def test_a_cut_holds_camera_tip_and_middle():
+    middle, tip = np.array([0.0, 0.0, -0.02]), np.array([0.01, 0.004, 0.0])
+    plane = plane_through(CAMERA, middle, tip)
+    normal = np.cross(plane.across, plane.along)
+    assert np.abs([(tip - middle) @ normal, (CAMERA.centre - middle) @ normal]).max() < 1e-12
+    assert plane.across @ CAMERA.T_camera_world[0, :3] > 0.0
+    level = plane_through(CAMERA, middle, CAMERA.centre + 0.9 * (middle - CAMERA.centre))
+    np.testing.assert_allclose(level.across, plane_through(CAMERA, middle, None).across)
+    assert abs(level.across @ CAMERA.T_camera_world[1, :3]) < 1e-12
+    places = np.array([[0.002, -0.01], [0.0, 0.0]])
+    np.testing.assert_allclose(plane.coordinates(plane.points(places)), places, atol=1e-15)
+
+
+def test_a_cut_shows_the_surface_the_section_and_nothing_in_the_air():
+    picture, at = seen(0.0), tumour()
+    plane: Plane = plane_through(CAMERA, at.vertices.mean(axis=0), None)
+    roles = Roles((), (CORTEX,)).of(picture.segmentation)
+    places, what = profile(CAMERA, plane, picture.depth, roles, 0.04)
+    assert np.abs(plane.points(places)[:, 2]).max() < 2e-4  # the sheet lies at z = 0
+    right = plane.points(places)[:, 0] > 5e-4
+    assert (what[right] == SHUT).all() and not what[plane.points(places)[:, 0] < -5e-4].any()
+    ink = key_of(ink_of(GREEN))
+    inset = section(CAMERA, at, plane, (places, what), (240, 180), ink)
+    bar = np.flatnonzero((inset[-6] == np.asarray(WHITE, np.uint8)).all(axis=1))
+    scale = (np.ptp(bar) - 1) / 0.01  # the bar is 10 mm
+    assert of_ink(inset, ink).sum() == pytest.approx(np.pi * (0.012 * scale) ** 2, rel=0.1)
+    assert of_ink(inset, EMPTY)[:8].mean() > 0.8 and not of_ink(inset, EMPTY)[-60:-20].any()
+
+
+def test_distances_are_signed_and_end():
+    surface = tumour((0.0, 0.0, 0.0), 0.01)
+    turned = replace(surface, triangles=surface.triangles[:, ::-1])
+    points = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.0, 0.005, 0.0], [0.5, 0.0, 0.0]])
+    for each in (surface, turned):
+        found = signed_distance(tree_of(each.vertices, each.triangles), points, 0.1)
+        assert found[:3] == pytest.approx([-0.01, 0.01, -0.005], abs=2e-4) and np.isnan(found[3])
+
+
+@pytest.mark.parametrize("tip", [(0.0, 0.0), (0.052, 0.03), (-0.07, 0.0), (0.0, -0.09), (0.3, 0.3)])
+def test_the_number_stands_beside_the_tip_inside_the_frame(tip):
+    picture = seen()
+    gauge = Gauge(np.array([*tip, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
+    shown = composite(picture, CAMERA, tumour(), gauge=gauge).colour
+    found = found_at(shown, str(gauge), GAUGE)
+    assert found is not None
+    left, top, right, foot = found
+    assert left >= 4 and top >= 4 and right <= 636 and foot <= 476
+    pixel = np.clip(CAMERA.project(gauge.tip[None])[0][0], 0, (639, 479))
+    assert np.linalg.norm(pixel - np.clip(pixel, found[:2], found[2:])) < 110
+
+
+def test_a_tip_inside_is_said_to_be():
+    assert gauge_words(2.1e-3, None, True) == "inside, 2.1 mm from its edge"
+    assert gauge_words(2.1e-3, 1e-3, False) == "2.1 +- 1.0 mm"
+    gauge = Gauge(np.array([0.0, 0.0, -0.02]), np.array([0.0, 0.0, -0.008]), inside=True)
+    assert stands(composite(seen(), CAMERA, tumour(), gauge=gauge).colour, "inside, 12.0 mm from its edge", GAUGE)
+
+
+def test_the_legend_names_lines_without_their_ink_and_leaves_the_cortex_in_sight():
+    picture, at = seen(0.0), tumour()
+    names = Names("it", "its error", "before")
+    plain, named = (
+        composite(picture, CAMERA, at, margin=0.003, before=at, opening=OPENING, names=each).colour
+        for each in (Names(), names)
+    )
+    changed = (plain != named).any(axis=2)
+    assert changed.sum() > 500 and (picture.segmentation[changed] == DRAPE).all()
+    assert not of_ink(named, ink_of(GREEN))[changed].any()
+    crowded = composite(seen(), CAMERA, at, margin=0.003, before=at, opening=OPENING, names=names).colour
+    without = composite(seen(), CAMERA, at, margin=0.003, before=at, opening=OPENING).colour
+    assert np.array_equal(crowded, without)  # there is cortex everywhere: no room
+
+
+def test_a_panel_moves_out_of_sight_of_what_it_would_hide():
+    colour, hidden = np.full((360, 640, 3), 90, np.uint8), np.zeros((360, 640), np.uint8)
+    hidden[:, :400] = 1
+    lines = ["a line that is as wide as more than half of the picture, or wider", "another"]
+    shown = panel(colour, lines, below=40, sights=[np.ones_like(hidden), hidden])
+    changed = (shown != colour).any(axis=2)
+    assert changed.any() and not changed[:, :400].any()
+    assert np.array_equal(panel(colour, lines, sights=[np.ones_like(hidden)]), panel(colour, lines))
+
+
+def test_a_mask_of_another_size_is_refused():
+    with pytest.raises(ValueError, match="covered"):
+        composite(seen(), CAMERA, tumour(), covered=np.zeros((4, 4), bool))
