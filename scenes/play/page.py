@@ -12,7 +12,6 @@ from html import escape
 
 from ar.browser import Browser
 from ar.history import History
-from ar.overlay import Style
 from ar.page_parts import Playback
 from ar.styles import Style
 from sim.errors import InputError
