@@ -13,7 +13,7 @@ import pytest
 from theatres import template_theatre
 
 from ar.layer import Layer
-from ar.overlay import ink_of, silhouette
+from ar.outlines import ink_of, silhouette
 from ar.real_picture import real_picture
 from ar.refind import of_ink, outline_gap
 from ar.tracking.live_camera import camera_pictures, newest

@@ -21,6 +21,7 @@ from .demo import add_bodies
 from .interrupt import until_ended
 from .json_line import json_line
 from .outputs import add_force, claimed
+from .style_option import add_style
 from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from ..play.overlay_run import Shown
     from ..script.scene import Scene
 
-STYLES = ("window", "contour", "fill", "none")
 FILMS = (".mp4", ".gif", ".webp")
 TABLE = "a table of `sulcus overlay`"
 # Only this machine reaches a camera's page.
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FILM.mp4", help="the film with its overlay: .mp4, .gif or .webp")
     parser.add_argument("--table", type=Path, metavar="ROWS.csv", help="a row for each picture: state, place, error")
-    parser.add_argument("--style", choices=STYLES, default="window", help="how it is drawn (default %(default)s)")
+    add_style(parser)
     parser.add_argument("--rate", type=float, default=30.0, help="pictures a second, of a folder (default %(default)s)")
     parser.add_argument(
         "--live", action="store_true", help="play the film as a camera would: pictures that come too fast are lost"

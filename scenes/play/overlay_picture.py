@@ -8,36 +8,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from ar.camera import Camera
+from ar.gauge import Gauge
 from ar.hud import folded
 from ar.layer import Layer
-from ar.overlay import (
-    BEFORE,
-    DOTTED,
-    Gauge,
-    Overlaid,
-    Style,
-    box_around,
-    composite,
-    dash,
-    ink_of,
-    joined,
-    outlines,
-    silhouette,
-    write_doubt,
-    write_head,
-)
+from ar.outlines import box_around, dash, ink_of, joined, outlines, silhouette
+from ar.overlay import Overlaid, composite, write_doubt, write_head
 from ar.real_picture import real_picture
+from ar.styles import Opening, Style
+from ar.traces import BEFORE, DOTTED
 
 from ..script.tracked_tool import TrackedTool
 from ..script.uncertainty import DEVIATIONS
 from .error_text import length
 from .overlay_follower import Known, State
 from .player import WIDE, gauged
-from .stage import TOOL, TOOL_COLOUR, Stage
+from .stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
 
 REST = "as in the scan: no motion is known"
 ABOVE = "the tool does not touch: as in the scan"
 NOT_KNOWN = "error by tissue and segmentation: not known"
+SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
+"""Only the opening in the skull is known."""
 IN_GREY = (State.NO_TOOL, State.STALE, State.NO_REFERENCE)
 """States in which the tumour is drawn in grey, and dotted."""
 
@@ -81,12 +72,13 @@ class Painter:
         head = [part for line in head_lines(known) for part in folded(line, WIDE * camera.width)]
         return composite(
             picture, camera, tumour, (TOOL,), self.style, band, gauge, before, doubt,
-            moved=(known.motion.moved, known.motion.error), head=head,
+            moved=(known.motion.moved, known.motion.error), head=head, opening=SEEN_THROUGH, error=known.band,
+            names=PREDICTED_LINES,
         )  # fmt: skip
 
     def _layers(self, known: Known) -> list[Layer]:
-        """The cortex, under which the tumour lies, and the tool, which is in front."""
-        cortex = self.stage.visible(known.motion.positions)
+        """The open cortex, under which the tumour is seen, and the tool, which is in front."""
+        cortex = self.stage.cortex(known.motion.positions)
         if self.tool is None or known.T_scan_tool is None:
             return [cortex]
         vertices, triangles = self.tool.mesh

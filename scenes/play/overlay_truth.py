@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from ar.calibration import Calibration
-from ar.overlay import iou, silhouette
+from ar.outlines import iou, silhouette
 
 from ..script.film_truth import Truth
 from .overlay_follower import Known

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ar.overlay import Style
+from ar.styles import Style
 
 from .page_referee import Truth
 from .page_verdict import Judged

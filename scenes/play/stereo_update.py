@@ -10,7 +10,7 @@ import numpy as np
 
 from ar.camera import Camera
 from ar.disparity import Cloud, StereoView, cloud, viewed
-from ar.overlay import silhouette
+from ar.outlines import silhouette
 from ar.point_flow import followed, supported
 from ar.rectified import rectified
 from sim.errors import InputError
