@@ -177,7 +177,7 @@ class TestWithoutATool:
             assert not (frame.picture.segmentation == TOOL).any()
             assert (frame.shown != frame.picture.colour).any()
         lines = []
-        monkeypatch.setattr("scenes.play.player.panel", lambda colour, text, below: lines.extend(text) or colour)
+        monkeypatch.setattr("scenes.play.player.panel", lambda colour, text, **given: lines.extend(text) or colour)
         labelled(frames[-1], "fem")
         assert any("gravity pulls to the left (0.87) and the back (0.50)" in line for line in lines)
         assert not any("0.00 N" in line for line in lines)
@@ -201,7 +201,7 @@ class TestWithoutATool:
         demo = Demo(theatre, sinking(), "fem", "127.0.0.1", free_port())
         try:
             assert (
-                set(demo.browser.inputs) == {"scene", "deformer", "overlay", "Gravity"}
+                set(demo.browser.inputs) == {"scene", "deformer", "overlay", "camera", "Gravity"}
                 and "tool" not in demo.browser.meshes
             )
             assert wait_for(lambda: demo.run(0.3) and "gravity pulls" in demo.browser.shown[2])

@@ -18,6 +18,7 @@ from scenes.play.effect_ablation import without
 from scenes.play.page import Demo
 from scenes.play.page_referee import Referee
 from scenes.play.page_requests import HAND, SCRIPT
+from scenes.play.page_view import move_bodies
 from scenes.play.player import Frame, Player
 from scenes.play.replay import IN_ORDER, Course, Reel, Session, course_of
 from scenes.script.debulking import Debulking
@@ -227,8 +228,13 @@ class TestPages:
         less = straight(theatre.player("fem", without(scene, Gravity())))
         assert not same(full[6], less[6])
         shown: dict[Demo, list] = {page: [] for page in pages}
-        show = Demo.show
-        monkeypatch.setattr(Demo, "show", lambda page, frame, by: shown[page].append(frame) or show(page, frame, by))
+        owners = {page.browser: page for page in pages}
+
+        def moved(browser, frame, player):
+            shown[owners[browser]].append(frame)
+            move_bodies(browser, frame, player)
+
+        monkeypatch.setattr("scenes.play.page.move_bodies", moved)
 
         def seen(page: Demo, **wishes: object) -> Deformation:
             shown[page].clear()

@@ -77,7 +77,7 @@ def honest(frame: Frame, mask: np.ndarray) -> bool:
     ink, shut = ink_of(DOUBTFUL if frame.doubt else TUMOUR_COLOUR), closed(frame)
     least, most = BROKEN_SHARES
     inked = inked_share(frame.shown, ink, mask, _above(frame) | ~shut)
-    changed = changed_share(frame.picture.colour, frame.shown, mask & shut)
+    changed = changed_share(frame.picture.colour, frame.shown, mask & shut & (frame.taken == 0))
     return _said(frame, mask) and not (inked < least or inked > most or changed > CHANGED)  # NaN: none is there
 
 
