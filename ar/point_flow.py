@@ -58,7 +58,7 @@ def _searched(before: StereoView, now: StereoView, pixels: np.ndarray) -> tuple[
         cv2.copyMakeBorder(each, by, by, by, by, cv2.BORDER_REPLICATE)
         for each, by in zip(small, (HALF, HALF + REACH), strict=True)
     )
-    coarse = np.round((pixels + 0.5) * share - 0.5).astype(int).clip(0, few - 1)
+    coarse = np.nan_to_num(np.round((pixels + 0.5) * share - 0.5)).clip(0.0, few - 1.0).astype(int)
     guess, alike = np.empty(pixels.shape), np.empty(len(pixels))
     for number, (column, row) in enumerate(coarse.tolist()):
         sample = one[row : row + 2 * HALF + 1, column : column + 2 * HALF + 1]
