@@ -73,13 +73,15 @@ def test_what_determines_no_registration_is_refused():
         registered(SCAN[:2], patient[:2])
     with pytest.raises(ValueError, match="points of the scan lie on a line"):
         registered(line, moved(line))
-    with pytest.raises(ValueError, match=r"1e\+03 times as far apart .*millimetres"):
+    with pytest.raises(ValueError, match=r"lie within 0\.\d+ mm of each other: give millimetres"):
         registered(1e-3 * SCAN, patient)
+    with pytest.raises(ValueError, match=r"1\.5 times as far apart as the scan's: give both in millimetres"):
+        registered(SCAN, 1.5 * patient)
     with pytest.raises(ValueError, match="mirror image only"):
         registered(SCAN * [1.0, 1.0, -1.0], patient)
     wrong = patient.copy()
     wrong[4] += [0.0, 0.03, 0.0]
-    with pytest.raises(ValueError, match="pair 5 fits far worse"):
+    with pytest.raises(ValueError, match=r"pair 5 \(below the header\) fits worse"):
         registered(SCAN, wrong)
     with pytest.raises(ValueError, match=r"stay .* apart"):
         registered(SCAN, patient[::-1])

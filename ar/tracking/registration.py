@@ -16,6 +16,8 @@ FEWEST_PAIRS, FEWEST_SURFACE = 3, 20
 LEAST, MOST = 0.1e-3, 5e-3
 # Shares: the least spread of points beside the largest, and by how much two sets of points may differ in size.
 FLATTEST, RESIZED = 0.05, 0.1
+# Points round a head are farther apart [m].
+SMALLEST = 5e-3
 # A pair is called wrong if the others fit so many times better without it. So is a frame beside its mirror image.
 CLEARLY = 4.0
 # Rounds of Gauss-Newton on a surface, and the change at which they end [m], [rad].
@@ -128,6 +130,8 @@ def _demand_shape(scan: np.ndarray, patient: np.ndarray) -> None:
     for what, size in zip(("scan", "patient"), sizes, strict=True):
         if not size[1] > FLATTEST * size[0]:
             raise ValueError(f"the points of the {what} lie on a line: choose some that lie apart from it.")
+    if not sizes[0][0] > SMALLEST:
+        raise ValueError(f"the points lie within {2e3 * sizes[0][0]:.2g} mm of each other: give millimetres.")
     ratio = float(np.linalg.norm(sizes[1]) / np.linalg.norm(sizes[0]))
     if abs(np.log(ratio)) > RESIZED:
         raise ValueError(
@@ -140,14 +144,14 @@ def _demand_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
     rms = _rms(off)
     mirrored = _rms(_fitted(scan * [-1.0, 1.0, 1.0], patient)[1])
     if CLEARLY * max(mirrored, LEAST) < rms:
-        raise ValueError("the scan's points fit their mirror image only: one frame is left-handed; give both in RAS.")
+        raise ValueError("the scan's points fit their mirror image only: one frame is left-handed. Give RAS.")
     if len(scan) > FEWEST_PAIRS + 1:
         others = [_rms(_fitted(*(np.delete(p, row, axis=0) for p in (scan, patient)))[1]) for row in range(len(scan))]
         row = int(np.argmin(others))
         if rms > MOST / 2 and CLEARLY * max(others[row], LEAST) < rms:
             raise ValueError(
-                f"pair {row + 1} fits far worse than the others, which are {1e3 * others[row]:.1f} mm off without it: "
-                "touch it again, or leave it out."
+                f"pair {row + 1} (below the header) fits worse than the others, which are {1e3 * others[row]:.1f} mm "
+                "off without it: touch it again, or leave it out."
             )
     if not rms <= MOST:
         raise ValueError(

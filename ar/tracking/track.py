@@ -70,7 +70,7 @@ class Tracker:
         """
         if grey.shape != (self.camera.height, self.camera.width) or grey.dtype != np.uint8:
             raise ValueError(
-                f"the picture has shape {grey.shape} of {grey.dtype}, and the camera takes "
+                f"the picture is {' x '.join(map(str, grey.shape[::-1]))} of {grey.dtype}, and the camera takes "
                 f"{self.camera.width} x {self.camera.height} grey pixels of 8 bits: calibrate it at this size."
             )
         number = 0 if before is None else before.number + 1

@@ -209,8 +209,9 @@ def _deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: 
         return None, still
     name = args.deformer
     if name is None and not theatre.knowing(scene):
-        refused = next(iter(theatre.refusals(scene).values()), "there is none; give --model, or --deformer fem")
-        print(f"sulcus overlay: no model says how the brain moves: {refused}", file=sys.stderr)
+        refused = next(iter(theatre.refusals(scene).values()), "there is none")
+        said = f"no model says how the brain moves: {refused}. Give --deformer fem, or a model of the tool's poses"
+        print(f"sulcus overlay: {said}", file=sys.stderr)
         name = REST
     if name == REST:
         return None, still

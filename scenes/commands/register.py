@@ -73,7 +73,9 @@ def run(args: argparse.Namespace) -> int:
         figures = {} if target is None else {"tumour_p95_mm": 1e3 * target[1], "along_mm": target[0].tolist()}
         print(json_line({"out": str(out), **as_stored(found), **figures}))
         return 0
-    print(f"{found.pairs} pairs fit to {1e3 * found.rms:.2f} mm (rms); that is not yet the error at the tumour")
+    print(f"{found.pairs} pairs fit to {1e3 * found.rms:.2f} mm (rms); that is not the error at the tumour")
+    if target is None:
+        print("give --anatomy for that error")
     if target is not None:
         print(f"the tumour's middle is within {1e3 * target[1]:.1f} mm in the patient's frame (95 %), by these points")
     print(f"written: {out}")

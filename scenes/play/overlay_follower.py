@@ -25,8 +25,11 @@ from .tool_motion import Motion, ToolMotion
 HELD, GAP = 0.2, 0.2
 # A slow film's pictures may be apart by so many of its own intervals, which are no longer than this [s].
 MISSED, SLOWEST = 1.5, 1.0
+# Times of pictures are rounded [s].
+ROUNDING = 1e-6
 # A tumour whose place in the picture is not known this well is not to be relied on [m].
 LIMIT = 5e-3
+UNKNOWN = "as in the scan, and nobody says how it moved: do not rely on it"
 TOOL, PATIENT = tool_cube().name, patient_reference().name
 
 
@@ -35,6 +38,7 @@ class State(Enum):
 
     GOOD = "where it is now"
     REST = "as in the scan"
+    UNKNOWN = "as in the scan, its motion not known"
     UNSURE = "not to be relied on"
     NO_TOOL = "tool lost"
     STALE = "stale"
@@ -147,6 +151,8 @@ class Follower:
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
         band, parts = self._band(reference, middle, known.motion)
         known = replace(known, camera=camera, band=band, parts=parts, seen=time)
+        if known.state is State.UNKNOWN:
+            known = replace(known, band=None, parts={})
         if stale and apart is not None:
             why = f"no picture for {apart:.1f} s" if apart > 0.0 else "the camera repeats a picture"
             return replace(known, state=State.STALE, words=f"stale, {why}: do not rely on it")
@@ -159,7 +165,7 @@ class Follower:
         """The reference is not seen: for a moment the overlay stays where it was."""
         seen = None if before is None else before.seen
         motion = self.motion.rest if before is None else before.motion
-        held = before is not None and seen is not None and 0.0 <= time - seen <= HELD
+        held = before is not None and seen is not None and 0.0 <= time - seen < HELD + ROUNDING
         camera = before.camera if before is not None and held else None
         why = "not seen yet" if seen is None else "lost"
         what = "nothing is drawn" if camera is None else "drawn where it was"
@@ -174,7 +180,7 @@ class Follower:
         cube = tracked.poses.get(TOOL)
         if self.tool is None or cube is None:
             if self.motion.deformer is None:
-                return Known(time, State.REST, "", tracked, self.motion.rest, felt=felt)
+                return Known(time, State.UNKNOWN, UNKNOWN, tracked, self.motion.rest, felt=felt)
             if felt is None or last is None:
                 words = "tool not seen yet: the tumour as in the scan"
                 return Known(time, State.NO_TOOL, words, tracked, self.motion.rest)

@@ -24,7 +24,6 @@ from .overlay_follower import Known, State
 from .player import WIDE, gauged
 from .stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
 
-REST = "as in the scan: no motion is known"
 ABOVE = "the tool does not touch: as in the scan"
 NOT_KNOWN = "error by tissue and segmentation: not known"
 SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
@@ -116,8 +115,7 @@ def head_lines(known: Known) -> Sequence[str]:
     if known.band is None:
         return ()
     largest = max(known.parts, key=lambda name: known.parts[name])
-    where = {State.REST: ABOVE if known.motion.known else REST}.get(known.state, "")
-    lines = [where] if where else []
+    lines = [ABOVE] if known.state is State.REST else []
     if known.relied:
         lines.append(f"tumour: within {length(known.band, 1)} across the view (95 %), above all {largest}")
     motion = "; of motion: not known" if not known.motion.known else ""
