@@ -134,10 +134,14 @@ def _broken(text: str, room: float, scale: float) -> list[str]:
 
 def millimetres(length: float, error: float | None = None) -> str:
     """A length [m] as it is read: in millimetres, with what it may be off by [m], rounded up, where that is finite."""
-    beside = ""
-    if error is not None and math.isfinite(error):
-        beside = f" +- {max(rounded_up(1e3 * error, 1), 0.1):.1f}"
-    return f"{1e3 * length:.1f}{beside} mm"
+    if error is None or not math.isfinite(error):
+        return f"{1e3 * length:.1f} mm"
+    return f"{1e3 * length:.1f} +- {bound_words(error, 1)}"
+
+
+def bound_words(metres: float, digits: int) -> str:
+    """A bound in millimetres, rounded up: nothing is known to be without error."""
+    return f"{max(rounded_up(1e3 * metres, digits), 10.0**-digits):.{digits}f} mm"
 
 
 def rounded_up(value: float, digits: int) -> float:

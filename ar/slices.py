@@ -11,9 +11,11 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
-from .hud import FINE, WHITE, rounded_up, towards, write
+from .hud import FINE, WHITE, bound_words, towards, write
 from .layer import Layer, Solid
-from .overlay import BEFORE, BROKEN, DASHED, DOTTED, DOUBTFUL, dash, ink_of
+from .outlines import dash, ink_of
+from .overlay import BROKEN, DASHED, DOUBTFUL
+from .traces import BEFORE, DOTTED
 
 # Of a view: half of its side [m], its side [pixel], and how far apart the scan is read [m]: finer adds nothing.
 REACH, SIDE, GRAIN = 40e-3, 280, 0.8e-3
@@ -124,7 +126,7 @@ def said_of(cut: Cut) -> str:
     """What the band is, in few words."""
     if cut.doubtful or cut.error is None:
         return "tumour: not known"
-    return f"tumour: within {max(rounded_up(1e3 * cut.error, 1), 0.1):.1f} mm"
+    return f"tumour: within {bound_words(cut.error, 1)}"
 
 
 def resampled(plane: Plane, scan: Solid, middle: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..camera import Camera
 from .detection import window_round
-from .targets import BORDER, Face, Target
+from .targets import BORDER, Face, Target, seen_from_front
 
 # Texture pixels along a square, and how many samples of the picture lie along a pixel.
 TEXTURE, SAMPLES = 48, 4
@@ -42,7 +42,7 @@ def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, n
         for face in target.faces
     ]
     windows = [(face, T, window_round(own, _edge(face) @ T[:3, :3].T + T[:3, 3], 0.0, MARGIN)) for face, T in placed]
-    seen = [(face, T, where) for face, T, where in windows if where is not None and T[:3, 2] @ T[:3, 3] > 0.0]
+    seen = [(face, T, where) for face, T, where in windows if where is not None and seen_from_front(T)]
     if not seen:
         return picture.copy()
     box = tuple(

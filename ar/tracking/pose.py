@@ -11,7 +11,7 @@ import numpy as np
 from ..camera import Camera
 from .detection import Corners
 from .rigid import angles_of, cross_matrices
-from .targets import Target
+from .targets import Target, seen_from_front
 
 # Corners that a pose needs at least; residuals are believed to be no smaller, and no larger, than these [pixel].
 FEWEST, LEAST, MOST = 6, 0.1, 1.0
@@ -137,7 +137,7 @@ def _faces_camera(target: Target, corners: Corners, T: np.ndarray) -> bool:
     """Whether every face with corners is seen from its front, and lies before the camera."""
     for number in np.unique(corners.face):
         T_camera_face = T @ target.faces[number].T_target_face
-        if T_camera_face[2, 3] <= 0.0 or T_camera_face[:3, 2] @ T_camera_face[:3, 3] <= 0.0:
+        if T_camera_face[2, 3] <= 0.0 or not seen_from_front(T_camera_face):
             return False
     return True
 

@@ -6,10 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
-from .rigid import cross_matrices
+from .rigid import cross_matrices, moved_about
 
 FEWEST_PAIRS, FEWEST_SURFACE = 3, 20
 # Nobody touches a point more exactly [m]; pairs that fit no better than this fit no rigid motion [m].
@@ -111,7 +110,7 @@ def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Ne
         K = np.einsum("ni,nij->nj", turned, _slopes(T, place, centre).reshape(-1, 3, 6)) / traced
         normal = J.T @ J + K.T @ K
         step = -np.linalg.solve(normal, J.T @ off.ravel() / touched + K.T @ away / traced)
-        T = _moved(T, step, centre)
+        T = moved_about(T, centre, step)
         if np.abs(step).max() < SMALL:
             break
     if not max(_rms(off), _rms(away[:, None])) <= MOST:
@@ -174,14 +173,6 @@ def _slopes(T: np.ndarray, scan: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """(3 n, 6): how places of the scan (n, 3) move in the reference's frame by a shift, and a turn about the centre."""
     arms = (scan - centre) @ T[:3, :3].T
     return np.concatenate([np.broadcast_to(np.eye(3), (len(scan), 3, 3)), -cross_matrices(arms)], axis=2).reshape(-1, 6)
-
-
-def _moved(T: np.ndarray, step: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """T (4, 4) after a shift and a turn about the centre, `step` (6,)."""
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
-    out[:3, 3] = T[:3, :3] @ centre + T[:3, 3] + step[:3] - out[:3, :3] @ centre
-    return out
 
 
 def _widened(normal: np.ndarray, freedom: int) -> np.ndarray:

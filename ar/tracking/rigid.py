@@ -1,8 +1,9 @@
-"""Rotations as matrices: how far they turn, and cross products written as products."""
+"""Rotations and rigid motions as matrices: how far they turn, what they are about, and whether they are any."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 def cross_matrices(vectors: np.ndarray) -> np.ndarray:
@@ -15,3 +16,19 @@ def cross_matrices(vectors: np.ndarray) -> np.ndarray:
 def angles_of(rotations: np.ndarray) -> np.ndarray:
     """By how much rotations (..., 3, 3) turn (...) [rad]."""
     return np.arccos(np.clip(0.5 * (np.trace(rotations, 0, -2, -1) - 1.0), -1.0, 1.0))
+
+
+def moved_about(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """A rigid motion T (4, 4) after a shift [m] and a turn [rad], `step` (6,), about what was `centre` (3,) [m]."""
+    out = np.eye(4)
+    out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
+    out[:3, 3] = T[:3, :3] @ centre + T[:3, 3] + step[:3] - out[:3, :3] @ centre
+    return out
+
+
+def is_rigid(T: np.ndarray, rounding: float) -> bool:
+    """Whether a matrix is a rotation and a shift (4, 4); its columns may be so far from square."""
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
+        return False
+    turn = T[:3, :3]
+    return bool(np.abs(turn.T @ turn - np.eye(3)).max() < rounding and np.linalg.det(turn) > 0.0)

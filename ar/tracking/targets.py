@@ -89,6 +89,16 @@ class Target:
     name: str
     faces: tuple[Face, ...]
 
+    @property
+    def outline(self) -> np.ndarray:
+        """The corners of all faces in the target's frame (n, 3) [m]."""
+        return np.concatenate([face.outline for face in self.faces])
+
+
+def seen_from_front(T_camera_face: np.ndarray) -> bool:
+    """Whether a face at a pose (4, 4) turns its print to the camera."""
+    return bool(T_camera_face[:3, 2] @ T_camera_face[:3, 3] > 0.0)
+
 
 # Squares of the cube's faces, and how far the white border goes round them [m].
 CUBE_SQUARE, BORDER = 8e-3, 4e-3

@@ -90,7 +90,7 @@ class Tracker:
         found: dict[str, Corners] = {}
         for target in self.targets:
             if target.name in last:
-                T, outline = last[target.name][0], np.concatenate([face.outline for face in target.faces])
+                T, outline = last[target.name][0], target.outline
                 window = window_round(self.camera, outline @ T[:3, :3].T + T[:3, 3], AROUND, MARGIN)
                 seen = None if window is None else self._detector.seen_in(target, grey, window)
                 found |= {target.name: seen} if seen is not None and len(seen.points) >= FEWEST else {}

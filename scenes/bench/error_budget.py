@@ -20,7 +20,7 @@ from surrogate.locating.calibration import RADIUS_SQUARED
 
 from ..script.priors import MESH, OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION, Draw
 from ..script.site import Site
-from ..script.uncertainty import SURROGATE
+from ..script.uncertainty import LEVEL, SURROGATE
 from ..script.viewpoint import Viewpoint
 from .tracking_errors import CORNER, changed, corners_in
 from .uncertainty import Motions, off_by
@@ -30,7 +30,6 @@ TECHNICAL = (CALIBRATION, MARKERS, LATENCY, SURROGATE, MESH)
 """What the system itself is off by."""
 CLINICAL = (*TECHNICAL, REGISTRATION, SEGMENTATION, PARAMETERS)
 """With what nobody measures of the patient."""
-LEVEL = 0.95
 # How many calibrations are drawn.
 CALIBRATIONS = 100
 

@@ -13,7 +13,7 @@ from ar.lens import Lens
 from ar.tracking.board_views import View
 from ar.tracking.detection import Corners
 from ar.tracking.intrinsics import covariance_of
-from ar.tracking.targets import Target, calibration_board
+from ar.tracking.targets import Target, calibration_board, seen_from_front
 
 CORNER = 0.1
 """Deviation of a corner along each axis [pixel], by default: twice that of sharp pictures (`sulcus bench track`)."""
@@ -56,8 +56,7 @@ def corners_in(camera: Camera, target: Target, T_world_target: np.ndarray, off: 
     """The corners of a target's faces that look at a camera, each off by a row of `off` (n, 2) [pixel]."""
     points, faces, T = [], [], camera.T_camera_world @ T_world_target
     for number, face in enumerate(target.faces):
-        T_camera_face = T @ face.T_target_face
-        if T_camera_face[:3, 2] @ T_camera_face[:3, 3] > 0.0:
+        if seen_from_front(T @ face.T_target_face):
             points.append(face.corners)
             faces += [number] * len(face.corners)
     at = np.concatenate([np.zeros((0, 3)), *points])

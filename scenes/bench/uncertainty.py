@@ -182,6 +182,27 @@ def ensemble(theatre: Theatre, scene: Scene, draws: Sequence[Draw]) -> Iterator[
         yield solved(theatre, changed(scene, draw))
 
 
+def sound_of(draws: Sequence[Draw], answers: Iterable[Answer]) -> list[tuple[Draw, tuple[np.ndarray, ...]]]:
+    """The draws that have an equilibrium at each moment, with their motions."""
+    return [(draw, answer) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
+
+
+def enough_of(
+    scene: Scene, draws: Sequence[Draw], answers: Iterable[Answer]
+) -> list[tuple[Draw, tuple[np.ndarray, ...]]]:
+    """As `sound_of`, of a scene that is known by them.
+
+    Raises
+    ------
+    InputError
+        Too few draws have an equilibrium.
+    """
+    sound = sound_of(draws, answers)
+    if len(sound) < LEAST * len(draws):
+        raise InputError(f"of {len(draws)} draws of the scene {scene.name} {len(sound)} have an equilibrium: too few.")
+    return sound
+
+
 def uncertainty(
     theatre: Theatre, scene: Scene, still: Motions, draws: Sequence[Draw], answers: Iterable[Answer], seed: int = 0
 ) -> Uncertainty:
@@ -192,9 +213,7 @@ def uncertainty(
     InputError
         Too few draws have an equilibrium.
     """
-    sound = [(draw, answer) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
-    if len(sound) < LEAST * len(draws):
-        raise InputError(f"of {len(draws)} draws of the scene {scene.name} {len(sound)} have an equilibrium: too few.")
+    sound = enough_of(scene, draws, answers)
     kept, shifts = [draw for draw, _ in sound], rigid(SHIFTS, seed)
     rows, held = [], []
     for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
@@ -278,7 +297,7 @@ def coverage(still: Motions, stated: Uncertainty, draws: Sequence[Draw], answers
 
     Twins are other draws, with other errors of registration and segmentation.
     """
-    sound = [(draw, answer) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
+    sound = sound_of(draws, answers)
     kept, held = [draw for draw, _ in sound], []
     for moment in range(1, len(still.times)):
         motion = np.stack([answer[moment] for _, answer in sound])

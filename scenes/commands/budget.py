@@ -47,8 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     add_tissue_arguments(parser)
     add_element_argument(parser)
-    add_camera(parser)
-    parser.set_defaults(path="hand-held")
+    add_camera(parser, "hand-held")
     parser.add_argument(
         "--intrinsics", type=Path, metavar="K.json",
         help="covariance of --camera, written beside it by `sulcus calibrate` (default: of 24 good views of the board)",
@@ -181,15 +180,12 @@ def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int
     InputError
         Too few have one.
     """
-    from ..bench.uncertainty import LEAST, ensemble
+    from ..bench.uncertainty import enough_of, ensemble
     from ..script.priors import drawn
 
     draws = drawn(count, seed)
     bar = tqdm(ensemble(theatre, scene, draws), total=count, unit="body", desc=scene.name, leave=False, file=sys.stderr)
-    sound = [(draw, answer) for draw, answer in zip(draws, bar, strict=True) if answer is not None]
-    if len(sound) < LEAST * count:
-        raise InputError(f"of {count} bodies {len(sound)} have an equilibrium in the scene {scene.name}: too few.")
-    return sound
+    return enough_of(scene, draws, bar)
 
 
 def _at(bodies: Bodies, number: int) -> tuple[np.ndarray, list[Draw]]:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 PATHS = ("hand-held", "microscope", "orbit")
 
 
-def add_camera(parser: argparse.ArgumentParser) -> None:
-    """Declare the camera's options: shared by every command that draws a scene."""
+def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None:
+    """Declare the camera's options: shared by every command that draws a scene; `path` is the usual one."""
     group = parser.add_argument_group("the camera; docs/camera.md says more")
     group.add_argument(
         "--camera", type=Path, metavar="FILE.yaml", help="calibration of a camera, of OpenCV or ROS (default: ideal)"
@@ -26,7 +26,9 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--size", type=size, metavar="WxH", help="scale the calibration of --camera to pictures of this size [pixel]"
     )
-    group.add_argument("--path", choices=PATHS, help="how the camera moves (default: it stays)")
+    group.add_argument(
+        "--path", choices=PATHS, default=path, help=f"how the camera moves (default: {path or 'it stays'})"
+    )
     group.add_argument("--path-seed", type=int, default=0, help="of --path hand-held (default %(default)s)")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
 

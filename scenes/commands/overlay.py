@@ -116,9 +116,7 @@ def run(args: argparse.Namespace) -> int:
     report = _report(shown, parts.who)
     if truth is not None:
         report["off"] = summary([each.known for each in shown], errors)
-    report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
-    print(json_line(report) if args.json else _words(report))
-    return 0 if any(each.known.relied for each in shown) else 1
+    return _ended(args, report, shown, out, table)
 
 
 def _served(args: argparse.Namespace, closing: ExitStack) -> int:
@@ -151,7 +149,14 @@ def _served(args: argparse.Namespace, closing: ExitStack) -> int:
         write_rows(table, shown, [None] * len(shown), parts.painter.stage)
     if not shown:
         return 1
-    report = _report(shown, parts.who) | {"out": None, "table": None if table is None else str(table)}
+    return _ended(args, _report(shown, parts.who), shown, None, table)
+
+
+def _ended(
+    args: argparse.Namespace, report: dict[str, object], shown: list[Shown], out: Path | None, table: Path | None
+) -> int:
+    """Print what a run was like; returns 1 if the tumour is drawn as known in no picture."""
+    report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
     print(json_line(report) if args.json else _words(report))
     return 0 if any(each.known.relied for each in shown) else 1
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ar.hud import rounded_up
+from ar.hud import bound_words
 
 from ..script.uncertainty import TumourError
 
@@ -37,7 +37,7 @@ def model_words(promised: float | None, trained: bool, brief: bool = False) -> s
         return "model: FEM itself" if brief else "model: finite elements themselves"
     if promised is None:
         return "model: not known" if brief else "model: error against its finite elements not known"
-    within = f"model: within {length(promised, 2)}"
+    within = f"model: within {bound_words(promised, 2)}"
     return within if brief else f"{within} of its finite elements (95 %)"
 
 
@@ -45,18 +45,13 @@ def tumour_words(error: TumourError, brief: bool = False) -> str:
     """What the tumour is off by, against where it is in the patient."""
     if error.bound is None:
         return "tumour: not known" if brief else NOT_KNOWN_WORDS
-    within = f"tumour: within {length(error.bound, 1)}"
+    within = f"tumour: within {bound_words(error.bound, 1)}"
     if brief:
         return within
     said = f"{within} of where it is (95 %)"
     if error.observed is None:
         return f"{said}, above all {error.largest}"
-    return said if error.prior is None else f"{said}; without observation {length(error.prior, 1)}"
-
-
-def length(metres: float, digits: int) -> str:
-    """A bound in millimetres, rounded up: nothing is known to be without error."""
-    return f"{max(rounded_up(1e3 * metres, digits), 10.0**-digits):.{digits}f} mm"
+    return said if error.prior is None else f"{said}; without observation {bound_words(error.prior, 1)}"
 
 
 def worst(errors: Sequence[TumourError]) -> TumourError:

@@ -15,6 +15,7 @@ from ar.renderer import Renderer
 from ar.tracking.detection import window_round
 from ar.tracking.drawn import drawn
 from ar.tracking.registration import Registration
+from ar.tracking.rigid import moved_about
 from ar.tracking.stamp import stamped
 from ar.tracking.targets import Target, patient_reference, tool_cube
 from sim.errors import InputError
@@ -136,10 +137,8 @@ def registered(player: Player, mounts: Mounted, shift: float, turn: float, seed:
     """
     deviations = np.repeat([1e-3 * shift, np.radians(turn)], 3)
     error = deviations * np.random.default_rng([seed, 1]).standard_normal(6)
-    T, centre = np.linalg.inv(mounts.T_scan_patient), player.site.origin
-    place = T[:3, :3] @ centre + T[:3, 3]
-    T[:3, :3] = Rotation.from_rotvec(error[3:]).as_matrix() @ T[:3, :3]
-    T[:3, 3] = place + error[:3] - T[:3, :3] @ centre
+    centre = player.site.origin
+    T = moved_about(np.linalg.inv(mounts.T_scan_patient), centre, error)
     return Registration(T, np.diag(deviations**2), centre, 0.0, 0)
 
 
@@ -182,7 +181,7 @@ NAMES = {"tool": "tool", "patient": "reference"}
 def _covered(colour: np.ndarray, camera: Camera, target: Target, T_scan_target: np.ndarray) -> np.ndarray:
     """The picture with a hand before a target."""
     T = camera.T_camera_world @ T_scan_target
-    outline = np.concatenate([face.outline for face in target.faces])
+    outline = target.outline
     where = window_round(replace(camera, T_camera_world=np.eye(4)), outline @ T[:3, :3].T + T[:3, 3], 0.1, 0.0)
     out = colour.copy()
     if where is not None:

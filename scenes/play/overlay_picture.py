@@ -9,7 +9,7 @@ import numpy as np
 
 from ar.camera import Camera
 from ar.gauge import Gauge
-from ar.hud import folded
+from ar.hud import bound_words, folded
 from ar.layer import Layer
 from ar.outlines import box_around, dash, ink_of, joined, outlines, silhouette
 from ar.overlay import Overlaid, composite, write_doubt, write_head
@@ -19,7 +19,6 @@ from ar.traces import BEFORE, DOTTED
 
 from ..script.tracked_tool import TrackedTool
 from ..script.uncertainty import DEVIATIONS
-from .error_text import length
 from .overlay_follower import Known, State
 from .player import WIDE, gauged
 from .stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
@@ -117,6 +116,6 @@ def head_lines(known: Known) -> Sequence[str]:
     largest = max(known.parts, key=lambda name: known.parts[name])
     lines = [ABOVE] if known.state is State.REST else []
     if known.relied:
-        lines.append(f"tumour: within {length(known.band, 1)} across the view (95 %), above all {largest}")
+        lines.append(f"tumour: within {bound_words(known.band, 1)} across the view (95 %), above all {largest}")
     motion = "; of motion: not known" if not known.motion.known else ""
     return (*lines, f"{NOT_KNOWN}{motion}")

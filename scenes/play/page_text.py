@@ -18,7 +18,6 @@ from ..script.site import Site
 from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
 from .deformers import GUARDED, Theatre
-from .error_text import length
 from .load_text import acting
 from .observer import ELLIPSOID_COLOUR, Estimate
 from .page_tally import Row
@@ -180,7 +179,7 @@ def trust(answer: Deformation, name: str) -> str:
         return f"<p>{who}: {how}.</p>"
     return (
         f"<p>{who}: {how}. Error of the model: in 95 of 100 loads no point of the tumour is more than "
-        f"{length(bound, 2)} from where its finite elements have it.</p>"
+        f"{hud.bound_words(bound, 2)} from where its finite elements have it.</p>"
     )
 
 
@@ -197,10 +196,11 @@ def tumour_trust(error: TumourError) -> str:
             "<p>Error of the tumour: not known. It is known of scripted scenes alone, after "
             "<code>sulcus uncertainty SCENE</code>.</p>"
         )
-    said = f"Error of the tumour: 95 of 100 times no point of it is more than {length(error.bound, 1)} from where it is"
+    within = hud.bound_words(error.bound, 1)
+    said = f"Error of the tumour: 95 of 100 times no point of it is more than {within} from where it is"
     if error.observed is None:
         return f"<p>{said}; the largest part is {escape(error.largest)}.</p>"
-    return f"<p>{said}{'' if error.prior is None else f'; without observation {length(error.prior, 1)}'}.</p>"
+    return f"<p>{said}{'' if error.prior is None else f'; without observation {hud.bound_words(error.prior, 1)}'}.</p>"
 
 
 def report(
@@ -212,7 +212,9 @@ def report(
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([acts] if acts else [])]
     facts += [f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"]
     if frame.distance_error is not None and frame.distance_error < np.inf:
-        facts += [f"tip to tumour within {length(frame.distance_error, 1)} of the model's finite elements (95 %)"]
+        facts += [
+            f"tip to tumour within {hud.bound_words(frame.distance_error, 1)} of the model's finite elements (95 %)"
+        ]
     parts = [] if frame.distance is None else [f'<p class="number">tip to tumour {hud.millimetres(frame.distance)}</p>']
     number, *found = [""] if frame.estimate is None else estimated(frame.estimate)
     # A narrow window shows the first lines alone: both errors are among them.

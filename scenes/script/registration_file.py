@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ar.tracking.registration import Registration
+from ar.tracking.rigid import is_rigid
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import path_of, read_as
@@ -47,18 +48,13 @@ def read_registration(path: str | Path) -> Registration:
         if T.shape != (4, 4) or covariance.shape != (6, 6) or centre.shape != (3,):
             raise InputError("its numbers have other shapes than 4 x 4, 6 x 6 and 3.")
         T[:3, 3], centre, covariance = 1e-3 * T[:3, 3], 1e-3 * centre, covariance / np.outer(_UNITS, _UNITS)
-        _demand_rigid(T)
+        if not is_rigid(T, RIGID):
+            raise InputError("T_patient_scan_mm is no rigid motion: rows of a rotation, and a shift in millimetres.")
         _demand_covariance(covariance)
         if not np.isfinite(centre).all():
             raise InputError("its centre is not finite.")
         counts = int(stored["pairs"]), int(stored["surface"])
         return Registration(T, covariance, centre, 1e-3 * float(stored["rms_mm"]), *counts)
-
-
-def _demand_rigid(T: np.ndarray) -> None:
-    off = np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max()
-    if not (off < RIGID and np.linalg.det(T[:3, :3]) > 0.0 and np.isfinite(T).all() and (T[3] == [0, 0, 0, 1]).all()):
-        raise InputError("T_patient_scan_mm is no rigid motion: rows of a rotation, and a shift in millimetres.")
 
 
 def _demand_covariance(covariance: np.ndarray) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ar.tracking.rigid import is_rigid
 from ar.tracking.targets import TIP, tool_cube
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
@@ -99,9 +100,7 @@ def _least(matrix: np.ndarray) -> float:
 
 
 def _demand_rigid(T: np.ndarray) -> None:
-    turn = T[:3, :3]
-    good = T.shape == (4, 4) and np.isfinite(T).all() and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0])
-    if not good or not np.allclose(turn @ turn.T, np.eye(3), atol=SQUARE) or np.linalg.det(turn) < 0.0:
+    if not is_rigid(T, SQUARE):
         raise InputError(f"T_cube_tool is no rigid transform (4, 4). {WANTED}")
     if np.linalg.norm(T[:3, 3]) > FARTHEST:
         raise InputError("T_cube_tool has the tip farther than 1 m from the cube: give millimetres.")
