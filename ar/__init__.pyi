@@ -1,14 +1,14 @@
 """What the surgeon sees: triangles and cameras in, pixels out. Knows no brain."""
 
-from .browser import Browser
-from .camera import Camera, look_at
-from .layer import Layer, Solid
-from .lens import Lens
-from .overlay import Overlaid, composite
-from .rasteriser import rasterise
-from .renderer import Lamp, Picture, Pictures, Renderer, lamp_beside, render
+from .optics.camera import Camera, look_at
+from .optics.lens import Lens
+from .optics.stereo_pair import stereo_pair
+from .overlay.composite import Overlaid, composite
+from .page.browser import Browser
+from .rendering.layer import Layer, Solid
+from .rendering.rasteriser import rasterise
+from .rendering.renderer import Lamp, Picture, Pictures, Renderer, lamp_beside, render
 from .screen import read_png, write_png, write_video
-from .stereo import stereo_pair
 
 __all__ = [
     "Browser",

@@ -5,8 +5,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from ar.camera import Camera
-from ar.lens import Lens
+from ar.optics.camera import Camera
+from ar.optics.lens import Lens
 from ar.tracking.board_views import View
 from ar.tracking.targets import calibration_board
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from visitor import Visitor, free_port, wait_for
 
-from ar.browser import Browser
-from ar.guard import LIMITS, Limits
-from ar.page_aside import STYLE
-from ar.page_parts import Body, Choice, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
-from ar.page_recorder import RECORDS, STOPS
-from ar.page_sight import PICTURE, SAID, SLICES, coded
-from ar.page_style import NOTE, PAGE, STATUS, style
+from ar.page.aside import STYLE
+from ar.page.browser import Browser
+from ar.page.guard import LIMITS, Limits
+from ar.page.parts import Body, Choice, Fold, Note, Playback, Sign, Slider, Toggle, Viewpoint
+from ar.page.recorder import RECORDS, STOPS
+from ar.page.sight import PICTURE, SAID, SLICES, coded
+from ar.page.style import NOTE, PAGE, STATUS, style
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 

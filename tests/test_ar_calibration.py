@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from ar.calibration import Calibration, opencv_text, ros_text
-from ar.calibration_text import LONGEST_TEXT, parsed
-from ar.lens import Lens
+from ar.optics.calibration import Calibration, opencv_text, ros_text
+from ar.optics.calibration_text import LONGEST_TEXT, parsed
+from ar.optics.lens import Lens
 
 SOME = Calibration((820.5, 818.25), (321.0, 236.5), 640, 480, Lens(-0.31, 0.12, 1e-3, -2e-3, -0.02), "left/1")
 RATIONAL = Calibration((820.5, 818.25), (321.0, 236.5), 640, 480, Lens(-0.3, 0.1, 0, 0, 0, 0.1, 0.02, 1e-3), 'Nähe "2"')

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ar.camera import Camera, look_at, project_cv2
+from ar.optics.camera import Camera, look_at, project_cv2
 
 EYE, TARGET, UP = np.array([0.1, -0.3, 0.2]), np.array([0.02, 0.01, 0.05]), np.array([0.0, 0.0, 1.0])
 

@@ -7,13 +7,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from test_ar_lens import SOME
 
-from ar.camera import Camera, look_at
-from ar.disparity import Cloud, StereoView, cloud, viewed
-from ar.layer import Layer, Solid
-from ar.point_flow import followed, supported
-from ar.rectified import Rectified, rectified
-from ar.renderer import Lamp, Picture, Renderer
-from ar.stereo import stereo_pair
+from ar.optics.camera import Camera, look_at
+from ar.optics.stereo_pair import stereo_pair
+from ar.rendering.layer import Layer, Solid
+from ar.rendering.renderer import Lamp, Picture, Renderer
+from ar.stereo.disparity import Cloud, StereoView, cloud, viewed
+from ar.stereo.point_flow import followed, supported
+from ar.stereo.rectified import Rectified, rectified
 
 TARGET, REACH, FINE = np.array([0.04, 0.03, 0.02]), 15e-3, 6000.0
 LAMP = Lamp(TARGET + [0.05, 0.05, 0.3], TARGET, radius=0.06)

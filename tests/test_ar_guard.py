@@ -17,9 +17,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from ar import guard
-from ar.browser import Browser
-from ar.messages import MessageError, checked
-from ar.page_parts import Choice, Playback, Slider, Toggle, Viewpoint
+from ar.page.browser import Browser
+from ar.page.messages import MessageError, checked
+from ar.page.parts import Choice, Playback, Slider, Toggle, Viewpoint
 
 PROTOCOL = [f"viser-v{viser.__version__}"]
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from ar.camera import look_at
-from ar.hud import FINE, FONT, bearings, folded, lay, marked, millimetres, panel, towards
-from ar.places import ASIDE, CLEAR, PAD, STEP, free_place
+from ar.optics.camera import look_at
+from ar.overlay.hud import FINE, FONT, bearings, folded, lay, marked, millimetres, panel, towards
+from ar.overlay.places import ASIDE, CLEAR, PAD, STEP, free_place
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 import ar
-from ar.overlay import load_kernels
-from ar.parallel import load
+from ar.overlay.composite import load_kernels
+from ar.rendering.parallel import load
 
 
 @pytest.fixture
@@ -37,8 +37,11 @@ def of_kernels(path):
 
 def test_every_kernel_of_a_picture_is_loaded_ahead(loading):
     load_kernels()
-    names = {f"ar.{path.stem}" for path in Path(ar.__file__).parent.glob("*.py") if of_kernels(path)}
-    later = {"ar.raycast", "ar.lens_rasteriser", "ar.unbent"}  # the tests' own, and those of cameras with a lens
+    house = Path(ar.__file__).parents[1]
+    paths = (path.relative_to(house) for path in Path(ar.__file__).parent.rglob("*.py") if of_kernels(path))
+    names = {".".join(path.with_suffix("").parts) for path in paths}
+    # The tests' own, and those of cameras with a lens.
+    later = {f"ar.rendering.{name}" for name in ("raycast", "lens_rasteriser", "unbent")}
     assert len(names) > 5 and sorted(loading[0]) == sorted(names - later)
 
 
@@ -48,6 +51,6 @@ def test_whoever_needs_them_meanwhile_waits(loading):
     ahead.start()
     while not most:
         time.sleep(0.001)
-    load("cpu", "ar.window")
-    assert loaded[-1] == "ar.window" and len(loaded) == 6 and max(most) == 1
+    load("cpu", "ar.overlay.window")
+    assert loaded[-1] == "ar.overlay.window" and len(loaded) == 6 and max(most) == 1
     ahead.join()

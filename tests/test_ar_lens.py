@@ -8,16 +8,16 @@ import pytest
 from test_ar_raster import sphere
 from test_ar_renderer import BALL, FLOOR, LAMP, ball, floor, scene
 
-from ar.camera import Camera, look_at, project_cv2
-from ar.gauge import Gauge
-from ar.layer import Layer
-from ar.lens import Lens
-from ar.outlines import box_around, silhouette
-from ar.overlay import composite
-from ar.rasteriser import rasterise
-from ar.raycast import raycast
-from ar.refind import of_ink, outline_gap
-from ar.renderer import Renderer, render
+from ar.optics.camera import Camera, look_at, project_cv2
+from ar.optics.lens import Lens
+from ar.overlay.composite import composite
+from ar.overlay.gauge import Gauge
+from ar.overlay.outlines import box_around, silhouette
+from ar.overlay.refind import of_ink, outline_gap
+from ar.rendering.layer import Layer
+from ar.rendering.rasteriser import rasterise
+from ar.rendering.raycast import raycast
+from ar.rendering.renderer import Renderer, render
 
 LENSES = {
     "barrel": Lens(-0.35, 0.15, 1e-3, -2e-3, -0.02),

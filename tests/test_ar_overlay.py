@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from ar.camera import look_at
-from ar.gauge import GAUGE, Gauge
-from ar.hud import FINE, HEAD, ROW, panel, write
-from ar.layer import Layer, Solid, vertex_normals
-from ar.outlines import ink_of, iou, silhouette
-from ar.overlay import DOUBTFUL, WARNING, composite, doubt_lines
-from ar.refind import outline_gap, stands
-from ar.renderer import Lamp, lamp_beside, render
-from ar.traces import BEFORE
+from ar.optics.camera import look_at
+from ar.overlay.composite import DOUBTFUL, WARNING, composite, doubt_lines
+from ar.overlay.gauge import GAUGE, Gauge
+from ar.overlay.hud import FINE, HEAD, ROW, panel, write
+from ar.overlay.outlines import ink_of, iou, silhouette
+from ar.overlay.refind import outline_gap, stands
+from ar.overlay.traces import BEFORE
+from ar.rendering.layer import Layer, Solid, vertex_normals
+from ar.rendering.renderer import Lamp, lamp_beside, render
 
 CORTEX, TOOL, TUMOUR = 1, 2, 3
 EYE = np.array([0.0, -0.05, 0.25])

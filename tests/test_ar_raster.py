@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ar.camera import Camera, look_at
-from ar.rasteriser import rasterise, rows_reached
-from ar.raycast import raycast
+from ar.optics.camera import Camera, look_at
+from ar.rendering.rasteriser import rasterise, rows_reached
+from ar.rendering.raycast import raycast
 
 NO_TRIANGLES = np.zeros((0, 3), int)
 

@@ -8,15 +8,15 @@ import pytest
 import warp as wp
 from test_ar_raster import sphere
 
-from ar.camera import Camera, look_at
-from ar.layer import Layer, Solid, vertex_normals
-from ar.outlines import box_around
-from ar.overlay import composite
-from ar.rasteriser import NOTHING, empty_buffer, keep_nearest, seen
-from ar.raycast import raycast
-from ar.renderer import Lamp, Picture, Pictures, Renderer, as_light, render, tone_curve
-from ar.shade import BRIGHTEST
-from ar.window import FADE, SURROUND, Lines, Roles, chamfer, overlaid
+from ar.optics.camera import Camera, look_at
+from ar.overlay.composite import composite
+from ar.overlay.outlines import box_around
+from ar.overlay.window import FADE, SURROUND, Lines, Roles, chamfer, overlaid
+from ar.rendering.layer import Layer, Solid, vertex_normals
+from ar.rendering.rasteriser import NOTHING, empty_buffer, keep_nearest, seen
+from ar.rendering.raycast import raycast
+from ar.rendering.renderer import Lamp, Picture, Pictures, Renderer, as_light, render, tone_curve
+from ar.rendering.shade import BRIGHTEST
 
 FLOOR, BALL, EGG = 1, 2, 3
 LAMP = Lamp(np.array([-0.15, 0.1, 0.3]), np.zeros(3), 0.08)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ar.camera import look_at
-from ar.layer import Layer
-from ar.renderer import Lamp, as_light, render
+from ar.optics.camera import look_at
+from ar.rendering.layer import Layer
+from ar.rendering.renderer import Lamp, as_light, render
 
 PLAIN, LID = 1, 2
 

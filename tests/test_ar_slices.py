@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from ar.history import SPAN, History, Line, Sample, ceiling
-from ar.layer import Layer, Solid
-from ar.lead import IDLE, Lead
-from ar.page_sight import coded
-from ar.recording import LONGEST, RATE, Recording, played
-from ar.slices import PLANES, REACH, SIDE, Cut, resampled, section, sliced, view, within
+from ar.page.history import SPAN, History, Line, Sample, ceiling
+from ar.page.lead import IDLE, Lead
+from ar.page.recording import LONGEST, RATE, Recording, played
+from ar.page.sight import coded
+from ar.page.slices import PLANES, REACH, SIDE, Cut, resampled, section, sliced, view, within
+from ar.rendering.layer import Layer, Solid
 from scenes.script.tool import sphere
 
 PITCH = 2.0 * REACH / SIDE

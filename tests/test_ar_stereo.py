@@ -7,9 +7,9 @@ from test_ar_camera import EYE, TARGET, points_in_front, some_camera
 from test_ar_lens import SOME, scene, seen_by
 from test_ar_renderer import LAMP
 
-from ar.camera import project_cv2
-from ar.renderer import render
-from ar.stereo import BASELINE, stereo_pair
+from ar.optics.camera import project_cv2
+from ar.optics.stereo_pair import BASELINE, stereo_pair
+from ar.rendering.renderer import render
 
 
 def near_points() -> np.ndarray:

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 import trimesh
 
-from ar.camera import look_at
-from ar.cut import EMPTY, Plane, plane_through, profile, section
-from ar.distances import distance_of_seen, signed_distance, tree_of
-from ar.gauge import GAUGE, Gauge, gauge_words
-from ar.hud import FINE, WHITE, panel
-from ar.layer import Layer
-from ar.legend import Names
-from ar.outlines import ink_of, key_of, silhouette
-from ar.overlay import composite
-from ar.refind import found_at, of_ink, outline_gap, stands
-from ar.renderer import Lamp, render
-from ar.rings import RING, RINGS, draw_rings
-from ar.styles import STYLES, Opening
-from ar.window import SHUT, Roles
+from ar.optics.camera import look_at
+from ar.overlay.composite import composite
+from ar.overlay.cut import EMPTY, Plane, plane_through, profile, section
+from ar.overlay.distances import distance_of_seen, signed_distance, tree_of
+from ar.overlay.gauge import GAUGE, Gauge, gauge_words
+from ar.overlay.hud import FINE, WHITE, panel
+from ar.overlay.legend import Names
+from ar.overlay.outlines import ink_of, key_of, silhouette
+from ar.overlay.refind import found_at, of_ink, outline_gap, stands
+from ar.overlay.rings import RING, RINGS, draw_rings
+from ar.overlay.styles import STYLES, Opening
+from ar.overlay.window import SHUT, Roles
+from ar.rendering.layer import Layer
+from ar.rendering.renderer import Lamp, render
 
 CORTEX, TOOL, TUMOUR, DRAPE = 1, 2, 3, 4
 GREEN = (0.2, 0.94, 0.42)

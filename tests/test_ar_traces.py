@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from ar.camera import Camera, look_at
-from ar.hud import FINE
-from ar.layer import Layer
-from ar.outlines import ink_of, silhouette
-from ar.overlay import SEEN, composite, draw_points
-from ar.refind import of_ink, outline_gap, stands
-from ar.renderer import Lamp, Picture, render
-from ar.traces import Trace
+from ar.optics.camera import Camera, look_at
+from ar.overlay.composite import SEEN, composite, draw_points
+from ar.overlay.hud import FINE
+from ar.overlay.outlines import ink_of, silhouette
+from ar.overlay.refind import of_ink, outline_gap, stands
+from ar.overlay.traces import Trace
+from ar.rendering.layer import Layer
+from ar.rendering.renderer import Lamp, Picture, render
 
 
 def camera(width: int, height: int) -> Camera:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ar.camera import Camera
-from ar.lens import Lens
+from ar.optics.camera import Camera
+from ar.optics.lens import Lens
 from ar.tracking.detection import Corners, Detector
 from ar.tracking.drawn import drawn
 from ar.tracking.pose import Verdict, pose_of

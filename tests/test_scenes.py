@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from theatres import PUSHING, on_template, small, template_theatre
 
-from ar.camera import project_cv2
+from ar.optics.camera import project_cv2
 from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage, clipped
 from scenes.script.head_posture import Lying
 from scenes.script.scene import SCENES, find_scene

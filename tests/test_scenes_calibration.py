@@ -4,9 +4,9 @@ import os
 
 import pytest
 
-from ar.calibration import Calibration
-from ar.calibration_text import LONGEST_TEXT
-from ar.lens import Lens
+from ar.optics.calibration import Calibration
+from ar.optics.calibration_text import LONGEST_TEXT
+from ar.optics.lens import Lens
 from scenes.script.calibration_file import read_calibration, write_calibration
 from sim.errors import InputError
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from theatres import player, small, theatre_of
 
-from ar.calibration import Calibration
-from ar.camera import Camera, project_cv2
-from ar.lens import Lens
-from ar.outlines import iou, silhouette
+from ar.optics.calibration import Calibration
+from ar.optics.camera import Camera, project_cv2
+from ar.optics.lens import Lens
+from ar.overlay.outlines import iou, silhouette
 from ar.screen import read_png
 from scenes.cli import main
 from scenes.commands.camera_options import PATHS as NAMES

@@ -8,9 +8,9 @@ import pytest
 import warp as wp
 from theatres import PUSHING, SIGHTED, player, put, small, theatre_of
 
-from ar.hud import millimetres
-from ar.overlay import composite
-from ar.renderer import Picture
+from ar.overlay.composite import composite
+from ar.overlay.hud import millimetres
+from ar.rendering.renderer import Picture
 from scenes.cli import main
 from scenes.play.checks import Figures, measure
 from scenes.play.player import annotate, gauged
@@ -161,7 +161,9 @@ class TestThePictureItself:
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not say")
 
     def test_with_a_number_ten_times_too_large_it_fails(self, play, frames, truth, monkeypatch):
-        monkeypatch.setattr("ar.gauge.millimetres", lambda length, error=None: millimetres(10.0 * length, error))
+        monkeypatch.setattr(
+            "ar.overlay.gauge.millimetres", lambda length, error=None: millimetres(10.0 * length, error)
+        )
         wrong = drawn(play, frames[2], play.positions(frames[2].deformation))
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not say")
 

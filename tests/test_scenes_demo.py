@@ -9,16 +9,16 @@ import pytest
 from theatres import small, theatre_of
 from visitor import Visitor, free_port, wait_for
 
-from ar.browser import Browser
-from ar.hud import FINE
-from ar.refind import stands
-from scenes.play.page import Demo
-from scenes.play.page_controls import PLAN
-from scenes.play.page_moment import Moment
-from scenes.play.page_referee import Referee
-from scenes.play.page_requests import HAND, SCRIPT, Wish
-from scenes.play.page_text import plan_words
-from scenes.play.page_view import FEM_COLOUR, STALE_COLOUR
+from ar.overlay.hud import FINE
+from ar.overlay.refind import stands
+from ar.page.browser import Browser
+from scenes.play.page.controls import PLAN
+from scenes.play.page.demo import Demo
+from scenes.play.page.moment import Moment
+from scenes.play.page.referee import Referee
+from scenes.play.page.requests import HAND, SCRIPT, Wish
+from scenes.play.page.text import plan_words
+from scenes.play.page.view import FEM_COLOUR, STALE_COLOUR
 from scenes.script.tool_paths import Touch, press
 from sim.fem import Fem
 from surrogate.model.learned import Learned

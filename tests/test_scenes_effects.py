@@ -15,7 +15,7 @@ from scenes.play.checks import measure
 from scenes.play.effect_ablation import without
 from scenes.play.episode import UNITS, collect
 from scenes.play.load_text import acting
-from scenes.play.page import Demo
+from scenes.play.page.demo import Demo
 from scenes.play.player import labelled
 from scenes.play.reference import truth_of
 from scenes.play.stage import CORTEX, TOOL, Stage

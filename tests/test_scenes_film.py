@@ -16,7 +16,7 @@ from ar.tracking.targets import patient_reference, tool_cube
 from ar.tracking.track import Tracker
 from scenes.cli import main
 from scenes.play.deformers import AtRest
-from scenes.play.filming import Taking, Trouble, mounted, registered, shots_of
+from scenes.play.overlay.filming import Taking, Trouble, mounted, registered, shots_of
 from scenes.play.player import Player
 from scenes.script.calibration_file import write_calibration
 from scenes.script.film_truth import read_truth

@@ -6,8 +6,8 @@ from functools import partial
 import pytest
 from theatres import put, short, theatre_of
 
-from ar.browser import Browser
-from ar.renderer import Renderer
+from ar.page.browser import Browser
+from ar.rendering.renderer import Renderer
 from scenes.bench import frame
 from scenes.bench.frame import STAGES, WARM_UP, batch_rate, frames_of, size_of, table
 from scenes.cli import main

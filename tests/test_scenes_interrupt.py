@@ -39,9 +39,9 @@ class Demo:
 
 theatre = Names(models={"linear"}, best=lambda scene: "linear", usual=lambda scene: "linear",
                 knowing=lambda scene: True, refusals=lambda scene: {}, described=lambda name, scene: name)
-sys.modules["ar.overlay"] = Names(load_kernels=lambda: None)
+sys.modules["ar.overlay.composite"] = Names(load_kernels=lambda: None)
 sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
-sys.modules["scenes.play.page"] = Names(Demo=Demo)
+sys.modules["scenes.play.page.demo"] = Names(Demo=Demo)
 scene = Names(name="none", viewpoint=None, made_of=lambda tissue, element: scene)
 sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",))
 sys.modules["scenes.play.deformers"] = Names(open_theatre=lambda *words: theatre)

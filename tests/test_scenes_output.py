@@ -9,7 +9,7 @@ import pytest
 from boxes import base_held, top_forces
 from boxes import box as cube
 
-from ar.calibration import Calibration
+from ar.optics.calibration import Calibration
 from ar.screen import signature, write_film, write_png
 from ar.tracking.pages import Page, listed_targets, png_bytes
 from ar.tracking.registration import Registration
@@ -17,7 +17,7 @@ from scenes.bench.figure_record import Origin, record_of, write_record
 from scenes.cli import main
 from scenes.commands.companion_files import demand_no_strangers, remove_data, strangers
 from scenes.commands.outputs import KINDS, claimed, claimed_frames, recognised
-from scenes.play.overlay_rows import write_rows
+from scenes.play.overlay.rows import write_rows
 from scenes.script.calibration_file import write_calibration
 from scenes.script.film_truth import Truth, write_table, write_truth
 from scenes.script.registration_file import write_registration

@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 from theatres import template_theatre
 
-from ar.layer import Layer
-from ar.outlines import ink_of, silhouette
-from ar.real_picture import real_picture
-from ar.refind import of_ink, outline_gap
+from ar.overlay.outlines import ink_of, silhouette
+from ar.overlay.refind import of_ink, outline_gap
+from ar.rendering.layer import Layer
+from ar.rendering.real_picture import real_picture
 from ar.tracking.live_camera import camera_pictures, newest
 from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
-from scenes.play.overlay_follower import HELD, Follower, State
-from scenes.play.overlay_page import OverlayPage
-from scenes.play.overlay_picture import Painter
-from scenes.play.overlay_run import Timed, aged, overlaid, paced, timed
-from scenes.play.overlay_truth import off, summary
+from scenes.play.overlay.follower import HELD, Follower, State
+from scenes.play.overlay.page import OverlayPage
+from scenes.play.overlay.picture import Painter
+from scenes.play.overlay.run import Timed, aged, overlaid, paced, timed
+from scenes.play.overlay.tool_motion import ToolMotion
+from scenes.play.overlay.truth import off, summary
 from scenes.play.stage import TUMOUR_COLOUR
-from scenes.play.tool_motion import ToolMotion
 from scenes.script.calibration_file import read_calibration
 from scenes.script.film_truth import read_truth
 from scenes.script.registration_file import read_registration

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from theatres import short, sinking, small, theatre_of
 
-from ar.page_parts import Choice, Fold, Slider
+from ar.page.parts import Choice, Fold, Slider
 from scenes.play.deformers import GUARDED, plan_of
-from scenes.play.page_beside import TIP, TUMOUR_MIDDLE, lines_of, sample_of, slices_of
-from scenes.play.page_controls import clocked, controls
-from scenes.play.page_referee import Truth
-from scenes.play.page_requests import Wish
-from scenes.play.page_text import RESEARCH, about, fem_words, plan_words, report, side, trust, words
-from scenes.play.page_verdict import Judged, judge, verdict_words
+from scenes.play.page.beside import TIP, TUMOUR_MIDDLE, lines_of, sample_of, slices_of
+from scenes.play.page.controls import clocked, controls
+from scenes.play.page.referee import Truth
+from scenes.play.page.requests import Wish
+from scenes.play.page.text import RESEARCH, about, fem_words, plan_words, report, side, trust, words
+from scenes.play.page.verdict import Judged, judge, verdict_words
 from scenes.play.player import Player
 from scenes.play.stage import Stage
 from scenes.play.waiting_notice import NOTICED, Busy

@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from theatres import PUSHING, on_template, player, put, short, small, template_theatre, theatre_of
 
-from ar.camera import project_cv2
-from ar.hud import FINE, NARROW, WHITE, folded
-from ar.outlines import ink_of
-from ar.overlay import WARNING
-from ar.refind import stands
+from ar.optics.camera import project_cv2
+from ar.overlay.composite import WARNING
+from ar.overlay.hud import FINE, NARROW, WHITE, folded
+from ar.overlay.outlines import ink_of
+from ar.overlay.refind import stands
 from scenes.cli import main
 from scenes.play.deformers import model_path, open_theatre
 from scenes.play.player import CARRIED, IN_BONE, STAGES, labelled

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from theatres import player, put, short, theatre_of
 
-from ar.camera import Camera, project_cv2
+from ar.optics.camera import Camera, project_cv2
 from scenes.cli import main
 from scenes.play.episode import DEPTH_SCALE, collect
 from scenes.play.player import STAGES

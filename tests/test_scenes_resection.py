@@ -11,11 +11,11 @@ import pytest
 from theatres import player, put, small, theatre_of
 from visitor import free_port, wait_for
 
-from ar.outlines import silhouette
+from ar.overlay.outlines import silhouette
 from scenes.cli import main
 from scenes.play.episode import collect
 from scenes.play.load_text import acting
-from scenes.play.page import Demo
+from scenes.play.page.demo import Demo
 from scenes.script.debulking import Debulking
 from scenes.script.head_posture import drained
 from scenes.script.tool_paths import Touch

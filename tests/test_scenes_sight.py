@@ -8,13 +8,13 @@ import pytest
 from locators import locator_of
 from theatres import SIGHTED, short, small
 
-from ar.outlines import ink_of
-from ar.refind import of_ink
+from ar.overlay.outlines import ink_of
+from ar.overlay.refind import of_ink
 from scenes.cli import main
 from scenes.play.checks import measure, within
 from scenes.play.deformers import Theatre, open_theatre
 from scenes.play.observer import ELLIPSOID_COLOUR, Observer
-from scenes.play.page_text import estimated, legend, report
+from scenes.play.page.text import estimated, legend, report
 from scenes.play.player import REFUSED, labelled
 from scenes.play.reference import truth_of
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR

@@ -10,8 +10,8 @@ from theatres import put, theatre_of
 from visitor import free_port
 
 from scenes.cli import limit_threads, main
-from scenes.play.page import Demo
-from scenes.play.page_cast import Cast
+from scenes.play.page.cast import Cast
+from scenes.play.page.demo import Demo
 from scenes.play.waiting_notice import Busy
 
 
@@ -34,7 +34,7 @@ def test_the_page_opens_while_kernels_are_compiled_and_plays_when_they_are(name,
         assert opened.wait(30.0)
         done.append("compiled")
 
-    monkeypatch.setattr("ar.overlay.load_kernels", slow)
+    monkeypatch.setattr("ar.overlay.composite.load_kernels", slow)
     monkeypatch.setattr(Busy, "on", lambda busy, what: done.append(what) or opened.set())
     monkeypatch.setattr(Cast, "predicted", lambda *words: done.append("answered") or predicted(*words))
     monkeypatch.setattr(Demo, "run", lambda page, seconds: done.append("plays"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from theatres import template_theatre
 
-from ar.outlines import silhouette
+from ar.overlay.outlines import silhouette
 from scenes.bench.stereo_study import row
 from scenes.cli import main
 from scenes.play.deformers import AtRest

@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ar.gauge import GAUGE, Gauge
-from ar.outlines import ink_of
-from ar.overlay import DOUBTFUL, composite
-from ar.refind import found_at
-from ar.styles import STYLES
-from ar.traces import BEFORE
+from ar.overlay.composite import DOUBTFUL, composite
+from ar.overlay.gauge import GAUGE, Gauge
+from ar.overlay.outlines import ink_of
+from ar.overlay.refind import found_at
+from ar.overlay.styles import STYLES
+from ar.overlay.traces import BEFORE
 from scenes.cli import main
 from scenes.play.checks import measure
 from scenes.play.deformers import open_theatre

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_ar_tracking import CAMERA, CUBE, PLATE, flat, looking, taken
 
-from ar.calibration import Calibration
+from ar.optics.calibration import Calibration
 from ar.tracking.targets import TIP
 from scenes.cli import main
 from scenes.script.calibration_file import write_calibration

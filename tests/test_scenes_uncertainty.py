@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from theatres import put, short, small, theatre_of
 
-from ar.hud import FINE, millimetres
-from ar.refind import stands
+from ar.overlay.hud import FINE, millimetres
+from ar.overlay.refind import stands
 from scenes.bench.uncertainty import (
     Motions,
     causes,

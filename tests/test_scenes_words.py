@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-import ar.hud
-from ar.outlines import outlines, silhouette
-from ar.styles import Style
+import ar.overlay.hud
+from ar.overlay.outlines import outlines, silhouette
+from ar.overlay.styles import Style
 from scenes.play.deformers import open_theatre
-from scenes.play.page import pictured
+from scenes.play.page.demo import pictured
 from scenes.play.player import Player, gauged
 from scenes.play.stage import TOOL
 from scenes.script.scene import find_scene
@@ -67,7 +67,7 @@ def seen(monkeypatch, name, size, touch=None, number=51, style="window"):
             found.append(Written(text, at[0], at[1] - above, at[0] + width, at[1] + below))
         return write(colour, text, at, font, scale, ink, *more)
 
-    monkeypatch.setattr(ar.hud.cv2, "putText", heard)
+    monkeypatch.setattr(ar.overlay.hud.cv2, "putText", heard)
     frame = play.drawn(number, touch or play.touch(number), *answered(name, touch, number), 0.0)
     picture = pictured(frame)
     monkeypatch.undo()

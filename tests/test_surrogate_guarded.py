@@ -10,7 +10,7 @@ from theatres import player, small, theatre_of
 
 from scenes.commands.demo import add_theatre, theatre_asked
 from scenes.play.deformers import GUARDED, AtRest
-from scenes.play.page_cast import ALL, Cast
+from scenes.play.page.cast import ALL, Cast
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
 from sim.errors import InputError

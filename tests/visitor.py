@@ -13,7 +13,7 @@ from viser import _messages
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from ar.browser import Browser
+from ar.page.browser import Browser
 
 
 def free_port() -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from ..camera import Camera
+from ..optics.camera import Camera
 from .targets import MARKERS, Target
 
 Window = tuple[slice, slice]

@@ -9,7 +9,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from ..camera import Camera
+from ..optics.camera import Camera
 from .detection import window_round
 from .targets import BORDER, Face, Target, seen_from_front
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..calibration import Calibration
-from ..lens import Lens
+from ..optics.calibration import Calibration
+from ..optics.lens import Lens
 from .board_views import View, covered, directions
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

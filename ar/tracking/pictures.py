@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from ..calibration import LARGEST_SIDE
+from ..optics.calibration import LARGEST_SIDE
 
 # Pictures that are looked at, spread evenly over those that there are.
 MOST_PICTURES = 300

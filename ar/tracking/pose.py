@@ -8,7 +8,7 @@ from enum import Enum
 import cv2
 import numpy as np
 
-from ..camera import Camera
+from ..optics.camera import Camera
 from .detection import Corners
 from .rigid import angles_of, cross_matrices
 from .targets import Target, seen_from_front

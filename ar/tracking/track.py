@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..camera import Camera
+from ..optics.camera import Camera
 from .detection import Corners, Detector, window_round
 from .pose import FEWEST, Pose, Verdict, pose_of
 from .targets import Target

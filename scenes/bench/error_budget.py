@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ar.calibration import Calibration
-from ar.camera import Camera
+from ar.optics.calibration import Calibration
+from ar.optics.camera import Camera
 from ar.tracking.pose import pose_of
 from ar.tracking.registration import Registration
 from ar.tracking.targets import patient_reference

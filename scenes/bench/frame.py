@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ar.browser import Browser
-from ar.page_parts import Body, Playback, Viewpoint
-from ar.page_sight import coded
-from ar.renderer import Renderer
+from ar.page.browser import Browser
+from ar.page.parts import Body, Playback, Viewpoint
+from ar.page.sight import coded
+from ar.rendering.renderer import Renderer
 from sim.errors import InputError
 
-from ..play.page import pictured
+from ..play.page.demo import pictured
 from ..play.player import Player
 from ..play.stage import CORTEX_COLOUR, TUMOUR_COLOUR
 

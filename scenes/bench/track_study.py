@@ -15,8 +15,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, qmc
 
-from ar.camera import Camera
-from ar.lens import Lens
+from ar.optics.camera import Camera
+from ar.optics.lens import Lens
 from ar.tracking.drawn import drawn
 from ar.tracking.pose import Pose, Verdict
 from ar.tracking.targets import MARKER, TIP, tool_cube

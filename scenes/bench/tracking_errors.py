@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ar.calibration import Calibration
-from ar.camera import Camera
-from ar.lens import Lens
+from ar.optics.calibration import Calibration
+from ar.optics.camera import Camera
+from ar.optics.lens import Lens
 from ar.tracking.board_views import View
 from ar.tracking.detection import Corners
 from ar.tracking.intrinsics import covariance_of

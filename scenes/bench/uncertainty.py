@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ar.layer import vertex_normals
+from ar.rendering.layer import vertex_normals
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import Deformation

@@ -23,7 +23,7 @@ from .json_line import json_line
 from .tissue_options import add_element_argument, add_tissue_arguments
 
 if TYPE_CHECKING:
-    from ar.calibration import Calibration
+    from ar.optics.calibration import Calibration
 
     from ..bench.error_budget import Budget, Errors, Filmed
     from ..play.deformers import Theatre

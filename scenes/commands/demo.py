@@ -154,7 +154,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until the time is over, Ctrl-C (exit code 0) or SIGTERM (143)."""
-    from ar.overlay import load_kernels
+    from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
 
@@ -164,7 +164,7 @@ def run(args: argparse.Namespace) -> int:
     # One thread for all kernels of the first picture: each that compiles reads Warp's headers first, for two seconds.
     kernels = ThreadPoolExecutor(1, "kernels")
     kernels.submit(load_kernels)
-    from ar.guard import check_address
+    from ar.page.guard import check_address
 
     from .interrupt import until_ended
 
@@ -177,9 +177,9 @@ def run(args: argparse.Namespace) -> int:
 
 def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitStack) -> int:
     """Open the page, and play when `kernels` has loaded those of the first picture; `closing` closes the page."""
-    from ar.guard import UnguardedError
+    from ar.page.guard import UnguardedError
 
-    from ..play.page import Demo
+    from ..play.page.demo import Demo
 
     def asked(scene: str) -> Scene:
         return filmed(args, scene_asked(args, scene))

@@ -22,7 +22,7 @@ from .json_line import json_line
 from .outputs import add_force, claimed, claimed_folder, claimed_frames
 
 if TYPE_CHECKING:
-    from ..play.filming import Shot
+    from ..play.overlay.filming import Shot
     from ..play.player import Player
     from ..script.scene import Scene
 
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         What cannot be read, written or filmed; numbers that are out of range.
     """
-    from ..play.filming import Taking, Trouble, mounted, registered, shots_of
+    from ..play.overlay.filming import Taking, Trouble, mounted, registered, shots_of
     from ..script.calibration_file import write_calibration
     from ..script.film_truth import Truth, write_table, write_truth
     from ..script.registration_file import write_registration

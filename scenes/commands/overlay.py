@@ -25,14 +25,14 @@ from .style_option import add_style
 from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
 
 if TYPE_CHECKING:
-    from ar.calibration import Calibration
+    from ar.optics.calibration import Calibration
     from sim.deformation import Deformer
     from sim.tools import BuiltIn
 
     from ..play.deformers import Theatre
-    from ..play.overlay_follower import Follower
-    from ..play.overlay_picture import Painter
-    from ..play.overlay_run import Shown
+    from ..play.overlay.follower import Follower
+    from ..play.overlay.picture import Painter
+    from ..play.overlay.run import Shown
     from ..script.scene import Scene
 
 FILMS = (".mp4", ".gif", ".webp")
@@ -93,8 +93,8 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Files that cannot be read, written, or do not belong together; pictures of another size than the camera's.
     """
-    from ..play.overlay_rows import write_rows
-    from ..play.overlay_truth import off, summary
+    from ..play.overlay.rows import write_rows
+    from ..play.overlay.truth import off, summary
     from ..script.film_truth import read_truth
 
     if args.pictures.isdecimal() and not Path(args.pictures).exists():
@@ -121,12 +121,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _served(args: argparse.Namespace, closing: ExitStack) -> int:
     """Show what a camera sees on a page, until the time is over or a signal comes."""
-    from ar.browser import check_address
+    from ar.page.browser import check_address
     from ar.tracking.live_camera import camera_pictures, newest, opened
 
-    from ..play.overlay_follower import GAP
-    from ..play.overlay_page import OverlayPage
-    from ..play.overlay_rows import write_rows
+    from ..play.overlay.follower import GAP
+    from ..play.overlay.page import OverlayPage
+    from ..play.overlay.rows import write_rows
 
     if args.out is not None or args.truth is not None or args.live:
         raise InputError("--out, --truth and --live belong to films: leave them out with a camera.")
@@ -169,14 +169,14 @@ def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path
 
 def _parts(args: argparse.Namespace) -> Parts:
     """Read what the pictures are looked at with."""
-    from ar.overlay import load_kernels
+    from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
 
     from ..play.deformers import open_theatre
-    from ..play.overlay_follower import Follower
-    from ..play.overlay_picture import Painter
-    from ..play.tool_motion import ToolMotion
+    from ..play.overlay.follower import Follower
+    from ..play.overlay.picture import Painter
+    from ..play.overlay.tool_motion import ToolMotion
     from ..script.calibration_file import read_calibration
     from ..script.registration_file import read_registration
     from ..script.tracked_tool import read_tool
@@ -229,7 +229,7 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
     from ar.screen import write_film
     from ar.tracking.pictures import GIVE, film_of, rate_of
 
-    from ..play.overlay_run import overlaid, timed
+    from ..play.overlay.run import overlaid, timed
 
     shown: list[Shown] = []
 
@@ -256,7 +256,7 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
 
 def _report(shown: list[Shown], who: str) -> dict[str, object]:
     """What a run was like, for machines."""
-    from ..play.overlay_run import latencies
+    from ..play.overlay.run import latencies
 
     count = len(shown)
     states = Counter(each.known.state.value for each in shown)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ar.styles import STYLES, Style
+from ar.overlay.styles import STYLES, Style
 
 
 def add_style(parser: argparse.ArgumentParser, without: tuple[Style, ...] = ()) -> None:

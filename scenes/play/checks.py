@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from ar.camera import Camera, project_cv2
-from ar.layer import Layer
-from ar.outlines import iou, silhouette
+from ar.optics.camera import Camera, project_cv2
+from ar.overlay.outlines import iou, silhouette
+from ar.rendering.layer import Layer
 from sim.deformation import Deformation
 from surrogate.locating.prior import middle_of
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ar.hud import panel
+from ar.overlay.hud import panel
 from ar.screen import shrunk
 
 from .player import Frame, Player, labelled

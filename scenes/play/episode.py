@@ -17,7 +17,7 @@ import cv2
 import h5py
 import numpy as np
 
-from ar.outlines import silhouette
+from ar.overlay.outlines import silhouette
 from sim.deformation import Deformation
 from sim.effects import Elasticity
 from sim.errors import InputError

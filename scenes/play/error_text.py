@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ar.hud import bound_words
+from ar.overlay.hud import bound_words
 
 from ..script.uncertainty import TumourError
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from ar.layer import Layer
+from ar.rendering.layer import Layer
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.geometry.closest_point import closest

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ar.camera import Camera
-from ar.gauge import GAUGE, gauge_words
-from ar.hud import FINE, NARROW, WHITE, folded, millimetres
-from ar.layer import Layer
-from ar.outlines import ink_of
-from ar.overlay import BROKEN, DOUBTFUL, HIDDEN, ground_lines
-from ar.raycast import raycast
-from ar.refind import changed_share, found_at, inked_share, of_ink, outline_gap, stands
-from ar.styles import NOTICED, WHOLE
+from ar.optics.camera import Camera
+from ar.overlay.composite import BROKEN, DOUBTFUL, HIDDEN, ground_lines
+from ar.overlay.gauge import GAUGE, gauge_words
+from ar.overlay.hud import FINE, NARROW, WHITE, folded, millimetres
+from ar.overlay.outlines import ink_of
+from ar.overlay.refind import changed_share, found_at, inked_share, of_ink, outline_gap, stands
+from ar.overlay.styles import NOTICED, WHOLE
+from ar.rendering.layer import Layer
+from ar.rendering.raycast import raycast
 from sim.geometry.surface import encloses
 from surrogate.locating.prior import middle_of
 from surrogate.model.guarded import answering

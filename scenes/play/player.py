@@ -9,15 +9,15 @@ from functools import cached_property
 
 import numpy as np
 
-from ar.camera import Camera
-from ar.gauge import Gauge
-from ar.hud import HEAD, NARROW, ROW, folded, lay, panel
-from ar.layer import Layer
-from ar.legend import Names
-from ar.overlay import Overlaid, composite, draw_points
-from ar.renderer import Picture
-from ar.styles import Style
-from ar.traces import Trace
+from ar.optics.camera import Camera
+from ar.overlay.composite import Overlaid, composite, draw_points
+from ar.overlay.gauge import Gauge
+from ar.overlay.hud import HEAD, NARROW, ROW, folded, lay, panel
+from ar.overlay.legend import Names
+from ar.overlay.styles import Style
+from ar.overlay.traces import Trace
+from ar.rendering.layer import Layer
+from ar.rendering.renderer import Picture
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
 from sim.geometry.ball_at_rest import resting_tip

@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ar.camera import Camera
-from ar.layer import Layer, Solid, vertex_normals
-from ar.legend import Names
-from ar.renderer import Lamp, Picture, Renderer, lamp_beside
-from ar.styles import Opening
+from ar.optics.camera import Camera
+from ar.overlay.legend import Names
+from ar.overlay.styles import Opening
+from ar.rendering.layer import Layer, Solid, vertex_normals
+from ar.rendering.renderer import Lamp, Picture, Renderer, lamp_beside
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity
 from sim.discretisation.resected_body import Remains, bodies

@@ -8,11 +8,11 @@ from typing import cast
 
 import numpy as np
 
-from ar.camera import Camera
-from ar.disparity import Cloud, StereoView, cloud, viewed
-from ar.outlines import silhouette
-from ar.point_flow import followed, supported
-from ar.rectified import rectified
+from ar.optics.camera import Camera
+from ar.overlay.outlines import silhouette
+from ar.stereo.disparity import Cloud, StereoView, cloud, viewed
+from ar.stereo.point_flow import followed, supported
+from ar.stereo.rectified import rectified
 from sim.errors import InputError
 from sim.geometry.closest_point import closest
 from surrogate.locating.evidence import SIGMA, WHITE

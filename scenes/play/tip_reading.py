@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ar.hud import millimetres
+from ar.overlay.hud import millimetres
 from sim.anatomy import Anatomy
 from sim.bodies.tip_distance import tip_gauge
 from sim.deformation import Deformation, Deformer

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import affine_transform, gaussian_filter
 from scipy.spatial import KDTree
 
-from ar.layer import Solid
+from ar.rendering.layer import Solid
 from sim.bodies.intensity import Intensity
 
 from ..script.site import Site

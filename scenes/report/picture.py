@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ar.camera import look_at
-from ar.hud import panel
-from ar.outlines import dash, outlines, silhouette
-from ar.overlay import DASHED, composite
+from ar.optics.camera import look_at
+from ar.overlay.composite import DASHED, composite
+from ar.overlay.hud import panel
+from ar.overlay.outlines import dash, outlines, silhouette
 from sim.bodies.intensity import read_intensity, sidecar
 from sim.geometry.ball_at_rest import resting_tip
 from sim.loads import Pushed

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ar.camera import Camera
+from ar.optics.camera import Camera
 from sim.errors import InputError
 
 # Of a breath [Hz]: fifteen a minute.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ar.calibration import Calibration
+from ar.optics.calibration import Calibration
 from ar.tracking.pictures import GIVE, film_of
 from ar.tracking.pose import Pose, Verdict
 from ar.tracking.targets import all_targets

@@ -1,0 +1,1 @@
+"""Cameras: where points land in a picture, lenses, calibrations."""

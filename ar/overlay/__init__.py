@@ -1,0 +1,1 @@
+"""What is drawn over the picture: the hidden surface, in each style, its lines and its words."""

@@ -1,0 +1,182 @@
+"""A cut through a hidden surface, in an inset: along the line of sight, through its middle and the tool's tip.
+
+The plane holds the camera's centre, so that the picture sees it as a line, and what is seen along that line lies in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..optics.camera import Camera
+from ..rendering.layer import Layer
+from .distances import signed_distance, tree_of
+from .hud import WHITE, haloed
+from .outlines import dash, outlines
+from .window import FRONT, SHUT
+
+# A tip so near to the line of sight through the middle gives no direction: the picture's own is taken [m].
+ASTRAY = 1e-3
+# What the inset shows round the hidden surface, and above what is seen [m]; of how much of that distance is measured.
+ROUND, OVER, FAR = 12e-3, 4e-3, 60e-3
+# Tissue is toned by its distance: a tone every so many metres.
+BAND = 5e-3
+TONES = np.array([(222, 206, 192), (184, 168, 156), (146, 132, 124), (112, 100, 94), (82, 74, 70)], np.float64)
+EMPTY = (20.0, 24.0, 27.0)
+"""Of the inset above the surface."""
+CLOSED = (120.0, 165.0, 180.0)
+"""Of the surface where the hidden one is not seen through it."""
+# Letters, a line of them, strokes of the margin [pixel].
+SMALL, LEADING, STROKES = 0.38, 14, (5, 4)
+SCALE = 10e-3
+"""Length of the bar that says how large things are [m]."""
+ENDS = ("a", "b")
+"""Letters at the ends of the line along which the picture is cut, and at the inset's sides."""
+# Half the width of a number [pixel].
+WIDE = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane through `middle` (3,) [m]: `along` (3,) the line of sight and, at right angles, `across` (3,)."""
+
+    middle: np.ndarray
+    across: np.ndarray
+    along: np.ndarray
+
+    def coordinates(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) [m] of the plane as (..., 2) [m]: across, and along the line of sight."""
+        return (points - self.middle) @ np.stack([self.across, self.along], axis=1)
+
+    def points(self, coordinates: np.ndarray) -> np.ndarray:
+        """The same back."""
+        return self.middle + coordinates @ np.stack([self.across, self.along])
+
+
+def plane_through(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) -> Plane:
+    """The plane of a camera's centre, a middle (3,) [m] and a tip (3,) [m], which lies to its right in the picture.
+
+    Without a tip, or where that is on the line of sight, the plane lies level in the picture.
+    """
+    along = (middle - camera.centre) / np.linalg.norm(middle - camera.centre)
+    level = camera.T_camera_world[0, :3]
+    towards = level if tip is None else tip - middle
+    across = towards - (towards @ along) * along
+    if np.linalg.norm(across) < ASTRAY:
+        across = level - (level @ along) * along
+    across /= np.linalg.norm(across)
+    return Plane(middle, across if across @ level >= 0.0 else -across, along)
+
+
+def profile(
+    camera: Camera, plane: Plane, depth: np.ndarray, roles: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is seen along the plane: places (n, 2) [m] of it, in order across, and what they are (n,).
+
+    depth (H, W) [m] and roles (H, W) uint8 of the picture; what is in front of the overlay is left out. `reach` [m] is
+    how far across to look.
+    """
+    steps = np.linspace(-reach, reach, 4 * max(camera.width, 1))
+    pixels, _ = camera.project(plane.points(np.stack([steps, 0.0 * steps], axis=1)))
+    pixels = np.unique(pixels[np.isfinite(pixels).all(axis=1)].round().astype(int), axis=0)
+    pixels = pixels[((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)]
+    far, role = depth[pixels[:, 1], pixels[:, 0]], roles[pixels[:, 1], pixels[:, 0]]
+    kept = (far > 0.0) & (role != FRONT)
+    places = plane.coordinates(camera.unproject(pixels[kept], far[kept]))
+    order = np.argsort(places[:, 0], kind="stable")
+    return places[order], role[kept][order]
+
+
+def section(
+    camera: Camera,
+    hidden: Layer,
+    plane: Plane,
+    seen: tuple[np.ndarray, np.ndarray],
+    size: tuple[int, int],
+    ink: tuple[float, ...],
+    tip: np.ndarray | None = None,
+    error: float | None = None,
+) -> np.ndarray:
+    """The inset (h, w, 3) uint8: tissue toned by its distance to the hidden surface, whose inside has its ink.
+
+    Parameters
+    ----------
+    seen
+        As `profile` gives it.
+    size
+        Width and height [pixel].
+    tip
+        (3,) [m]: a dot.
+    error
+        How far off the surface may be [m]: a broken line so far outside of it.
+    """
+    wide, tall = size
+    low, scale = _frame(plane, hidden, seen[0], tip, size)
+    columns, rows = np.meshgrid(np.arange(wide), np.arange(tall))
+    places = low + np.stack([columns, rows], axis=2) / scale
+    distance = signed_distance(
+        tree_of(hidden.vertices, hidden.triangles), plane.points(places).reshape(-1, 3), FAR
+    ).reshape(tall, wide)
+    tone = np.nan_to_num(distance / BAND, nan=len(TONES)).clip(0, len(TONES) - 1).astype(int)
+    out = TONES[tone]
+    out[distance < 0.0] = ink
+    if len(seen[0]):
+        out[places[..., 1] < np.interp(places[..., 0], seen[0][:, 0], seen[0][:, 1])] = EMPTY
+    out = out.astype(np.uint8)
+    if error is not None:
+        dash(out, outlines(distance < error), ink, STROKES, 2)
+    at = np.rint((seen[0] - low) * scale).astype(np.int32)
+    for (column, row), role in zip(at.tolist(), seen[1].tolist(), strict=True):
+        cv2.circle(out, (column, row), 1, (*(CLOSED if role == SHUT else WHITE), 255), -1)
+    if tip is not None:
+        column, row = np.rint((plane.coordinates(tip) - low) * scale).astype(int).tolist()
+        cv2.circle(out, (column, row), 5, (10, 12, 12, 255), -1, cv2.LINE_AA)
+        cv2.circle(out, (column, row), 3, (*WHITE, 255), -1, cv2.LINE_AA)
+    _write_bands(out, distance, places, seen[0])
+    for letter, column in zip(ENDS, (4, wide - 12), strict=True):
+        haloed(out, letter, (column, 12), SMALL)
+    bar = round(SCALE * scale)
+    cv2.line(out, (6, tall - 6), (6 + bar, tall - 6), (*WHITE, 255), 2)
+    haloed(out, f"{1e3 * SCALE:.0f} mm", (6, tall - 11), SMALL)
+    return out
+
+
+def captioned(inset: np.ndarray, lines: list[str]) -> np.ndarray:
+    """An inset (h, w, 3) uint8 with lines of text under it and a thin frame."""
+    foot = np.full((LEADING * len(lines) + 4, inset.shape[1], 3), np.array(EMPTY), np.uint8)
+    for number, line in enumerate(lines):
+        haloed(foot, line, (5, LEADING * (number + 1) - 2), SMALL)
+    out = np.concatenate([inset, foot])
+    cv2.rectangle(out, (0, 0), (out.shape[1] - 1, out.shape[0] - 1), (150, 154, 158, 255), 1)
+    return out
+
+
+def _frame(
+    plane: Plane, hidden: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
+) -> tuple[np.ndarray, float]:
+    """The place (2,) [m] of the inset's upper left corner, and pixels a metre."""
+    places = plane.coordinates(hidden.vertices)
+    held = [places.min(axis=0) - ROUND, places.max(axis=0) + ROUND]
+    near = surface[(surface[:, 0] > held[0][0]) & (surface[:, 0] < held[1][0])]
+    held += [near.min(axis=0) - OVER] * bool(len(near))
+    held += [] if tip is None else [plane.coordinates(tip) - OVER, plane.coordinates(tip) + OVER]
+    low, high = np.min(held, axis=0), np.max(held, axis=0)
+    scale = float((np.array(size) / (high - low)).min())
+    return 0.5 * (low + high) - 0.5 * np.array(size) / scale, scale
+
+
+def _write_bands(out: np.ndarray, distance: np.ndarray, places: np.ndarray, surface: np.ndarray) -> None:
+    """Write the distances [mm] where tones change, about the middle's row, on the side of more tissue; in place."""
+    middle, wide = int(np.abs(places[:, 0, 1]).argmin()), out.shape[1]
+    for step in (1, 2, 3):
+        row = min(max(middle + (step - 2) * LEADING, 0), len(out) - 1)
+        tissue = np.ones(wide, bool)
+        if len(surface):
+            tissue = places[row, :, 1] > np.interp(places[row, :, 0], surface[:, 0], surface[:, 1])
+        left = tissue[: wide // 2].sum() >= tissue[wide // 2 :].sum()
+        columns = np.flatnonzero((distance[row] < step * BAND) & tissue)
+        column = int(columns[0 if left else -1]) if len(columns) else 0
+        if WIDE < column < wide - WIDE and tissue[column - WIDE : column + WIDE].all():
+            haloed(out, f"{1e3 * step * BAND:.0f}", (column - WIDE // 2, row + 4), SMALL)

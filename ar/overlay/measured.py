@@ -1,0 +1,139 @@
+"""What the styles that measure add to a picture: rings on the ground, a cut in an inset, the scale of a tint."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..optics.camera import Camera
+from ..rendering.layer import Layer
+from ..rendering.renderer import Picture
+from .cut import ENDS, Plane, captioned, plane_through, profile, section
+from .distances import distance_of_seen, tree_of
+from .gauge import Gauge
+from .hud import FINE, HEAD, folded, haloed, lay, millimetres
+from .legend import SMALL, depth_scale, paste, place_sheet
+from .outlines import OPAQUE, dash, ink_of, key_of
+from .places import PAD, free_place
+from .rings import RING, RINGS, draw_rings
+from .styles import Style
+from .window import Roles
+
+# Rings are looked for so far beyond the last [m].
+BEYOND = 3e-3
+# Shares of the picture's width that the inset of a cut may have, the first for which there is room; its height to its
+# width; and strokes of the line along which the picture is cut [pixel].
+WIDTHS, ASPECT, CUT_STROKES = (0.34, 0.27, 0.21), 0.75, (3, 5)
+# How far across the plane the surface over a cut is looked for, in radii of what is hidden.
+ACROSS = 4.0
+# Letters of the cut stay so far from a sheet's edge [pixel].
+EDGE = 12
+NO_ROOM = "no room for the cut"
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """A style that measures, of one picture.
+
+    Parameters
+    ----------
+    name
+        What the hidden surface is called.
+    error
+        How far off it may be [m]; None where nobody knows.
+    """
+
+    style: Style
+    picture: Picture
+    camera: Camera
+    hidden: Layer
+    roles: Roles
+    gauge: Gauge | None = None
+    name: str = ""
+    error: float | None = None
+
+    @property
+    def off(self) -> str:
+        """How far off what is measured may be, in words."""
+        return "error not known" if self.error is None else f"error {millimetres(self.error)} (95 %)"
+
+    @property
+    def reached(self) -> np.ndarray:
+        """Points (n, 3) [m] whose box in the picture holds what is drawn round the silhouette."""
+        low, high = self.hidden.vertices.min(axis=0), self.hidden.vertices.max(axis=0)
+        if self.style != "rings":
+            return np.stack([low, high])[:0]
+        beyond = RINGS[-1] + BEYOND
+        return np.stack(np.meshgrid(*np.stack([low - beyond, high + beyond], axis=1)), axis=-1).reshape(-1, 3)
+
+    @property
+    def plane(self) -> Plane:
+        """The plane of a cut."""
+        middle = self.hidden.vertices.mean(axis=0)
+        return plane_through(self.camera, middle, None if self.gauge is None else self.gauge.tip)
+
+    def draw(self, sheet: np.ndarray, box: tuple[slice, slice]) -> None:
+        """Draw the lines of rings, or that along which the picture is cut, on the sheet of a box; in place."""
+        if self.style == "rings":
+            free = self.roles.of(self.picture.segmentation, box) == 0
+            tree = tree_of(self.hidden.vertices, self.hidden.triangles, str(self.picture.drawn.depth.device))
+            reach = RINGS[-1] + BEYOND
+            draw_rings(
+                sheet,
+                distance_of_seen(tree, self.camera, box, self.picture.drawn.depth[0], free, reach),
+                free & (sheet[..., 3] == 0),
+            )
+        if self.style == "cut":
+            plane, part = self.plane, self.camera.cropped(*box)
+            far = 1.2 * float(np.abs(plane.coordinates(self.hidden.vertices)[:, 0]).max())
+            steps = np.linspace(-far, far, 2 * part.width)
+            pixels, _ = part.project(plane.points(np.stack([steps, 0.0 * steps], axis=1)))
+            line = pixels[np.isfinite(pixels).all(axis=1)].round().astype(np.int32)
+            line = line[np.diff(line, axis=0, append=-1).any(axis=1)]
+            dash(sheet, [line[:, None]], RING, CUT_STROKES, 1)
+            line = line[((line >= EDGE) & (line < (part.width - EDGE, part.height - EDGE))).all(axis=1)]
+            for letter, at in zip(ENDS, (0, -1), strict=True) if len(line) else ():
+                column, row = line[at].tolist()
+                haloed(sheet, letter, (column - 4, row + 4), FINE, RING)
+
+    def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
+        """Lay what explains the lines into a composite picture, as `place_sheet` takes it; in place.
+
+        needed (H, W) uint8: above 0 on what alone stays in sight where a cut would become too small.
+        """
+        width = taken.shape[1]
+        if self.style == "depth":
+            caption = f"{self.name or 'surface'}: mm under\nwhat is seen\n{self.off}"
+            place_sheet(colour, taken, depth_scale(key_of(ink_of(self.hidden.colour)), caption), sights)
+        if self.style == "rings":
+            said = f"rings: mm to the {self.name or 'surface'}; {self.off}"
+            lay(colour, taken, folded(said, 0.3 * width), (width, HEAD), sights=sights)
+        if self.style == "cut":
+            self._lay_cut(colour, taken, sights, needed)
+
+    def _lay_cut(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
+        roles = self.roles.of(self.picture.segmentation)
+        plane = self.plane
+        reach = ACROSS * float(np.abs(plane.coordinates(self.hidden.vertices)[:, 0]).max())
+        seen = profile(self.camera, plane, self.picture.depth, roles, reach)
+        tip = None if self.gauge is None else self.gauge.tip
+        ink = key_of(ink_of(self.hidden.colour))
+        for shut, share in itertools.product((taken | sights, taken | needed), WIDTHS):
+            wide = round(share * taken.shape[1])
+            lines = [
+                line
+                for text in (f"cut: mm to the {self.name or 'surface'}", self.off)
+                for line in folded(text, wide - PAD, SMALL)
+            ]
+            inset = captioned(np.zeros((round(ASPECT * wide), wide, 3), np.uint8), lines)
+            place = free_place(shut, inset.shape[1::-1], (taken.shape[1], HEAD))
+            if place is not None:
+                drawn = section(
+                    self.camera, self.hidden, plane, seen, (wide, round(ASPECT * wide)), ink, tip, self.error
+                )
+                whole = captioned(drawn, lines)
+                paste(colour, taken, np.dstack([whole, np.full(whole.shape[:2], OPAQUE, np.uint8)]), place)
+                return
+        lay(colour, taken, [NO_ROOM], (taken.shape[1], HEAD))

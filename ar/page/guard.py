@@ -1,0 +1,300 @@
+"""The page's server lets in the page's own visitors alone, and hears from them what `ar.page.messages` passes.
+
+Whoever can reach the server may ask it for anything: another page in a visitor's browser, a name that its owner points
+at this machine (DNS rebinding), a program. Each request is held to the page's own address and, where others than this
+machine can reach it, to a secret in the page's address.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import logging
+import secrets
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import viser
+import websockets.asyncio.server
+from viser import _messages
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from .messages import LARGEST, MessageError, checked
+
+# The guard stands on how this release line of viser serves: another is refused.
+KNOWN = "1.1."
+# Another page must not frame this one to have it clicked, nor learn its address.
+HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "Referrer-Policy": "no-referrer"}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much goes back and forth between a page and its visitors.
+
+    Parameters
+    ----------
+    visitors
+        Browsers that are served at once.
+    burst, per_second
+        Messages that one may send at once, and per second for long; viser's own page sends some 50 a second at most.
+    sendings
+        Times per second that the page sends what is new, at most.
+    asides
+        The same of slices and of the last seconds, which take longer to draw.
+    """
+
+    visitors: int = 32
+    burst: float = 1000.0
+    per_second: float = 200.0
+    sendings: float = 15.0
+    asides: float = 2.0
+
+
+LIMITS = Limits()
+
+
+class UnguardedError(RuntimeError):
+    """A viser that serves otherwise than this guard knows."""
+
+
+@dataclass(frozen=True)
+class Door:
+    """Who may come in: `host` as the page is bound to, `token` (None: whoever is on this machine)."""
+
+    host: str
+    token: str | None
+
+    @classmethod
+    def of(cls, host: str) -> Door:
+        """A door with a fresh token, unless only this machine reaches the host.
+
+        Raises
+        ------
+        OSError
+            A host that has no address.
+        """
+        addresses = [entry[4][0] for entry in socket.getaddrinfo(host, None)]
+        near = all(ipaddress.ip_address(str(address).split("%")[0]).is_loopback for address in addresses)
+        return cls(host, None if near else secrets.token_urlsafe(24))
+
+    def refusal(self, request: Request, address: str, port: int) -> str | None:
+        """Why a request that reached this machine at an address and a port is refused; None where it is not."""
+        names = {"localhost", "127.0.0.1", "[::1]", bracketed(self.host), bracketed(address)}
+        if self.token is not None:
+            names.add(socket.gethostname())
+        places = {f"{name}:{port}".lower() for name in names}
+        if port == 80:  # browsers leave it out
+            places |= {name.lower() for name in names}
+        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+        if len(hosts) != 1 or hosts[0].lower() not in places:
+            return f"This page is not served under that host name. Open it as it was printed, at port {port}.\n"
+        if origins and (len(origins) > 1 or origins[0].lower() not in {f"http://{place}" for place in places}):
+            return "Another page may not use this one.\n"
+        if self.token is not None and not any(map(self.is_token, self.tokens(request, port))):
+            return "This page asks for a token: open the address that was printed, with its ?token=...\n"
+        return None
+
+    def is_token(self, text: str) -> bool:
+        """Whether a text is the token; the time that it takes does not tell how much of it is right."""
+        return self.token is not None and hmac.compare_digest(text.encode(), self.token.encode())
+
+    def tokens(self, request: Request, port: int) -> Iterator[str]:
+        """What a request gives as tokens, in its address or as a cookie."""
+        yield from parse_qs(urlsplit(plain(request.path)).query).get("token", [])
+        for header in request.headers.get_all("Cookie"):
+            for pair in plain(header).split(";"):
+                name, _, value = pair.strip().partition("=")
+                if name == cookie(port):
+                    yield value
+
+
+class Visit(ServerConnection):
+    """A visitor's connection: what it sends is checked before viser hears it; `controls` finds what can be set."""
+
+    def __init__(self, *args: Any, controls: Callable[[str], object], limits: Limits, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        self.controls, self.limits = controls, limits
+        self.credit, self.counted = limits.burst, self.loop.time()
+
+    def data_received(self, data: bytes) -> None:
+        """Answer what asks otherwise than by GET, which websockets leaves without an answer."""
+        if self.request is None and not data.startswith(b"GET "[: len(data)]):
+            self.transport.write(b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nContent-Length: 0\r\n\r\n")
+            self.transport.close()
+        elif not self.transport.is_closing():
+            super().data_received(data)
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        """Wait for the next message that may be passed on; none of a page's, or a flood, ends the visit."""
+        while True:
+            message = await super().recv(decode)
+            try:
+                self.count()
+                return checked(message, self.controls)
+            except MessageError as error:
+                self.logger.warning("A visitor's message was refused: %s.", error)
+                if self.credit < 0.0:
+                    self.transport.abort()  # what lies unread is not waited for
+                elif error.malformed:
+                    await self.close(1008, "That is no message of this page.")
+
+    def count(self) -> None:
+        """Note that a message came.
+
+        Raises
+        ------
+        MessageError
+            More came than a page sends.
+        """
+        now, limits = self.loop.time(), self.limits
+        self.credit = min(limits.burst, self.credit + (now - self.counted) * limits.per_second) - 1.0
+        self.counted = now
+        if self.credit < 0.0:
+            raise MessageError("there are too many", malformed=True)
+
+
+class Brief(logging.Filter):
+    """What goes to the terminal about visitors: each sentence once, without what led to it; scanners, not at all."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a record is shown; its traceback is cut."""
+        record.exc_info = None
+        text = record.getMessage()
+        new = text not in self.said and text != "opening handshake failed"
+        self.said.add(text)
+        return new and record.levelno >= logging.WARNING
+
+
+@dataclass
+class Controls:
+    """What visitors can set or hit, found by its identifier; nothing before viser's server stands."""
+
+    server: viser.ViserServer | None = None
+
+    def __call__(self, identifier: str) -> object:
+        """Find a control of all visitors, or of one alone, or a command."""
+        if self.server is None:
+            return None
+        for gui in (self.server.gui, *(client.gui for client in self.server.get_clients().values())):
+            if identifier in gui._gui_input_handle_from_uuid:
+                return gui._gui_input_handle_from_uuid[identifier]
+        return self.server.gui._command_handle_from_uuid.get(identifier)
+
+
+def open_server(host: str, port: int, title: str, limits: Limits = LIMITS) -> tuple[viser.ViserServer, str | None]:
+    """Serve a page; returns viser's server and the token that the page's address must carry, if any.
+
+    Raises
+    ------
+    UnguardedError
+        A viser that serves otherwise than this guard knows: nothing is served.
+    """
+    if not viser.__version__.startswith(KNOWN):
+        raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}*.")
+    door, controls = Door.of(host), Controls()
+    with guarding(door, controls, limits) as opened:
+        server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+    try:
+        assert opened
+        controls.server = server
+        controls("")
+        for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+            server._websock_server.unregister_handler(message)
+    except (AttributeError, AssertionError, KeyError) as error:
+        server.stop()
+        raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}1.") from error
+    return server, door.token
+
+
+PATCHING = threading.Lock()
+
+
+@contextmanager
+def guarding(door: Door, controls: Controls, limits: Limits) -> Iterator[list[bool]]:
+    """Guard the server that viser opens meanwhile; what it yields is true once it was opened."""
+    opened: list[bool] = []
+    serve = websockets.asyncio.server.serve
+    log = logging.Logger("page", logging.WARNING)
+    log.addFilter(Brief())
+
+    def guarded(*args: Any, process_request: Callable, **settings: Any) -> Any:
+        opened.append(True)
+        visit = partial(Visit, controls=controls, limits=limits)
+        settings |= {"max_size": LARGEST, "logger": log, "create_connection": visit}
+        return serve(*args, process_request=partial(answer, door, limits, process_request), **settings)
+
+    with PATCHING:
+        websockets.asyncio.server.serve = guarded
+        try:
+            yield opened
+        finally:
+            websockets.asyncio.server.serve = serve
+
+
+def answer(
+    door: Door, limits: Limits, served: Callable, connection: ServerConnection, request: Request
+) -> Response | None:
+    """Answer a request as viser does, if it may come in; None opens a visit."""
+    address, port = connection.local_address[:2]
+    refusal = door.refusal(request, address, port)
+    if refusal is not None:
+        return connection.respond(HTTPStatus.FORBIDDEN, refusal)
+    if request.headers.get_all("Upgrade"):
+        if request.headers.get_all("Sec-WebSocket-Protocol") != [f"viser-v{viser.__version__}"]:
+            return connection.respond(HTTPStatus.BAD_REQUEST, "This is no page of this server: load it again.\n")
+        if len(connection.server.connections) >= limits.visitors:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{limits.visitors} visitors look already.\n")
+    try:
+        response = served(connection, request)
+    except (OSError, ValueError):
+        response = connection.respond(HTTPStatus.NOT_FOUND, "There is no such file.\n")
+    if response is not None:
+        response.headers.update(HEADERS)
+        if door.token is not None:
+            secret = f"{cookie(port)}={door.token}; HttpOnly; SameSite=Strict; Path=/"
+            response.headers["Set-Cookie"] = secret
+    return response
+
+
+def bracketed(host: str) -> str:
+    """A host as it stands in an address."""
+    return f"[{host}]" if ":" in host else host
+
+
+def cookie(port: int) -> str:
+    """What a page's cookie is called; pages on other ports of the same host have others."""
+    return f"page-{port}"
+
+
+def plain(text: str) -> str:
+    """A header's text, of which websockets keeps bytes that are no characters."""
+    return text.encode("ascii", "replace").decode()
+
+
+def check_address(host: str, port: int) -> None:
+    """Raise where no page can be served: viser would fail on a thread of its own, and its maker wait for ever.
+
+    Raises
+    ------
+    ValueError
+        A port outside 0 .. 65535.
+    OSError
+        A host that is not this machine.
+    """
+    if not 0 <= port <= 65535:
+        raise ValueError(f"{port} is no port: give 0 .. 65535.")
+    family = socket.getaddrinfo(host, None)[0][0]
+    with socket.create_server((host, 0), family=family):
+        pass

@@ -1,0 +1,243 @@
+"""Slices of a scan through a point: axial, coronal and sagittal, with the surfaces that their planes cut."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.spatial import KDTree
+
+from ..overlay.composite import BROKEN, DASHED, DOUBTFUL
+from ..overlay.hud import FINE, WHITE, bound_words, towards, write
+from ..overlay.outlines import dash, ink_of
+from ..overlay.traces import BEFORE, DOTTED
+from ..rendering.layer import Layer, Solid
+
+# Of a view: half of its side [m], its side [pixel], and how far apart the scan is read [m]: finer adds nothing.
+REACH, SIDE, GRAIN = 40e-3, 280, 0.8e-3
+# What the scan does not hold, as grey; the scan's brightest, for lines must stand out; the band's share of its colour.
+NOWHERE, BRIGHT, TINT = 26, 190.0, 0.22
+# Grey between two views.
+EDGE = 90
+# The band is found at every so many pixels, between which distances are straight lines.
+COARSE = 7
+# Length of the scale's bar [m]; a tip no farther from a plane lies in it [m].
+BAR, BESIDE = 20e-3, 1e-3
+# From the edge to a letter, a name or the bar [pixel].
+PAD = 8
+# Outlines are drawn to so many binary digits of a pixel.
+DIGITS = 4
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A view along an axis of RAS: what lies to the right of it and below, as unit vectors (3,)."""
+
+    name: str
+    right: tuple[float, float, float]
+    down: tuple[float, float, float]
+
+    @property
+    def normal(self) -> np.ndarray:
+        """(3,): away from the viewer."""
+        return np.cross(self.right, self.down)
+
+    def points(self, middle: np.ndarray, count: int) -> np.ndarray:
+        """Places (count, count, 3) [m] of a square grid of pixels round a middle (3,) [m], row by row."""
+        steps = REACH * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
+        return middle + steps[:, None, None] * np.asarray(self.down) + steps[None, :, None] * np.asarray(self.right)
+
+    def pixels(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
+        """Columns and rows (n, 2) of places (n, 3) [m], in a view of `SIDE` pixels; whole numbers are centres."""
+        off = (np.asarray(points) - middle) @ np.stack([self.right, self.down], axis=1)
+        return (off / REACH + 1.0) * (0.5 * SIDE) - 0.5
+
+
+PLANES = (
+    Plane("axial", (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
+    Plane("coronal", (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    Plane("sagittal", (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
+)
+"""As radiologists have them: the patient's right on the left."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """What is cut by the planes.
+
+    Parameters
+    ----------
+    now, before
+        The tumour's surface, and where the scan has it.
+    error
+        With a probability of 95 % no point of it is farther off [m]; None: not known.
+    doubtful
+        Whether its place may not be relied on. Then its outline is amber and broken, and has no band.
+    others
+        Surfaces beside it, such as the tool's: plain lines of their colours.
+    tip
+        Where the tool touches (3,) [m].
+    """
+
+    now: Layer
+    before: Layer
+    error: float | None = None
+    doubtful: bool = False
+    others: Sequence[Layer] = ()
+    tip: np.ndarray | None = None
+
+
+def sliced(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
+    """Three views (SIDE, 3 SIDE, 3) uint8 through a middle (3,) [m], side by side; without a scan, on plain ground."""
+    return np.concatenate([view(plane, scan, np.asarray(middle, np.float64), cut) for plane in PLANES], axis=1)
+
+
+def view(plane: Plane, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
+    """One view (SIDE, SIDE, 3) uint8."""
+    grey = np.full((SIDE, SIDE), NOWHERE, np.uint8) if scan is None else resampled(plane, scan, middle)
+    colour = np.repeat(grey[..., None], 3, axis=2)
+    ink = ink_of(DOUBTFUL if cut.doubtful else cut.now.colour if len(cut.now.vertices) else BEFORE)
+    if cut.error is not None and not cut.doubtful:
+        inside = within(plane, middle, cut.now, cut.error)
+        colour[inside] = (1.0 - TINT) * colour[inside] + TINT * np.array(ink)
+        edges = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
+        dash(colour, list(edges), ink, DASHED, 1)
+    for layer in cut.others:
+        stroke(colour, lines_of(plane, layer, middle), ink_of(layer.colour))
+    dash(colour, [dense(line) for line in lines_of(plane, cut.before, middle)], ink_of(BEFORE), DOTTED)
+    now = lines_of(plane, cut.now, middle)
+    if cut.doubtful:
+        dash(colour, [dense(line) for line in now], ink, BROKEN)
+    else:
+        stroke(colour, now, ink, 2)
+    if cut.tip is not None:
+        mark(colour, plane, np.asarray(cut.tip), middle)
+    label(colour, plane, middle)
+    write(colour, said_of(cut), (PAD, 4 * PAD + 6), FINE)
+    colour[:, -1] = EDGE
+    return colour
+
+
+def said_of(cut: Cut) -> str:
+    """What the band is, in few words."""
+    if cut.doubtful or cut.error is None:
+        return "tumour: not known"
+    return f"tumour: within {bound_words(cut.error, 1)}"
+
+
+def resampled(plane: Plane, scan: Solid, middle: np.ndarray) -> np.ndarray:
+    """The scan in a view, (SIDE, SIDE) uint8; `NOWHERE` where there is none."""
+    count = round(2.0 * REACH / GRAIN)
+    matrix = scan.T_index_world
+    index = plane.points(middle, count) @ matrix[:3, :3].T + matrix[:3, 3]
+    held = ((index >= -0.5) & (index <= np.array(scan.values.shape) - 0.5)).all(axis=-1)
+    read = np.zeros((count, count), np.float32)
+    map_coordinates(scan.values, np.moveaxis(index, -1, 0), order=1, mode="nearest", output=read)
+    large = cv2.resize(BRIGHT * read, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+    inside = cv2.resize(np.asarray(held, np.uint8), (SIDE, SIDE), interpolation=cv2.INTER_NEAREST) > 0
+    return np.where(inside, np.clip(large, 0.0, 255.0), NOWHERE).astype(np.uint8)
+
+
+def within(plane: Plane, middle: np.ndarray, layer: Layer, error: float) -> np.ndarray:
+    """(SIDE, SIDE) bool: the pixels that are no farther [m] than an error from a surface, wherever in space that is."""
+    count = SIDE // COARSE
+    if not len(layer.triangles):
+        return np.zeros((SIDE, SIDE), bool)
+    corners = layer.vertices[layer.triangles]
+    halves = 0.5 * (corners + np.roll(corners, 1, axis=1))
+    samples = np.concatenate([layer.vertices, halves.reshape(-1, 3), corners.mean(axis=1)])
+    far = error + 4.0 * REACH / count
+    away = KDTree(samples).query(plane.points(middle, count).reshape(-1, 3), distance_upper_bound=far)[0]
+    grid = np.minimum(away, far).reshape(count, count)
+    return cv2.resize(grid, (SIDE, SIDE), interpolation=cv2.INTER_LINEAR) <= error
+
+
+def section(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
+    """Lines (n, 3) [m] in which a plane cuts a surface; a closed one ends where it begins.
+
+    vertices (V, 3) [m], triangles (F, 3), point (3,) [m] and normal (3,) of the plane.
+    """
+    height = (np.asarray(vertices) - point) @ normal
+    above = height >= 0.0
+    some = above[triangles]
+    mixed = np.asarray(triangles)[some.any(axis=1) & ~some.all(axis=1)]
+    if not len(mixed):
+        return []
+    edges = np.sort(np.stack([mixed, np.roll(mixed, -1, axis=1)], axis=2), axis=2)
+    crossed = edges[above[edges[..., 0]] != above[edges[..., 1]]]
+    unique, segments = np.unique(crossed, axis=0, return_inverse=True)
+    start, end = unique.T
+    share = (height[start] / (height[start] - height[end]))[:, None]
+    points = (1.0 - share) * vertices[start] + share * vertices[end]
+    return [points[line] for line in chained(segments.reshape(-1, 2))]
+
+
+def chained(segments: np.ndarray) -> list[list[int]]:
+    """Segments (n, 2) of numbered points as lines of such numbers; a closed one ends where it begins."""
+    beside: dict[int, list[int]] = defaultdict(list)
+    for a, b in segments.tolist():
+        beside[a].append(b)
+        beside[b].append(a)
+    lines = []
+    # From the ends of open lines first: what is left is closed.
+    for start in sorted(beside, key=lambda point: len(beside[point]) != 1):
+        while beside[start]:
+            line = [start]
+            while beside[line[-1]]:
+                after = beside[line[-1]].pop()
+                beside[after].remove(line[-1])
+                line.append(after)
+            lines.append(line)
+    return lines
+
+
+def lines_of(plane: Plane, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
+    """The lines in which a view's plane cuts a surface, each (n, 2) as columns and rows."""
+    found = section(layer.vertices, layer.triangles, middle, plane.normal)
+    return [plane.pixels(line, middle) for line in found]
+
+
+def stroke(colour: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], width: int = 1) -> None:
+    """Draw lines, each (n, 2), between pixels too, into a picture (H, W, 3), in place."""
+    fine = [np.rint(line * 2**DIGITS).astype(np.int32)[:, None] for line in lines]
+    cv2.polylines(colour, fine, False, tuple(ink), width, cv2.LINE_AA, DIGITS)
+
+
+def dense(line: np.ndarray) -> np.ndarray:
+    """A line (n, 2) as `dash` takes it: (m, 1, 2) int32, a pixel apart."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    steps = np.arange(0.0, along[-1] + 1.0)
+    at = np.stack([np.interp(steps, along, line[:, axis]) for axis in (0, 1)], axis=1)
+    return np.rint(at).astype(np.int32)[:, None]
+
+
+def mark(colour: np.ndarray, plane: Plane, tip: np.ndarray, middle: np.ndarray) -> None:
+    """Mark a tip (3,) [m], in place: a dot where it lies in the plane, and a ring where it lies beside it."""
+    ((column, row),) = np.clip(plane.pixels(tip[None], middle), -1e4, 1e4).round().astype(int).tolist()
+    beside = abs(float((tip - middle) @ plane.normal)) > BESIDE
+    cv2.circle(colour, (column, row), 5, (12, 14, 16), 1 if beside else -1, cv2.LINE_AA)
+    cv2.circle(colour, (column, row), 4, WHITE, 1 if beside else -1, cv2.LINE_AA)
+
+
+def label(colour: np.ndarray, plane: Plane, middle: np.ndarray) -> None:
+    """Write a view's name, where it lies, the patient's sides and a scale, in place."""
+    right, down = np.asarray(plane.right), np.asarray(plane.down)
+    axis = int(np.argmax(np.abs(plane.normal)))
+    write(colour, f"{plane.name}  {'xyz'[axis]} {1e3 * middle[axis]:.0f} mm", (PAD, 2 * PAD + 4), FINE)
+    half = SIDE // 2
+    places = (
+        (-right, (PAD, half)),
+        (right, (SIDE - 3 * PAD, half)),
+        (-down, (half + 4 * PAD, 2 * PAD + 4)),
+        (down, (half, SIDE - PAD)),
+    )
+    for way, at in places:
+        write(colour, towards(way), at)
+    length, row = round(0.5 * SIDE * BAR / REACH), SIDE - PAD
+    for ink, width in (((12, 14, 16), 4), (WHITE, 2)):
+        cv2.line(colour, (PAD, row), (PAD + length, row), ink, width)
+    write(colour, f"{1e3 * BAR:.0f} mm", (PAD, row - PAD), FINE)

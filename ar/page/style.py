@@ -1,0 +1,137 @@
+"""Where things are on the page: the picture pinned and growing with the window, words, controls and 3-D view around it.
+
+viser places panels in pixels; these rules go over its own. Its elements have no names, so they are found by what they
+hold. In a wide window the controls stand in two columns, so that all are in sight. A browser that knows no `:has()`
+leaves the rules aside and shows picture and controls in one docked panel.
+"""
+
+from __future__ import annotations
+
+from .aside import ASIDE, HELP, TABS
+from .sight import HISTORY, PICTURE, SAID, SLICES
+
+PAGE, STATUS = "sulcus", "sulcus-status"
+"""Names of the elements that hold the words under the picture, and the line over it."""
+NOTE = "sulcus-note"
+"""Class of the words of a note."""
+PANEL = f"div:has(canvas) ~ div:has(#{PAGE})"
+VIEW = f"div:has(canvas):has(~ div #{PAGE})"
+PARTS = f"div:has(> div > #{SAID})"
+NOTES = ".mantine-Notifications-root"
+
+# For a visitor who looks on: what they could set is dimmed, and no pointer reaches it.
+DIMMED = (
+    ".mantine-Slider-root, .mantine-InputWrapper-root, .mantine-NumberInput-root, .mantine-Checkbox-root, "
+    "div:has(> button):has(+ div .mantine-Slider-root) > button, div:has(> button) + div:has(> button) > button"
+)
+LOOKS_ON = f"<style>{PARTS} :is({DIMMED}) {{ opacity: 0.45; pointer-events: none }}</style>"
+"""Rules for a visitor who looks on while another leads."""
+
+RULES = """
+:root { --w: min(62vw, calc((100vh - 10.5rem) * var(--aspect))); --low: max(29vh, 9rem); }
+#PAGE { font-size: 0.82rem; line-height: 1.35; box-sizing: border-box; padding: 0.45rem 0.8rem;
+  overflow-wrap: anywhere }
+#PAGE p, #SAID p { margin: 0 0 0.3rem 0 }
+#PAGE .legend { display: flex; flex-wrap: wrap; gap: 0.1rem 1rem; margin-bottom: 0.3rem }
+#PAGE .legend span { display: inline-flex; align-items: center; gap: 0.4rem; white-space: nowrap }
+#PAGE .dim, #SAID .dim { opacity: 0.62 }
+#SAID { font-size: 0.88rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
+#SAID .stale { opacity: 0.5 }
+#SAID .warn { color: #ff922b; font-weight: 600 }
+#SAID .number { font-size: 1.25rem; font-weight: 600 }
+#SAID table { border-collapse: collapse; font-size: 0.8rem; margin-bottom: 0.3rem }
+#SAID .best { font-weight: 700 }
+#SAID td, #SAID th { padding: 0 0.9rem 0 0; text-align: left; font-weight: inherit }
+.NOTE { font-size: 0.8rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
+.NOTE ul { margin: 0; padding-left: 1.1rem }
+#STATUS { position: fixed; top: 0.6rem; right: calc(100vw - var(--w) + 0.6rem); z-index: 7; pointer-events: none }
+#STATUS span { background: #e8590c; color: #fff; border-radius: 0.3rem; padding: 0.2rem 0.6rem; font-size: 0.9rem }
+PANEL #PICTURE { position: fixed; left: 0; top: 0; width: var(--w); aspect-ratio: var(--aspect); background: #181818;
+  z-index: 6 }
+#PICTURE img { width: 100%; display: block }
+NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !important }
+#ASIDE { position: fixed; left: var(--w); right: 0; bottom: 0; height: var(--low); z-index: 7; pointer-events: none;
+  font-size: 0.8rem; display: flex; flex-wrap: wrap; align-content: flex-start; box-sizing: border-box }
+#ASIDE > input { position: absolute; opacity: 0 }
+#ASIDE > label, #ASIDE > button { pointer-events: auto; cursor: pointer; padding: 0.1rem 0.6rem; background: #2c2c2c;
+  color: #ddd; border: 0; border-right: 1px solid #444; font: inherit; z-index: 1 }
+#ASIDE > button { margin-left: auto }
+#ASIDE > input:checked + label { background: #1971c2; color: #fff }
+#ASIDE > input:focus-visible + label { outline: 2px solid #fff; outline-offset: -2px }
+#ASIDE > .shown { display: none; position: absolute; inset: 1.5rem 0 0 0; background: #141414; pointer-events: auto;
+  overflow: auto; padding: 0.2rem; box-sizing: border-box }
+#ASIDE > input:nth-of-type(2):checked ~ .shown:nth-of-type(1),
+#ASIDE > input:nth-of-type(3):checked ~ .shown:nth-of-type(2) { display: block }
+#ASIDE p { margin: 0; font-size: 0.72rem; opacity: 0.75; line-height: 1.25 }
+#SLICES img { display: block; width: 100%; max-width: calc(3 * (var(--low) - 3.9rem)); margin: 0 auto }
+#HISTORY svg { display: block; width: 100%; height: calc(var(--low) - 2rem) }
+#HISTORY text { fill: #ddd; font-size: 12px }
+#HELP { pointer-events: auto; background: #2c2c2c; color: #eee; border: 1px solid #888; border-radius: 0.4rem;
+  font-size: 0.95rem }
+#HELP td { padding: 0.15rem 0.8rem 0.15rem 0 }
+#HELP kbd { border: 1px solid #888; border-radius: 0.2rem; padding: 0 0.4rem }
+#webgl-software-rendering { display: none }
+:root:has(TABBED:checked) { --low: max(34vh, 13rem) }
+@media (min-width: 36.01em) {
+  PANEL { left: var(--w) !important; right: 0 !important; width: auto !important; bottom: var(--low) !important }
+  PANEL > div:first-child, PANEL > div:last-child { display: none !important }
+  PANEL > div > div { width: 100% !important }
+  VIEW { inset: auto 0 0 var(--w) !important; height: var(--low); border-top: 1px solid #444 }
+  #PAGE { position: fixed; left: 0; top: calc(var(--w) / var(--aspect)); width: var(--w); bottom: 0; overflow: auto }
+}
+@media (min-width: 75em) and (min-aspect-ratio: 13/10) {
+  PARTS { display: grid; grid-template-columns: 1fr 1fr; grid-auto-flow: dense; align-items: center }
+  PARTS > * { grid-column: 1 / -1 }
+  PARTS > div:has(> button), PARTS > div:has(> .mantine-Flex-root) { grid-column: auto }
+  PARTS > div:has(> button) + div:has(.mantine-Slider-root) { grid-column: 1 / -1 }
+}
+@media (min-width: 75em) and (min-aspect-ratio: 13/10) and (max-height: 50em) {
+  :root { --low: max(22vh, 9rem) }
+}
+@media (min-width: 36.01em) and (max-aspect-ratio: 13/10) {
+  PANEL { bottom: 0 !important }
+  VIEW { inset: auto calc(100vw - var(--w)) 0 0 !important }
+  #PAGE { bottom: var(--low) }
+  #ASIDE { left: 0; right: calc(100vw - var(--w)) }
+  NOTES { left: 0.5rem !important }
+}
+@media (max-width: 74.99em) {
+  #STATUS { top: calc(var(--w) / var(--aspect) - 3.6rem) }
+}
+@media (max-width: 36em) {
+  :root { --w: 100vw; --low: 17vh }
+  :root:has(TABBED:checked) { --low: max(25vh, 14rem) }
+  PANEL { left: 0; top: calc(100vw / var(--aspect)); width: 100% !important; max-height: none !important;
+    bottom: var(--low) !important }
+  PANEL div[style*="20em"] { width: 100% !important }
+  VIEW { position: absolute !important; inset: auto 0 0 0 !important; height: var(--low) !important }
+  #PAGE { font-size: 0.78rem }
+  #ASIDE { left: 0 }
+  #STATUS span { font-size: 0.75rem }
+  #SAID { font-size: 0.82rem; max-height: 11.4rem; overflow-y: auto }
+  NOTES { left: 0.5rem !important }
+}
+"""
+
+
+def style(aspect: float) -> str:
+    """An element of rules for a picture of width / height `aspect`."""
+    rules = RULES
+    for name, value in (
+        ("#PICTURE", f"#{PICTURE}"),
+        ("PANEL", PANEL),
+        ("VIEW", VIEW),
+        ("PARTS", PARTS),
+        ("NOTES", NOTES),
+        ("#PAGE", f"#{PAGE}"),
+        ("#STATUS", f"#{STATUS}"),
+        ("#SAID", f"#{SAID}"),
+        ("#ASIDE", f"#{ASIDE}"),
+        ("#SLICES", f"#{SLICES}"),
+        ("#HISTORY", f"#{HISTORY}"),
+        ("#HELP", f"#{HELP}"),
+        ("TABBED", f":is({', '.join(f'#{name}' for _, name in TABS[1:])})"),
+        (".NOTE", f".{NOTE}"),
+    ):
+        rules = rules.replace(name, value)
+    return f"<style>:root {{ --aspect: {aspect:.4f} }}{rules}</style>"

@@ -1,0 +1,1 @@
+"""From surfaces and a camera to a lit picture."""

@@ -1,0 +1,335 @@
+"""Which triangle does each pixel see: a z-buffer rasteriser in Warp.
+
+Triangles are tested in homogeneous pixel coordinates q = K x_camera = (u w, v w, w), so nothing is ever clipped
+(Olano & Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates"). With p = (u, v, 1):
+
+    e_a = p . (q_b x q_c), and e_b, e_c likewise    edge functions, of one sign inside
+    n = (q_b - q_a) x (q_c - q_a)                   p . n is the sum of the edge functions
+    n . q_a / p . n                                 depth
+    e / sum e                                       weights on the triangle itself, hence perspective-correct
+
+A lens bends the picture, not the formulas: p is then where the pixel would be without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..optics.camera import Camera
+from .lens_rasteriser import keep_nearest_through_lens
+from .parallel import forward_kernel, in_bands, launch_in_bands, load, run_length
+from .triangle import box_of, edge, first_row, weights_of
+from .unbent import Unbent, pixel_at, unbent
+
+NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
+"""Of a z-buffer where nothing is seen."""
+NEAR = 1e-3
+"""Nothing closer to a camera is drawn [m]."""
+PARTS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Fragments:
+    """What each pixel sees.
+
+    face (H, W) int32: index of the triangle, -1 where empty. weights (H, W, 3) float32: barycentric weights of the
+    triangle's corners, 0 where empty. depth (H, W) float32 [m]: z in the camera frame, 0 where empty.
+    """
+
+    face: np.ndarray
+    weights: np.ndarray
+    depth: np.ndarray
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(H, W) bool: where anything is seen."""
+        return self.face >= 0
+
+    def interpolate(self, triangles: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Vertex values (V, C) at every pixel, (H, W, C); 0 where empty. triangles (F, 3) as rasterised."""
+        picture = np.zeros((*self.face.shape, values.shape[1]), values.dtype)
+        seen = self.mask
+        picture[seen] = np.einsum("nk,nkc->nc", self.weights[seen], values[triangles[self.face[seen]]])
+        return picture
+
+
+def rasterise(
+    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu"
+) -> Fragments:
+    """The nearest triangle at every pixel centre.
+
+    Both sides of a triangle are seen. A pixel centre on an edge belongs to both neighbours, so shared edges leave no
+    cracks: the z-buffer keeps one, the lower index at equal depth. Triangles without area leave no trace.
+
+    Parameters
+    ----------
+    vertices, triangles
+        (V, 3) world points [m]; (F, 3) vertex indices.
+    near
+        Nothing closer than this depth [m] is drawn; triangles may reach through the plane and behind the camera.
+    device
+        A Warp device.
+
+    Raises
+    ------
+    ValueError
+        Wrong shapes, indices out of range, vertices that are not finite, or near <= 0.
+    """
+    found = seen(camera, vertices, triangles, near, device)
+    shape, rows = (camera.height, camera.width), found.rows
+    face = wp.full(shape, value=-1, dtype=wp.int32, device=device)
+    weights = wp.zeros(shape, dtype=wp.vec3f, device=device)
+    depth = wp.zeros(shape, dtype=wp.float32, device=device)
+    inputs = [found.nearest[0, rows], found.points, found.triangles, rows.start, found.unbent.pixels]
+    launch_in_bands(
+        read_nearest, inputs, [face[rows], weights[rows], depth[rows]], (rows.stop - rows.start) * camera.width, device
+    )
+    return Fragments(face.numpy(), weights.numpy(), depth.numpy())
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A surface in one picture, on a device.
+
+    points (1, V) vec3d: homogeneous, without the lens; triangles (F,) vec3i; nearest (1, H, W): z-buffer of (depth,
+    face); rows: those that may be covered. `unbent` is where pixels would be without the lens.
+    """
+
+    points: wp.array
+    triangles: wp.array
+    nearest: wp.array
+    rows: slice
+    unbent: Unbent
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(H, W) bool: the pixels whose centres the surface covers."""
+        mask = wp.empty(self.nearest.size, dtype=wp.uint8, device=self.nearest.device)
+        launch_in_bands(cover, [self.nearest.flatten()], [mask], self.nearest.size, str(self.nearest.device))
+        return mask.numpy().reshape(self.nearest.shape[1:]).view(bool)
+
+
+def seen(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu") -> Seen:
+    """Draw one surface into a z-buffer. Arguments and errors as in `rasterise`."""
+    vertices, triangles = checked_mesh(vertices, triangles)
+    if not near > 0.0:
+        raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
+    homogeneous = camera.in_frame(vertices) @ camera.K.T
+    rows = slice(*rows_reached(homogeneous, near, camera.height)) if camera.lens is None else slice(0, camera.height)
+    points = wp.array(homogeneous[None], dtype=wp.vec3d, device=device)
+    corners = wp.array(triangles, dtype=wp.vec3i, device=device, copy=False)
+    nearest = empty_buffer(1, camera.height, camera.width, device)
+    through = unbent([camera], device)
+    draw(points, corners, 0, rows, nearest, device, near, through)
+    return Seen(points, corners, nearest, rows, through)
+
+
+def empty_buffer(count: int, height: int, width: int, device: str) -> wp.array:
+    """Z-buffers (count, height, width) of (depth, face) that hold nothing."""
+    return wp.full((count, height, width), value=NOTHING, dtype=wp.uint64, device=device)
+
+
+def draw(
+    points: wp.array,
+    triangles: wp.array,
+    since: int,
+    rows: slice,
+    nearest: wp.array,
+    device: str,
+    near: float = NEAR,
+    through: Unbent | None = None,
+) -> None:
+    """Draw the triangles from number `since` on into z-buffers (B, H, W), in some rows.
+
+    points (B, V) vec3d: homogeneous, in each picture; triangles (F,) vec3i, the same in all pictures; `through`: the
+    lenses of the cameras, if they have any.
+    """
+    bent = through is not None and through.pixels.size > 0
+    kernel = keep_nearest_through_lens if bent else keep_nearest
+    load(device, kernel.module)
+    count, run = triangles.shape[0] - since, run_length(device)
+    # On a card the rows of a triangle are shared by several threads.
+    parts = 1 if device == "cpu" else PARTS
+    size = nearest.shape[0], -(-count // run), parts
+
+    def scan(begin: int, end: int) -> None:
+        inputs = [points, triangles, since, wp.float64(near), rows.start + begin, rows.start + end, parts, run]
+        wp.launch(kernel, size, inputs + [through] * bent, [nearest], device=device)
+
+    in_bands(scan, rows.stop - rows.start, device)
+
+
+def rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int, int]:
+    """First and last-but-one row of the picture that points (V, 3) (u w, v w, w) can cover: all, if one is too near."""
+    if not len(homogeneous):
+        return 0, 0
+    if homogeneous[:, 2].min() < near:
+        return 0, height
+    rows = homogeneous[:, 1] / homogeneous[:, 2]
+    first, last = np.clip([np.floor(rows.min()), np.ceil(rows.max()) + 1.0], 0, height).astype(int).tolist()
+    return first, last
+
+
+def checked_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 and triangles (F, 3) int32; ValueError with the reason when they are no mesh."""
+    vertices = np.asarray(vertices, np.float64)
+    triangles = np.asarray(triangles, np.int32)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise ValueError(f"a surface is vertices (V, 3) and triangles (F, 3), not {vertices.shape}, {triangles.shape}.")
+    if not np.isfinite(vertices).all():
+        raise ValueError("a vertex is not finite: every coordinate must be a finite number of metres.")
+    if triangles.size and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
+        raise ValueError(f"a triangle names a vertex outside 0 .. {len(vertices) - 1}.")
+    return vertices, triangles
+
+
+@wp.func
+def depth_of(key: wp.uint64) -> wp.float32:
+    """The depth in an entry of the z-buffer."""
+    return wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
+
+
+@wp.func
+def face_of(key: wp.uint64) -> wp.int32:
+    """The face in an entry of the z-buffer."""
+    return wp.int32(key & wp.uint64(0xFFFFFFFF))
+
+
+@wp.func
+def within(slope: wp.float64, offset: wp.float64, span: wp.vec2d) -> wp.vec2d:
+    """The part of a row's span where slope u + offset >= 0, and a little more: each pixel is tested again."""
+    slack = wp.float64(1.0e-3)
+    if slope > wp.float64(0.0):
+        return wp.vec2d(wp.max(span[0], -offset / slope - slack), span[1])
+    if slope < wp.float64(0.0):
+        return wp.vec2d(span[0], wp.min(span[1], -offset / slope + slack))
+    return span
+
+
+@wp.func
+def draw_triangle(
+    picture: wp.int32,
+    face: wp.int32,
+    q: wp.array2d(dtype=wp.vec3d),
+    triangles: wp.array(dtype=wp.vec3i),
+    near: wp.float64,
+    begin: wp.int32,
+    end: wp.int32,
+    part: wp.int32,
+    parts: wp.int32,
+    nearest: wp.array3d(dtype=wp.uint64),
+):
+    """Keep, at each pixel centre inside triangle `face`, the minimum of (depth, face).
+
+    Only in the rows begin + part, begin + part + parts, ... below end. Both fit in 64 bits, because the bits of
+    positive floats sort as the floats do.
+    """
+    t = triangles[face]
+    a = q[picture, t[0]]
+    b = q[picture, t[1]]
+    c = q[picture, t[2]]
+    normal = wp.cross(b - a, c - a)
+    volume = wp.dot(normal, a)
+    if volume == wp.float64(0.0):
+        return
+    box = box_of(a, b, c, near)
+    # Rounding must not push a pixel out that lies on the box.
+    slack = wp.vec2d(wp.float64(1.0e-6))
+    low = wp.vec2d(box[0], box[1]) - slack
+    high = wp.vec2d(box[2], box[3]) + slack
+    zero = wp.float64(0.0)
+    left = wp.clamp(wp.ceil(low[0]), zero, wp.float64(nearest.shape[2]))
+    right = wp.clamp(wp.floor(high[0]), wp.float64(-1.0), wp.float64(nearest.shape[2] - 1))
+    first = wp.int32(wp.clamp(wp.ceil(low[1]), wp.float64(begin), wp.float64(end)))
+    stop = wp.int32(wp.clamp(wp.floor(high[1]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
+    if left > right or first >= stop:
+        return
+    side = wp.sign(volume)
+    ea = edge(b, c, t[1], t[2]) * side
+    eb = edge(c, a, t[2], t[0]) * side
+    ec = edge(a, b, t[0], t[1]) * side
+    for row in range(first_row(first, begin, part, parts), stop, parts):
+        v = wp.float64(row)
+        ra = ea[1] * v + ea[2]
+        rb = eb[1] * v + eb[2]
+        rc = ec[1] * v + ec[2]
+        span = within(ec[0], rc, within(eb[0], rb, within(ea[0], ra, wp.vec2d(left, right))))
+        first_u = wp.int32(wp.min(wp.ceil(span[0]), right + wp.float64(1.0)))
+        last_u = wp.int32(wp.max(wp.floor(span[1]), left - wp.float64(1.0)))
+        for column in range(first_u, last_u + 1):
+            u = wp.float64(column)
+            if ea[0] * u + ra >= zero and eb[0] * u + rb >= zero and ec[0] * u + rc >= zero:
+                across = normal[0] * u + normal[1] * v + normal[2]
+                if across * side > zero:
+                    z = volume / across
+                    if z >= near:
+                        bits = wp.uint64(wp.cast(wp.float32(z), wp.uint32))
+                        wp.atomic_min(nearest, picture, row, column, (bits << wp.uint64(32)) | wp.uint64(face))
+
+
+@forward_kernel
+def keep_nearest(
+    q: wp.array2d(dtype=wp.vec3d),
+    triangles: wp.array(dtype=wp.vec3i),
+    since: wp.int32,
+    near: wp.float64,
+    begin: wp.int32,
+    end: wp.int32,
+    parts: wp.int32,
+    run: wp.int32,
+    # outputs
+    nearest: wp.array3d(dtype=wp.uint64),
+):
+    """A run of triangles in one picture, each in a part of the rows begin .. end - 1."""
+    picture, chunk, part = wp.tid()
+    start = since + chunk * run
+    for face in range(start, wp.min(start + run, triangles.shape[0])):
+        draw_triangle(picture, face, q, triangles, near, begin, end, part, parts, nearest)
+
+
+@forward_kernel
+def cover(
+    begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    nearest: wp.array(dtype=wp.uint64),
+    # output
+    mask: wp.array(dtype=wp.uint8),
+):
+    """Each pixel: 1 where anything is seen."""
+    start = begin + wp.tid() * run
+    for index in range(start, wp.min(start + run, end)):
+        mask[index] = wp.uint8(wp.where(nearest[index] != NOTHING, 1, 0))
+
+
+@forward_kernel
+def read_nearest(
+    begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    nearest: wp.array2d(dtype=wp.uint64),
+    q: wp.array2d(dtype=wp.vec3d),
+    triangles: wp.array(dtype=wp.vec3i),
+    first: wp.int32,
+    pixels: wp.array3d(dtype=wp.vec2d),
+    # outputs
+    face: wp.array2d(dtype=wp.int32),
+    weights: wp.array2d(dtype=wp.vec3f),
+    depth: wp.array2d(dtype=wp.float32),
+):
+    """Each pixel: the winning face, its barycentric weights, its depth; `first` is the arrays' first row."""
+    start = begin + wp.tid() * run
+    for index in range(start, wp.min(start + run, end)):
+        row = index / nearest.shape[1]
+        column = index - row * nearest.shape[1]
+        key = nearest[row, column]
+        if key != NOTHING:
+            winner = face_of(key)
+            t = triangles[winner]
+            face[row, column] = winner
+            p = pixel_at(0, column, first + row, pixels)
+            weights[row, column] = weights_of(p, q[0, t[0]], q[0, t[1]], q[0, t[2]])
+            depth[row, column] = depth_of(key)

@@ -1,0 +1,314 @@
+"""Surfaces and a camera in, a lit picture out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+import warp as wp
+
+from ..optics.camera import Camera, look_at
+from .layer import Layer
+from .parallel import launch_in_bands, load
+from .place import place
+from .rasteriser import NEAR, draw, empty_buffer, rows_reached
+from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
+from .shade_structs import Light, Placed, Shadow
+from .surfaces import Stack
+from .unbent import Unbent, unbent
+
+DRAPE = (0.13, 0.30, 0.36)
+SHADOW_PIXELS = 384
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """What cameras see, on the device that drew it; `.numpy()` of an array brings it here.
+
+    colour (B, H, W) vec3ub: in NumPy (B, H, W, 3) uint8; depth (B, H, W) float32 [m] and segmentation (B, H, W) uint8
+    are as in `Picture`.
+    """
+
+    colour: wp.array
+    depth: wp.array
+    segmentation: wp.array
+
+    @property
+    def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
+        """All of them."""
+        return self.colour, self.depth, self.segmentation
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What one camera sees; what is asked for is brought from the device that drew it."""
+
+    drawn: Pictures
+
+    @cached_property
+    def colour(self) -> np.ndarray:
+        """(H, W, 3) uint8, sRGB."""
+        return self.drawn.colour.numpy()[0]
+
+    @cached_property
+    def depth(self) -> np.ndarray:
+        """(H, W) float32 [m]: z in the camera frame, 0 where nothing is seen."""
+        return self.drawn.depth.numpy()[0]
+
+    @cached_property
+    def segmentation(self) -> np.ndarray:
+        """(H, W) uint8: the id of the layer seen, 0 where nothing is seen."""
+        return self.drawn.segmentation.numpy()[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Backdrop:
+    """What one camera sees of the layers that stand still, in full light.
+
+    `nearest` is the z-buffer, `placed` where all layers were when it was drawn; `lit_at` (H W) is where the shadow map
+    is read for each pixel.
+    """
+
+    camera: Camera
+    nearest: wp.array
+    placed: Placed
+    pictures: Pictures
+    lit_at: wp.array
+
+
+@dataclass(frozen=True, eq=False)
+class Lamp:
+    """A surgical lamp: a spot with a soft rim.
+
+    position, target (3,) [m]; radius [m] of the lit circle at the target; strength and ambient light, scene-linear.
+    """
+
+    position: np.ndarray
+    target: np.ndarray
+    radius: float
+    strength: float = 1.0
+    ambient: float = 0.16
+
+    def camera(self) -> Camera:
+        """The view from the lamp, in which shadows are found."""
+        axis = np.asarray(self.target) - self.position
+        angle = np.arctan(self.radius / np.linalg.norm(axis))
+        side = np.eye(3)[np.argmin(np.abs(axis))]
+        return look_at(np.asarray(self.position), self.target, side, 2.0 * angle, SHADOW_PIXELS, SHADOW_PIXELS)
+
+
+def lamp_beside(camera: Camera, target: np.ndarray, radius: float = 0.06) -> Lamp:
+    """A lamp above the camera's left shoulder, on `target` (3,) [m]: shadows fall beside the tool, not under it."""
+    distance = np.linalg.norm(np.asarray(target) - camera.centre)
+    right, down = camera.T_camera_world[0, :3], camera.T_camera_world[1, :3]
+    return Lamp(camera.centre - distance * (0.45 * right + 0.3 * down), np.asarray(target), radius)
+
+
+def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> Picture:
+    """Draw layers as seen by a camera under a lamp. Those who draw the same layers again make a `Renderer`.
+
+    Raises
+    ------
+    ValueError
+        Two layers with one id.
+    """
+    return Renderer(layers, lamp, device).picture(camera, [layer.vertices for layer in layers if not layer.still])
+
+
+class Renderer:
+    """Layers under a lamp, made ready once and drawn any number of times; from one thread at a time.
+
+    What one camera sees of layers that stand still is drawn once.
+    """
+
+    def __init__(self, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> None:
+        """Bring the layers to a Warp device; ValueError when two have one id."""
+        load(device, shade.module, place.module)
+        self.device, self.stack = device, Stack(layers, device)
+        self.light, self.lamp_camera = as_light(lamp), lamp.camera()
+        self.curve = wp.array(tone_curve(), dtype=wp.uint8, device=device)
+        self.unshaded = wp.empty(0, dtype=wp.vec3i, device=device)
+        self.nowhere = wp.empty(0, dtype=wp.vec3f, device=device)
+        self.backdrop: Backdrop | None = None
+
+    def picture(self, camera: Camera, vertices: Sequence[np.ndarray]) -> Picture:
+        """What a camera sees; vertices (V, 3) [m]: of each layer that moves, in order.
+
+        Raises
+        ------
+        ValueError
+            Vertices of other shapes than the layers'.
+        """
+        moved = self.stack.moved(np.concatenate([np.zeros((0, 3)), *vertices])[None])
+        return Picture(self._drawn([camera], moved, self._backdrop(camera, moved) if self.stack.still_faces else None))
+
+    def pictures(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
+        """What cameras of one size see; nothing leaves the device.
+
+        Parameters
+        ----------
+        vertices
+            (B, n, 3) [m]: of all layers that move, one after the other, in each picture. A Warp array (B, n) of
+            `vec3d` on this device is taken as it is, and must be finite.
+        cameras
+            B of them, or one for all pictures.
+
+        Raises
+        ------
+        ValueError
+            Other shapes, another number of cameras, or cameras of several sizes.
+        """
+        moved = self.stack.moved(vertices)
+        count = moved.shape[0]
+        if len(cameras) not in (1, count):
+            raise ValueError(f"{len(cameras)} cameras for {count} pictures: give one for each, or one for all.")
+        if len({(camera.width, camera.height) for camera in cameras}) > 1:
+            raise ValueError("the cameras have several sizes: draw those of each size together.")
+        return self._drawn([*cameras] * (count // len(cameras)), moved, None)
+
+    def _drawn(self, cameras: Sequence[Camera], moved: wp.array, backdrop: Backdrop | None) -> Pictures:
+        """Draw every picture, upon the backdrop if there is one."""
+        count, height, width = len(cameras), cameras[0].height, cameras[0].width
+        if count * max(height * width, SHADOW_PIXELS**2) >= 2**31:
+            raise ValueError(f"{count} pictures of {width} x {height} are too many at once: draw fewer.")
+        stack, vertex, face = self.stack, 0, 0
+        if backdrop is None:
+            nearest, placed = empty_buffer(count, height, width, self.device), stack.unplaced(count)
+            pictures, lit_at = empty_pictures(count, height, width, self.device), self.nowhere
+        else:
+            vertex, face, lit_at = stack.still_vertices, stack.still_faces, backdrop.lit_at
+            nearest, placed = wp.clone(backdrop.nearest), copied(backdrop.placed)
+            pictures = Pictures(*(wp.clone(array) for array in backdrop.pictures.arrays))
+        self._place(cameras, moved, placed, vertex)
+        through = unbent(cameras, self.device)
+        rows = slice(0, height) if through.pixels.size else self._rows(placed.seen, vertex, height)
+        draw(placed.seen, stack.surfaces.triangles, face, rows, nearest, self.device, through=through)
+        self._shade(cameras, placed, nearest, stack.casting, face, lit_at, through, pictures)
+        return pictures
+
+    def _shade(
+        self,
+        cameras: Sequence[Camera],
+        placed: Placed,
+        nearest: wp.array,
+        casting: wp.array,
+        still: int,
+        lit_at: wp.array,
+        through: Unbent,
+        pictures: Pictures,
+    ) -> None:
+        """Light what the z-buffers hold, in the shadow of some triangles, into pictures that hold all else."""
+        count, height, width = nearest.shape
+        shadow = self._shadow(placed, casting)
+        inputs = [
+            width, height * width, nearest.flatten(), self.stack.surfaces, placed, self._eyes(cameras), self.light,
+            shadow, self.curve, still, lit_at, through.pixels,
+        ]  # fmt: skip
+        outputs = [array.flatten() for array in pictures.arrays]
+        launch_in_bands(shade, inputs, outputs, count * height * width, self.device, bands=4)
+
+    def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: Placed, since: int) -> None:
+        """Find where the vertices from number `since` on lie in each picture."""
+        stack = self.stack
+        matrices = wp.array([projection(camera) for camera in cameras], dtype=wp.mat44d, device=self.device)
+        inputs = [
+            since, stack.still, moved, matrices, wp.mat44d(projection(self.lamp_camera)), stack.surfaces.triangles,
+            stack.around, stack.faces,
+        ]  # fmt: skip
+        launch_in_bands(place, inputs, [placed], len(cameras) * (stack.vertices - since), self.device)
+
+    def _rows(self, seen: wp.array, since: int, height: int) -> slice:
+        """The rows that vertices from number `since` on can cover: on a card all, for to ask would take longer."""
+        if self.device != "cpu":
+            return slice(0, height)
+        return slice(*rows_reached(seen.numpy()[:, since:].reshape(-1, 3), NEAR, height))
+
+    def _shadow(self, placed: Placed, casting: wp.array) -> Shadow:
+        """Draw the shadow map of each picture."""
+        count, tiles = placed.lit.shape[0], SHADOW_PIXELS // int(TILE)
+        shadow = Shadow()
+        shadow.size = SHADOW_PIXELS
+        shadow.depth = wp.empty(count * SHADOW_PIXELS**2, dtype=wp.float32, device=self.device)
+        shadow.bounds = wp.empty(count * tiles**2, dtype=wp.vec2f, device=self.device)
+        nearest = empty_buffer(count, SHADOW_PIXELS, SHADOW_PIXELS, self.device)
+        draw(placed.lit, casting, 0, slice(0, SHADOW_PIXELS), nearest, self.device)
+        launch_in_bands(bound, [nearest], [shadow], count * tiles**2, self.device)
+        return shadow
+
+    def _eyes(self, cameras: Sequence[Camera]) -> wp.array:
+        return wp.array([camera.centre for camera in cameras], dtype=wp.vec3f, device=self.device)
+
+    def _backdrop(self, camera: Camera, moved: wp.array) -> Backdrop:
+        """What a camera sees of the layers that stand still; that of the last camera is kept."""
+        if self.backdrop is not None and self.backdrop.camera is camera:
+            return self.backdrop
+        stack, height, width = self.stack, camera.height, camera.width
+        placed, nearest = stack.unplaced(1), empty_buffer(1, height, width, self.device)
+        pictures = empty_pictures(1, height, width, self.device)
+        self._place([camera], moved, placed, 0)
+        there = stack.surfaces.triangles[: stack.still_faces]
+        through = unbent([camera], self.device)
+        draw(placed.seen, there, 0, slice(0, height), nearest, self.device, through=through)
+        self._shade([camera], placed, nearest, self.unshaded, 0, self.nowhere, through, pictures)
+        lit_at = wp.zeros(height * width, dtype=wp.vec3f, device=self.device)
+        inputs = [width, nearest.flatten(), stack.surfaces, placed, self._eyes([camera]), self.light, through.pixels]
+        launch_in_bands(remember, inputs, [lit_at], height * width, self.device)
+        self.backdrop = Backdrop(camera, nearest, placed, pictures, lit_at)
+        return self.backdrop
+
+
+def empty_pictures(count: int, height: int, width: int, device: str) -> Pictures:
+    """Pictures in which nothing is seen but what is behind all."""
+    shape = count, height, width
+    colour = wp.empty(shape, dtype=wp.vec3ub, device=device)
+    for row in range(count):
+        wp.copy(colour[row], background(width, height, device))
+    depth = wp.zeros(shape, dtype=wp.float32, device=device)
+    return Pictures(colour, depth, wp.zeros(shape, dtype=wp.uint8, device=device))
+
+
+def copied(placed: Placed) -> Placed:
+    """The same arrays anew."""
+    out = Placed()
+    for name in ("seen", "lit", "vertices", "normals"):
+        setattr(out, name, wp.clone(getattr(placed, name)))
+    return out
+
+
+def projection(camera: Camera) -> np.ndarray:
+    """(4, 4): takes a world point (x, 1) [m] to (u w, v w, w, 1)."""
+    P = np.eye(4)
+    P[:3] = camera.K @ camera.T_camera_world[:3]
+    return P
+
+
+def as_light(lamp: Lamp) -> Light:
+    """The lamp as the kernel takes it."""
+    camera = lamp.camera()
+    axis = np.asarray(lamp.target) - lamp.position
+    light = Light()
+    light.position, light.axis = wp.vec3f(lamp.position), wp.vec3f(axis / np.linalg.norm(axis))
+    angle = np.arctan(lamp.radius / np.linalg.norm(axis))
+    light.outer, light.steepness = float(np.cos(angle)), float(1.0 / (np.cos(0.55 * angle) - np.cos(angle)))
+    light.strength, light.ambient, light.P = lamp.strength, lamp.ambient, wp.mat44f(projection(camera))
+    # As high as the filter is wide: then no slant to the lamp brings the surface itself under the filter.
+    light.offset = float(1.05 * (SOFT + 0.5) * np.linalg.norm(axis) / camera.K[0, 0])
+    return light
+
+
+@lru_cache(maxsize=4)
+def background(width: int, height: int, device: str) -> wp.array:
+    """(H, W, 3) uint8 on a device: a drape, brighter in the middle."""
+    y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
+    fall = 1.0 - 0.45 * np.clip(np.hypot(x, y) / np.sqrt(2.0), 0.0, 1.0)
+    return wp.array((255.0 * fall[..., None] * DRAPE).astype(np.uint8), dtype=wp.vec3ub, device=device)
+
+
+@lru_cache(maxsize=1)
+def tone_curve() -> np.ndarray:
+    """(4096,) uint8: scene-linear light to display: filmic curve (Narkowicz 2016), then a gamma of 2."""
+    x = np.linspace(0.0, float(BRIGHTEST), 4096)
+    filmic = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
+    return (255.0 * np.sqrt(filmic) + 0.5).astype(np.uint8)

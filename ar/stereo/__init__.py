@@ -1,0 +1,1 @@
+"""What two eyes see: rows made alike, depths, points that are followed."""

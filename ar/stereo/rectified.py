@@ -1,0 +1,110 @@
+"""Two eyes turned so that rows of both show the same: a window of each about what they look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from ..optics.camera import Camera
+
+# The right eye is to the right of the left one: the least share of the way between them along the left one's rows.
+ALONG_ROWS = 0.9
+Maps = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Rectified:
+    """Windows of a pair of eyes. What is as deep as their target has the same place in both.
+
+    Fusiello, Trucco, Verri 2000, "A compact algorithm for rectification of stereo pairs", Mach. Vis. Appl. 12:16-22.
+
+    Parameters
+    ----------
+    T_window_world
+        (4, 4): places [m] in the left eye's turned frame, whose x axis goes to the right eye.
+    focal, principal
+        Of the left window: focal length and principal point (2,) [pixel].
+    baseline, depth
+        Between the eyes; from there to the target along the axis [m].
+    size
+        Of a window along each side [pixel].
+    maps
+        Of the left and of the right eye: where the pixels of its window are in its picture.
+    """
+
+    T_window_world: np.ndarray
+    focal: float
+    principal: np.ndarray
+    baseline: float
+    depth: float
+    size: int
+    maps: tuple[Maps, Maps]
+
+    def windows(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pictures (H, W, ...) uint8 of both eyes as windows (size, size, ...), black beyond their borders."""
+        one, other = self.maps
+        return cv2.remap(left, *one, cv2.INTER_LINEAR), cv2.remap(right, *other, cv2.INTER_LINEAR)
+
+    @property
+    def gauge(self) -> float:
+        """Disparity [pixel] times depth [m], both from the eyes."""
+        return self.focal * self.baseline
+
+    def disparity(self, depth: np.ndarray) -> np.ndarray:
+        """How much farther to the left the right window shows what is so deep [m], in pixels: 0 at the target."""
+        return self.gauge / depth - self.gauge / self.depth
+
+    def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (n, 2) of the left window, and disparities (n,), of world points (n, 3) [m]."""
+        at = points @ self.T_window_world[:3, :3].T + self.T_window_world[:3, 3]
+        return self.focal * at[:, :2] / at[:, 2:] + self.principal, self.disparity(at[:, 2])
+
+    def points(self, pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+        """World points (n, 3) [m] at pixels (n, 2) of the left window with disparities (n,)."""
+        depth = self.depths(disparity)
+        ray = np.column_stack([(pixels - self.principal) / self.focal, np.ones(len(pixels))])
+        return (depth[:, None] * ray - self.T_window_world[:3, 3]) @ self.T_window_world[:3, :3]
+
+    def depths(self, disparity: np.ndarray) -> np.ndarray:
+        """Depths [m] of disparities [pixel]."""
+        return self.gauge / (disparity + self.gauge / self.depth)
+
+
+@lru_cache(maxsize=4)
+def rectified(
+    left: Camera, right: Camera, target: tuple[float, float, float], reach: float, fineness: float
+) -> Rectified:
+    """Windows about a target [m] that reach so far [m] to each side, with so many pixels to a metre at its depth.
+
+    Raises
+    ------
+    ValueError
+        Eyes that do not stand side by side, the left one on the left; a target that is not ahead of them.
+    """
+    between = right.centre - left.centre
+    baseline = float(np.linalg.norm(between))
+    if not left.T_camera_world[0, :3] @ between > ALONG_ROWS * baseline or not baseline > 0.0:
+        raise ValueError("the right eye is not to the right of the left one: check which is which.")
+    x = between / baseline
+    y = np.cross(left.T_camera_world[2, :3] + right.T_camera_world[2, :3], x)
+    R = np.stack([x, y / np.linalg.norm(y), np.cross(x, y / np.linalg.norm(y))])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, -R @ left.centre
+    at = R @ np.asarray(target) + T[:3, 3]
+    if not at[2] > 0.0:
+        raise ValueError("the target is not ahead of the eyes: check where they are.")
+    size, focal = 2 * round(reach * fineness), fineness * float(at[2])
+    middle = 0.5 * (size - 1)
+    principal = middle - focal * at[:2] / at[2]
+    shift = np.array([focal * baseline / at[2], 0.0])
+    maps = tuple(_maps(eye, R, focal, place, size) for eye, place in ((left, principal), (right, principal + shift)))
+    return Rectified(T, focal, principal, baseline, float(at[2]), size, (maps[0], maps[1]))
+
+
+def _maps(eye: Camera, R: np.ndarray, focal: float, principal: np.ndarray, size: int) -> Maps:
+    K = np.array([[focal, 0.0, principal[0]], [0.0, focal, principal[1]], [0.0, 0.0, 1.0]])
+    turn = R @ eye.T_camera_world[:3, :3].T
+    return cv2.initUndistortRectifyMap(eye.K, eye.distortion, turn, K, (size, size), cv2.CV_16SC2)

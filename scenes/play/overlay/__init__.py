@@ -1,0 +1,1 @@
+"""A real or drawn film in, an overlay out."""

@@ -1,0 +1,227 @@
+"""From one picture of a real camera to the next: where the tumour is, how far off that may be, and what is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from scipy.stats import chi2
+
+from ar.optics.calibration import Calibration
+from ar.optics.camera import Camera
+from ar.tracking.pose import Pose
+from ar.tracking.registration import Registration
+from ar.tracking.targets import patient_reference, tool_cube
+from ar.tracking.track import Tracked, Tracker
+
+from ...script.tracked_tool import TrackedTool
+from ...script.uncertainty import LEVEL
+from .tool_motion import Motion, ToolMotion
+
+# So long a picture's overlay stays where it was when the reference is lost, and so long pictures may be missing [s].
+HELD, GAP = 0.2, 0.2
+# A slow film's pictures may be apart by so many of its own intervals, which are no longer than this [s].
+MISSED, SLOWEST = 1.5, 1.0
+# Times of pictures are rounded [s].
+ROUNDING = 1e-6
+# A tumour whose place in the picture is not known this well is not to be relied on [m].
+LIMIT = 5e-3
+UNKNOWN = "as in the scan, and nobody says how it moved: do not rely on it"
+TOOL, PATIENT = tool_cube().name, patient_reference().name
+
+
+class State(Enum):
+    """What a picture shows of the tumour."""
+
+    GOOD = "where it is now"
+    REST = "as in the scan"
+    UNKNOWN = "as in the scan, its motion not known"
+    UNSURE = "not to be relied on"
+    NO_TOOL = "tool lost"
+    STALE = "stale"
+    NO_REFERENCE = "reference lost"
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known after a picture.
+
+    Parameters
+    ----------
+    time
+        When it was taken [s].
+    state, words
+        What it shows; why that is no more, or not to be relied on, for people; empty where it may be.
+    tracked
+        What was seen of the targets.
+    motion
+        The brain as it is believed to be.
+    camera
+        With T_camera_scan; None where the reference has been lost for longer than `HELD`.
+    T_scan_tool, tip_covariance
+        (4, 4) [m] and (3, 3) [m^2], where the tool is seen.
+    band
+        With a probability of 95 % the tumour is no farther off across the line of sight [m]; None where that is not
+        known.
+    parts
+        The same by what it comes from [m].
+    seen, felt
+        When the reference, and the tool beside it, were seen last [s]; None: never.
+    interval
+        The shortest between two pictures so far [s].
+    """
+
+    time: float
+    state: State
+    words: str
+    tracked: Tracked
+    motion: Motion
+    camera: Camera | None = None
+    T_scan_tool: np.ndarray | None = None
+    tip_covariance: np.ndarray | None = None
+    band: float | None = None
+    parts: Mapping[str, float] = field(default_factory=dict)
+    seen: float | None = None
+    felt: float | None = None
+    interval: float = SLOWEST
+
+    @property
+    def relied(self) -> bool:
+        """Whether the tumour is drawn as known."""
+        return self.state in (State.GOOD, State.REST)
+
+
+@dataclass(frozen=True, eq=False)
+class Follower:
+    """Follows reference and tool through the pictures of a calibrated camera, and asks how the brain lies.
+
+    Parameters
+    ----------
+    calibration
+        Of the camera.
+    registration
+        Of the patient's reference to the scan.
+    tool
+        With its cube; None: no tool is looked for.
+    motion
+        Who says how the brain lies under it.
+    """
+
+    calibration: Calibration
+    registration: Registration
+    tool: TrackedTool | None
+    motion: ToolMotion
+
+    @cached_property
+    def tracker(self) -> Tracker:
+        """Of the targets that are wanted."""
+        wanted = (patient_reference(),) if self.tool is None else (patient_reference(), tool_cube())
+        return Tracker(self.calibration.camera(np.eye(4)), wanted)
+
+    def step(self, grey: np.ndarray, time: float, before: Known | None = None) -> Known:
+        """What is known after a picture (H, W) uint8 that was taken at a time [s], from what was known `before`.
+
+        Raises
+        ------
+        ValueError
+            As `Tracker.track`.
+        """
+        known = self._looked(grey, time, before)
+        if before is None:
+            return known
+        apart = time - before.time
+        return replace(known, interval=min(before.interval, apart) if apart > 0.0 else before.interval)
+
+    def _looked(self, grey: np.ndarray, time: float, before: Known | None) -> Known:
+        """As `step`, whatever the intervals are."""
+        apart = None if before is None else time - before.time
+        longest = GAP if before is None else max(GAP, MISSED * before.interval)
+        stale = apart is not None and not 0.0 < apart <= longest
+        forgotten = before is None or (apart is not None and not 0.0 <= apart <= longest)
+        tracked = self.tracker.track(grey, None if before is None or forgotten else before.tracked)
+        reference = tracked.poses.get(PATIENT)
+        if reference is None:
+            return self._without_reference(tracked, time, before)
+        T_patient_scan = self.registration.T_patient_scan
+        camera = self.calibration.camera(reference.T_camera_target @ T_patient_scan)
+        known = self._with_tool(tracked, reference, time, before)
+        middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
+        band, parts = self._band(reference, middle, known.motion)
+        known = replace(known, camera=camera, band=band, parts=parts, seen=time)
+        if known.state is State.UNKNOWN:
+            known = replace(known, band=None, parts={})
+        if stale and apart is not None:
+            why = f"no picture for {apart:.1f} s" if apart > 0.0 else "the camera repeats a picture"
+            return replace(known, state=State.STALE, words=f"stale, {why}: do not rely on it")
+        if known.state in (State.GOOD, State.REST) and band > LIMIT:
+            words = f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
+            return replace(known, state=State.UNSURE, words=words)
+        return known
+
+    def _without_reference(self, tracked: Tracked, time: float, before: Known | None) -> Known:
+        """The reference is not seen: for a moment the overlay stays where it was."""
+        seen = None if before is None else before.seen
+        motion = self.motion.rest if before is None else before.motion
+        held = before is not None and seen is not None and 0.0 <= time - seen < HELD + ROUNDING
+        camera = before.camera if before is not None and held else None
+        why = "not seen yet" if seen is None else "lost"
+        what = "nothing is drawn" if camera is None else "drawn where it was"
+        return Known(
+            time, State.NO_REFERENCE, f"reference {why}: {what}", tracked, motion, camera, seen=seen,
+            felt=None if before is None else before.felt,
+        )  # fmt: skip
+
+    def _with_tool(self, tracked: Tracked, reference: Pose, time: float, before: Known | None) -> Known:
+        """How the brain lies under the tool, by its pose beside the reference."""
+        felt, last = (None, None) if before is None else (before.felt, before.motion)
+        cube = tracked.poses.get(TOOL)
+        if self.tool is None or cube is None:
+            if self.motion.deformer is None:
+                return Known(time, State.UNKNOWN, UNKNOWN, tracked, self.motion.rest, felt=felt)
+            if felt is None or last is None:
+                words = "tool not seen yet: the tumour as in the scan"
+                return Known(time, State.NO_TOOL, words, tracked, self.motion.rest)
+            words = f"tool lost: the tumour as {time - felt:.1f} s ago"
+            return Known(time, State.NO_TOOL, words, tracked, last, felt=felt)
+        beside = cube.seen_from(reference)
+        into = np.linalg.inv(self.registration.T_patient_scan)
+        pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
+        spread = self._tip_covariance(beside)
+        motion = self.motion.under(pose, spread, last)
+        state = State.UNSURE if motion.doubt else State.GOOD if motion.moved > 0.0 else State.REST
+        return Known(time, state, motion.doubt, tracked, motion, None, pose, spread, felt=time)
+
+    def _tip_covariance(self, beside: Pose) -> np.ndarray:
+        """Of the tool's tip in the scan (3, 3) [m^2]: by both poses, the tool's calibration and the registration."""
+        assert self.tool is not None
+        T = self.registration.T_patient_scan
+        arm, tracked = beside.point(self.tool.T_cube_tool[:3, 3])
+        turned = beside.T_camera_target[:3, :3]
+        _, registered = self.registration.point((arm - T[:3, 3]) @ T[:3, :3])
+        whole = tracked + turned @ self.tool.tip_covariance @ turned.T + registered
+        return T[:3, :3].T @ whole @ T[:3, :3]
+
+    def _band(self, reference: Pose, middle: np.ndarray, motion: Motion) -> tuple[float, dict[str, float]]:
+        """How far off the tumour's `middle` (3,) [m] may be across the line of sight, and by what."""
+        place, beside = self.registration.point(middle)
+        at, tracked = reference.point(place)
+        turned = reference.T_camera_target[:3, :3]
+        registered = turned @ beside @ turned.T
+        parts = {
+            "tracking": across(tracked, at),
+            "registration": across(registered, at),
+            "tool": motion.tool,
+            "model": motion.model,
+        }
+        return float(np.hypot(across(tracked + registered, at), motion.error)), parts
+
+
+def across(covariance: np.ndarray, sight: np.ndarray) -> float:
+    """The radius [m] that holds 95 % of an error of covariance (3, 3) [m^2] across a line of sight along (3,)."""
+    ray = sight / np.linalg.norm(sight)
+    plane = np.eye(3) - np.outer(ray, ray)
+    largest = float(np.linalg.eigvalsh(plane @ covariance @ plane)[-1])
+    return float(np.sqrt(chi2.ppf(LEVEL, 2) * max(largest, 0.0)))

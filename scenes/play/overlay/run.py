@@ -1,0 +1,138 @@
+"""The loop of a real picture: track, ask how the brain lies, draw; and how long after the picture that was ready."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from ar.tracking.pictures import Named
+from ar.tracking.stamp import read_stamp
+
+from .follower import Follower, Known, State
+from .picture import Painter
+
+# Edges of the histogram of latencies [ms].
+EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)
+# A picture that is so much older than its overlay is not the view any more [s].
+OLD = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A picture with its overlay.
+
+    Parameters
+    ----------
+    known
+        What is drawn.
+    colour
+        (H, W, 3) uint8.
+    seconds
+        What it took, from the picture's arrival.
+    latency
+        From when the picture was taken to when its overlay was ready [s]: of pictures that come as time goes on.
+    stamped
+        Whether the time was read from the picture's pixels.
+    """
+
+    known: Known
+    colour: np.ndarray
+    seconds: float
+    latency: float | None = None
+    stamped: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """A picture whose time [s] is read from its pixels, where it is written there, and from its source elsewhere."""
+
+    picture: Named
+    stamped: bool
+
+
+def timed(film: Iterator[Named]) -> Iterator[Timed]:
+    """Pictures with the times that they hold."""
+    for picture in film:
+        stamp = read_stamp(picture.grey)
+        yield Timed(picture if stamp is None else replace(picture, time=stamp), stamp is not None)
+
+
+def paced(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
+    """Pictures as a camera gives them: the newest that is taken by now, and the moment [s] that its time 0 was.
+
+    Those that come while nobody asks are lost.
+    """
+    waiting = next(film, None)
+    if waiting is None:
+        return
+    begun = clock.perf_counter() - waiting.picture.time
+    while waiting is not None:
+        newer = next(film, None)
+        while newer is not None and newer.picture.time <= clock.perf_counter() - begun:
+            waiting, newer = newer, next(film, None)
+        clock.sleep(max(0.0, waiting.picture.time - (clock.perf_counter() - begun)))
+        yield waiting, begun
+        waiting = newer
+
+
+def overlaid(film: Iterator[Timed], follower: Follower, painter: Painter, live: bool = False) -> Iterator[Shown]:
+    """Every picture with its overlay; `live`: as time goes on, so that late pictures are left out and old ones said.
+
+    Raises
+    ------
+    ValueError
+        As `Follower.step`, and of the film.
+    """
+    known: Known | None = None
+    for taken, begun in paced(film) if live else ((each, None) for each in film):
+        shown = overlaid_one(taken, begun, known, follower, painter)
+        known = shown.known
+        yield shown
+
+
+def overlaid_one(
+    taken: Timed, begun: float | None, before: Known | None, follower: Follower, painter: Painter
+) -> Shown:
+    """One picture with its overlay, from what was known `before`.
+
+    `begun` is the moment [s] that the pictures' time 0 was, if they come as time goes on: one that is old is stale.
+
+    Raises
+    ------
+    ValueError
+        As `Follower.step`.
+    """
+    arrived, picture = clock.perf_counter(), taken.picture
+    assert picture.colour is not None
+    known = follower.step(picture.grey, picture.time, before)
+    drawn = known if begun is None else aged(known, clock.perf_counter() - begun - picture.time)
+    colour = painter.paint(picture.colour, drawn).colour
+    ready = clock.perf_counter()
+    latency = None if begun is None else ready - begun - picture.time
+    return Shown(drawn, colour, ready - arrived, latency, taken.stamped)
+
+
+def aged(known: Known, age: float) -> Known:
+    """What is known of a picture that is so old [s]: one that is too old is stale."""
+    if age <= OLD or not known.relied:
+        return known
+    return replace(known, state=State.STALE, words=f"stale, the picture is {age:.1f} s old: do not rely on it")
+
+
+def latencies(shown: list[Shown]) -> dict[str, object]:
+    """Median, 95th percentile and histogram [ms], of pictures as time goes on, or else of what each took."""
+    live = [each.latency for each in shown if each.latency is not None]
+    milliseconds = 1e3 * np.array(live or [each.seconds for each in shown])
+    counts = np.histogram(milliseconds, [*EDGES, np.inf])[0]
+    names = [*(f"{low}-{high}" for low, high in pairwise(EDGES)), f"over {EDGES[-1]}"]
+    return {
+        "what": "from the picture's time to its overlay" if live else "from the picture's arrival to its overlay",
+        "time_from": "pixels" if all(each.stamped for each in shown) else "the source",
+        "p50_ms": float(np.median(milliseconds)),
+        "p95_ms": float(np.percentile(milliseconds, 95.0)),
+        "histogram_ms": {name: int(count) for name, count in zip(names, counts, strict=True) if count},
+    }
