@@ -11,7 +11,19 @@ from scipy.spatial.transform import Rotation
 from scenes.bench import locate_twins
 from scenes.bench.kelvinlets import kelvinlets
 from scenes.bench.locate_rivals import kelvin_forces, oracle, rigid, springs, thin_plates
-from scenes.bench.locate_study import OURS, Estimate, PointsSeen, estimate, observed, ours, row, rows, sights_of, spoilt
+from scenes.bench.locate_study import (
+    ORACLE,
+    OURS,
+    Estimate,
+    PointsSeen,
+    estimate,
+    observed,
+    ours,
+    row,
+    rows,
+    sights_of,
+    spoilt,
+)
 from scenes.bench.locate_twins import CAUSES, Twin, drawn, effects_of, loads_of, solved, twins
 from scenes.cli import main
 from sim.accuracy import REFERENCE
@@ -50,7 +62,7 @@ def locator(body):
     shape = np.einsum("nivj,ni->nvj", kelvinlets(nodes, source, 25e-3), force)
     shape *= 1e-3 / np.sqrt((shape**2).sum(axis=2).mean(axis=1))[:, None, None]
     prior = Prior(body, shape.astype(np.float32), *np.array(labels).T, centre=np.zeros((2, 3)))
-    return Locator(prior, np.tile([[0.0, 3.0, 3.0], [3.0, 6.0, 3.0]], (20, 1)))
+    return Locator(prior, np.tile([[0.0, 3.0, 0.0, 3.0], [3.0, 6.0, 0.0, 3.0]], (20, 1)))
 
 
 def some_motion(locator, number):
@@ -204,6 +216,10 @@ def test_every_twin_is_seen_on_points_of_its_own(locator, body):
     found = list(rows(some, sights_of([30], [50], [0, 1]), spy, locator))
     assert [(each.noise, each.estimator) for each in found[::3]] == [(0, "spy"), (1, "spy")] and len(found) == 6
     assert np.array_equal(given[0], given[2]) and not np.array_equal(given[0], given[1])
+    clouds = list(rows(some, sights_of([30], [50], [0], named=False), spy, locator))
+    assert [each.estimator for each in clouds] == [OURS, ORACLE] and len(given) == 4
+    seen = [observed(body, some[0].motion, PointsSeen(30, 50, 0, named), (0, 0)) for named in (True, False)]
+    assert seen[1].rest is None and np.array_equal(seen[0].now, seen[1].now)
     with pytest.raises(InputError, match="level 3"):
         list(rows(some, sights_of([30], [50], [3]), spy, locator))
     with pytest.raises(InputError, match="no twin"):

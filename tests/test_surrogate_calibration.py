@@ -8,7 +8,15 @@ from conftest import make_box
 from scipy.stats import chi2
 
 from sim.errors import InputError
-from surrogate.locating.calibration import covering_factor, left_out, likeness, seen_patch, trials, was_tried
+from surrogate.locating.calibration import (
+    NEAREST,
+    covering_factor,
+    left_out,
+    likeness,
+    seen_patch,
+    trials,
+    was_tried,
+)
 from surrogate.locating.ensemble import Ensemble
 from surrogate.locating.prior import middle_of
 
@@ -39,8 +47,20 @@ def test_points_lie_on_a_patch_of_the_open_cortex_and_move_with_it(body, evidenc
 
 def test_likeness_is_of_motion_over_error_and_of_the_number_of_points(evidence):
     exact, shifted = (replace(evidence, sigma=np.full(180, 3e-4), shift=shift) for shift in (0.0, 4e-4))
-    assert likeness(exact) == pytest.approx(np.log([3e-3 / 3e-4, 60.0]))
-    assert likeness(shifted) == pytest.approx(np.log([3e-3 / 5e-4, 60.0]))
+    assert likeness(exact)[:2] == pytest.approx(np.log([3e-3 / 3e-4, 60.0]))
+    assert likeness(shifted)[:2] == pytest.approx(np.log([3e-3 / 5e-4, 60.0]))
+
+
+def test_a_cloud_is_like_no_named_points(evidence):
+    """One row a point, as clouds have, and three."""
+    cloud = evidence.rows(np.arange(0, 180, 3))
+    assert likeness(cloud)[1] == likeness(evidence)[1] and likeness(cloud)[2] > 100.0 + likeness(evidence)[2]
+    named, unnamed = (
+        np.tile(np.append(likeness(of), square), (NEAREST, 1)) for of, square in ((evidence, 1.0), (cloud, 9.0))
+    )
+    tried = np.concatenate([named, unnamed])
+    assert covering_factor(tried, cloud) == pytest.approx(9.0 * covering_factor(tried, evidence))
+    assert was_tried(named, evidence) and not was_tried(named, cloud) and was_tried(tried, cloud)
 
 
 def some_members(body, skull, group):
@@ -63,19 +83,20 @@ def test_whole_groups_are_left_out_one_of_each_skull(body):
 def test_the_factor_makes_ellipsoids_hold_in_95_of_100_trials(evidence, times):
     """Squares that are chi-square of three degrees, times a number, need just that number."""
     random = np.random.default_rng(1)
-    squares = times * chi2.ppf((np.arange(80) + 0.5) / 80, 3)
-    tried = np.column_stack([likeness(evidence) + 0.01 * random.standard_normal((80, 2)), squares])
+    squares = times * chi2.ppf((np.arange(NEAREST) + 0.5) / NEAREST, 3)
+    spread = 0.01 * random.standard_normal((NEAREST, 3)) * [1.0, 1.0, 0.0]
+    tried = np.column_stack([likeness(evidence) + spread, squares])
     assert covering_factor(tried, evidence) == pytest.approx(times, rel=0.12)
     # Trials that are unlike it do not count.
-    other = np.column_stack([likeness(evidence) + np.full((500, 2), 3.0), np.full(500, 1e3)])
+    other = np.column_stack([likeness(evidence) + np.full((500, 3), 3.0), np.full(500, 1e3)])
     assert covering_factor(np.concatenate([other, tried]), evidence) == covering_factor(tried, evidence)
 
 
 def test_what_was_never_tried_is_said(evidence):
-    around = likeness(evidence) + np.array([[-0.1, -0.1], [0.1, 0.1]])
+    around = likeness(evidence) + np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.0]])
     assert was_tried(np.column_stack([around, [1.0, 1.0]]), evidence)
-    assert not was_tried(np.column_stack([around + [0.2, 0.0], [1.0, 1.0]]), evidence)
-    assert not was_tried(np.column_stack([around - [0.0, 0.2], [1.0, 1.0]]), evidence)
+    assert not was_tried(np.column_stack([around + [0.2, 0.0, 0.0], [1.0, 1.0]]), evidence)
+    assert not was_tried(np.column_stack([around - [0.0, 0.2, 0.0], [1.0, 1.0]]), evidence)
 
 
 def test_the_tumours_middle_is_that_of_its_volume(body):

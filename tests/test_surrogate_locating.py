@@ -227,7 +227,7 @@ def test_covariances_grow_by_what_trials_ask_for(locator, body, truth):
     """Errors twice as large in trials make covariances four times as large, and the radius twice."""
     seen = observed(body, truth[0][0])
     found = locator.locate(seen)
-    wider = Locator(locator.prior, locator.tried * [1.0, 1.0, 4.0]).locate(seen)
+    wider = Locator(locator.prior, locator.tried * [1.0, 1.0, 1.0, 4.0]).locate(seen)
     assert wider.centroid == pytest.approx(found.centroid)
     assert wider.centroid_covariance == pytest.approx(4.0 * found.centroid_covariance)
     assert wider.p95 == pytest.approx(2.0 * found.p95)
@@ -269,6 +269,16 @@ def test_a_cloud_without_names_tells_the_motion_along_the_surfaces_normal(locato
         middle = middle_of(body, motion[None])[0]
         left, all_of_it = left + abs((found.centroid - middle)[2]), all_of_it + abs(middle[2])
     assert left < 0.4 * all_of_it
+
+
+def test_a_cloud_may_lie_as_far_off_as_brains_sink(locator, body):
+    """Its points are where the surface is now; named points are looked for at rest, and not so far off."""
+    rest = observed(body, np.zeros_like(body.mesh.nodes)).rest
+    sunk = rest - [0.0, 0.0, 14e-3]
+    assert placed(body, Observation(sunk)).value == pytest.approx(-14e-3)
+    for far in (Observation(rest - [0.0, 0.0, 19e-3]), Observation(rest, sunk)):
+        with pytest.raises(InputError, match="off the open cortex"):
+            placed(body, far)
 
 
 def test_wild_points_change_nothing_much(locator, body, truth):
@@ -319,10 +329,11 @@ def test_a_tip_without_support_is_left_out_and_says_nothing_of_the_tool(locator,
     assert not len(right.tips_left_out)
 
 
-def test_where_nothing_moved_nothing_is_claimed(locator, body):
-    found = locator.locate(
-        replace(observed(body, np.zeros_like(body.mesh.nodes)), now=observed(body, np.zeros_like(body.mesh.nodes)).rest)
-    )
+@pytest.mark.parametrize("rigid", [0.0, 0.8e-3])
+def test_where_nothing_moved_nothing_is_claimed(locator, body, rigid):
+    """Without a rigid error too: what is smaller than the noise is not known."""
+    seen = observed(body, np.zeros_like(body.mesh.nodes))
+    found = locator.locate(replace(seen, now=seen.rest, rigid=rigid))
     assert not found.centroid.any() and found.explained == 0.0 and not found.calibrated
     assert found.causes == dict.fromkeys(KINDS, 0.0) and found.p95 > 0.0
 

@@ -34,11 +34,15 @@ TRANSLATIONS = (0.0, 1e-3, 2e-3)
 
 @dataclass(frozen=True)
 class PointsSeen:
-    """What is seen: so many points, on a round share `cover` [%] of the open cortex, at a level of noise."""
+    """What is seen: so many points, on a round share `cover` [%] of the open cortex, at a level of noise.
+
+    Points without names are a cloud.
+    """
 
     points: int
     cover: int
     noise: int
+    named: bool = True
 
 
 @dataclass(frozen=True)
@@ -103,11 +107,12 @@ def observed(body: Anatomy, motion: np.ndarray, sight: PointsSeen, seed: tuple[i
     place = np.random.default_rng([*seed, sight.points, sight.cover])
     evidence = seen_patch(body, motion, place, sight.points, 1e-2 * sight.cover)
     rest, moved = evidence.at[::3], evidence.value.reshape(-1, 3)
+    known = rest if sight.named else None
     if not sight.noise:
-        return Observation(rest + moved, rest, np.full(len(rest), EXACT), rigid=0.0)
+        return Observation(rest + moved, known, np.full(len(rest), EXACT), rigid=0.0)
     random = np.random.default_rng([*seed, sight.points, sight.cover, sight.noise])
     translation = TRANSLATIONS[sight.noise]
-    return Observation(spoilt(rest, rest + moved, translation, random), rest, rigid=translation / np.sqrt(3.0))
+    return Observation(spoilt(rest, rest + moved, translation, random), known, rigid=translation / np.sqrt(3.0))
 
 
 def spoilt(rest: np.ndarray, now: np.ndarray, translation: float, random: np.random.Generator) -> np.ndarray:
@@ -131,7 +136,7 @@ def rows(
     seed: int = 0,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Iterator[Row]:
-    """Every estimator under each sight, sight by sight.
+    """Every estimator under each sight, sight by sight; rivals where points have names, which they need.
 
     `progress` hears how many observations are done, and of how many.
 
@@ -147,10 +152,11 @@ def rows(
             raise InputError(f"no noise is of level {sight.noise}: choose from 0 to {len(TRANSLATIONS) - 1}.")
     best = {twin.draw.number: _best(locator, twin) for twin in twins}
     for number, sight in enumerate(sights):
-        found: dict[str, list[Estimate]] = {name: [] for name in (*rivals, OURS, ORACLE)}
+        asked = rivals if sight.named else {}
+        found: dict[str, list[Estimate]] = {name: [] for name in (*asked, OURS, ORACLE)}
         for done, twin in enumerate(twins, start=1):
             seen = observed(locator.anatomy, twin.motion, sight, (seed, twin.draw.number))
-            for name, rival in rivals.items():
+            for name, rival in asked.items():
                 found[name].append(_rivalling(locator.anatomy, twin, rival, seen))
             found[OURS].append(ours(locator, twin.motion, seen))
             found[ORACLE].append(best[twin.draw.number])
@@ -159,9 +165,11 @@ def rows(
             yield row(sight, name, estimates)
 
 
-def sights_of(points: Sequence[int], covers: Sequence[int], noises: Sequence[int]) -> tuple[PointsSeen, ...]:
+def sights_of(
+    points: Sequence[int], covers: Sequence[int], noises: Sequence[int], named: bool = True
+) -> tuple[PointsSeen, ...]:
     """Every combination."""
-    return tuple(PointsSeen(*each) for each in product(points, covers, noises))
+    return tuple(PointsSeen(*each, named) for each in product(points, covers, noises))
 
 
 def row(sight: PointsSeen, name: str, estimates: Sequence[Estimate]) -> Row:

@@ -53,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="levels (default 0 1 2). 0: none. 1 and 2: white 0.3 mm, smooth 0.5 mm, and a rigid error of half a "
         "degree and 1 or 2 mm, whose size `sulcus locate` is given",
     )  # fmt: skip
+    parser.add_argument(
+        "--clouds", action="store_true", help="points have no names: where the surface is; rivals need names, and rest"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the twins and of what is seen (default %(default)s)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default %(default)s)")
     parser.add_argument(
@@ -82,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     table = sys.stderr if args.json else sys.stdout
     where = f"{machine(args.device)}; truths of {len(finer.mesh.nodes)} nodes, {args.element}"
     print(f"{where}\n\n{len(some)} twins\n\n| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
-    sights = sights_of(args.points, args.cover, args.noise)
+    sights = sights_of(args.points, args.cover, args.noise, not args.clouds)
     made = []
     with bar("observations") as heard:
         for row in rows(some, sights, rivals(body), locator, args.seed, heard):

@@ -136,7 +136,7 @@ def _sentences(found: Location, out: Path | None) -> str:
     ]
     if not found.calibrated:
         lines.append(
-            "It is a guess: ellipsoids were not tried on clouds, so few or many points, or motions so near errors."
+            "It is a guess: ellipsoids were not tried on so few or many points, or motions so near or far above errors."
         )
     if len(found.outliers):
         rows = ", ".join(str(number + 2) for number in found.outliers[:20]) + (

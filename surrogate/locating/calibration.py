@@ -15,21 +15,25 @@ from sim.geometry.locate import Located
 from .causes import DRAINAGE, SWELLING, TOOL
 from .ensemble import Ensemble, surface_size
 from .evidence import SIGMA, Evidence, of_motions
-from .posterior import conditioned
+from .observation import Observation
+from .posterior import Posterior
 from .presses import Presses
 from .prior import Prior, middle_of, prior_of
+from .rounds import settled
 
 LEVEL = 0.95
 """Probability with which ellipsoids are made to hold."""
 RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
 """The squared radius of a Gaussian's ellipsoid of that probability, in deviations: of chi-squared of three numbers."""
 # Trials in all. So many of those most like an observation say how far its covariance must grow.
-TRIALS, NEAREST = 240, 80
+TRIALS, NEAREST = 960, 120
+# What makes a cloud unlike all named points, in logarithms.
+UNLIKE = 1e3
 # What moves the brain in a trial.
 ALONE = (TOOL, DRAINAGE, SWELLING)
 # Points of a trial, the share of the open cortex that they lie on, how much softer its tissue is than the ensemble's,
 # and errors as shares of the usual. Rigid errors along each axis [m], and how often there is none.
-POINTS, COVER, SOFTER, ERRORS = (20, 300), (0.2, 0.6), (0.7, 2.0), (0.1, 1.0)
+POINTS, COVER, SOFTER, ERRORS = (20, 300), (0.2, 0.6), (0.7, 2.0), (0.05, 1.0)
 SHIFTS, UNSHIFTED = (0.05e-3, 3e-3), 0.25
 # Of motion over error, so that its logarithm is finite.
 LITTLE = 1e-3
@@ -38,12 +42,16 @@ LEAST_SEEN = 0.5e-3
 
 
 def trials(
-    ensemble: Ensemble, presses: Presses, progress: Callable[[int, int], object] = lambda done, total: None
+    ensemble: Ensemble,
+    presses: Presses,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+    count: int = TRIALS,
 ) -> np.ndarray:
-    """What came of trials (TRIALS, 3): `likeness` of each, and its error's square by its own covariance.
+    """What came of `count` trials (k, 4): `likeness` of each, and its error's square by its own covariance.
 
     Groups are left out in turn, so that a trial's tissue, tumour and directions are unknown to its estimator. A motion
-    in three is two causes' together. Rigid errors are as large as is stated, from none to 3 mm.
+    in three is two causes' together. Rigid errors are as large as is stated, from none to 3 mm. In half of them the
+    points have no names, and are a cloud. What is refused is no trial. None has a tip: with one, errors are smaller.
 
     Raises
     ------
@@ -54,12 +62,17 @@ def trials(
     if fold.max() < 0:
         raise InputError("no skull has two groups to try one by the other: give causes of several Poisson's ratios.")
     large = surface_size(ensemble.anatomy, ensemble.motion) > LEAST_SEEN
-    for turn, numbers in enumerate(np.array_split(np.arange(TRIALS), fold.max() + 1)):
+    for turn, numbers in enumerate(np.array_split(np.arange(count), fold.max() + 1)):
         prior, members = prior_of(ensemble, presses, fold != turn), np.flatnonzero((fold == turn) & large)
         for number in numbers:
-            evidence, middle = _trial(ensemble, members, number, np.random.default_rng(number))
-            found.append([*likeness(evidence), _square(prior, evidence, middle)])
-            progress(len(found), TRIALS)
+            observation, middle = _trial(ensemble, members, int(number), np.random.default_rng(number))
+            progress(int(number), count)
+            try:
+                posterior, _ = settled(prior, observation)
+            except InputError:
+                continue
+            found.append([*likeness(posterior.evidence), _square(prior, posterior, middle)])
+    progress(count, count)
     return np.array(found)
 
 
@@ -76,8 +89,8 @@ def left_out(ensemble: Ensemble) -> np.ndarray:
 
 def covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
     """By how much covariances must grow for ellipsoids of the tumour's middle to hold in 95 of 100 trials like this."""
-    away = ((tried[:, :2] - likeness(evidence)) ** 2).sum(axis=1)
-    square = np.sort(tried[np.argsort(away, kind="stable")[:NEAREST], 2])
+    away = ((tried[:, :-1] - likeness(evidence)) ** 2).sum(axis=1)
+    square = np.sort(tried[np.argsort(away, kind="stable")[:NEAREST], -1])
     rank = min(int(np.ceil(LEVEL * (len(square) + 1))), len(square))
     return float(square[rank - 1] / RADIUS_SQUARED)
 
@@ -85,19 +98,24 @@ def covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
 def was_tried(tried: np.ndarray, evidence: Evidence) -> bool:
     """Whether such an observation lies within the range of the trials."""
     own = likeness(evidence)
-    return bool((own >= tried[:, :2].min(axis=0)).all() and (own <= tried[:, :2].max(axis=0)).all())
+    alike = tried[tried[:, 2] == own[2], :3]
+    return bool(len(alike) and (own >= alike.min(axis=0)).all() and (own <= alike.max(axis=0)).all())
 
 
 def likeness(evidence: Evidence) -> np.ndarray:
-    """Logarithms (2,) of the seen motion over its error, the rigid one too, and of the number of points."""
+    """Logarithms of the seen motion over its error, the rigid one too, and of the number of points; and 0, or `UNLIKE`.
+
+    The last of the (3,) tells named points, of which each gives three numbers, from clouds.
+    """
     count = len(np.unique(evidence.point))
     seen = np.sqrt((evidence.value**2).sum() / count)
-    return np.log([max(seen / np.hypot(np.median(evidence.sigma), evidence.shift), LITTLE), count])
+    ratio = max(seen / np.hypot(np.median(evidence.sigma), evidence.shift), LITTLE)
+    return np.append(np.log([ratio, count]), UNLIKE * (len(evidence) < 2 * count))
 
 
 def _trial(
     ensemble: Ensemble, members: np.ndarray, number: int, random: np.random.Generator
-) -> tuple[Evidence, np.ndarray]:
+) -> tuple[Observation, np.ndarray]:
     """What is seen of some member's motion, or of two; and how that moves the tumour's middle (3,) [m]."""
     anatomy = ensemble.anatomy
     here = members[ensemble.skull[members] == random.choice(np.unique(ensemble.skull[members]))]
@@ -113,8 +131,11 @@ def _trial(
     off = np.linalg.cholesky(evidence.noise()) @ random.standard_normal(len(evidence))
     way = random.standard_normal((2, 3))
     way *= np.sqrt(3.0) / np.linalg.norm(way, axis=1, keepdims=True)
-    off += evidence.rigid @ (evidence.rigid_scale * way.ravel())
-    return replace(evidence, value=evidence.value + off), middle_of(anatomy, motion[None])[0]
+    shifted, turned = evidence.rigid_scale.reshape(2, 3) * way
+    rest = evidence.at[::3]
+    now = rest + (evidence.value + off).reshape(-1, 3) + shifted + np.cross(turned, rest - evidence.middle)
+    observation = Observation(now, rest if number % 2 else None, sigma[::3], rigid=shift)
+    return observation, middle_of(anatomy, motion[None])[0]
 
 
 def seen_patch(anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator, count: int, cover: float) -> Evidence:
@@ -134,8 +155,7 @@ def seen_patch(anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator
     return of_motions(place, at, moved, np.full(count, SIGMA))
 
 
-def _square(prior: Prior, evidence: Evidence, middle: np.ndarray) -> float:
+def _square(prior: Prior, found: Posterior, middle: np.ndarray) -> float:
     """The square of an estimate's error (3,) [m], by its own covariance."""
-    found = conditioned(prior, evidence)
     off = found.weight @ prior.middle - middle
     return float(off @ np.linalg.solve(found.covariance(prior.middle[:, None])[0], off))

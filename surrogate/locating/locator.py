@@ -14,13 +14,11 @@ from sim.runtime.threads import one_thread
 
 from .calibration import covering_factor, was_tried
 from .causes import KINDS
-from .observation import Observation, placed, placed_anew
-from .posterior import Posterior, conditioned
+from .observation import MOST, Observation
+from .posterior import Posterior
 from .prior import Prior
+from .rounds import settled
 
-# Rounds in which points without a place at rest look for it on the surface as it is believed to be. They end sooner
-# where what they find moves by less than this [m].
-ROUNDS, STEADY = 6, 0.1e-3
 # More points than this share are no outliers, and no cause of the ensemble moves what this is more surprised by.
 MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
 # A cause of a smaller share is not named.
@@ -44,8 +42,8 @@ class Location:
     outliers, tips_left_out
         Numbers of points, and of tips, from 0. They lie off the open cortex, or no other point supports them.
     calibrated
-        Whether covariances were tried on observations like this: on so many points, and motions so far above errors.
-        They never were on clouds, whose points have no places at rest.
+        Whether covariances were tried on observations like this: named points or a cloud, so many, and motions so far
+        above errors.
     seconds
         What this took, set-up apart.
     """
@@ -120,7 +118,7 @@ class Locator:
     prior
         What is believed of motions before they are seen.
     tried
-        (k, 3): what came of trials (`calibration.trials`).
+        (k, 4): what came of trials (`calibration.trials`).
     """
 
     prior: Prior
@@ -151,21 +149,10 @@ class Locator:
 
     def _located(self, observation: Observation) -> Location:
         begun, prior, count = time.perf_counter(), self.prior, len(observation.now)
-        evidence = placed(self.anatomy, observation)
-        named = np.unique(evidence.point[evidence.point < count])
-        found, tips = conditioned(prior, evidence, observation.tips), observation.tips
-        if observation.rest is None or len(tips):
-            cortex, motion = np.unique(self.anatomy.open_surface), np.zeros_like(self.anatomy.mesh.nodes)
-            for _ in range(ROUNDS):
-                motion[cortex] = np.tensordot(found.weight, prior.at(cortex), 1)
-                before, evidence = evidence, placed_anew(self.anatomy, observation, named, motion, found.bias_at)
-                if np.abs(evidence.value - before.value).max() < STEADY:
-                    break
-                supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
-                found = conditioned(prior, evidence, tips[supported])
+        found, named = settled(prior, observation)
         off = np.setdiff1d(np.arange(count), named) if observation.rest is not None else np.zeros(0, int)
         outliers = np.union1d(off, found.outliers[found.outliers < count])
-        _demand_explained(found, len(outliers), len(off) + int((np.unique(evidence.point) < count).sum()))
+        _demand_explained(found, len(outliers), count if observation.rest is not None else min(count, MOST))
         found = replace(found, factor=covering_factor(self.tried, found.evidence))
         return Location(
             prior,
@@ -173,7 +160,7 @@ class Locator:
             radius_of(found.covariance(prior.middle[:, None])[0]),
             outliers,
             found.outliers[found.outliers >= count] - count,
-            observation.rest is not None and was_tried(self.tried, found.evidence),
+            was_tried(self.tried, found.evidence),
             time.perf_counter() - begun,
         )
 

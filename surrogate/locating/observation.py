@@ -19,14 +19,17 @@ from .evidence import SHIFT, SIGMA, Evidence, of_motions
 FEWEST = 6
 # Spread of points across a line, as a share of that along it: less is a line.
 THIN = 0.05
-# How far [m] half of the points may lie off the surface they are said to be of, and how far any may.
-NEAR, FAR = 6e-3, 12e-3
+# How far [m] half of the points may lie off the surface they are said to be of, and how far any may. Half of a cloud
+# may be farther off: it lies where the surface is now, and drained brains sink by more than a centimetre.
+NEAR, FAR, NEAR_NOW = 6e-3, 12e-3, 18e-3
 # Farther than this no tip touches the cortex [m], however it has moved; points nearer than that are one place [m].
 FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
 # Motions [m] beyond which no brain goes, and rigid errors that no tracker has.
 LONGEST_MOTION, FARTHEST_OFF = 0.025, 0.02
-# Points of a cloud that are looked at together, and at most.
-TOGETHER, MOST = 128, 400
+# Points of a cloud that are looked at together.
+TOGETHER = 128
+MOST = 400
+"""Points of a cloud that are looked at, spread over it: more tell no more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +73,10 @@ def placed(anatomy: Anatomy, observation: Observation) -> Evidence:
         reason: units, LPS for RAS, another anatomy.
     """
     _check(observation)
-    where = observation.now if observation.rest is None else observation.rest
+    where, near = (observation.now, NEAR_NOW) if observation.rest is None else (observation.rest, NEAR)
     off = _off_surface(anatomy, where)
-    if _mostly_off(off):
-        raise InputError(_elsewhere(anatomy, where, float(np.median(off))))
+    if _mostly_off(off, near):
+        raise InputError(_elsewhere(anatomy, where, float(np.median(off)), near))
     _demand_spread(where)
     if observation.rest is not None:
         motion = np.median(np.linalg.norm(observation.now - observation.rest, axis=1))
@@ -210,17 +213,17 @@ def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     return away
 
 
-def _mostly_off(off: np.ndarray) -> bool:
-    """Whether more than half of distances (n,) [m] are more than `NEAR`."""
-    return bool(np.count_nonzero(off > NEAR) > 0.5 * len(off))
+def _mostly_off(off: np.ndarray, near: float) -> bool:
+    """Whether more than half of distances (n,) [m] are larger than is `near` [m]."""
+    return bool(np.count_nonzero(off > near) > 0.5 * len(off))
 
 
-def _elsewhere(anatomy: Anatomy, points: np.ndarray, off: float) -> str:
-    """Why points may be so far off the open cortex [m]."""
+def _elsewhere(anatomy: Anatomy, points: np.ndarray, off: float, near: float) -> str:
+    """Why half of some points (n, 3) [m] may be so far `off` the open cortex, farther than is `near` [m]."""
     start = f"half of the points lie more than {1e3 * off:.3g} mm off the open cortex"
     for scale, unit_meant in ((1e-3, "a thousandth"), (1e3, "a thousand times")):
-        if not _mostly_off(_off_surface(anatomy, scale * points)):
+        if not _mostly_off(_off_surface(anatomy, scale * points), near):
             return f"{start}, and would lie on it if they were {unit_meant} of that: files are in mm, arrays in metres."
-    if not _mostly_off(_off_surface(anatomy, points * [-1.0, -1.0, 1.0])):
+    if not _mostly_off(_off_surface(anatomy, points * [-1.0, -1.0, 1.0]), near):
         return f"{start}, and would lie on it if x and y were turned: they are LPS. Give RAS."
     return f"{start}: they are of another brain or frame. Give the scan's own RAS, in millimetres."

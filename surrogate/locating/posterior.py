@@ -189,8 +189,8 @@ class SeenPrior:
 def seen_prior(prior: Prior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> SeenPrior:
     """How a prior is seen by some evidence, where tips of tools (k, 3) [m] touch the cortex."""
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
-    # A motion and a rigid error may cancel, so that little is seen of either.
-    scale = 1e3 * float(np.hypot(seen, np.sqrt(3.0) * evidence.shift))
+    # A motion and a rigid error may cancel, so that little is seen of either; and noise hides what is smaller.
+    scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift)), float(np.median(evidence.sigma)))
     return SeenPrior(prior, scale, whitened(prior, evidence, seen), prior.odds(tips))
 
 

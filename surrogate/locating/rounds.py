@@ -1,0 +1,40 @@
+"""Points without a place at rest find one: on the surface as it is believed to be, which they then tell of.
+
+This is iterated conditioning with the closest points renewed, as in Besl, McKay 1992, "A method for registration of
+3-D shapes", IEEE Trans. Pattern Anal. Mach. Intell. 14:239-256.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .observation import Observation, placed, placed_anew
+from .posterior import Posterior, conditioned
+from .prior import Prior
+
+# Rounds at most. They end sooner where the tumour's middle moves by less than this [m]: later ones then come no nearer.
+ROUNDS, STEADY = 6, 0.2e-3
+
+
+def settled(prior: Prior, observation: Observation) -> tuple[Posterior, np.ndarray]:
+    """What an observation leaves of a prior, and the numbers (k,) of its named points that were looked at.
+
+    Raises
+    ------
+    InputError
+        As `placed`.
+    """
+    anatomy, tips, count = prior.anatomy, observation.tips, len(observation.now)
+    evidence = placed(anatomy, observation)
+    named = np.unique(evidence.point[evidence.point < count])
+    found = conditioned(prior, evidence, tips)
+    if observation.rest is None or len(tips):
+        cortex, motion = np.unique(anatomy.open_surface), np.zeros_like(anatomy.mesh.nodes)
+        for _ in range(ROUNDS):
+            motion[cortex] = np.tensordot(found.weight, prior.at(cortex), 1)
+            evidence = placed_anew(anatomy, observation, named, motion, found.bias_at)
+            supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
+            before, found = found, conditioned(prior, evidence, tips[supported])
+            if np.linalg.norm((found.weight - before.weight) @ prior.middle) < STEADY:
+                break
+    return found, named
