@@ -13,9 +13,9 @@ STYLES: Mapping[Style, str] = MappingProxyType(
         "window": "outline and window",
         "contour": "outline",
         "fill": "outline and tint",
-        "depth": "outline and depth under the surface",
-        "rings": "outline and rings of distance",
-        "cut": "outline and a cut through tip and middle",
+        "depth": "outline and depth",
+        "rings": "outline and rings",
+        "cut": "outline and cut",
         "none": "none",
     }
 )

@@ -14,8 +14,8 @@ SPAN = 20.0
 WIDE, HIGH, LEFT, ABOVE, BELOW = 600.0, 105.0, 44.0, 20.0, 16.0
 # Samples that are kept, and that are drawn: a pixel or two apart.
 MOST, DRAWN = 1200, 240
-# Moments farther apart are not joined [s].
-PAUSE = 2.0
+# Moments farther apart are not joined [s]. Half the width of one alone [s].
+PAUSE, DOT = 2.0, 0.06
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,17 @@ class History:
         while self.samples[0].time < sample.time - SPAN:
             self.samples.popleft()
 
+    def break_off(self, time: float) -> None:
+        """Let no line go from what was read before a time [s] to what is read after."""
+        unknown = (None,) * len(self.lines)
+        self.add(Sample(time, unknown, unknown))
+
     def chart(self) -> str:
         """All lines, one over the other, as an SVG element."""
         kept = list(self.samples)
-        kept = kept[:: max(1, math.ceil(len(kept) / DRAWN))][:-1] + kept[-1:]
+        step = max(1, math.ceil(len(kept) / DRAWN))
+        gaps = [None in each.values for each in kept]
+        kept = [each for place, each in enumerate(kept[:-1]) if place % step == 0 or gaps[place]] + kept[-1:]
         parts = [_plot(line, number, kept) for number, line in enumerate(self.lines)]
         words = "; ".join(f"{line.name}: {_newest(kept, number)}" for number, line in enumerate(self.lines))
         size = f"0 0 {WIDE:g} {HIGH * len(self.lines):g}"
@@ -81,15 +88,21 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
         return f"{across:.1f},{top + room * (1.0 - min(max(value / high, 0.0), 1.0)):.1f}"
 
     drawn = []
-    for piece in pieces(known, number):
+    for piece in pieces(samples, number):
+        # A moment alone is as wide as its dot.
+        moments = [(each.time + aside, each) for each in piece for aside in ((0.0,) if len(piece) > 1 else (-DOT, DOT))]
         if piece[-1].errors[number] is not None:
-            above = [at(each.time, (each.values[number] or 0.0) + (each.errors[number] or 0.0)) for each in piece]
-            below = [at(each.time, (each.values[number] or 0.0) - (each.errors[number] or 0.0)) for each in piece]
+            above = [at(time, (each.values[number] or 0.0) + (each.errors[number] or 0.0)) for time, each in moments]
+            below = [at(time, (each.values[number] or 0.0) - (each.errors[number] or 0.0)) for time, each in moments]
             corners = " ".join([*above, *reversed(below)])
             drawn.append(f'<polygon points="{corners}" fill="{line.colour}" fill-opacity="0.28"/>')
         dotted = ' stroke-dasharray="2 3"' if piece[-1].errors[number] is None else ""
-        corners = " ".join(at(each.time, each.values[number] or 0.0) for each in piece)
+        corners = " ".join(at(time, each.values[number] or 0.0) for time, each in moments)
         drawn.append(f'<polyline points="{corners}" fill="none" stroke="{line.colour}" stroke-width="1.6"{dotted}/>')
+    if not known:
+        middle = f'x="{0.5 * (LEFT + WIDE):g}" y="{top + 0.5 * room + 4:g}"'
+        what = "not known" if samples else "nothing yet"
+        drawn.append(f'<text {middle} text-anchor="middle" opacity="0.7">{what}</text>')
     said = f"{line.name} [{line.unit}]" + (f", {line.whose}" if line.whose else "")
     scale = "".join(
         f'<text x="{LEFT - 5:g}" y="{top + room * (1 - share) + 4:g}" text-anchor="end">{share * high:g}</text>'
@@ -104,15 +117,21 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
 
 
 def pieces(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
-    """Parts of a line that are joined, and of one kind: its error is known, or it is not."""
+    """Parts of a line that are joined, and of one kind: its error is known, or it is not.
+
+    They end where the value is not known.
+    """
     found: list[list[Sample]] = []
+    last: Sample | None = None
     for each in samples:
-        last = found[-1][-1] if found else None
-        if last is not None and each.time - last.time < PAUSE:
-            if (last.errors[number] is None) == (each.errors[number] is None):
+        before, last = last, each if each.values[number] is not None else None
+        if last is None:
+            continue
+        if before is not None and each.time - before.time < PAUSE:
+            if (before.errors[number] is None) == (each.errors[number] is None):
                 found[-1].append(each)
                 continue
-            found.append([last, each] if each.errors[number] is None else [each])
+            found.append([before, each] if each.errors[number] is None else [each])
             continue
         found.append([each])
     return found

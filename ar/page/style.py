@@ -44,8 +44,9 @@ RULES = """
 #SAID td, #SAID th { padding: 0 0.9rem 0 0; text-align: left; font-weight: inherit }
 .NOTE { font-size: 0.8rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
 .NOTE ul { margin: 0; padding-left: 1.1rem }
-#STATUS { position: fixed; top: 0.6rem; right: calc(100vw - var(--w) + 0.6rem); z-index: 7; pointer-events: none }
-#STATUS span { background: #e8590c; color: #fff; border-radius: 0.3rem; padding: 0.2rem 0.6rem; font-size: 0.9rem }
+#STATUS { position: fixed; top: 0; right: calc(100vw - var(--w)); z-index: 7; pointer-events: none }
+#STATUS span { display: block; background: #e8590c; color: #fff; border-radius: 0 0 0 0.3rem; padding: 0.1rem 0.6rem;
+  font-size: 0.9rem }
 PANEL #PICTURE { position: fixed; left: 0; top: 0; width: var(--w); aspect-ratio: var(--aspect); background: #181818;
   z-index: 6 }
 #PICTURE img { width: 100%; display: block }
@@ -72,6 +73,7 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
 #HELP kbd { border: 1px solid #888; border-radius: 0.2rem; padding: 0 0.4rem }
 #webgl-software-rendering { display: none }
 :root:has(TABBED:checked) { --low: max(34vh, 13rem) }
+#ASIDE:has(TABBED:checked) { background: #141414 }
 @media (min-width: 36.01em) {
   PANEL { left: var(--w) !important; right: 0 !important; width: auto !important; bottom: var(--low) !important }
   PANEL > div:first-child, PANEL > div:last-child { display: none !important }
@@ -109,6 +111,7 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   #ASIDE { left: 0 }
   #STATUS span { font-size: 0.75rem }
   #SAID { font-size: 0.82rem; max-height: 11.4rem; overflow-y: auto }
+  #SAID { mask-image: linear-gradient(#000 calc(100% - 1.1rem), transparent); padding-bottom: 1.1rem }
   NOTES { left: 0.5rem !important }
 }
 """

@@ -163,7 +163,8 @@ def equalised(grey: np.ndarray, covered: np.ndarray, square: int) -> tuple[np.nd
     count = np.maximum(cv2.blur(part, (square, square)), np.float32(1e-3))
     level = grey.astype(np.float32)
     level = (level - cv2.blur(level * part, (square, square)) / count) * part
-    varies = cv2.sqrt(cv2.blur(level * level, (square, square)) / count)
+    # Sums that run along a row may round to less than nothing.
+    varies = cv2.sqrt(np.maximum(cv2.blur(level * level, (square, square)), np.float32(0.0)) / count)
     return np.clip(level * (STEEP / (varies + FLAT)) + 128.0, 0.0, 255.0).astype(np.uint8), varies
 
 

@@ -231,6 +231,7 @@ class Demo:
         frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.touch(number))
         move_bodies(self.browser, frame, player)
         self.browser.show(number, pictured(frame), RESTS)
+        self._beside(frame, player)
         now.rests = True
 
     def _draw(self, now: Moment, found: Truth) -> None:
