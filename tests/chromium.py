@@ -10,10 +10,17 @@ import urllib.request
 from contextlib import suppress
 from pathlib import Path
 
+import cv2
+import numpy as np
 from websockets.sync.client import connect
+
+from ar.page.sight import PICTURE, SAID
 
 PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 """Where the browser is; None where there is none."""
+SIZES = [(1600, 900), (1280, 720), (900, 900), (420, 900)]
+"""Windows in which a page is looked at."""
+BOX = "(r => [r.left, r.top, r.right, r.bottom])({}.getBoundingClientRect())"
 
 
 class Chromium:
@@ -115,3 +122,33 @@ class Chromium:
         self.process.wait()
         with suppress(OSError):
             self.folder.cleanup()
+
+
+def box_of(window: Chromium, element: str) -> np.ndarray:
+    """Left, top, right and bottom of an element, once it is there: a narrow window lays the panel out anew."""
+    assert window.wait(element)
+    return np.array(window.value(BOX.format(element)))
+
+
+def assert_fits(window: Chromium, size: tuple[int, int], lines: tuple[str, ...]) -> None:
+    """Nothing is cut off: the page, its picture, and those of its words that hold some lines."""
+    whole, said = "document.documentElement", f"document.getElementById('{SAID}')"
+    assert max(window.value(f"[{whole}.scrollWidth - innerWidth, {whole}.scrollHeight - innerHeight]")) <= 0
+    left, top, right, bottom = box_of(window, f"document.querySelector('#{PICTURE} img')")
+    assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1]
+    room = box_of(window, said)
+    for words in lines:
+        line = box_of(window, f"[...document.querySelectorAll('#{SAID} p')].find(p => p.innerText.includes('{words}'))")
+        assert line[1] >= room[1] and line[3] <= min(room[3], size[1]) and line[2] <= size[0], words
+
+
+def assert_in_register(window: Chromium, colour: np.ndarray) -> None:
+    """The picture on the page is the server's (H, W, 3), to a pixel."""
+    left, top, right, bottom = box_of(window, f"document.querySelector('#{PICTURE} img')")
+    shown = cv2.imdecode(np.frombuffer(window.shot(), np.uint8), cv2.IMREAD_GRAYSCALE).astype(np.float64)
+    seen = shown[round(top) : round(bottom), round(left) : round(right)]
+    sent = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY).astype(np.float64)
+    sent = cv2.resize(sent, seen.shape[::-1], interpolation=cv2.INTER_AREA)
+    shift, _ = cv2.phaseCorrelate(sent, seen, cv2.createHanningWindow(seen.shape[::-1], cv2.CV_64F))
+    assert max(map(abs, shift)) < 1.0
+    assert np.corrcoef(sent.ravel(), seen.ravel())[0, 1] > 0.98

@@ -2,10 +2,8 @@
 
 import threading
 
-import cv2
-import numpy as np
 import pytest
-from chromium import PROGRAM, Chromium
+from chromium import PROGRAM, SIZES, Chromium, assert_fits, assert_in_register, box_of
 from theatres import Silent, small, theatre_of
 from visitor import free_port, wait_for
 
@@ -14,8 +12,6 @@ from ar.page.sight import HISTORY, PICTURE, SAID, SLICES
 from scenes.play.page.demo import Demo
 from scenes.script.tool_paths import press
 
-SIZES = [(1600, 900), (1280, 720), (900, 900), (420, 900)]
-BOX = "(r => [r.left, r.top, r.right, r.bottom])({}.getBoundingClientRect())"
 LOADED = f"document.querySelector('#{PICTURE} img') && document.querySelector('#{SLICES} img')"
 FRAME = "document.querySelector('[aria-label=frame][role=slider]')"
 
@@ -54,33 +50,14 @@ def window(demo):
     window.close()
 
 
-def box_of(window, element):
-    """Left, top, right and bottom of an element, once it is there: a narrow window lays the panel out anew."""
-    assert window.wait(element)
-    return np.array(window.value(BOX.format(element)))
-
-
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 def test_the_page_fits_and_is_in_register(demo, window, size):
     """Nothing is cut off or complained of, and both errors are in sight; the picture is the server's to a pixel."""
     window.size(*size)
     said = f"document.getElementById('{SAID}')"
     assert window.wait(f"innerWidth == {size[0]} && {said}.innerText.includes('Error of the tumour')")
-    whole = "document.documentElement"
-    assert max(window.value(f"[{whole}.scrollWidth - innerWidth, {whole}.scrollHeight - innerHeight]")) <= 0
-    left, top, right, bottom = box_of(window, f"document.querySelector('#{PICTURE} img')")
-    assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1]
-    shown = cv2.imdecode(np.frombuffer(window.shot(), np.uint8), cv2.IMREAD_GRAYSCALE).astype(np.float64)
-    seen = shown[round(top) : round(bottom), round(left) : round(right)]
-    sent = cv2.cvtColor(demo.browser.shown[1], cv2.COLOR_RGB2GRAY).astype(np.float64)
-    sent = cv2.resize(sent, seen.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    shift, _ = cv2.phaseCorrelate(sent, seen, cv2.createHanningWindow(seen.shape[::-1], cv2.CV_64F))
-    assert max(map(abs, shift)) < 1.0
-    assert np.corrcoef(sent.ravel(), seen.ravel())[0, 1] > 0.98
-    room = box_of(window, said)
-    for words in ("Error of the model", "Error of the tumour"):
-        line = box_of(window, f"[...document.querySelectorAll('#{SAID} p')].find(p => p.innerText.includes('{words}'))")
-        assert line[1] >= room[1] and line[3] <= min(room[3], size[1]) and line[2] <= size[0], words
+    assert_fits(window, size, ("Error of the model", "Error of the tumour"))
+    assert_in_register(window, demo.browser.shown[1])
     track = box_of(window, f"{FRAME}?.closest('.mantine-Slider-root')")
     assert track[2] - track[0] > 150.0 and track[2] <= size[0]
     for number, place in ((1, SLICES), (2, HISTORY)):

@@ -3,13 +3,13 @@
 import csv
 import json
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from films import FILM, Plugged, Recorded, follower_of, truth_of
 from theatres import template_theatre
 
 from ar.overlay.outlines import ink_of, silhouette
@@ -19,8 +19,7 @@ from ar.rendering.real_picture import real_picture
 from ar.tracking.live_camera import camera_pictures, newest
 from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
-from scenes.play.overlay.follower import HELD, Follower, State
-from scenes.play.overlay.page import OverlayPage
+from scenes.play.overlay.follower import HELD, State
 from scenes.play.overlay.picture import Painter
 from scenes.play.overlay.run import Timed, aged, overlaid, paced, timed
 from scenes.play.overlay.tool_motion import ToolMotion
@@ -28,36 +27,17 @@ from scenes.play.overlay.truth import off, summary
 from scenes.play.stage import TUMOUR_COLOUR
 from scenes.script.calibration_file import read_calibration
 from scenes.script.film_truth import read_truth
-from scenes.script.registration_file import read_registration
 from scenes.script.scene import find_scene
-from scenes.script.tracked_tool import read_tool
 from sim.errors import InputError
 from sim.loads import Touching
 from surrogate.model.learned import predicted
 
-FILM = Path(__file__).parent / "data" / "film"
 GIVEN = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]
 GOOD, REST, LOST, TOOL, STALE = State.GOOD, State.REST, State.NO_REFERENCE, State.NO_TOOL, State.STALE
 # Of a film of palpate that is over-exposed at 0.53 s, hides the cube from 0.93 to 1.07 s and the reference from
 # 1.33 to 1.73 s, and lacks a picture at 2 s. The ball lies on the cortex from 0.4 s on.
 STATES = [REST, REST, REST, GOOD, LOST, GOOD, GOOD, TOOL, TOOL, GOOD, LOST, LOST, LOST, LOST, GOOD, STALE, GOOD]
 INK = ink_of(TUMOUR_COLOUR)
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """A deformer that knows what is true of the film: of the pose that is nearest to the one asked for."""
-
-    anatomy: object
-    vertices: np.ndarray
-    poses: np.ndarray
-    displacement: np.ndarray
-    deeper: float = 0.0
-
-    def deform(self, loads, start=None, at=None):
-        cause = loads.only(Touching)
-        row = np.abs(self.poses[:, :3, 3] - cause.pose[0, 0, :3, 3]).max(axis=1).argmin()
-        return predicted(self.displacement[row][None], self.vertices, loads, [False], 0.0, np.full((2, 1), np.nan), "")
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +47,7 @@ def stage():
 
 @pytest.fixture(scope="module")
 def truth(stage):
-    return read_truth(FILM / "truth.npz", stage.anatomy.digest, len(stage.tumour_vertices))
+    return truth_of(stage)
 
 
 @pytest.fixture(scope="module")
@@ -76,10 +56,8 @@ def calibration():
 
 
 @pytest.fixture(scope="module")
-def follower(stage, truth, calibration):
-    recorded = Recorded(stage.anatomy, stage.tumour_vertices, truth.T_scan_tool, truth.displacement)
-    tool, registration = read_tool(FILM / "tool.json"), read_registration(FILM / "registration.json")
-    return Follower(calibration, registration, tool, ToolMotion(stage, recorded))
+def follower(stage):
+    return follower_of(stage)
 
 
 def pictures():
@@ -261,31 +239,21 @@ def test_what_does_not_belong_together_is_refused(tmp_path, capsys):
         read_truth(tmp_path / "text.mp4", "", 0)
 
 
-class Plugged:
-    """A camera that gives a film's pictures, and then is unplugged."""
+def test_a_camera_that_is_unplugged_is_opened_until_it_is_back():
+    cameras, moments, late = [Plugged(2), Plugged(0), Plugged(1)], iter(range(9)), []
+    first = cameras.pop(0)
 
-    def __init__(self, count):
-        self.frames = [each.colour[..., ::-1] for each in islice(film_of(FILM / "film.mp4", 30.0, colour=True), count)]
-        self.released = False
+    def again():
+        late.append(cameras.pop(0))
+        return late[-1]
 
-    def isOpened(self):
-        return True
-
-    def read(self):
-        return (True, self.frames.pop(0)) if self.frames else (False, None)
-
-    def release(self):
-        self.released = True
-
-
-def test_a_camera_that_is_unplugged_says_so_and_is_let_go():
-    camera, moments = Plugged(3), iter(range(9))
-    seen = []
-    with pytest.raises(ValueError, match="camera 0 gives no more pictures: plug it in again"):
-        for picture in camera_pictures(camera, "camera 0", lambda: next(moments)):
-            seen.append(picture)
-    assert [each.time for each in seen] == [0, 1, 2] and camera.released
-    assert seen[0].colour.shape == (720, 960, 3) and seen[0].grey.shape == (720, 960)
+    found = camera_pictures(first, "camera 0", again, lambda: next(moments))
+    seen = [next(found) for _ in range(2)]
+    assert [each.time for each in seen] == [0, 1] and seen[0].colour.shape == (720, 960, 3)
+    seen = list(islice(found, 21))
+    assert first.released and seen[:20] == [None] * 20 and seen[20].time == 2 and late[0].released
+    found.close()
+    assert late[1].released
 
 
 def test_the_newest_picture_is_had_and_a_silence_is_said():
@@ -302,18 +270,3 @@ def test_the_newest_picture_is_had_and_a_silence_is_said():
     with pytest.raises(ValueError, match="unplugged"):
         for each in found:
             assert each in ("d", None)
-
-
-def test_a_page_shows_what_a_camera_sees_and_dims_it_once_that_is_old(follower, stage):
-    page = OverlayPage(follower, Painter(stage, follower.tool), port=0)
-    picture = replace(next(iter(pictures())).picture, time=time.perf_counter())
-    try:
-        shown = page.run(iter([picture, None]))
-        assert len(shown) == 1 and shown[0].known.state is State.REST and shown[0].latency > 0.0
-        _, dimmed, said, _ = page.browser.wanted
-        assert "no picture for 0.2 s" in said and dimmed.mean() < 0.4 * picture.colour.mean()
-        with pytest.raises(ValueError, match="calibrate it at this size"):
-            page.run(iter([replace(picture, grey=picture.grey[::2])]), 0.1)
-        assert "what is shown is old" in page.browser.line.content or page.browser.newest
-    finally:
-        page.browser.close()

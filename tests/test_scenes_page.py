@@ -166,7 +166,7 @@ class TestControls:
         labels = [
             control.label for control in controls(short(), theatre.site, ("fem",), Wish("fem", Touch()), print, print)
         ]
-        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-3] == "slices"
+        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-4] == "slices"
 
     def test_every_overlay_style_is_offered(self, theatre):
         wish = Wish("fem", Touch())

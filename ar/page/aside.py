@@ -17,7 +17,7 @@ TABS = (("3-D view", "sulcus-tab-view"), ("slices", "sulcus-tab-slices"), ("last
 """What the tabs are called, and the names of their buttons."""
 CAPTION = (
     "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: where its outline is, 95 of 100 times "
-    "(none: not known). White: the tool; a ring: its tip, beside the slice."
+    "by the error that is named (none: not known). White: the tool; a ring: its tip, beside the slice."
 )
 # An image of one pixel: loading it runs the script, which an element's HTML alone would not.
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
@@ -30,8 +30,9 @@ BACK, ON = (
 )
 STYLE = Key("s", "S", "s", "next overlay")
 RECORD = Key("r", "R", "r", "start or stop recording")
+LIVE_KEYS = (SPACE, STYLE, RECORD)
 KEYS = (SPACE, BACK, ON, STYLE, RECORD)
-"""The keys that the server hears of."""
+"""The keys that the server hears of: of a page without frames to go to, and of any other."""
 # In the 3-D view arrows and letters move the camera: a key of ours goes to viser's own commands alone, which listen on
 # the document's element. What is being typed into, or is moved by arrows, keeps its keys.
 SCRIPT = """

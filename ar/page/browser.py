@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import viser
 
-from .aside import BACK, ON, RECORD, SPACE, aside
+from .aside import BACK, KEYS, LIVE_KEYS, ON, RECORD, SPACE, aside
 from .crowd import Crowd
 from .guard import LIMITS, Limits, bracketed, check_address, open_server
 from .inputs import Inputs, noted
@@ -86,7 +86,7 @@ class Browser:
         self.wanted: Shown = self.shown
         self.coded, self.sent = coded(blank), 0
         self.sight = gui.add_html(sight(0, self.coded, ""))
-        gui.add_html(aside())
+        gui.add_html(aside(KEYS if playback.frames else LIVE_KEYS))
         self.beside = gui.add_html("")
         # What draws slices and the last seconds, if they are others than those that were sent; when they may be [s].
         self.drawn: Callable[[], tuple[np.ndarray, str]] | None = None
@@ -182,14 +182,15 @@ class Browser:
         """Send the picture with its words, unless both are there."""
         with self.lock:
             _, colour, words, place = wanted = self.wanted
+        at = self.shown[3]
         if colour is not self.shown[1]:
             self.coded = coded(colour)
         if colour is not self.shown[1] or words != self.shown[2]:
             self.put_sight(self.coded, words)
-        # Not oftener: a visitor may be moving it.
-        if place != self.shown[3]:
-            self.controls.assign(self.frame, place)
         self.shown = wanted
+        # Not oftener: a visitor may be moving it.
+        if place != at:
+            self.controls.assign(self.frame, place)
 
     def put_sight(self, code: str, words: str) -> None:
         """Send a `coded` picture and words, HTML, at once."""
@@ -297,10 +298,10 @@ class Browser:
                 self.send_beside()
 
     def add_playback(self, playback: Playback) -> None:
-        """A button that plays and pauses, and a slider over the frames; keys do the same."""
-        gui, self.playing = self.server.gui, True
+        """A button that plays and pauses, and a slider over the frames, if there are any; keys do the same."""
+        gui, self.playing, seekable = self.server.gui, True, playback.frames > 0
         self.button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
-        self.frame = gui.add_slider("frame", 0, max(playback.frames - 1, 1), 1, 0)
+        self.frame = gui.add_slider("frame", 0, max(playback.frames - 1, 1), 1, 0, visible=seekable)
 
         def toggle(_: viser.ClientHandle | None = None) -> None:
             self.plays(not self.playing)
@@ -317,8 +318,9 @@ class Browser:
         # The slider of a single frame has a second place: it must have a length.
         self.controls.hear(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
         self.controls.command(SPACE, toggle)
-        self.controls.command(BACK, lambda _: step(-1))
-        self.controls.command(ON, lambda _: step(1))
+        if seekable:
+            self.controls.command(BACK, lambda _: step(-1))
+            self.controls.command(ON, lambda _: step(1))
 
     def add_savers(self) -> None:
         """Buttons that download the picture as it is shown, for everybody, and a film, for who leads."""

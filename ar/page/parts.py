@@ -104,7 +104,10 @@ Control = Slider | Choice | Toggle
 
 @dataclass(frozen=True)
 class Playback:
-    """Play, pause and scrub over frames 0 .. frames - 1: `played` takes whether to play, `sought` a frame number."""
+    """Play, pause and scrub over frames 0 .. frames - 1: `played` takes whether to play, `sought` a frame number.
+
+    Of 0 frames, as of a camera, there is nothing to scrub over.
+    """
 
     frames: int
     played: Callable[[bool], None]

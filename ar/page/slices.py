@@ -81,6 +81,8 @@ class Cut:
         Surfaces beside it, such as the tool's: plain lines of their colours.
     tip
         Where the tool touches (3,) [m].
+    whose
+        What the error is of, in a word.
     """
 
     now: Layer
@@ -89,6 +91,7 @@ class Cut:
     doubtful: bool = False
     others: Sequence[Layer] = ()
     tip: np.ndarray | None = None
+    whose: str = "tumour"
 
 
 def sliced(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
@@ -125,8 +128,8 @@ def view(plane: Plane, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.n
 def said_of(cut: Cut) -> str:
     """What the band is, in few words."""
     if cut.doubtful or cut.error is None:
-        return "tumour: not known"
-    return f"tumour: within {bound_words(cut.error, 1)}"
+        return f"{cut.whose}: not known"
+    return f"{cut.whose}: within {bound_words(cut.error, 1)}"
 
 
 def resampled(plane: Plane, scan: Solid, middle: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Protocol
 
 import cv2
@@ -12,7 +12,7 @@ import numpy as np
 
 from .pictures import Named, in_colour
 
-# So many pictures in a row may fail before the camera counts as unplugged, with a pause between them [s].
+# So many pictures in a row may fail before the camera is opened again, with a pause between them [s].
 FAILURES, PAUSE = 10, 0.05
 
 
@@ -41,36 +41,36 @@ def opened(number: int, width: int, height: int) -> Source:
     return camera
 
 
-def camera_pictures(source: Source, name: str, now: Callable[[], float] = clock.perf_counter) -> Iterator[Named]:
-    """Pictures of a camera, each with the moment [s] by `now` at which it was there.
+def camera_pictures(
+    source: Source, name: str, again: Callable[[], Source], now: Callable[[], float] = clock.perf_counter
+) -> Generator[Named | None]:
+    """Pictures of a camera, each with the moment [s] by `now` at which it was there; None where there was none.
 
-    Raises
-    ------
-    ValueError
-        A camera that cannot be opened, or gives no more pictures.
+    A camera that gives no more is let go, and opened `again` until it gives some.
     """
+    failed = 0
     try:
-        if not source.isOpened():
-            raise ValueError(f"{name} cannot be opened: plug it in, and see that no other program has it.")
-        failed = 0
         while True:
-            good, frame = source.read()
+            good, frame = source.read() if source.isOpened() else (False, None)
             if good and frame is not None:
                 failed = 0
                 yield in_colour(name, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), now())
                 continue
+            yield None
             failed += 1
-            if failed >= FAILURES:
-                raise ValueError(f"{name} gives no more pictures: plug it in again, and start anew.")
             clock.sleep(PAUSE)
+            if failed % FAILURES == 0:
+                source.release()
+                source = again()
     finally:
         source.release()
 
 
-def newest(pictures: Iterator[Named], patience: float) -> Iterator[Named | None]:
+def newest(pictures: Generator[Named | None], patience: float) -> Iterator[Named | None]:
     """The newest picture that has come each time one is asked for; None where none came for so long [s].
 
-    A thread of its own takes the pictures: those that come while nobody asks are lost, and none waits.
+    A thread of its own takes the pictures: those that come while nobody asks are lost, and none waits. It ends, and
+    closes the pictures, with the last that is had here.
 
     Raises
     ------
@@ -79,28 +79,35 @@ def newest(pictures: Iterator[Named], patience: float) -> Iterator[Named | None]
     """
     waiting: list[Named] = []
     ended: list[BaseException | None] = []
-    came = threading.Condition()
+    came, left = threading.Condition(), threading.Event()
 
     def take() -> None:
         failure: BaseException | None = None
         try:
             for picture in pictures:
-                with came:
-                    waiting[:] = [picture]
-                    came.notify()
+                if left.is_set():
+                    break
+                if picture is not None:
+                    with came:
+                        waiting[:] = [picture]
+                        came.notify()
         except Exception as error:
             failure = error
+        pictures.close()
         with came:
             ended.append(failure)
             came.notify()
 
     threading.Thread(target=take, name="camera", daemon=True).start()
-    while True:
-        with came:
-            came.wait_for(lambda: waiting or ended, patience)
-            picture, over = (waiting.pop() if waiting else None), list(ended)
-        if picture is None and over:
-            if over[0] is not None:
-                raise over[0]
-            return
-        yield picture
+    try:
+        while True:
+            with came:
+                came.wait_for(lambda: waiting or ended, patience)
+                picture, over = (waiting.pop() if waiting else None), list(ended)
+            if picture is None and over:
+                if over[0] is not None:
+                    raise over[0]
+                return
+            yield picture
+    finally:
+        left.set()

@@ -61,8 +61,8 @@ def pictures_of(path: Path) -> Iterator[Named]:
     return islice(_in_video(path, None), MOST_PICTURES)
 
 
-def film_of(path: Path, rate: float, colour: bool = False) -> Iterator[Named]:
-    """Every picture of a video, or of a folder in the order of names, with its time [s].
+def film_of(path: Path, rate: float, colour: bool = False, first: int = 0) -> Iterator[Named]:
+    """Every picture from the `first` on of a video, or of a folder in the order of names, with its time [s].
 
     Of a folder `rate` is how many there are in a second; a video says its own times. `colour` asks for that, too.
 
@@ -72,11 +72,29 @@ def film_of(path: Path, rate: float, colour: bool = False) -> Iterator[Named]:
         As `pictures_of`.
     """
     if path.is_dir():
-        files = enumerate(_files(path))
+        files = islice(enumerate(_files(path)), first, None)
         if colour:
             return (in_colour(file.name, _read(file, "RGB"), number / rate) for number, file in files)
         return (Named(file.name, _read(file), number / rate) for number, file in files)
-    return _in_video(path, 1, colour)
+    return _in_video(path, 1, colour, first)
+
+
+def length_of(path: Path) -> int:
+    """How many pictures `film_of` gives: of a video as it says itself, which may be wrong.
+
+    Raises
+    ------
+    ValueError
+        As `pictures_of`.
+    """
+    if path.is_dir():
+        return len(_files(path))
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    finally:
+        video.release()
+    return count if count > 0 else sum(1 for _ in _in_video(path, 1))
 
 
 def in_colour(name: str, colour: np.ndarray, time: float) -> Named:
@@ -110,8 +128,8 @@ def _read(path: Path, kind: str = "L") -> np.ndarray:
         raise ValueError(f"{path}: is no picture that can be read. Remove it, or write it anew.") from error
 
 
-def _in_video(path: Path, step: int | None, colour: bool = False) -> Iterator[Named]:
-    """One in `step` frames of a video; None: so many that there are `MOST_PICTURES`."""
+def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0) -> Iterator[Named]:
+    """One in `step` frames of a video from the `first` on; None: so many that there are `MOST_PICTURES`."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file. {GIVE}")
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
@@ -125,7 +143,7 @@ def _in_video(path: Path, step: int | None, colour: bool = False) -> Iterator[Na
         every = step or (-(-count // MOST_PICTURES) if count > 0 else STEP)
         number = 0
         while video.grab():
-            if number % every == 0:
+            if number >= first and (number - first) % every == 0:
                 time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
                 good, frame = video.retrieve()
                 if good and colour:

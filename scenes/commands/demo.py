@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
 
 
+FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
+"""How names of films end."""
+
+
 def add_bodies(parser: argparse.ArgumentParser) -> None:
     """Declare which anatomy and models there are."""
     parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
@@ -158,6 +162,9 @@ def run(args: argparse.Namespace) -> int:
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
 
+    if args.scene.isdecimal() or Path(args.scene).suffix.lower() in FILMS or Path(args.scene).is_dir():
+        own = f"sulcus overlay {args.scene} --page --camera K.yaml --registration R.json --tool T.json"
+        raise InputError(f"{args.scene} is no scene. For a film or a camera of your own: {own}")
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
     find_device(args.device, LIVE.precision)

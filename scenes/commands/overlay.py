@@ -7,7 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,13 +31,14 @@ if TYPE_CHECKING:
 
     from ..play.deformers import Theatre
     from ..play.overlay.follower import Follower
+    from ..play.overlay.page import OverlayPage
     from ..play.overlay.picture import Painter
     from ..play.overlay.run import Shown
     from ..script.scene import Scene
 
 FILMS = (".mp4", ".gif", ".webp")
 TABLE = "a table of `sulcus overlay`"
-# Only this machine reaches a camera's page.
+# Only this machine reaches the page.
 HOST = "127.0.0.1"
 REST = "rest"
 """The deformer that lets the brain stay as in the scan."""
@@ -65,8 +66,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--live", action="store_true", help="play the film as a camera would: pictures that come too fast are lost"
     )
     parser.add_argument("--truth", metavar="TRUTH.npz", help="of `sulcus film`: says how far off the overlay is")
-    parser.add_argument("--port", type=int, default=8080, help="of the page of a camera (default %(default)s)")
-    parser.add_argument("--seconds", type=float, default=np.inf, help="end a camera's page after so long")
+    parser.add_argument(
+        "--page", action="store_true", help="show the film on a page in the browser; a camera has one always"
+    )
+    parser.add_argument("--port", type=int, default=8080, help="of the page, or the next free (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="end the page after so long (default: never)")
     add_tissue_arguments(parser)
     add_skull_argument(parser)
     add_element_argument(parser)
@@ -97,10 +101,11 @@ def run(args: argparse.Namespace) -> int:
     from ..play.overlay.truth import off, summary
     from ..script.film_truth import read_truth
 
-    if args.pictures.isdecimal() and not Path(args.pictures).exists():
-        return until_ended(partial(_served, args))
+    camera = args.pictures.isdecimal() and not Path(args.pictures).exists()
     if not 0.0 < args.rate < np.inf:
         raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
+    if camera or args.page:
+        return until_ended(partial(_served, args, camera))
     inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth]
     out = None if args.out is None else _film_path(args.out, args.force, inputs)
     table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, inputs)
@@ -112,44 +117,63 @@ def run(args: argparse.Namespace) -> int:
     shown = _played(args, parts, out)
     errors = [None if truth is None else off(each.known, truth, parts.calibration, stage) for each in shown]
     if table is not None:
-        write_rows(table, shown, errors, stage)
+        write_rows(table, shown, errors)
     report = _report(shown, parts.who)
     if truth is not None:
         report["off"] = summary([each.known for each in shown], errors)
     return _ended(args, report, shown, out, table)
 
 
-def _served(args: argparse.Namespace, closing: ExitStack) -> int:
-    """Show what a camera sees on a page, until the time is over or a signal comes."""
-    from ar.page.browser import check_address
-    from ar.tracking.live_camera import camera_pictures, newest, opened
+def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
+    """Show a film, or what a camera sees, on a page, until the time is over or a signal comes."""
+    from ar.page.guard import UnguardedError, check_address
 
-    from ..play.overlay.follower import GAP
-    from ..play.overlay.page import OverlayPage
     from ..play.overlay.rows import write_rows
 
     if args.out is not None or args.truth is not None or args.live:
-        raise InputError("--out, --truth and --live belong to films: leave them out with a camera.")
+        raise InputError("--out, --truth and --live belong to films without a page: leave them out here.")
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
     table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, [args.camera])
-    parts = _parts(args)
     try:
         check_address(HOST, args.port)
-        source = opened(int(args.pictures), parts.calibration.width, parts.calibration.height)
-        if not source.isOpened():
-            raise InputError(f"camera {args.pictures} cannot be opened: plug it in, and give its number.")
-        page = OverlayPage(parts.follower, parts.painter, HOST, args.port)
-        closing.callback(page.browser.close)
-        print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {parts.who}", flush=True)
-        shown = page.run(newest(camera_pictures(source, f"camera {args.pictures}"), GAP), args.seconds)
-    except (ValueError, OSError) as error:
+        parts = _parts(args)
+        shown = (_camera_shown if camera else _film_shown)(args, parts, closing)
+    except (ValueError, OSError, UnguardedError) as error:
         raise InputError(str(error)) from error
     if table is not None:
-        write_rows(table, shown, [None] * len(shown), parts.painter.stage)
+        write_rows(table, shown, [None] * len(shown))
     if not shown:
         return 1
     return _ended(args, _report(shown, parts.who), shown, None, table)
+
+
+def _camera_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
+    from ar.tracking.live_camera import camera_pictures, newest, opened
+
+    from ..play.overlay.follower import GAP
+
+    again = partial(opened, int(args.pictures), parts.calibration.width, parts.calibration.height)
+    name, source = f"camera {args.pictures}", again()
+    if not source.isOpened():
+        raise InputError(f"{name} cannot be opened: plug it in, see that no other program has it, and give its number.")
+    return _page(args, parts, closing, name).watch(newest(camera_pictures(source, name, again), GAP), args.seconds)
+
+
+def _film_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
+    from ..play.overlay.seekable_film import SeekableFilm
+
+    film = SeekableFilm(Path(args.pictures), args.rate)
+    return _page(args, parts, closing, film.path.name, film.count).play(film, args.seconds)
+
+
+def _page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str, frames: int = 0) -> OverlayPage:
+    from ..play.overlay.page import OverlayPage
+
+    page = OverlayPage(parts.follower, parts.painter, name, parts.who, HOST, args.port, frames)
+    closing.callback(page.close)
+    print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {parts.who}", flush=True)
+    return page
 
 
 def _ended(
@@ -236,7 +260,7 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
     def pictures() -> Iterator[np.ndarray]:
         film = timed(film_of(Path(args.pictures), args.rate, colour=True))
         for each in overlaid(film, parts.follower, parts.painter, args.live):
-            shown.append(replace(each, colour=each.colour[:0]))
+            shown.append(each.without_picture())
             yield each.colour
 
     try:

@@ -52,13 +52,17 @@ class TrackedTool:
     tip_covariance: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
 
     @cached_property
+    def bare(self) -> tuple[np.ndarray, np.ndarray]:
+        """How it looks without its cube, which hides what lies behind: vertices (n, 3) [m], triangles (m, 3)."""
+        return shafted(self.shape, np.linalg.inv(self.T_cube_tool)[:3, 3])
+
+    @cached_property
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """How it looks, as far as that is known, with its cube: vertices (n, 3) [m] in its own frame, triangles (m, 3).
 
         The faces with print alone are there, with their borders.
         """
-        T_tool_cube = np.linalg.inv(self.T_cube_tool)
-        vertices, triangles = shafted(self.shape, T_tool_cube[:3, 3])
+        T_tool_cube, (vertices, triangles) = np.linalg.inv(self.T_cube_tool), self.bare
         box, sides = _cube()
         at = box @ T_tool_cube[:3, :3].T + T_tool_cube[:3, 3]
         return np.concatenate([vertices, at]), np.concatenate([triangles, sides + len(vertices)])

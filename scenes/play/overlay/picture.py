@@ -57,7 +57,7 @@ class Painter:
         if known.state in IN_GREY or known.camera is None:
             return self._grey(colour, known)
         camera, tumour = known.camera, self.stage.tumour(known.motion.positions)
-        gauge = self._gauge(known, tumour)
+        gauge = self.gauge(known, tumour)
         before = self.stage.tumour_at_rest if known.motion.known and known.motion.moved > 0.0 else None
         doubt = "" if known.relied else known.words
         band = 0.0 if known.band is None else known.band
@@ -76,15 +76,19 @@ class Painter:
 
     def _layers(self, known: Known) -> list[Layer]:
         """The open cortex, under which the tumour is seen, and the tool, which is in front."""
-        cortex = self.stage.cortex(known.motion.positions)
-        if self.tool is None or known.T_scan_tool is None:
-            return [cortex]
-        vertices, triangles = self.tool.mesh
-        pose = known.T_scan_tool
-        return [cortex, Layer("tool", TOOL, vertices @ pose[:3, :3].T + pose[:3, 3], triangles, TOOL_COLOUR)]
+        tool = self.held(known)
+        return [self.stage.cortex(known.motion.positions), *([] if tool is None else [tool])]
 
-    def _gauge(self, known: Known, tumour: Layer) -> Gauge | None:
-        """From the tool's tip to the tumour, with the error of both."""
+    def held(self, known: Known, cubed: bool = True) -> Layer | None:
+        """The tool where it is seen, with its cube or without."""
+        pose = known.T_scan_tool
+        if self.tool is None or pose is None:
+            return None
+        vertices, triangles = self.tool.mesh if cubed else self.tool.bare
+        return Layer("tool", TOOL, vertices @ pose[:3, :3].T + pose[:3, 3], triangles, TOOL_COLOUR)
+
+    def gauge(self, known: Known, tumour: Layer) -> Gauge | None:
+        """From the tool's tip to the tumour, with the error of both; None where the tool is not seen."""
         if known.T_scan_tool is None or known.tip_covariance is None:
             return None
         gauge = gauged(known.T_scan_tool[:3, 3], tumour)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from sim.runtime.atomic_files import written_whole
 
-from ..stage import Stage
 from .run import Shown
 from .truth import Off
 
@@ -19,7 +18,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[Off | None], stage: Stage) -> None:
+def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[Off | None]) -> None:
     """Write a row for each picture, which appear all or not at all; what is not known is blank.
 
     The place is that of the tumour's middle in the scan, RAS. `within_mm` holds with 95 %, across the line of sight.
@@ -28,14 +27,13 @@ def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[Off | None],
     with written_whole(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(COLUMNS)
-        table.writerows(_row(each, error, stage) for each, error in zip(shown, errors, strict=True))
+        table.writerows(_row(each, error) for each, error in zip(shown, errors, strict=True))
 
 
-def _row(shown: Shown, error: Off | None, stage: Stage) -> list[str]:
+def _row(shown: Shown, error: Off | None) -> list[str]:
     known = shown.known
     placed = known.camera is not None
-    middle = known.motion.positions[stage.tumour_vertices].mean(axis=0)
-    lengths: list[float | None] = [*middle, known.motion.moved if known.motion.known else None]
+    lengths: list[float | None] = [*shown.middle, known.motion.moved if known.motion.known else None]
     lengths.append(known.motion.error if known.motion.known else None)
     lengths += [known.band, *(known.parts.get(name) for name in ("tracking", "registration", "tool", "model"))]
     cells = [_number(None if value is None or not placed else 1e3 * value) for value in lengths]

@@ -33,6 +33,8 @@ class Shown:
         (H, W, 3) uint8.
     seconds
         What it took, from the picture's arrival.
+    middle
+        Of the tumour in the scan (3,) [m], as it is drawn.
     latency
         From when the picture was taken to when its overlay was ready [s]: of pictures that come as time goes on.
     stamped
@@ -42,8 +44,18 @@ class Shown:
     known: Known
     colour: np.ndarray
     seconds: float
+    middle: np.ndarray
     latency: float | None = None
     stamped: bool = False
+
+    def without_picture(self) -> Shown:
+        """The same without its colours, which take memory."""
+        return replace(self, colour=np.empty((0, 0, 3), np.uint8))
+
+    def without_mesh(self) -> Shown:
+        """The same without where the brain is, and without its colours."""
+        motion = replace(self.known.motion, positions=np.empty((0, 3)), answer=None)
+        return replace(self.without_picture(), known=replace(self.known, motion=motion))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +125,8 @@ def overlaid_one(
     colour = painter.paint(picture.colour, drawn).colour
     ready = clock.perf_counter()
     latency = None if begun is None else ready - begun - picture.time
-    return Shown(drawn, colour, ready - arrived, latency, taken.stamped)
+    middle = drawn.motion.positions[painter.stage.tumour_vertices].mean(axis=0)
+    return Shown(drawn, colour, ready - arrived, middle, latency, taken.stamped)
 
 
 def aged(known: Known, age: float) -> Known:

@@ -14,7 +14,7 @@ from sim.loads import Loads, Pushed
 
 from ...script.scene import Scene
 from ..player import Frame, Player
-from ..stage import TOOL, TOOL_COLOUR
+from ..stage import TOOL, TOOL_COLOUR, Stage
 
 TUMOUR_MIDDLE, TIP = "the tumour's middle", "the tool's tip"
 """Where the slices lie."""
@@ -57,18 +57,22 @@ def force_of(loads: Loads, answer: Deformation) -> tuple[float | None, float | N
 def slices_of(frame: Frame, player: Player, through: str) -> np.ndarray:
     """Three slices (h, 3 h, 3) uint8 through the tumour's middle, or through the tool's tip where there is one."""
     stage, positions = player.stage.at(frame.loads), player.believed(frame)
-    now, before, others = stage.tumour(positions), stage.tumour_at_rest, []
-    shape = now if len(now.vertices) else player.stage.tumour_at_rest
-    middle = 0.5 * (shape.vertices.min(axis=0) + shape.vertices.max(axis=0))
-    tool = player.scene.tool
+    others, tool = [], player.scene.tool
     if tool is not None and frame.pose is not None:
         corners = np.asarray(tool.mesh.vertices) @ frame.pose[:3, :3].T + frame.pose[:3, 3]
         others.append(Layer("tool", TOOL, corners, np.asarray(tool.mesh.faces), TOOL_COLOUR))
     if frame.estimate is not None:
         others.append(replace(stage.truth(player.positions(frame.deformation)), name="truth"))
-    at = frame.tip if through == TIP and frame.tip is not None else middle
+    now, before = stage.tumour(positions), stage.tumour_at_rest
     cut = Cut(now, before, frame.tumour_error.bound, bool(frame.doubt), others, frame.tip)
-    return sliced(stage.scan, at, cut)
+    return sliced_where(player.stage, cut, through)
+
+
+def sliced_where(stage: Stage, cut: Cut, through: str) -> np.ndarray:
+    """Three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above; of no tip, the middle's."""
+    shape = cut.now if len(cut.now.vertices) else stage.tumour_at_rest
+    middle = 0.5 * (shape.vertices.min(axis=0) + shape.vertices.max(axis=0))
+    return sliced(stage.scan, cut.tip if through == TIP and cut.tip is not None else middle, cut)
 
 
 def _scaled(value: float | None, by: float) -> float | None:

@@ -27,6 +27,14 @@ STAYS = "stays"
 """What a visitor calls a camera that does not move."""
 PLAN = "how the finite elements solve a load"
 """Label of the note that says which solvers they try."""
+OWN_FILM = "your own film or camera"
+"""Label of the note that says how to have them in the scene's place."""
+ASKED = (
+    "<p>The same page shows your own film, or what a camera of this machine sees, with the tumour drawn into it:</p>"
+    "<p><code>sulcus overlay FILM --page --camera K.yaml --registration R.json --tool T.json</code></p>"
+    "<p>A camera's number in the film's place asks for that camera. <code>sulcus film palpate --out film</code> makes "
+    "a film to try it on. <code>sulcus overlay --help</code> says which command makes each file.</p>"
+)
 HANDS = "A slider takes the tool in your hand; 'script' gives it back."
 
 
@@ -42,17 +50,16 @@ def controls(
 
     `give` takes who gets the tool, `take` numbers of its touch, as `Wish.hand` does.
     """
-    styles: dict[str, Style] = {words: style for style, words in STYLES.items()}
     cameras = "as the scene has it", STAYS, *PATHS
 
     def film(name: str) -> None:
         wish.set(path="" if name == cameras[0] else name)
 
-    shown = next(words for words, style in styles.items() if style == wish.style)
     switches = tuple(
         Toggle(effect, True, partial(wish.switch, effect), effect_words(effect), "what happens without it?")
         for effect in switched(scene, site)
     )
+    slices = through(wish.through, lambda name: wish.set(through=name))
     scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
     return [
         Choice("scene", scenes, scene.name, lambda name: wish.set(scene=name), hint="what happens to the brain"),
@@ -64,26 +71,28 @@ def controls(
             "answered by",
             "fem: finite elements, solved anew; the others: models that were trained on them",
         ),
-        Choice(
-            "overlay",
-            tuple(styles),
-            shown,
-            lambda words: wish.set(style=styles[words]),
-            hint="how it is drawn",
-            key=STYLE,
-        ),
+        overlays(wish.style, lambda style: wish.set(style=style)),
         Choice("camera", cameras, wish.path or cameras[0], film, hint="how the camera moves"),
-        *([] if scene.tool is None else [*hand(scene, site, wish, give, take), through(wish)]),
+        *([] if scene.tool is None else [*hand(scene, site, wish, give, take), slices]),
         *([Fold("more: switch parts of the physics off", switches)] if switches else []),
         Note(PLAN),
+        Note(OWN_FILM, ASKED),
     ]
 
 
-def through(wish: Wish) -> Choice:
+def overlays(now: Style, choose: Callable[[Style], None]) -> Choice:
+    """How the overlay is drawn."""
+    styles: dict[str, Style] = {words: style for style, words in STYLES.items()}
+    return Choice(
+        "overlay", tuple(styles), STYLES[now], lambda words: choose(styles[words]), hint="how it is drawn", key=STYLE
+    )
+
+
+def through(now: str, choose: Callable[[str], None]) -> Choice:
     """Where the slices of the scan lie."""
     places = TUMOUR_MIDDLE, TIP
     hint = "where the slices of the scan lie, which a tab beside the 3-D view shows"
-    return Choice("slices", places, wish.through or places[0], lambda name: wish.set(through=name), hint=hint)
+    return Choice("slices", places, now or places[0], choose, hint=hint)
 
 
 def switched(scene: Scene, site: Site) -> list[str]:

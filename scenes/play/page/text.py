@@ -66,7 +66,7 @@ def words(theatre: Theatre, scene: Scene, anatomy: str) -> str:
 def legend(scene: Scene) -> str:
     """What the lines mean, each beside a piece of it."""
     scan = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
-    now, true, ellipsoid = (_stroke(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
+    now, true, ellipsoid = (stroked(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
     under = (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone")
     keys = [
         (f'{now} stroke-width="3"', "tumour now (predicted)"),
@@ -85,6 +85,11 @@ def legend(scene: Scene) -> str:
         ]
     if scene.tool is not None:
         keys.append(('stroke="#fff" stroke-width="1.5"', "tip to tumour, in mm"))
+    return keyed(keys)
+
+
+def keyed(keys: Sequence[tuple[str, str]]) -> str:
+    """A legend: each line's attributes as SVG has them, and what it means."""
     lines = (
         f'<span><svg width="26" height="8"><line x1="1" y1="4" x2="25" y2="4" {line}/></svg>{text}</span>'
         for line, text in keys
@@ -92,7 +97,7 @@ def legend(scene: Scene) -> str:
     return f'<div class="legend">{"".join(lines)}</div>'
 
 
-def _stroke(colour: Sequence[float]) -> str:
+def stroked(colour: Sequence[float]) -> str:
     """A colour, sRGB in [0, 1], as a line has it in HTML."""
     return 'stroke="#' + "".join(f"{round(255.0 * share):02x}" for share in colour) + '"'
 
@@ -231,13 +236,13 @@ def report(
 
 def estimated(found: Estimate) -> list[str]:
     """What an estimate says, how far it is from the truth, and what it was given; or why it was refused."""
-    truth = f"truly {_unbroken(float(np.linalg.norm(found.true)))}"
+    truth = f"truly {unbroken(float(np.linalg.norm(found.true)))}"
     if found.location is None:
         return [
             f'<p class="number">where the tumour is, is not known ({truth})</p>',
             f'<p class="warn">What is seen was refused: {escape(found.refusal)}</p>',
         ]
-    moved = _unbroken(found.moved, found.location.p95)
+    moved = unbroken(found.moved, found.location.p95)
     held = "inside" if found.held else "outside of"
     guess = "" if found.location.calibrated else " It is a guess: such observations were not tried."
     still = "" if found.noticed else " No motion is seen beyond its error."
@@ -248,10 +253,10 @@ def estimated(found: Estimate) -> list[str]:
     ]
 
 
-def _unbroken(length: float, error: float | None = None) -> str:
+def unbroken(length: float, error: float | None = None) -> str:
     """A length and its error [m] in millimetres, whose unit no new line parts from them."""
     said = hud.millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
-    return said.replace(" mm", "&nbsp;mm")
+    return said.replace(" ", "&nbsp;")
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -25,15 +25,9 @@ BESIDE = 12e-3
 
 def bodies_of(stage: Stage) -> list[Body]:
     """Brain, open cortex, tumour, the finite elements' tumour, an estimate's ellipsoid and the tool, at rest."""
-    positions = stage.site.anatomy.mesh.nodes
-    tool, site = stage.scene.tool, stage.site
-    brain, cortex, tumour = stage.brain, stage.cortex(positions), stage.tumour(positions)
-    bodies = [
-        Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
-        Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
-        Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
-        Body("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True),
-    ]
+    tool, site, tumour = stage.scene.tool, stage.site, stage.tumour(stage.site.anatomy.mesh.nodes)
+    wire = Body("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True)
+    bodies = [*brain_of(stage), wire]
     if stage.observer is not None:
         middle = tumour.vertices.mean(axis=0)
         bodies.append(Body("ellipsoid", middle + SMALL * BALL, BALL_FACES, ELLIPSOID_COLOUR, wireframe=True))
@@ -42,6 +36,17 @@ def bodies_of(stage: Stage) -> list[Body]:
         at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
         bodies.append(Body("tool", at, tool.mesh.faces, TOOL_COLOUR))
     return bodies
+
+
+def brain_of(stage: Stage) -> list[Body]:
+    """Brain, open cortex and tumour, at rest."""
+    positions = stage.site.anatomy.mesh.nodes
+    brain, cortex, tumour = stage.brain, stage.cortex(positions), stage.tumour(positions)
+    return [
+        Body("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
+        Body("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
+        Body("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
+    ]
 
 
 def signs_of(site: Site) -> list[Sign]:

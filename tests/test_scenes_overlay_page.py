@@ -1,0 +1,213 @@
+"""The page of a film or a camera: in real pictures, in words, for all visitors, and in a real browser."""
+
+import re
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from chromium import PROGRAM, SIZES, Chromium, assert_fits, assert_in_register, box_of
+from films import FILM, follower_of
+from theatres import template_theatre
+from visitor import Visitor, free_port, wait_for
+
+from ar.page.aside import KEYS, TABS
+from ar.page.sight import HISTORY, PICTURE, SAID, SLICES
+from ar.tracking.pictures import film_of
+from scenes.cli import main
+from scenes.play.overlay.follower import State
+from scenes.play.overlay.page import OverlayPage
+from scenes.play.overlay.picture import Painter
+from scenes.play.overlay.seekable_film import SeekableFilm
+from scenes.script.scene import find_scene
+
+
+@pytest.fixture(scope="module")
+def stage():
+    return template_theatre().stage(find_scene("palpate"))
+
+
+@pytest.fixture(scope="module")
+def follower(stage):
+    return follower_of(stage)
+
+
+@contextmanager
+def opened(follower, stage, frames=0):
+    page = OverlayPage(follower, Painter(stage, follower.tool), "film.mp4", "a test", port=free_port(), frames=frames)
+    try:
+        yield page
+    finally:
+        page.close()
+
+
+@pytest.fixture(scope="module")
+def page(follower, stage):
+    """The page of the film, paused."""
+    film = SeekableFilm(FILM / "film.mp4", 30.0)
+    done = threading.Event()
+    with opened(follower, stage, film.count) as page:
+        page.plays = False
+        page.browser.plays(False)
+
+        def play():
+            while not done.is_set():
+                page.play(film, 0.3)
+
+        loop = threading.Thread(target=play)
+        loop.start()
+        assert seek(page, 6)
+        yield page
+        done.set()
+        loop.join()
+
+
+def seek(page, number):
+    page.sought.append(number)
+    return wait_for(lambda: page.browser.shown[0] == number and f"picture {number} of" in page.browser.shown[2])
+
+
+def test_a_film_is_gone_to_and_fro_in(tmp_path):
+    film, pictures = SeekableFilm(FILM / "film.mp4", 30.0), list(film_of(FILM / "film.mp4", 30.0, colour=True))
+    assert film.count == len(pictures) == 17
+    for number in (3, 4, 16, 0):
+        found = film.at(number)
+        assert found.stamped and np.array_equal(found.picture.colour, pictures[number].colour)
+    film.count = 40  # as a file may say
+    assert film.at(20) is None and film.count == 20 and film.at(17) is None and film.count == 17
+    assert film.at(16).picture.name == "frame 16"
+
+
+@pytest.mark.parametrize(
+    ("number", "state", "words"),
+    [
+        (6, State.GOOD, "The tumour is drawn where it is now."),
+        (8, State.NO_TOOL, "tool not seen yet: the tumour as in the scan"),
+        (12, State.NO_REFERENCE, "reference not seen yet: nothing is drawn"),
+    ],
+)
+def test_each_state_is_said_with_both_errors(page, number, state, words):
+    assert seek(page, number)
+    said = page.browser.shown[2]
+    assert page.newest.known.state is state and words in said and "Error of the tumour: not known" in said
+    if state is State.GOOD:
+        assert re.search(r'"number">tip to tumour \d+\.\d&nbsp;±&nbsp;\d\.\d&nbsp;mm<', said)
+        assert "within 0.2 mm of where it is drawn" in said and "registration 0.1 mm" in said
+        assert "reference seen; tool seen; tumour moved 0.5&nbsp;±&nbsp;0.1&nbsp;mm" in said
+    else:
+        assert "tip to tumour: not known" in said and "Error of the overlay: not known" in said
+        sample = page.history.samples[-1]
+        assert sample.values == sample.errors[:1] + (None,) == (None, None)
+
+
+def test_a_style_is_had_on_a_picture_that_stands(page):
+    assert seek(page, 6)
+    before = page.browser.shown[1]
+    visitor = Visitor(page.browser, 1200)
+    assert wait_for(lambda: page.browser.visitors == 1)
+    visitor.set(page.browser.inputs["overlay"], "none")
+    assert wait_for(lambda: page.browser.shown[1] is not before and page.browser.shown[0] == 6)
+    assert not np.array_equal(page.browser.shown[1], before)
+    other = Visitor(page.browser, 1200)
+    assert wait_for(lambda: "(number 1) leads" in str(other.updates))
+    other.set(page.browser.inputs["overlay"], "outline")
+    time.sleep(0.3)
+    assert page.style == "none"
+    visitor.set(page.browser.inputs["overlay"], "outline and window")
+    assert wait_for(lambda: np.array_equal(page.browser.shown[1], before))
+    for each in (visitor, other):
+        each.wire.close()
+    assert wait_for(lambda: page.browser.visitors == 0)
+
+
+def test_a_film_plays_on_and_after_its_end_anew(follower, stage):
+    film = SeekableFilm(FILM / "film.mp4", 30.0)
+    film.count = 40  # as a file may say
+    with opened(follower, stage, film.count) as page:
+
+        def played(start, count):
+            page.sought.append(start)
+            before, until = len(page.shown), time.monotonic() + 30.0
+            while len(page.shown) < before + count and time.monotonic() < until:
+                page.play(film, 0.2)
+            return [each.known.state for each in list(page.shown)[before : before + count]]
+
+        assert played(14, 4) == [State.GOOD, State.GOOD, State.GOOD, State.REST] and film.count == 17
+        # By now it is known how far apart its pictures are.
+        assert played(14, 2) == [State.GOOD, State.STALE]
+        one = page.shown[0]
+    assert one.colour.size == one.known.motion.positions.size == 0 and one.middle.shape == (3,)
+
+
+def test_a_camera_s_picture_is_dimmed_once_it_is_old_and_goes_on_when_it_is_back(follower, stage):
+    first = next(film_of(FILM / "film.mp4", 30.0, colour=True))
+
+    def pictures():
+        yield replace(first, time=time.perf_counter())
+        yield None
+        fades.append(page.browser.wanted)
+        time.sleep(1.1)
+        yield None
+        fades.append(page.browser.wanted)
+        yield replace(first, time=time.perf_counter())
+        fades.append(page.browser.wanted)
+        page.plays = False
+        yield None
+        fades.append(page.browser.wanted)
+
+    fades = []
+    with opened(follower, stage) as page:
+        shown = page.watch(pictures())
+        assert not page.browser.frame.visible and len(page.browser.controls.commands) == len(KEYS) - 2
+        assert len(shown) == 2 and {each.known.state for each in shown} <= {State.REST, State.STALE}
+        assert all(each.latency > 0.0 for each in shown)
+        silent, unplugged, back, paused = fades
+        assert "no picture for 0.2 s" in silent[2] and silent[1].mean() < 0.4 * first.colour.mean()
+        assert "no picture for 1 s: what is shown is old" in unplugged[2] and "Is film.mp4 plugged in?" in unplugged[2]
+        assert back[1].mean() > 0.8 * first.colour.mean() and "live from film.mp4" in back[2]
+        assert "paused: what is shown is old" in paused[2] and "Error of the overlay: not known" in paused[2]
+        with pytest.raises(ValueError, match="calibrate it at this size"):
+            page.plays = True
+            page.watch(iter([replace(first, grey=first.grey[::2])]), 0.1)
+
+
+def test_the_command_s_page_is_of_films_and_of_cameras_and_the_demo_says_so(capsys):
+    given = [f"--camera={FILM}/camera.yaml", f"--registration={FILM}/registration.json", "--device", "cpu"]
+    film, port = str(FILM / "film.mp4"), str(free_port())
+    assert main(["overlay", film, *given, "--page", "--port", port, "--seconds", "2"]) == 1  # nobody knows the motion
+    said = capsys.readouterr().out
+    assert f"open http://localhost:{port} (Ctrl-C ends)" in said and "its motion not known" in said
+    assert main(["overlay", film, *given, "--page", "--live"]) == 2
+    assert "films without a page" in capsys.readouterr().err
+    for own in (film, "0"):
+        assert main(["demo", own]) == 2
+        assert f"sulcus overlay {own} --page" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def window(page):
+    if PROGRAM is None:
+        pytest.skip("there is no Chromium here")
+    window = Chromium()
+    window.open(page.browser.address, *SIZES[0])
+    assert window.wait(f"document.querySelector('#{PICTURE} img') && document.querySelector('#{SLICES} img')")
+    yield window
+    window.close()
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+def test_the_page_fits_and_is_in_register(page, window, size):
+    assert seek(page, 6)
+    window.size(*size)
+    assert window.wait(f"innerWidth == {size[0]} && document.getElementById('{SAID}').innerText.includes('picture 6')")
+    assert_fits(window, size, ("Error of the overlay", "Error of the tumour"))
+    assert_in_register(window, page.browser.shown[1])
+    for number, place in ((1, SLICES), (2, HISTORY)):
+        window.value(f"document.getElementById('{TABS[number][1]}').click()")
+        part = box_of(window, f"document.querySelector('#{place} > *')")
+        assert part[0] >= 0 and part[2] <= size[0] and part[3] <= size[1] and part[2] - part[0] > 200.0
+    window.press("ArrowRight", "ArrowRight")
+    assert wait_for(lambda: page.browser.shown[0] == 7)
+    assert window.errors == []
