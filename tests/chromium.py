@@ -136,6 +136,8 @@ def assert_fits(window: Chromium, size: tuple[int, int], lines: tuple[str, ...])
     assert max(window.value(f"[{whole}.scrollWidth - innerWidth, {whole}.scrollHeight - innerHeight]")) <= 0
     left, top, right, bottom = box_of(window, f"document.querySelector('#{PICTURE} img')")
     assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1]
+    shut = "[...document.querySelectorAll('input:not([type=radio])')].filter(i => i.scrollWidth > i.clientWidth)"
+    assert not window.value(f"{shut}.map(i => i.value)")
     room = box_of(window, said)
     for words in lines:
         line = box_of(window, f"[...document.querySelectorAll('#{SAID} p')].find(p => p.innerText.includes('{words}'))")

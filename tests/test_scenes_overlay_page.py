@@ -165,7 +165,8 @@ def test_a_camera_s_picture_is_dimmed_once_it_is_old_and_goes_on_when_it_is_back
         assert all(each.latency > 0.0 for each in shown)
         silent, unplugged, back, paused = fades
         assert "no picture for 0.2 s" in silent[2] and silent[1].mean() < 0.4 * first.colour.mean()
-        assert "no picture for 1 s: what is shown is old" in unplugged[2] and "Is film.mp4 plugged in?" in unplugged[2]
+        assert re.search("no picture for [1-9][0-9]* s: what is shown is old", unplugged[2])
+        assert "Is film.mp4 plugged in?" in unplugged[2]
         assert back[1].mean() > 0.8 * first.colour.mean() and "live from film.mp4" in back[2]
         assert "paused: what is shown is old" in paused[2] and "Error of the overlay: not known" in paused[2]
         with pytest.raises(ValueError, match="calibrate it at this size"):

@@ -79,7 +79,8 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   PANEL > div:first-child, PANEL > div:last-child { display: none !important }
   PANEL > div > div { width: 100% !important }
   VIEW { inset: auto 0 0 var(--w) !important; height: var(--low); border-top: 1px solid #444 }
-  #PAGE { position: fixed; left: 0; top: calc(var(--w) / var(--aspect)); width: var(--w); bottom: 0; overflow: auto }
+  #PAGE { position: fixed; left: 0; top: calc(var(--w) / var(--aspect)); width: var(--w); bottom: 0; overflow: auto;
+    mask-image: linear-gradient(#000 calc(100% - 1.1rem), transparent); padding-bottom: 1.1rem }
 }
 @media (min-width: 75em) and (min-aspect-ratio: 13/10) {
   PARTS { display: grid; grid-template-columns: 1fr 1fr; grid-auto-flow: dense; align-items: center }
