@@ -28,9 +28,16 @@ if TYPE_CHECKING:
     from ..script.uncertainty import TumourError
 
 
+# The name of what is no scene: a drawn film whose markers are lost and found.
+TRACKING = "tracking"
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
+    parser.add_argument(
+        "scenes", nargs="*",
+        help="built-in scenes, or MY_SCENE.py; tracking: a drawn film whose markers are lost and found (default: all)",
+    )  # fmt: skip
     parser.add_argument("--every", type=int, default=10, help="check one frame in so many (default %(default)s)")
     parser.add_argument(
         "--certify", action="store_true", help="give each frame's error without solving to the end, and correct it"
@@ -51,7 +58,8 @@ def run(args: argparse.Namespace) -> int:
     from ..script.scene import SCENES
 
     at_least("--every", args.every, 1)
-    scenes = [filmed(args, scene_asked(args, name)) for name in args.scenes or SCENES]
+    asked = args.scenes or [*SCENES, TRACKING]
+    scenes = [filmed(args, scene_asked(args, name)) for name in asked if name != TRACKING]
     theatre = theatre_asked(args)
     scenes = playable(args, theatre, scenes)
     rows, table = [], sys.stderr if args.json else sys.stdout
@@ -90,10 +98,30 @@ def run(args: argparse.Namespace) -> int:
             rows[-1]["certificates"] = _certificates(theatre, scene, frames, truth, table)
         for sentence in broken:
             print(f"{'':11s} {sentence}", file=table)
-    passed = not any(row["broken"] for row in rows)
+    tracking = _tracking(args, theatre, table) if TRACKING in asked else None
+    passed = not any(row["broken"] for row in (*rows, *([] if tracking is None else [tracking])))
     if args.json:
-        print(json.dumps({"passed": passed, "scenes": rows}))
+        print(json.dumps({"passed": passed, "scenes": rows, "tracking": tracking}))
     return 0 if passed else 1
+
+
+def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict[str, object]:
+    """What a drawn film shows whose markers are lost and found."""
+    from ..play.overlay.drawn_film import drawn_film
+    from ..play.overlay.tracking_checks import measure_tracking, usual
+
+    film = drawn_film(theatre)
+    figures = measure_tracking(film, *usual(film, args.style))
+    broken = figures.broken()
+    print(
+        f"{TRACKING:11s} {'FAILS' if broken else 'passes'}  markers covered, pictures repeated, late and missing: "
+        f"{figures.confident} of {figures.pictures} pictures draw a lost or old place as known, {figures.unsaid} do "
+        f"not say so. Known places are off by {figures.off:.1f} px, and known again after {figures.back:g} pictures",
+        file=table,
+    )
+    for sentence in broken:
+        print(f"{'':11s} {sentence}", file=table)
+    return {**figures.row(), "broken": broken}
 
 
 def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:

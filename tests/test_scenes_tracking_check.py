@@ -1,0 +1,104 @@
+"""What `sulcus check` judges of lost, found and stale pictures fails where the code that it guards is perturbed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from theatres import template_theatre
+
+from scenes.play.overlay.drawn_film import drawn_film
+from scenes.play.overlay.follower import Follower, State
+from scenes.play.overlay.picture import Painter
+from scenes.play.overlay.tracking_checks import TrackingFigures, measure_tracking, usual
+
+
+@pytest.fixture(scope="module")
+def film():
+    return drawn_film(template_theatre())
+
+
+@pytest.fixture(scope="module")
+def parts(film):
+    return usual(film, "contour")
+
+
+def as_known(known):
+    return replace(known, state=State.GOOD, words="")
+
+
+def made(kind, whole):
+    """The same follower or painter, as another class."""
+    return kind(**{name: value for name, value in vars(whole).items() if name in kind.__dataclass_fields__})
+
+
+class Sure(Follower):
+    """Says that it knows the tumour's place while reference or tool are lost."""
+
+    def step(self, grey, time, before=None):
+        known = super().step(grey, time, before)
+        return as_known(known) if known.state in (State.NO_REFERENCE, State.NO_TOOL) else known
+
+
+class Blind(Follower):
+    """Finds nothing again that it lost."""
+
+    def step(self, grey, time, before=None):
+        lost = before is not None and before.state is State.NO_REFERENCE
+        return super().step(np.full_like(grey, 120) if lost else grey, time, before)
+
+
+class Frozen(Follower):
+    """Goes on with the camera of the first picture."""
+
+    def step(self, grey, time, before=None):
+        known = super().step(grey, time, before)
+        return known if before is None or before.camera is None else replace(known, camera=before.camera)
+
+
+class Fresh(Painter):
+    """Draws what is stale as if it were known."""
+
+    def paint(self, colour, known):
+        return super().paint(colour, as_known(known) if known.state is State.STALE else known)
+
+
+class Silent(Painter):
+    """Does not say why."""
+
+    def paint(self, colour, known):
+        return super().paint(colour, replace(known, words=""))
+
+
+def test_what_was_not_perturbed_passes(film, parts):
+    figures = measure_tracking(film, *parts)
+    assert figures.broken() == []
+    assert figures.pictures == 16 and figures.confident == figures.unsaid == 0 and figures.back <= 3
+    assert 0.0 < figures.off < 1.6
+
+
+@pytest.mark.parametrize(
+    ("follower", "painter", "broken"),
+    [
+        (Sure, Painter, "draw a lost or old place as if it were known"),
+        (Blind, Painter, "back after inf pictures"),
+        (Frozen, Painter, "pixels off, more than 2"),
+        (Follower, Fresh, "draw a lost or old place as if it were known"),
+        (Follower, Silent, "do not say that something is lost or old"),
+    ],
+)
+def test_each_judgement_fails_where_it_should(film, parts, follower, painter, broken):
+    figures = measure_tracking(film, made(follower, parts[0]), made(painter, parts[1]))
+    assert any(broken in sentence for sentence in figures.broken())
+
+
+def test_a_registration_that_is_off_by_two_millimetres_fails(film, parts):
+    T = parts[0].registration.T_patient_scan.copy()
+    T[:3, 3] += T[:3, :3] @ (2e-3 * film.stage.site.right)
+    off = replace(parts[0], registration=replace(parts[0].registration, T_patient_scan=T))
+    (sentence,) = measure_tracking(film, off, parts[1]).broken()
+    assert "pixels off" in sentence
+
+
+def test_what_never_comes_back_fails():
+    never = TrackingFigures(1, 0, 0, np.inf, 0.0)
+    assert never.row()["back"] is None and len(never.broken()) == 1
