@@ -32,3 +32,8 @@ def is_rigid(T: np.ndarray, rounding: float) -> bool:
         return False
     turn = T[:3, :3]
     return bool(np.abs(turn.T @ turn - np.eye(3)).max() < rounding and np.linalg.det(turn) > 0.0)
+
+
+def turn_vectors(rotations: np.ndarray) -> np.ndarray:
+    """Axes (n, 3) of rotations (n, 3, 3), as long as they turn [rad]."""
+    return Rotation.from_matrix(rotations).as_rotvec()

@@ -21,6 +21,7 @@ from .demo import add_bodies
 from .interrupt import until_ended
 from .json_line import json_line
 from .outputs import add_force, claimed
+from .poses_options import add_poses, demand_poses, elsewhere_of
 from .style_option import add_style
 from .tissue_options import add_element_argument, add_skull_argument, add_tissue_arguments, tissue_of
 
@@ -71,6 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--port", type=int, default=8080, help="of the page, or the next free (default %(default)s)")
     parser.add_argument("--seconds", type=float, default=np.inf, help="end the page after so long (default: never)")
+    add_poses(parser)
     add_tissue_arguments(parser)
     add_skull_argument(parser)
     add_element_argument(parser)
@@ -107,6 +109,8 @@ def run(args: argparse.Namespace) -> int:
     if camera or args.page:
         return until_ended(partial(_served, args, camera))
     inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth]
+    inputs += [*(args.poses or ()), args.hand_eye, args.camera_poses]
+    demand_poses(args)
     out = None if args.out is None else _film_path(args.out, args.force, inputs)
     table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, inputs)
     parts = _parts(args)
@@ -130,8 +134,8 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
 
     from ..play.overlay.rows import write_rows
 
-    if args.out is not None or args.truth is not None or args.live:
-        raise InputError("--out, --truth and --live belong to films without a page: leave them out here.")
+    if args.out is not None or args.truth is not None or args.live or args.poses is not None:
+        raise InputError("--out, --truth, --live and --poses belong to films without a page: leave them out here.")
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
     table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, [args.camera])
@@ -207,6 +211,7 @@ def _parts(args: argparse.Namespace) -> Parts:
 
     calibration, registration = read_calibration(args.camera), read_registration(args.registration)
     tool = None if args.tool is None else read_tool(args.tool)
+    elsewhere = elsewhere_of(args, calibration)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     scene = _scene(args, None if tool is None else tool.shape)
     stage = theatre.stage(scene)
@@ -214,7 +219,7 @@ def _parts(args: argparse.Namespace) -> Parts:
     motion = ToolMotion(stage, deformer)
     device = find_device(args.device, LIVE.precision).name
     load_kernels(device)
-    follower = Follower(calibration, registration, tool, motion)
+    follower = Follower(calibration, registration, tool, motion, elsewhere)
     return Parts(calibration, follower, Painter(stage, tool, args.style, device), who)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ar.tracking.pose import Pose, Verdict
+from ar.tracking.pose_stream import PoseStream, stream_of
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 from surrogate.locating.observed_files import read_columns
@@ -20,6 +21,10 @@ TIP, TIP_DEVIATION = ("tip_x_mm", "tip_y_mm", "tip_z_mm"), "tip_off_mm"
 COVARIANCE = tuple(f"cov_{row}{column}" for row in range(6) for column in range(row, 6))
 # By how much a quaternion's length may differ from 1, and a place be from the origin [m].
 ROUNDED, FARTHEST = 0.01, 100.0
+# Of the covariance: from metres and radians to millimetres and radians.
+UNITS = np.repeat([1e3, 1.0], 3)
+USUAL = 0.25e-3, float(np.radians(0.1))
+"""Deviations of a tracker that states none, along and about each axis [m], [rad]."""
 
 
 def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -34,15 +39,42 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         A file that is missing or no such table, times that do not ascend, quaternions that are not of length 1, or
         places farther than 100 m.
     """
-    columns = read_columns(path, {(TIME, *PLACE, *TURN)}, (*PLACE, *TURN), others=True)
+    times, poses, _ = _read(path)
+    back = np.flatnonzero(np.diff(times) <= 0.0)
+    if len(back):
+        raise InputError(f"{path}: row {back[0] + 3} is not later than the row before it: sort the rows by time_s.")
+    kept = ~np.isnan(poses[:, 0, 0])
+    return times[kept], poses[kept]
+
+
+def read_stream(path: str | Path) -> PoseStream:
+    """The poses of another tracker, in a file as of `read_poses`, whose clock may begin anew at midnight.
+
+    Covariances are read where there are columns `cov_00` to `cov_55`, as `write_poses` has them; elsewhere `USUAL`.
+
+    Raises
+    ------
+    InputError
+        As `read_poses`; no pose, or a covariance that is none.
+    """
+    times, poses, covariances = _read(path)
+    kept = ~np.isnan(poses[:, 0, 0])
+    if not _are_covariances(covariances[kept]):
+        raise InputError(f"{path}: has a covariance that is none: mend it, or leave its columns out.")
+    try:
+        return stream_of(times[kept], poses[kept], covariances[kept])
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (n,), poses (n, 4, 4) and covariances (n, 6, 6) of all rows; without a pose they are NaN."""
+    with_errors = (TIME, *PLACE, *TURN, *COVARIANCE)
+    columns = read_columns(path, {with_errors[:8], with_errors}, with_errors[1:], others=True)
     blank = np.isnan([columns[name] for name in (*PLACE, *TURN)])
     odd = np.flatnonzero(blank.any(axis=0) & ~blank.all(axis=0))
     if len(odd):
         raise InputError(f"{path}: row {odd[0] + 2} has a part of a pose: fill it in, or leave all of it blank.")
-    times = columns[TIME]
-    back = np.flatnonzero(np.diff(times) <= 0.0)
-    if len(back):
-        raise InputError(f"{path}: row {back[0] + 3} is not later than the row before it: sort the rows by time_s.")
     places = 1e-3 * np.column_stack([columns[name] for name in PLACE])
     far = np.flatnonzero((np.abs(places) > FARTHEST).any(axis=1))
     if len(far):
@@ -56,10 +88,29 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(
             f"{path}: row {odd[0] + 2} has a quaternion of length {lengths[odd[0]]:.3g}: give qx,qy,qz,qw of length 1."
         )
-    poses = np.tile(np.eye(4), (int(kept.sum()), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(turns[kept]).as_matrix()
-    poses[:, :3, 3] = places[kept]
-    return times[kept], poses
+    poses = np.full((len(kept), 4, 4), np.nan)
+    poses[kept] = np.eye(4)
+    poses[kept, :3, :3] = Rotation.from_quat(turns[kept]).as_matrix()
+    poses[kept, :3, 3] = places[kept]
+    return columns[TIME], poses, _covariances(columns, len(kept))
+
+
+def _covariances(columns: dict[str, np.ndarray], count: int) -> np.ndarray:
+    """Covariances (n, 6, 6) [m], [rad], of `write_poses`'s columns, or the usual one."""
+    if COVARIANCE[0] not in columns:
+        return np.tile(np.diag(np.repeat(np.square(USUAL), 3)), (count, 1, 1))
+    upper = np.zeros((count, 6, 6))
+    upper[(slice(None), *np.triu_indices(6))] = np.column_stack([columns[name] for name in COVARIANCE])
+    whole = upper + np.triu(upper, 1).transpose(0, 2, 1)
+    return whole / np.outer(UNITS, UNITS)
+
+
+def _are_covariances(matrices: np.ndarray) -> bool:
+    """Whether symmetric matrices (n, 6, 6) are finite and nowhere negative, within their rounding in a file."""
+    if not np.isfinite(matrices).all():
+        return False
+    values = np.linalg.eigvalsh(matrices * np.outer(UNITS, UNITS))
+    return bool((values[:, 0] >= -1e-3 * values[:, -1]).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +144,7 @@ def _of_pose(pose: Pose, tip: np.ndarray) -> list[str]:
     """Place, turn, tip and how far off it is (root mean square), and covariance."""
     T = pose.T_camera_target
     at, spread = pose.point(tip)
-    units = np.repeat([1e3, 1.0], 3)
-    covariance = (pose.covariance * units * units[:, None])[np.triu_indices(6)]
+    covariance = (pose.covariance * np.outer(UNITS, UNITS))[np.triu_indices(6)]
     return [
         *(f"{each:.4f}" for each in 1e3 * T[:3, 3]),
         *(f"{each:.8f}" for each in Rotation.from_matrix(T[:3, :3]).as_quat()),

@@ -19,6 +19,7 @@ from ar.tracking.track import Tracked, Tracker
 
 from ...script.tracked_tool import TrackedTool
 from ...script.uncertainty import LEVEL
+from .elsewhere import Elsewhere
 from .tool_motion import Motion, ToolMotion
 
 # So long a picture's overlay stays where it was when the reference is lost, and so long pictures may be missing [s].
@@ -108,17 +109,22 @@ class Follower:
         With its cube; None: no tool is looked for.
     motion
         Who says how the brain lies under it.
+    elsewhere
+        Poses of another tracker, which take the place of the cube's; where they say where the camera is, the
+        reference's, too.
     """
 
     calibration: Calibration
     registration: Registration
     tool: TrackedTool | None
     motion: ToolMotion
+    elsewhere: Elsewhere | None = None
 
     @cached_property
     def tracker(self) -> Tracker:
         """Of the targets that are wanted."""
-        wanted = (patient_reference(),) if self.tool is None else (patient_reference(), tool_cube())
+        cube = self.tool is not None and self.elsewhere is None
+        wanted = (patient_reference(), tool_cube()) if cube else (patient_reference(),)
         return Tracker(self.calibration.camera(np.eye(4)), wanted)
 
     def step(self, grey: np.ndarray, time: float, before: Known | None = None) -> Known:
@@ -142,7 +148,8 @@ class Follower:
         stale = apart is not None and not 0.0 < apart <= longest
         forgotten = before is None or (apart is not None and not 0.0 <= apart <= longest)
         tracked = self.tracker.track(grey, None if before is None or forgotten else before.tracked)
-        reference = tracked.poses.get(PATIENT)
+        other = self.elsewhere
+        reference = tracked.poses.get(PATIENT) if other is None or other.eye is None else other.reference(time)
         if reference is None:
             return self._without_reference(tracked, time, before)
         T_patient_scan = self.registration.T_patient_scan
@@ -167,7 +174,7 @@ class Follower:
         motion = self.motion.rest if before is None else before.motion
         held = before is not None and seen is not None and 0.0 <= time - seen < HELD + ROUNDING
         camera = before.camera if before is not None and held else None
-        why = "not seen yet" if seen is None else "lost"
+        why = self._late(time) or ("not seen yet" if seen is None else "lost")
         what = "nothing is drawn" if camera is None else "drawn where it was"
         return Known(
             time, State.NO_REFERENCE, f"reference {why}: {what}", tracked, motion, camera, seen=seen,
@@ -177,22 +184,37 @@ class Follower:
     def _with_tool(self, tracked: Tracked, reference: Pose, time: float, before: Known | None) -> Known:
         """How the brain lies under the tool, by its pose beside the reference."""
         felt, last = (None, None) if before is None else (before.felt, before.motion)
-        cube = tracked.poses.get(TOOL)
-        if self.tool is None or cube is None:
+        beside = self._beside(tracked, reference, time)
+        if self.tool is None or beside is None:
             if self.motion.deformer is None:
                 return Known(time, State.UNKNOWN, UNKNOWN, tracked, self.motion.rest, felt=felt)
             if felt is None or last is None:
                 words = "tool not seen yet: the tumour as in the scan"
                 return Known(time, State.NO_TOOL, words, tracked, self.motion.rest)
-            words = f"tool lost: the tumour as {time - felt:.1f} s ago"
+            words = f"tool {self._late(time) or 'lost'}: the tumour as {time - felt:.1f} s ago"
             return Known(time, State.NO_TOOL, words, tracked, last, felt=felt)
-        beside = cube.seen_from(reference)
         into = np.linalg.inv(self.registration.T_patient_scan)
         pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
         spread = self._tip_covariance(beside)
         motion = self.motion.under(pose, spread, last)
-        state = State.UNSURE if motion.doubt else State.GOOD if motion.moved > 0.0 else State.REST
-        return Known(time, state, motion.doubt, tracked, motion, None, pose, spread, felt=time)
+        moved = State.GOOD if motion.moved > 0.0 else State.REST
+        state = State.UNSURE if motion.doubt else moved if motion.known else State.UNKNOWN
+        words = UNKNOWN if state is State.UNKNOWN else motion.doubt
+        return Known(time, state, words, tracked, motion, None, pose, spread, felt=time)
+
+    def _beside(self, tracked: Tracked, reference: Pose, time: float) -> Pose | None:
+        """The tool's cube beside the reference."""
+        if self.elsewhere is not None:
+            return self.elsewhere.beside(time)
+        cube = tracked.poses.get(TOOL)
+        return None if cube is None else cube.seen_from(reference)
+
+    def _late(self, time: float) -> str:
+        """How old the poses of another tracker are, where they are what is missing; else empty."""
+        age = None if self.elsewhere is None else self.elsewhere.age(time)
+        if age is None:
+            return ""
+        return f"stale, no pose for {age:.1f} s" if np.isfinite(age) else "not seen yet by the other tracker"
 
     def _tip_covariance(self, beside: Pose) -> np.ndarray:
         """Of the tool's tip in the scan (3, 3) [m^2]: by both poses, the tool's calibration and the registration."""

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from ar.tracking.pictures import Named
+from ar.tracking.pose_stream import DAY
 from ar.tracking.stamp import read_stamp
 
 from .follower import Follower, Known, State
@@ -67,10 +68,15 @@ class Timed:
 
 
 def timed(film: Iterator[Named]) -> Iterator[Timed]:
-    """Pictures with the times that they hold."""
+    """Pictures with the times that they hold; a clock of 24 hours goes on at midnight."""
+    before, days = -np.inf, 0.0
     for picture in film:
         stamp = read_stamp(picture.grey)
-        yield Timed(picture if stamp is None else replace(picture, time=stamp), stamp is not None)
+        time = days + (picture.time if stamp is None else stamp)
+        if time < before - 0.5 * DAY:
+            time, days = time + DAY, days + DAY
+        before = time
+        yield Timed(replace(picture, time=time), stamp is not None)
 
 
 def paced(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:

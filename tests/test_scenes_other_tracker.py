@@ -1,0 +1,252 @@
+"""Poses of another tracker: between their samples, beside another clock, past midnight, and in a film's overlay."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from theatres import template_theatre
+
+from ar.tracking.clocks import Clock, clock_by_motion
+from ar.tracking.pictures import film_of
+from ar.tracking.pose import Pose, Verdict
+from ar.tracking.pose_stream import AHEAD, DAY, LONGEST, stream_of
+from ar.tracking.rigid import moved_about
+from scenes.cli import main
+from scenes.play.overlay.elsewhere import Elsewhere, Eye
+from scenes.play.overlay.follower import Follower, State
+from scenes.play.overlay.run import timed
+from scenes.play.overlay.tool_motion import ToolMotion
+from scenes.script.calibration_file import read_calibration
+from scenes.script.film_truth import read_truth
+from scenes.script.hand_eye_file import read_hand_eye
+from scenes.script.pose_file import TrackedRow, read_stream, write_poses
+from scenes.script.registration_file import read_registration
+from scenes.script.scene import find_scene
+from scenes.script.tracked_tool import read_tool
+from sim.errors import InputError
+
+FILM = Path(__file__).parent / "data" / "film"
+TRACKER = moved_about(np.eye(4), np.zeros(3), np.array([0.3, -0.2, 1.1, 0.5, -0.7, 1.2]))
+"""T_tracker_scan."""
+NOISE = np.diag(np.repeat([1e-4**2, 3e-4**2], 3))
+NONE = np.zeros((6, 6))
+
+
+def swung(time):
+    """A tool in a quick hand: 20 mm and 11 degrees to and fro, 1.2 times a second."""
+    phase = 2.0 * np.pi * 1.2 * time
+    step = [0.02 * np.sin(phase), 0.01 * np.sin(0.7 * phase), 0.0, 0.0, 0.2 * np.sin(phase + 1.0), 0.1 * np.cos(phase)]
+    return moved_about(TRACKER, np.zeros(3), np.array(step))
+
+
+def sampled(pose_at, times, rng=None, offset=0.0):
+    """A stream of what happens at times, with noise; its stamps are those times and an offset."""
+    poses = [pose_at(time) for time in times]
+    if rng is not None:
+        poses = [moved_about(T, np.zeros(3), rng.multivariate_normal(np.zeros(6), NOISE)) for T in poses]
+    return stream_of(
+        np.asarray(times) + offset, np.stack(poses), np.tile(NONE if rng is None else NOISE, (len(times), 1, 1))
+    )
+
+
+def twist(found, true):
+    turn = Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).as_rotvec()
+    return np.concatenate([found[:3, 3] - true[:3, 3], turn])
+
+
+@pytest.mark.parametrize(("rate", "late"), [(20.0, 0.08), (30.0, 0.05), (60.0, 0.03)])
+def test_between_samples_poses_are_better_than_the_newest_and_as_sure_as_they_say(rate, late):
+    rng = np.random.default_rng(int(rate))
+    stream = sampled(swung, np.arange(0.0, 4.0, 1.0 / rate), rng)
+    plain, found, inside = [], [], []
+    for time in rng.uniform(0.5, 3.5, 300):
+        pose, true = stream.at(time), swung(time)
+        off = twist(pose.T_camera_target, true)
+        inside.append(off @ np.linalg.solve(pose.covariance, off) <= chi2.ppf(0.95, 6))
+        found.append(np.linalg.norm(off[:3]))
+        newest = stream.poses[np.searchsorted(stream.times, time - late) - 1]  # that has come by then
+        plain.append(np.linalg.norm(newest[:3, 3] - true[:3, 3]))
+    assert np.median(plain) > 3e-3 and np.median(found) < 0.05 * np.median(plain)
+    assert np.percentile(found, 95) < (8e-4 if rate < 30.0 else 4e-4)
+    assert np.mean(inside) > 0.93
+
+
+def test_gaps_have_no_pose_and_the_last_one_goes_on_for_a_moment_only():
+    times = np.concatenate([np.arange(0.0, 1.0, 0.04), np.arange(1.3, 2.0, 0.04)])
+    stream = sampled(swung, times)
+    last = times[times < 1.0][-1]
+    on, beyond = stream.at(last + 0.9 * AHEAD), stream.at(last + 1.1 * AHEAD)
+    assert beyond is None and on is not None
+    off = twist(on.T_camera_target, swung(last + 0.9 * AHEAD))
+    assert off @ np.linalg.solve(on.covariance, off) <= chi2.ppf(0.95, 6)
+    assert np.trace(on.covariance) > 2.0 * np.trace(stream.at(0.5).covariance)
+    assert stream.at(-0.01) is None and stream.age(-0.01) == np.inf and stream.at(1.2) is None
+    assert stream.at(1.3) is not None and stream.at(1.31) is not None
+    assert stream.age(1.2) == pytest.approx(1.2 - last) and LONGEST < 0.3
+    with pytest.raises(ValueError, match="pose 3 is not later"):
+        stream_of(np.array([0.0, 2.0, 1.0]), np.tile(np.eye(4), (3, 1, 1)), np.tile(NONE, (3, 1, 1)))
+
+
+def test_a_clock_of_24_hours_goes_on_at_midnight():
+    times = np.arange(0.0, 2.0, 0.025)
+    stamps = (times + DAY - 1.0) % DAY
+    stream = stream_of(stamps, np.stack([swung(time) for time in times]), np.tile(NONE, (len(times), 1, 1)))
+    for time in (0.4, 1.5):
+        for days in (-DAY, 0.0, DAY):
+            pose = stream.at(time + DAY - 1.0 + days)
+            np.testing.assert_allclose(pose.T_camera_target, swung(time), atol=5e-4)
+    epoch = sampled(swung, times, offset=1.7e9)  # seconds since 1970: other days are other times
+    assert epoch.at(1.7e9 + 0.5) is not None and epoch.at(1.7e9 + 0.5 + DAY) is None
+
+
+def test_clocks_are_compared_by_motion_with_an_error_that_holds():
+    rng, off = np.random.default_rng(4), []
+    samples = np.arange(0.0, 5.0, 1.0 / 40.0)
+    others = np.stack([swung(time)[:3, 3] for time in samples])
+    for true in rng.uniform(-0.9, 0.9, 60):
+        times = np.arange(1.0, 4.0, 0.1)
+        places = np.stack([swung(time + true)[:3, 3] for time in times]) + 2e-4 * rng.normal(size=(30, 3)) + 0.05
+        clock = clock_by_motion(times, places, samples, others + 1e-4 * rng.normal(size=others.shape))
+        off.append((clock.offset - true) / clock.error)
+        assert abs(clock.offset - true) < 2e-3
+    assert 0.7 < np.std(off) < 1.5
+    still = np.tile(others[:1], (len(samples), 1)) + 1e-5 * rng.normal(size=others.shape)
+    with pytest.raises(ValueError, match="Move the tool"):
+        clock_by_motion(times, places[:1] + 1e-5 * rng.normal(size=places.shape), samples, still)
+    turning = np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in samples])
+    with pytest.raises(ValueError, match="more than one offset"):
+        clock_by_motion(times, np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in times]), samples, turning)
+    with pytest.raises(ValueError, match="pictures show what the poses have"):
+        clock_by_motion(times[:3], places[:3], samples, others)
+    with pytest.raises(ValueError, match="end before the pictures"):
+        clock_by_motion(3.0 * times, places, samples, others)
+
+
+@pytest.fixture(scope="module")
+def stage():
+    return template_theatre().stage(find_scene("palpate"))
+
+
+@pytest.fixture(scope="module")
+def bodies(stage):
+    """Where tool and reference are in the tracker's frame at a time of the film; the head sways."""
+    registration, tool = read_registration(FILM / "registration.json"), read_tool(FILM / "tool.json")
+    scene = find_scene("palpate")
+
+    def head(time):
+        return moved_about(TRACKER, np.zeros(3), np.array([0.0, 2e-3 * np.sin(4.0 * time), 0.0, 0.0, 0.0, 0.0]))
+
+    return {
+        "tool": lambda time: head(time) @ scene.pose(stage.site, scene.path(time)) @ np.linalg.inv(tool.T_cube_tool),
+        "patient": lambda time: head(time) @ np.linalg.inv(registration.T_patient_scan),
+        "head": head,
+    }
+
+
+@pytest.fixture(scope="module")
+def follower(stage):
+    read = read_registration(FILM / "registration.json"), read_tool(FILM / "tool.json")
+    return Follower(read_calibration(FILM / "camera.yaml"), *read, ToolMotion(stage))
+
+
+def tips(follower, elsewhere, truth):
+    """How far off the tool's tip is in the scan [m], and deviations, where it is known."""
+    out = []
+    for row, time in enumerate(truth.times):
+        beside = elsewhere.beside(time)
+        if beside is not None:
+            there = follower.registration.T_patient_scan @ [*truth.T_scan_tool[row][:3, 3], 1.0]
+            place, spread = beside.point(follower.tool.T_cube_tool[:3, 3])
+            out.append((np.linalg.norm(place - there[:3]), np.sqrt(np.trace(spread))))
+    return np.array(out).T
+
+
+def test_a_tool_in_a_film_is_where_another_tracker_has_it(follower, stage, bodies):
+    truth = read_truth(FILM / "truth.npz", stage.anatomy.digest, len(stage.tumour_vertices))
+    rng, late = np.random.default_rng(0), 0.06
+    times = np.arange(-0.5, 3.5, 1.0 / 30.0)
+    streams = [sampled(bodies[name], times, rng, DAY - 1.0 + late) for name in ("tool", "patient")]
+    right = Elsewhere(*streams, Clock(DAY - 1.0 + late, 2e-3))
+    wrong = replace(right, clock=Clock(DAY - 1.0))
+    (off, spread), (late_off, _) = tips(follower, right, truth), tips(follower, wrong, truth)
+    assert len(off) == len(truth.times) and off.max() < 6e-4 and (off < 3.0 * spread).all()
+    assert late_off.max() > 5e-4 and late_off.max() > 2.0 * off.max()
+    eye = Eye(np.linalg.inv(truth.T_camera_scan[0] @ np.linalg.inv(bodies["head"](0.0))), 1e-2 * NOISE)
+    looked = replace(right, eye=eye).reference(0.0)
+    true = truth.T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
+    step = twist(looked.T_camera_target, true)
+    assert np.linalg.norm(step[:3]) < 1e-3 and step @ np.linalg.solve(looked.covariance, step) < chi2.ppf(0.999, 6)
+    riding = replace(eye, body=sampled(lambda time: np.eye(4), times, offset=DAY - 1.0 + late))
+    np.testing.assert_allclose(replace(right, eye=riding).reference(0.0).T_camera_target, looked.T_camera_target)
+
+
+def test_a_picture_without_poses_is_stale(follower, bodies):
+    times = np.arange(0.0, 0.45, 0.025)
+    other = Elsewhere(*(sampled(bodies[name], times) for name in ("tool", "patient")))
+    one, known, said = replace(follower, elsewhere=other), None, []
+    one = replace(one, motion=replace(one.motion, deformer=Still()))
+    for each in timed(film_of(FILM / "film.mp4", 30.0)):
+        if each.picture.time > 0.9:
+            break
+        known = one.step(each.picture.grey, each.picture.time, known)
+        said.append((known.state, known.words))
+    assert [state for state, _ in said[:4]] == [State.REST] * 4
+    assert said[5] == (State.NO_TOOL, "tool stale, no pose for 0.2 s: the tumour as 0.3 s ago")
+    assert said[4][0] is State.NO_REFERENCE  # the film is over-exposed there
+
+
+class Still:
+    """A deformer of a brain that does not move."""
+
+    def deform(self, loads, start=None, at=None):
+        from scenes.play.overlay.drawn_film import Dent
+
+        found = Dent(template_theatre().anatomy, template_theatre().site).deform(loads)
+        return replace(found, displacement=0.0 * found.displacement)
+
+
+def written(path, stream):
+    rows = [
+        TrackedRow(time % DAY, Verdict.GOOD, Pose(T, covariance, 0.0, 0), 0.0)
+        for time, T, covariance in zip(stream.times.tolist(), stream.poses, stream.covariances, strict=True)
+    ]
+    write_poses(path, rows, np.zeros(3))
+    return str(path)
+
+
+def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys):
+    times, rng = np.arange(-0.5, 3.5, 0.025), np.random.default_rng(2)
+    files = [
+        written(tmp_path / f"{name}.csv", sampled(bodies[name], times, rng, DAY - 1.0)) for name in ("tool", "patient")
+    ]
+    again = read_stream(files[0])
+    assert again.daily and again.times[-1] > DAY and again.covariances[0, 0, 0] == pytest.approx(1e-8)
+    given = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]
+    words = ["overlay", str(FILM / "film.mp4"), *given, "--tool", str(FILM / "tool.json"), "--poses", *files]
+    quick = ["--deformer", "rest", "--device", "cpu", "--json"]
+    assert main([*words, "--clock", "auto", *quick]) == 1  # nobody says how the brain moved
+    out, err = capsys.readouterr()
+    said = json.loads(out)
+    assert said["tool_seen_percent"] == said["reference_seen_percent"] > 70.0
+    assert said["states"][State.UNKNOWN.value] == 11
+    offset, error = (float(part.split()[0]) for part in (err.split("clock is ")[1], err.split("+- ")[1]))
+    assert abs(offset - (DAY - 1.0)) < 5.0 * error < 0.05
+    for more, why in (
+        (["--clock", "soon"], "give seconds"),
+        (["--camera-poses", files[0]], "give --hand-eye"),
+        (["--hand-eye", files[0]], "hand-eye calibration"),
+    ):
+        assert main([*words, *more]) == 2
+        assert why in capsys.readouterr().err
+    assert main([*words[:-3], "--clock", "1"]) == 2 and "give --poses, too" in capsys.readouterr().err
+    stored = {"rotation": np.eye(3).tolist(), "shift_mm": [1.0, 2.0, 3.0], "rms_degrees": 0.1, "rms_mm": 0.5}
+    (tmp_path / "h.json").write_text(json.dumps(stored))
+    X, covariance = read_hand_eye(tmp_path / "h.json")
+    assert X[1, 3] == pytest.approx(2e-3) and covariance[0, 0] == pytest.approx(2.5e-7)
+    (tmp_path / "h.json").write_text(json.dumps(stored | {"rotation": (2.0 * np.eye(3)).tolist()}))
+    with pytest.raises(InputError, match="its rotation is none"):
+        read_hand_eye(tmp_path / "h.json")
