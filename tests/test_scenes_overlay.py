@@ -21,6 +21,7 @@ from ar.tracking.pictures import Named, film_of
 from scenes.cli import main
 from scenes.play.overlay.follower import HELD, State
 from scenes.play.overlay.picture import Painter
+from scenes.play.overlay.plausible import implausible
 from scenes.play.overlay.run import Timed, aged, overlaid, paced, timed
 from scenes.play.overlay.tool_motion import ToolMotion
 from scenes.play.overlay.truth import off, summary
@@ -115,6 +116,26 @@ def test_a_registration_that_is_not_sure_is_in_the_band_and_beyond_a_limit_not_t
         assert known.state is state and known.parts["registration"] == pytest.approx(2.448 * shift, rel=1e-3)
         assert known.band == pytest.approx(2.448 * shift, rel=0.02)
         assert ("do not rely" in known.words) is (state is State.UNSURE)
+
+
+def test_a_registration_of_another_patient_is_noticed(follower, stage):
+    first = next(iter(pictures())).picture
+    T = follower.registration.T_patient_scan.copy()
+    T[:3, 3] += [0.0, 0.0, -0.4]
+    other = replace(follower, registration=replace(follower.registration, T_patient_scan=T))
+    known = other.step(first.grey, 0.0)
+    assert known.state is State.UNSURE and known.band is None and "mm from the reference" in known.words
+    painted = Painter(stage, follower.tool).paint(first.colour, known).colour
+    assert np.count_nonzero(of_ink(painted, INK)) < 5
+    near = follower.step(first.grey, 0.0)
+    behind = replace(near.camera, T_camera_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ near.camera.T_camera_world)
+    assert "behind the camera" in implausible(follower.registration, stage, behind)
+    long = follower.tool.T_cube_tool @ [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.4], [0, 0, 0, 1.0]]
+    away = replace(follower, tool=replace(follower.tool, T_cube_tool=long))
+    known = away.step(first.grey, 0.0)
+    assert known.state is State.UNSURE and "no nearer to the head than 200 mm" in known.words and not known.near
+    assert near.near and away.step(first.grey, 0.1, near).near  # it has been there
+    assert "head" not in away.step(first.grey, 0.1, near).words
 
 
 def test_a_tool_s_error_is_in_the_band_by_what_a_deeper_one_does(follower, truth, stage):
@@ -231,6 +252,13 @@ def test_what_does_not_belong_together_is_refused(tmp_path, capsys):
     out = tmp_path / "none.mp4"
     assert "calibrate it at this size" in refused("--out", str(out), film=str(small))
     assert not list(tmp_path.glob("*none*"))
+    # What is quickly read is read before anatomy and models.
+    assert "calibrate it at this size" in refused("--model", str(small / "a.png"), film=str(small))
+    assert "none.vtu: no such file" in refused("--anatomy", str(tmp_path / "none.vtu"))
+    stored = json.loads((FILM / "registration.json").read_text())
+    made = {"anatomy": "another", "bounds_mm": [[0, 0, 0], [9, 9, 9]], "tumour_mm": [1, 2, 3]}
+    (tmp_path / "r.json").write_text(json.dumps(stored | {"scanned": made}))
+    assert "was made for another anatomy" in refused("--registration", str(tmp_path / "r.json"))
     blank = tmp_path / "blank"
     blank.mkdir()
     cv2.imwrite(str(blank / "a.png"), np.full((720, 960, 3), 120, np.uint8))

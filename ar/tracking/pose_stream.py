@@ -76,7 +76,7 @@ class PoseStream:
         return np.inf if first < 0 else float(time - self.times[first])
 
     def in_its_day(self, time: float) -> float:
-        """A time [s] as this stream's clock has it: of a clock of 24 hours, on the day that is nearest to its samples."""
+        """A time [s] as this stream's clock has it: of a clock of 24 hours, on the day nearest to its samples."""
         if not self.daily:
             return time
         middle = 0.5 * float(self.times[0] + self.times[-1])

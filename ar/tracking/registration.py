@@ -28,6 +28,29 @@ Nearest = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
+class Scanned:
+    """What a registration was made for.
+
+    Parameters
+    ----------
+    digest
+        Of the body, as it was meshed.
+    bounds
+        (2, 3) [m]: the least and largest coordinates of its surface in the scan.
+    target
+        (3,) [m]: the middle of what is shown in it.
+    """
+
+    digest: str
+    bounds: np.ndarray
+    target: np.ndarray
+
+    def apart(self, other: Scanned) -> float:
+        """How far two bodies' bounds and targets are from each other, at most [m]."""
+        return float(max(np.abs(self.bounds - other.bounds).max(), np.linalg.norm(self.target - other.target)))
+
+
+@dataclass(frozen=True, eq=False)
 class Registration:
     """How the scan lies in the frame of the patient's reference.
 
@@ -44,6 +67,8 @@ class Registration:
         Root mean square distance [m] that is left between the pairs.
     pairs, surface
         How many points of each kind there are.
+    scanned
+        What it was made for, where that is known.
     """
 
     T_patient_scan: np.ndarray
@@ -52,6 +77,7 @@ class Registration:
     rms: float
     pairs: int
     surface: int = 0
+    scanned: Scanned | None = None
 
     def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A place in the scan (3,) [m] in the reference's frame (3,) [m], and its covariance (3, 3) [m^2]."""
@@ -78,7 +104,7 @@ def registered(scan: np.ndarray, patient: np.ndarray) -> Registration:
     _demand_fit(scan, patient, off)
     centre = scan.mean(axis=0)
     freedom = 3 * len(scan) - 6
-    J = _slopes(T, scan, centre) / _scatter(off, freedom)
+    J = slopes_of(T, scan, centre) / _scatter(off, freedom)
     return Registration(T, _widened(J.T @ J, freedom), centre, _rms(off), len(scan))
 
 
@@ -106,8 +132,8 @@ def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Ne
         turned = outward @ T[:3, :3].T
         away = np.einsum("ni,ni->n", turned, place @ T[:3, :3].T + T[:3, 3] - seen)
         traced = _scatter(away, len(seen))
-        J = _slopes(T, scan, centre) / touched
-        K = np.einsum("ni,nij->nj", turned, _slopes(T, place, centre).reshape(-1, 3, 6)) / traced
+        J = slopes_of(T, scan, centre) / touched
+        K = np.einsum("ni,nij->nj", turned, slopes_of(T, place, centre).reshape(-1, 3, 6)) / traced
         normal = J.T @ J + K.T @ K
         step = -np.linalg.solve(normal, J.T @ off.ravel() / touched + K.T @ away / traced)
         T = moved_about(T, centre, step)
@@ -169,7 +195,7 @@ def _fitted(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return T, scan @ T[:3, :3].T + T[:3, 3] - patient
 
 
-def _slopes(T: np.ndarray, scan: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def slopes_of(T: np.ndarray, scan: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """(3 n, 6): how places of the scan (n, 3) move in the reference's frame by a shift, and a turn about the centre."""
     arms = (scan - centre) @ T[:3, :3].T
     return np.concatenate([np.broadcast_to(np.eye(3), (len(scan), 3, 3)), -cross_matrices(arms)], axis=2).reshape(-1, 6)

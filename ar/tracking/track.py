@@ -68,11 +68,7 @@ class Tracker:
         ValueError
             A picture of another size or kind.
         """
-        if grey.shape != (self.camera.height, self.camera.width) or grey.dtype != np.uint8:
-            raise ValueError(
-                f"the picture is {' x '.join(map(str, grey.shape[::-1]))} of {grey.dtype}, and the camera takes "
-                f"{self.camera.width} x {self.camera.height} grey pixels of 8 bits: calibrate it at this size."
-            )
+        demand_picture(grey, self.camera.width, self.camera.height)
         number = 0 if before is None else before.number + 1
         last = {} if before is None else {k: each for k, each in before.last.items() if number - each[1] <= STALE}
         found = self._seen(grey, number, last)
@@ -99,3 +95,18 @@ class Tracker:
         if missing and (just_left or number % SEARCHED == 0):
             found |= self._detector.seen(grey, missing)
         return found
+
+
+def demand_picture(grey: np.ndarray, width: int, height: int) -> None:
+    """Refuse a picture that a camera of so many pixels does not take.
+
+    Raises
+    ------
+    ValueError
+        A picture of another size or kind.
+    """
+    if grey.shape != (height, width) or grey.dtype != np.uint8:
+        raise ValueError(
+            f"the picture is {' x '.join(map(str, grey.shape[::-1]))} of {grey.dtype}, and the camera takes "
+            f"{width} x {height} grey pixels of 8 bits: calibrate it at this size."
+        )

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.deformers import open_theatre
     from ..play.stage import Stage
     from ..script.reference_place import reference_beside
-    from ..script.registration_file import read_registration
+    from ..script.registration_file import other_mesh, read_registration
 
     at_least("--draws", args.draws, FEWEST)
     at_least("--samples", args.samples, FEWEST_SAMPLES)
@@ -109,6 +109,8 @@ def run(args: argparse.Namespace) -> int:
     assert calibration is not None
     known = _known(args, calibration)
     registration = None if args.registration is None else read_registration(args.registration)
+    if registration is not None:
+        other_mesh(registration, theatre.anatomy, args.registration)
     still = nominal(theatre, scene)
     bodies = _bodies(args, theatre, scene, args.draws, args.seed)
     number = moment_of(still, [answer for _, answer in bodies], [draw for draw, _ in bodies])

@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     demand_poses(args)
     out = None if args.out is None else _film_path(args.out, args.force, inputs)
     table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, inputs)
-    parts = _parts(args)
+    parts = _parts(args, film=True)
     stage = parts.painter.stage
     truth = None
     if args.truth is not None:
@@ -141,7 +141,7 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, [args.camera])
     try:
         check_address(HOST, args.port)
-        parts = _parts(args)
+        parts = _parts(args, film=not camera)
         shown = (_camera_shown if camera else _film_shown)(args, parts, closing)
     except (ValueError, OSError, UnguardedError) as error:
         raise InputError(str(error)) from error
@@ -195,8 +195,22 @@ def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path
     return claimed(path, path.suffix, "a film of `sulcus render`", force, inputs)
 
 
-def _parts(args: argparse.Namespace) -> Parts:
-    """Read what the pictures are looked at with."""
+def _demand_film(args: argparse.Namespace, calibration: Calibration) -> None:
+    """Refuse what is no film, or one of another camera, before anything that takes long is read."""
+    from ar.tracking.pictures import GIVE, film_of
+    from ar.tracking.track import demand_picture
+
+    try:
+        first = next(iter(film_of(Path(args.pictures), args.rate)), None)
+        if first is None:
+            raise InputError(f"{args.pictures}: holds no picture. {GIVE}")
+        demand_picture(first.grey, calibration.width, calibration.height)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+
+
+def _parts(args: argparse.Namespace, film: bool) -> Parts:
+    """Read what the pictures are looked at with; what is quickly read comes first."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
@@ -206,13 +220,23 @@ def _parts(args: argparse.Namespace) -> Parts:
     from ..play.overlay.picture import Painter
     from ..play.overlay.tool_motion import ToolMotion
     from ..script.calibration_file import read_calibration
-    from ..script.registration_file import read_registration
+    from ..script.registration_file import other_mesh, read_registration
     from ..script.tracked_tool import read_tool
 
+    if args.tool is None and args.deformer not in (None, REST):
+        raise InputError(f"--deformer {args.deformer} answers for a tool's poses: give --tool TOOL.json, too.")
+    for path in (args.anatomy, args.model, args.truth):
+        if path is not None and not Path(path).is_file():
+            raise InputError(f"{path}: no such file. See whether its name is right.")
     calibration, registration = read_calibration(args.camera), read_registration(args.registration)
+    if film:
+        _demand_film(args, calibration)
     tool = None if args.tool is None else read_tool(args.tool)
     elsewhere = elsewhere_of(args, calibration)
     theatre = open_theatre(args.anatomy, args.model, args.device)
+    said = other_mesh(registration, theatre.anatomy, args.registration)
+    if said:
+        print(f"sulcus overlay: {said}", file=sys.stderr)
     scene = _scene(args, None if tool is None else tool.shape)
     stage = theatre.stage(scene)
     deformer, who = _deformer(args, theatre, scene, tool is not None)
@@ -238,8 +262,6 @@ def _deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: 
     """Who says how the brain lies, and that in words."""
     still = "nobody: the brain stays as in the scan"
     if not tooled:
-        if args.deformer not in (None, REST):
-            raise InputError(f"--deformer {args.deformer} answers for a tool's poses: give --tool TOOL.json, too.")
         return None, still
     name = args.deformer
     if name is None and not theatre.knowing(scene):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from .json_line import json_line
 from .outputs import add_force, claimed
 
 if TYPE_CHECKING:
+    from ar.tracking.pair_residuals import PairResiduals
     from ar.tracking.registration import Nearest, Registration
     from sim.anatomy import Anatomy
 
@@ -45,11 +47,12 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Files that cannot be read or written, a surface without anatomy, or points that determine no registration.
     """
+    from ar.tracking.pair_residuals import pair_residuals
     from ar.tracking.registration import refined, registered
     from sim import read_anatomy
     from surrogate.locating.observed_files import read_columns
 
-    from ..script.registration_file import as_stored, write_registration
+    from ..script.registration_file import as_stored, scanned_of, write_registration
 
     if args.surface is not None and args.anatomy is None:
         raise InputError("--surface is traced on an anatomy: give it by --anatomy.")
@@ -65,14 +68,17 @@ def run(args: argparse.Namespace) -> int:
             traced = read_columns(args.surface, {("px", "py", "pz")})
             seen = 1e-3 * np.column_stack([traced[name] for name in ("px", "py", "pz")])
             found = refined(scan, patient, seen, _nearest_on(anatomy))
+        fits = pair_residuals(scan, patient)
     except ValueError as error:
         raise InputError(f"{source}: {error}") from error
+    found = found if anatomy is None else replace(found, scanned=scanned_of(anatomy))
     write_registration(out, found)
     target = None if anatomy is None else _error_at_tumour(found, anatomy)
     if args.json:
         figures = {} if target is None else {"tumour_p95_mm": 1e3 * target[1], "along_mm": target[0].tolist()}
-        print(json_line({"out": str(out), **as_stored(found), **figures}))
+        print(json_line({"out": str(out), **as_stored(found), **figures, **_stored(fits)}))
         return 0
+    print("\n".join(_table(fits)))
     print(f"{found.pairs} pairs fit to {1e3 * found.rms:.2f} mm (rms); that is not the error at the tumour")
     if target is None:
         print("give --anatomy for that error")
@@ -80,6 +86,35 @@ def run(args: argparse.Namespace) -> int:
         print(f"the tumour's middle is within {1e3 * target[1]:.1f} mm in the patient's frame (95 %), by these points")
     print(f"written: {out}")
     return 0
+
+
+def _stored(fits: PairResiduals) -> dict[str, object]:
+    """How the pairs fit, for machines."""
+    return {
+        "residuals_mm": (1e3 * fits.off).tolist(),
+        "left_out_mm": (1e3 * fits.left_out).tolist(),
+        "studentised": fits.studentised.tolist(),
+        "worst_pair": fits.worst + 1,
+        "chance": fits.chance,
+        "suspect": fits.suspect,
+    }
+
+
+def _table(fits: PairResiduals) -> list[str]:
+    """The same for people: a row for each pair, and what the worst one means."""
+    if np.isnan(fits.chance):
+        rows = [f"{row + 1:4d} {1e3 * off:7.2f} mm" for row, off in enumerate(fits.off)]
+        return ["pair   is off", *rows, "three pairs do not tell a wrong one: touch a fourth, better six"]
+    lines = ["pair   is off   beside the others   of what they allow"]
+    for row, (off, left, times) in enumerate(zip(fits.off, fits.left_out, fits.studentised, strict=True)):
+        lines.append(f"{row + 1:4d} {1e3 * off:5.2f} mm {1e3 * left:16.2f} mm {times:17.1f} x")
+    worst = fits.worst
+    if fits.suspect:
+        lines.append(
+            f"pair {worst + 1} is suspect: it lies {1e3 * fits.left_out[worst]:.1f} mm from where the others have it. In "
+            f"{100.0 * fits.chance:.2g} % of sound sets one fits as badly. Touch it again, or leave it out"
+        )
+    return lines
 
 
 def _nearest_on(anatomy: Anatomy) -> Nearest:

@@ -88,11 +88,11 @@ def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise InputError(
             f"{path}: row {odd[0] + 2} has a quaternion of length {lengths[odd[0]]:.3g}: give qx,qy,qz,qw of length 1."
         )
-    poses = np.full((len(kept), 4, 4), np.nan)
+    poses = np.full((len(turns), 4, 4), np.nan)
     poses[kept] = np.eye(4)
     poses[kept, :3, :3] = Rotation.from_quat(turns[kept]).as_matrix()
     poses[kept, :3, 3] = places[kept]
-    return columns[TIME], poses, _covariances(columns, len(kept))
+    return columns[TIME], poses, _covariances(columns, len(turns))
 
 
 def _covariances(columns: dict[str, np.ndarray], count: int) -> np.ndarray:

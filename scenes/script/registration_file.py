@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ar.tracking.registration import Registration
+from ar.tracking.registration import Registration, Scanned
 from ar.tracking.rigid import is_rigid
+from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import path_of, read_as
@@ -19,6 +20,8 @@ WANTED = "Make one by `sulcus register`."
 LARGEST, RIGID = 1 << 16, 1e-4
 # A covariance's eigenvalues may be below 0 by this share of the largest, by rounding.
 ROUNDING = 1e-9
+# Two meshes of one scan are no farther apart, bounds and tumour [m].
+SAME = 5e-3
 _UNITS = np.repeat([1e3, 1.0], 3)
 
 
@@ -54,7 +57,42 @@ def read_registration(path: str | Path) -> Registration:
         if not np.isfinite(centre).all():
             raise InputError("its centre is not finite.")
         counts = int(stored["pairs"]), int(stored["surface"])
-        return Registration(T, covariance, centre, 1e-3 * float(stored["rms_mm"]), *counts)
+        scanned = _scanned(stored["scanned"]) if "scanned" in stored else None
+        return Registration(T, covariance, centre, 1e-3 * float(stored["rms_mm"]), *counts, scanned)
+
+
+def _scanned(stored: dict) -> Scanned:
+    bounds, target = 1e-3 * np.array(stored["bounds_mm"], float), 1e-3 * np.array(stored["tumour_mm"], float)
+    if bounds.shape != (2, 3) or target.shape != (3,) or not (np.isfinite(bounds).all() and np.isfinite(target).all()):
+        raise InputError("what it was made for has other numbers than bounds 2 x 3 and a tumour's middle of 3.")
+    return Scanned(str(stored["anatomy"]), bounds, target)
+
+
+def scanned_of(anatomy: Anatomy) -> Scanned:
+    """What a registration to the scan of an anatomy is made for; without a tumour its middle stands for that."""
+    nodes = anatomy.mesh.nodes
+    bounds = np.stack([nodes.min(axis=0), nodes.max(axis=0)])
+    tumour = nodes[anatomy.tumour_nodes] if len(anatomy.tumour_nodes) else bounds
+    return Scanned(anatomy.digest, bounds, tumour.mean(axis=0))
+
+
+def other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -> str:
+    """Say that a registration in a file was made for another mesh of the same scan; empty where it was not.
+
+    Raises
+    ------
+    InputError
+        One that was made for another body: its bounds or its tumour lie more than 5 mm from the anatomy's.
+    """
+    made, here = registration.scanned, scanned_of(anatomy)
+    if made is None or made.digest == here.digest:
+        return ""
+    if made.apart(here) > SAME:
+        raise InputError(
+            f"{path}: was made for another anatomy: bounds or tumour are {1e3 * made.apart(here):.0f} mm from those of "
+            "this one. Give the --anatomy that was registered, or register this one."
+        )
+    return f"{path} was made for another mesh of what seems to be the same scan"
 
 
 def _demand_covariance(covariance: np.ndarray) -> None:
@@ -68,6 +106,16 @@ def as_stored(registration: Registration) -> dict[str, object]:
     """What a file holds of a registration."""
     T = registration.T_patient_scan.copy()
     T[:3, 3] *= 1e3
+    made = registration.scanned
+    scanned = (
+        {}
+        if made is None
+        else {
+            "anatomy": made.digest,
+            "bounds_mm": (1e3 * made.bounds).tolist(),
+            "tumour_mm": (1e3 * made.target).tolist(),
+        }
+    )
     return {
         "format": FORMAT,
         "T_patient_scan_mm": T.tolist(),
@@ -76,6 +124,7 @@ def as_stored(registration: Registration) -> dict[str, object]:
         "rms_mm": 1e3 * registration.rms,
         "pairs": registration.pairs,
         "surface": registration.surface,
+        **({} if made is None else {"scanned": scanned}),
     }
 
 

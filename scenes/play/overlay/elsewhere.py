@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class Elsewhere:
 
     tool: PoseStream
     patient: PoseStream
-    clock: Clock = Clock()
+    clock: Clock = field(default_factory=Clock)
     eye: Eye | None = None
 
     def beside(self, time: float) -> Pose | None:

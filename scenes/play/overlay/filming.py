@@ -22,6 +22,7 @@ from sim.errors import InputError
 from sim.tools import BuiltIn
 
 from ...script.reference_place import reference_beside
+from ...script.registration_file import scanned_of
 from ...script.tracked_tool import TrackedTool
 from ..player import Player
 from ..stage import TOOL, TOOL_COLOUR
@@ -139,7 +140,7 @@ def registered(player: Player, mounts: Mounted, shift: float, turn: float, seed:
     error = deviations * np.random.default_rng([seed, 1]).standard_normal(6)
     centre = player.site.origin
     T = moved_about(np.linalg.inv(mounts.T_scan_patient), centre, error)
-    return Registration(T, np.diag(deviations**2), centre, 0.0, 0)
+    return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scanned=scanned_of(player.site.anatomy))
 
 
 def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[Shot]:

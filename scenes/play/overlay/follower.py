@@ -20,6 +20,7 @@ from ar.tracking.track import Tracked, Tracker
 from ...script.tracked_tool import TrackedTool
 from ...script.uncertainty import LEVEL
 from .elsewhere import Elsewhere
+from .plausible import NEAR, from_head, implausible
 from .tool_motion import Motion, ToolMotion
 
 # So long a picture's overlay stays where it was when the reference is lost, and so long pictures may be missing [s].
@@ -73,6 +74,8 @@ class Known:
         When the reference, and the tool beside it, were seen last [s]; None: never.
     interval
         The shortest between two pictures so far [s].
+    near
+        Whether the tool has been near the head: until then its place may be due to another patient's registration.
     """
 
     time: float
@@ -88,6 +91,7 @@ class Known:
     seen: float | None = None
     felt: float | None = None
     interval: float = SLOWEST
+    near: bool = False
 
     @property
     def relied(self) -> bool:
@@ -139,6 +143,7 @@ class Follower:
         if before is None:
             return known
         apart = time - before.time
+        known = replace(known, near=known.near or before.near)
         return replace(known, interval=min(before.interval, apart) if apart > 0.0 else before.interval)
 
     def _looked(self, grey: np.ndarray, time: float, before: Known | None) -> Known:
@@ -158,7 +163,11 @@ class Follower:
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
         band, parts = self._band(reference, middle, known.motion)
         known = replace(known, camera=camera, band=band, parts=parts, seen=time)
-        if known.state is State.UNKNOWN:
+        doubt, near = self._implausible(camera, known.T_scan_tool, before)
+        known = replace(known, near=near)
+        if doubt:
+            known = replace(known, state=State.UNSURE, words=doubt)
+        if doubt or known.state is State.UNKNOWN:
             known = replace(known, band=None, parts={})
         if stale and apart is not None:
             why = f"no picture for {apart:.1f} s" if apart > 0.0 else "the camera repeats a picture"
@@ -167,6 +176,16 @@ class Follower:
             words = f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
             return replace(known, state=State.UNSURE, words=words)
         return known
+
+    def _implausible(self, camera: Camera, tool: np.ndarray | None, before: Known | None) -> tuple[str, bool]:
+        """Why this can be no registration of this patient, in words; and whether the tool has been near the head."""
+        stage, near = self.motion.stage, before is not None and before.near
+        away = 0.0 if tool is None else from_head(tool[:3, 3], stage)
+        near = near or (tool is not None and away <= NEAR)
+        doubt = implausible(self.registration, stage, camera)
+        if not doubt and away > NEAR and not near:
+            doubt = f"the tool has been no nearer to the head than {1e3 * NEAR:.0f} mm: is this its registration?"
+        return doubt, near
 
     def _without_reference(self, tracked: Tracked, time: float, before: Known | None) -> Known:
         """The reference is not seen: for a moment the overlay stays where it was."""

@@ -88,8 +88,8 @@ class Painter:
         return Layer("tool", TOOL, vertices @ pose[:3, :3].T + pose[:3, 3], triangles, TOOL_COLOUR)
 
     def gauge(self, known: Known, tumour: Layer) -> Gauge | None:
-        """From the tool's tip to the tumour, with the error of both; None where the tool is not seen."""
-        if known.T_scan_tool is None or known.tip_covariance is None:
+        """From the tool's tip to the tumour, with the error of both; None where one is not known."""
+        if known.T_scan_tool is None or known.tip_covariance is None or known.band is None:
             return None
         gauge = gauged(known.T_scan_tool[:3, 3], tumour)
         along = (gauge.nearest - gauge.tip) / max(gauge.distance, np.finfo(float).tiny)
