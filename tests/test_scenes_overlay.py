@@ -13,7 +13,7 @@ from films import FILM, Plugged, Recorded, follower_of, truth_of
 from theatres import template_theatre
 
 from ar.overlay.outlines import ink_of, silhouette
-from ar.overlay.refind import of_ink, outline_gap
+from ar.overlay.refind import changed_share, of_ink, outline_gap
 from ar.rendering.layer import Layer
 from ar.rendering.real_picture import real_picture
 from ar.tracking.live_camera import camera_pictures, newest
@@ -25,7 +25,7 @@ from scenes.play.overlay.plausible import implausible
 from scenes.play.overlay.run import Timed, aged, overlaid, paced, timed
 from scenes.play.overlay.tool_motion import ToolMotion
 from scenes.play.overlay.truth import off, summary
-from scenes.play.stage import TUMOUR_COLOUR
+from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
 from scenes.script.calibration_file import read_calibration
 from scenes.script.film_truth import read_truth
 from scenes.script.scene import find_scene
@@ -94,6 +94,16 @@ def test_the_outline_in_the_pixels_is_where_the_tumour_is(shown, truth, calibrat
         mask = silhouette(camera, true, stage.tumour_at_rest.triangles)
         covered = silhouette(camera, vertices @ pose[:3, :3].T + pose[:3, 3], triangles)
         assert outline_gap(each.colour, INK, mask, covered) < 2.5
+
+
+def test_under_the_drape_that_a_film_has_nothing_shines_through(shown, truth, calibration, stage, follower):
+    each, known = next(islice(pictures(), 6, None)).picture, shown[6].known
+    painted = Painter(stage, follower.tool).paint(each.colour, known).colour
+    camera, tumour = calibration.camera(truth.T_camera_scan[6]), stage.tumour(known.motion.positions)
+    seen = stage.picture(camera, known.motion.positions, None).segmentation
+    mask = silhouette(camera, tumour.vertices, tumour.triangles)
+    under, through = (changed_share(each.colour, painted, mask & (seen == ground)) for ground in (DRAPE, CORTEX))
+    assert under < 0.03 and through > 0.8
 
 
 def test_it_is_no_farther_off_than_it_says(shown, truth, calibration, stage):

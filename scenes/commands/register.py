@@ -111,8 +111,8 @@ def _table(fits: PairResiduals) -> list[str]:
     worst = fits.worst
     if fits.suspect:
         lines.append(
-            f"pair {worst + 1} is suspect: it lies {1e3 * fits.left_out[worst]:.1f} mm from where the others have it. In "
-            f"{100.0 * fits.chance:.2g} % of sound sets one fits as badly. Touch it again, or leave it out"
+            f"pair {worst + 1} is suspect: it lies {1e3 * fits.left_out[worst]:.1f} mm from where the others have it. "
+            f"In {100.0 * fits.chance:.2g} % of sound sets one fits as badly. Touch it again, or leave it out"
         )
     return lines
 

@@ -26,7 +26,7 @@ from .follower import Known, State
 ABOVE = "the tool does not touch: as in the scan"
 NOT_KNOWN = "error by tissue and segmentation: not known"
 SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
-"""Only the opening in the skull is known."""
+"""Where the drape has its hole, the opening is; all else may be bone."""
 IN_GREY = (State.NO_TOOL, State.STALE, State.NO_REFERENCE)
 """States in which the tumour is drawn in grey, and dotted."""
 
@@ -75,9 +75,9 @@ class Painter:
         )  # fmt: skip
 
     def _layers(self, known: Known) -> list[Layer]:
-        """The open cortex, under which the tumour is seen, and the tool, which is in front."""
+        """The open cortex, under which the tumour is seen, the drape round it as films have it, and the tool."""
         tool = self.held(known)
-        return [self.stage.cortex(known.motion.positions), *([] if tool is None else [tool])]
+        return [*self.stage.layers(known.motion.positions, None), *([] if tool is None else [tool])]
 
     def held(self, known: Known, cubed: bool = True) -> Layer | None:
         """The tool where it is seen, with its cube or without."""
