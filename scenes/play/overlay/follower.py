@@ -23,8 +23,9 @@ from .elsewhere import Elsewhere
 from .plausible import NEAR, from_head, implausible
 from .tool_motion import Motion, ToolMotion
 
-# So long a picture's overlay stays where it was when the reference is lost, and so long pictures may be missing [s].
-HELD, GAP = 0.2, 0.2
+# So long a picture's overlay stays where it was when the reference is lost: in a hand's picture it is off by less than
+# LIMIT then. And so long pictures may be missing [s].
+HELD, GAP = 0.1, 0.2
 # A slow film's pictures may be apart by so many of its own intervals, which are no longer than this [s].
 MISSED, SLOWEST = 1.5, 1.0
 # Times of pictures are rounded [s].
