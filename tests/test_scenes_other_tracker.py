@@ -1,26 +1,29 @@
-"""Poses of another tracker: between their samples, beside another clock, past midnight, and in a film's overlay."""
+"""What an overlay has from elsewhere: another tracker's poses and clock, past midnight too, and a camera's errors."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from theatres import template_theatre
 
+from ar.optics.lens import Lens
 from ar.tracking.clocks import Clock, clock_by_motion
 from ar.tracking.pictures import film_of
 from ar.tracking.pose import Pose, Verdict
 from ar.tracking.pose_stream import AHEAD, DAY, LONGEST, stream_of
 from ar.tracking.rigid import moved_about
+from ar.tracking.targets import patient_reference
 from scenes.cli import main
 from scenes.play.overlay.elsewhere import Elsewhere, Eye
 from scenes.play.overlay.follower import Follower, State
 from scenes.play.overlay.run import timed
 from scenes.play.overlay.tool_motion import ToolMotion
-from scenes.script.calibration_file import read_calibration
+from scenes.script.calibration_file import read_calibration, read_intrinsic_covariance
 from scenes.script.film_truth import read_truth
 from scenes.script.hand_eye_file import read_hand_eye
 from scenes.script.pose_file import TrackedRow, read_stream, write_poses
@@ -250,3 +253,49 @@ def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys)
     (tmp_path / "h.json").write_text(json.dumps(stored | {"rotation": (2.0 * np.eye(3)).tolist()}))
     with pytest.raises(InputError, match="its rotation is none"):
         read_hand_eye(tmp_path / "h.json")
+
+
+def test_a_calibration_s_error_is_in_the_band_as_far_as_the_reference_does_not_take_it_up(follower, stage, tmp_path):
+    follower = replace(follower, motion=replace(follower.motion, deformer=Still()))
+    first, deviations = (
+        next(iter(film_of(FILM / "film.mp4", 30.0))),
+        np.array([2, 2, 2, 2, 5e-3, 0.05, 3e-4, 3e-4, 0.1]),
+    )
+    stored = {"format": "sulcus intrinsics 1", "covariance": np.diag(deviations**2).tolist()}
+    (tmp_path / "k.json").write_text(json.dumps(stored))
+    known = replace(follower, intrinsic=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
+    rng, off = np.random.default_rng(0), []
+    reference = known.tracked.poses["patient"].T_camera_target
+    corners = patient_reference().faces[0].corners
+    for step in deviations * rng.normal(size=(100, 9)):
+        # What another camera would have seen, and what this one makes of it.
+        focal, principal = (np.array(each) for each in (follower.calibration.focal, follower.calibration.principal))
+        lens = Lens(*(np.ravel(follower.calibration.camera(np.eye(4)).distortion)[:5] + step[4:]))
+        other = replace(
+            follower.calibration, focal=(*(focal + step[:2]),), principal=(*(principal + step[2:4]),), lens=lens
+        )
+        pixels = other.camera(reference).project(corners)[0]
+        tumour = np.linalg.inv(reference) @ [
+            *known.camera.in_frame(stage.tumour_at_rest.vertices.mean(axis=0)[None])[0],
+            1.0,
+        ]
+        camera = follower.calibration.camera(np.eye(4))
+        fitted = fit(camera, corners, pixels, reference)
+        apart = camera.project((fitted @ tumour)[None, :3])[0] - other.camera(reference).project(tumour[None, :3])[0]
+        off.append(apart[0] * (fitted @ tumour)[2] / focal)
+    assert known.parts["camera"] == pytest.approx(
+        2.448 * np.linalg.svd(np.cov(np.transpose(off)))[1][0] ** 0.5, rel=0.25
+    )
+    assert known.band > known.parts["camera"] > 1e-4 and follower.step(first.grey, 0.0).parts["camera"] == 0.0
+    (tmp_path / "k.json").write_text(json.dumps(stored | {"covariance": [[1.0]]}))
+    with pytest.raises(InputError, match="none of 9 x 9"):
+        read_intrinsic_covariance(tmp_path / "k.yaml")
+    assert read_intrinsic_covariance(FILM / "camera.yaml") is None
+
+
+def fit(camera, corners, pixels, start):
+    turn, shift = cv2.Rodrigues(start[:3, :3])[0], start[:3, 3].reshape(3, 1).copy()
+    turn, shift = cv2.solvePnPRefineLM(corners, pixels, camera.K, camera.distortion, turn, shift)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    return T

@@ -49,9 +49,9 @@ class PairResiduals:
 def pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResiduals:
     """How pairs of points (n, 3) [m], in the scan and in the reference's frame, fit one another.
 
-    Externally studentised residuals (Cook, Weisberg 1982, "Residuals and influence in regression", chapter 2.2) of
-    three coordinates each: their squares are F-distributed with 3 and 3 n - 9 degrees of freedom. The chance of the
-    worst is that by Bonferroni.
+    Externally studentised residuals, of three coordinates each (Cook, Weisberg 1982, "Residuals and influence in
+    regression"). Their squares are F-distributed with 3 and 3 n - 9 degrees of freedom. The chance of the worst is
+    that by Bonferroni.
 
     Raises
     ------

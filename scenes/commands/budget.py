@@ -108,8 +108,9 @@ def run(args: argparse.Namespace) -> int:
     calibration, site = scene.viewpoint.calibration, theatre.site
     assert calibration is not None
     known = _known(args, calibration)
-    registration = None if args.registration is None else read_registration(args.registration)
-    if registration is not None:
+    registration = None
+    if args.registration is not None:
+        registration = read_registration(args.registration)
         other_mesh(registration, theatre.anatomy, args.registration)
     still = nominal(theatre, scene)
     bodies = _bodies(args, theatre, scene, args.draws, args.seed)

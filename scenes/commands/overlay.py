@@ -219,7 +219,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     from ..play.overlay.follower import Follower
     from ..play.overlay.picture import Painter
     from ..play.overlay.tool_motion import ToolMotion
-    from ..script.calibration_file import read_calibration
+    from ..script.calibration_file import read_calibration, read_intrinsic_covariance
     from ..script.registration_file import other_mesh, read_registration
     from ..script.tracked_tool import read_tool
 
@@ -229,6 +229,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
         if path is not None and not Path(path).is_file():
             raise InputError(f"{path}: no such file. See whether its name is right.")
     calibration, registration = read_calibration(args.camera), read_registration(args.registration)
+    intrinsic = read_intrinsic_covariance(args.camera)
     if film:
         _demand_film(args, calibration)
     tool = None if args.tool is None else read_tool(args.tool)
@@ -243,7 +244,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     motion = ToolMotion(stage, deformer)
     device = find_device(args.device, LIVE.precision).name
     load_kernels(device)
-    follower = Follower(calibration, registration, tool, motion, elsewhere)
+    follower = Follower(calibration, registration, tool, motion, elsewhere, intrinsic)
     return Parts(calibration, follower, Painter(stage, tool, args.style, device), who)
 
 

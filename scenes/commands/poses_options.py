@@ -30,8 +30,8 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--clock", nargs="+", metavar="S", default=["0"],
-        help="the tracker's time less the pictures' [s], and by how much that is off; or auto: from the motion of a "
-        "cube and a reference that are seen in the film, too (default 0)",
+        help="the tracker's time less the pictures' [s], and by how much that is off (default 0). auto: from the "
+        "motion of a cube and a reference that the film shows, too",
     )  # fmt: skip
     group.add_argument(
         "--hand-eye", type=Path, metavar="H.json",

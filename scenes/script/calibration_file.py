@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Literal
+
+import numpy as np
 
 from ar.optics.calibration import Calibration, opencv_text, ros_text
 from ar.optics.calibration_text import LONGEST_TEXT, WANTED, parsed
@@ -12,6 +15,8 @@ from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import path_of, read_as
 
 SUFFIXES = (".yaml", ".yml")
+INTRINSICS = "sulcus intrinsics"
+"""The format of the covariance beside a calibration."""
 FORMATS = {"opencv": opencv_text, "ros": ros_text}
 
 
@@ -35,6 +40,27 @@ def read_calibration(path: str | Path) -> Calibration:
             return parsed(text)
         except ValueError as error:
             raise InputError(str(error)) from error
+
+
+def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
+    """The covariance (9, 9) that `sulcus calibrate` wrote beside a calibration, K.json for K.yaml; None: there is none.
+
+    Raises
+    ------
+    InputError
+        A file of that name and kind whose covariance is none.
+    """
+    beside = path_of(path).with_suffix(".json")
+    if not beside.is_file() or beside.stat().st_size > LONGEST_TEXT:
+        return None
+    with read_as(beside, "a covariance of `sulcus calibrate`", "Remove it, or calibrate the camera anew."):
+        stored = json.loads(beside.read_text(encoding="utf-8"))
+        if not isinstance(stored, dict) or not str(stored.get("format", "")).startswith(INTRINSICS):
+            return None
+        covariance = np.array(stored["covariance"], float)
+        if covariance.shape != (9, 9) or not np.isfinite(covariance).all() or np.diag(covariance).min() < 0.0:
+            raise InputError("its covariance is none of 9 x 9.")
+        return 0.5 * (covariance + covariance.T)
 
 
 def write_calibration(path: str | Path, calibration: Calibration, form: Literal["opencv", "ros"] = "opencv") -> None:

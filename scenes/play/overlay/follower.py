@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera
+from ar.tracking.calibration_error import calibration_error
 from ar.tracking.pose import Pose
 from ar.tracking.registration import Registration
 from ar.tracking.targets import patient_reference, tool_cube
@@ -117,6 +118,8 @@ class Follower:
     elsewhere
         Poses of another tracker, which take the place of the cube's; where they say where the camera is, the
         reference's, too.
+    intrinsic
+        (9, 9), covariance of the camera's calibration, as of `ar.tracking.intrinsics.PARAMETERS`; None: not known.
     """
 
     calibration: Calibration
@@ -124,6 +127,7 @@ class Follower:
     tool: TrackedTool | None
     motion: ToolMotion
     elsewhere: Elsewhere | None = None
+    intrinsic: np.ndarray | None = None
 
     @cached_property
     def tracker(self) -> Tracker:
@@ -252,13 +256,18 @@ class Follower:
         at, tracked = reference.point(place)
         turned = reference.T_camera_target[:3, :3]
         registered = turned @ beside @ turned.T
+        camera = np.zeros((3, 3))
+        if self.intrinsic is not None and (self.elsewhere is None or self.elsewhere.eye is None):
+            corners = patient_reference().faces[0].corners
+            camera = calibration_error(self.tracker.camera, reference.T_camera_target, corners, place, self.intrinsic)
         parts = {
             "tracking": across(tracked, at),
+            "camera": across(camera, at),
             "registration": across(registered, at),
             "tool": motion.tool,
             "model": motion.model,
         }
-        return float(np.hypot(across(tracked + registered, at), motion.error)), parts
+        return float(np.hypot(across(tracked + camera + registered, at), motion.error)), parts
 
 
 def across(covariance: np.ndarray, sight: np.ndarray) -> float:

@@ -13,8 +13,8 @@ from .truth import Off
 
 COLUMNS = (
     "time_s", "state", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", "motion_off_mm", "within_mm",
-    "tracking_mm", "registration_mm", "tool_mm", "model_mm", "ms", "latency_ms", "words", "outline_px", "overlap",
-    "middle_off_mm", "worst_off_mm",
+    "tracking_mm", "camera_mm", "registration_mm", "tool_mm", "model_mm", "ms", "latency_ms", "words",
+    "outline_px", "overlap", "middle_off_mm", "worst_off_mm",
 )  # fmt: skip
 
 
@@ -35,7 +35,10 @@ def _row(shown: Shown, error: Off | None) -> list[str]:
     placed = known.camera is not None
     lengths: list[float | None] = [*shown.middle, known.motion.moved if known.motion.known else None]
     lengths.append(known.motion.error if known.motion.known else None)
-    lengths += [known.band, *(known.parts.get(name) for name in ("tracking", "registration", "tool", "model"))]
+    lengths += [
+        known.band,
+        *(known.parts.get(name) for name in ("tracking", "camera", "registration", "tool", "model")),
+    ]
     cells = [_number(None if value is None or not placed else 1e3 * value) for value in lengths]
     late = None if shown.latency is None else 1e3 * shown.latency
     against = (None,) * 4 if error is None else (error.outline, error.overlap, 1e3 * error.middle, 1e3 * error.worst)
