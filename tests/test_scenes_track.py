@@ -99,6 +99,16 @@ def test_in_the_patient_s_frame_the_camera_is_of_no_account(folder, camera, tool
     assert [row["state"] for row in rows_of(tmp_path / "p.csv")] == ["good"] * 5
 
 
+def test_the_camera_s_pose_is_the_inverse_of_what_it_sees(folder, camera, tmp_path):
+    one, other = tmp_path / "camera.csv", tmp_path / "plate.csv"
+    words = ["track", str(folder), "--camera", camera]
+    assert main([*words, "--out", str(one), "--body", "camera", "--frame", "patient", "--tip", "0", "0", "0"]) == 0
+    assert main([*words, "--out", str(other), "--body", "patient"]) == 0
+    (_, found), (_, seen) = read_poses(one), read_poses(other)
+    np.testing.assert_allclose(found @ seen, np.tile(np.eye(4), (5, 1, 1)), atol=1e-6)
+    assert all(float(row["tip_off_mm"]) > 0.0 and int(row["corners"]) < 99 for row in rows_of(one))
+
+
 def test_a_video_has_its_own_times(pictures, camera, tmp_path):
     film, out = tmp_path / "film.avi", tmp_path / "tool.csv"
     writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (CAMERA.width, CAMERA.height))

@@ -16,7 +16,7 @@ from .outputs import add_force, claimed
 
 KIND = "poses of `sulcus track`"
 # What may be followed, and in whose frame.
-BODIES, FRAMES = ("tool", "patient", "board"), ("camera", "patient")
+BODIES, FRAMES = ("tool", "patient", "board", "camera"), ("camera", "patient", "board")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--body", choices=BODIES, default="tool", help="what is followed (default %(default)s)")
     parser.add_argument(
         "--frame", choices=FRAMES, default="camera",
-        help="whose frame the poses are in; patient: the reference must be seen, too (default %(default)s)",
+        help="whose frame the poses are in; patient, board: these must be seen, too (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--tip", type=float, nargs=3, metavar=("X", "Y", "Z"),

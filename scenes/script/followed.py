@@ -18,9 +18,12 @@ from sim.runtime.outside_files import read_as
 
 from .pose_file import TrackedRow
 
+AT_REST = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
+"""The camera in its own frame."""
+
 
 def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
-    """A row for each picture: of `body` (tool, patient, board) in the `frame` of the camera or the patient.
+    """A row for each picture: of `body` (tool, patient, board, camera) in the `frame` of one of them that is seen.
 
     Raises
     ------
@@ -28,7 +31,7 @@ def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: 
         What cannot be read, and pictures of another size than the camera was calibrated at.
     """
     targets = {each.name: each for each in all_targets()}
-    wanted = [body] if frame == "camera" else [body, frame]
+    wanted = [each for each in (body, frame) if each != "camera"]
     tracker = Tracker(calibration.camera(np.eye(4)), tuple(targets[name] for name in wanted))
     state: Tracked | None = None
     with read_as(path, "a film", GIVE):
@@ -37,6 +40,8 @@ def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: 
                 begun = time.perf_counter()
                 state = tracker.track(picture.grey, state)
                 verdict, pose = _known(state, wanted)
+                if pose is not None and body == "camera":
+                    pose = AT_REST.seen_from(pose)
                 yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun)
         except ValueError as error:
             raise InputError(str(error)) from error
