@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from theatres import put, short, small, theatre_of
 
-from ar.overlay.hud import FINE, millimetres
+from ar.overlay.hud import FINE, NARROW, folded, millimetres
 from ar.overlay.refind import stands
 from scenes.bench.uncertainty import (
     Motions,
@@ -222,8 +222,13 @@ class TestStored:
 
     def test_between_moments_it_goes_in_proportion_and_a_model_adds_its_own(self, theatre):
         found = stated(short(), theatre)
-        assert found.at(0.0) == TumourError(2e-3, "registration")
-        assert found.at(0.15) == TumourError(pytest.approx(3.5e-3), "E")
+        for time, worst, largest in ((0.0, 2e-3, "registration"), (0.15, 3.5e-3, "E")):
+            error = found.at(time)
+            assert error == TumourError(pytest.approx(worst), largest, moved=error.moved)
+            # How far it has moved has nothing of what puts it elsewhere in the scan, too.
+            own = [found.read(size, time) for name, size in found.parts.items() if name != "registration"]
+            assert error.moved == pytest.approx(min(1.96 * np.linalg.norm(own), worst))
+        assert found.at(0.0, 1.5e-3).moved >= 1.5e-3
         assert found.at(0.0, 1.5e-3).prior == pytest.approx(2.5e-3)
         assert found.at(0.0, 9e-3).largest == "surrogate"
 
@@ -304,7 +309,8 @@ class TestSaid:
         narrow = knowing.player("linear", scene).draw(3, 0.1, scene.path(0.1))
         assert narrow.shown.shape == (240, 320, 3)
         assert list(narrow.head) == error_lines(narrow.model_error, narrow.tumour_error, True, brief=True)
-        for line in (*narrow.head, f"moved {millimetres(narrow.moved)}", "frame 3"):
+        moved = folded(f"moved {millimetres(narrow.moved, narrow.tumour_error.moved)}", NARROW * 320)
+        for line in (*narrow.head, *moved, "frame 3"):
             assert stands(narrow.shown, line, FINE)
 
     def test_in_a_hand_and_of_a_doubtful_answer_it_is_not_known(self, theatre):

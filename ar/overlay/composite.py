@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from ..rendering import place, rasteriser, shade
+from ..rendering import place, rasteriser, shade, vignette
 from ..rendering.layer import Layer, vertex_normals
 from ..rendering.parallel import load
 from ..rendering.rasteriser import Seen, seen
@@ -68,7 +68,7 @@ class Ground:
 
 def load_kernels(device: str = "cpu") -> None:
     """Load all kernels that draw a picture with its overlay, so that the first does not wait for them."""
-    load(device, place, rasteriser, shade, window, distances)
+    load(device, place, rasteriser, shade, vignette, window, distances)
 
 
 def composite(
@@ -185,7 +185,7 @@ def composite(
     if before is not None and box is not None:
         motion = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
         said = millimetres(motion) if moved is None else millimetres(*moved)
-        lay(out, taken, [f"moved {said}"], (0, camera.height))
+        lay(out, taken, folded(f"moved {said}", NARROW * camera.width), (0, camera.height))
     write_doubt(drawn, doubt)
     if gauge is None and opening is None and style not in ("depth", "rings", "cut"):
         return drawn

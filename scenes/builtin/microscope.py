@@ -35,6 +35,6 @@ SCENE = Scene(
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity(), ToolForce()),
     lying=drained(2.0, to=0.2),
     sight=StereoSight(),
-    viewpoint=Viewpoint(distance=0.3, tilt=-0.4, fov=np.radians(9.0), width=800, height=600, eye="left"),
+    viewpoint=Viewpoint(distance=0.3, tilt=-0.4, fov=np.radians(9.0), width=800, height=600, eye="left", field=1.0),
     bounds=Bounds(overlap=0.7, error=3e-3, drawn=2.5, removed=0.5),
 )

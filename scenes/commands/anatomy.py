@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     for path in demand_no_strangers(args.out, anatomy.digest, args.force):
         print(f"{path}: was made with the anatomy that is replaced: simulate and train anew.", file=sys.stderr)
     with stage("write the mesh"):
-        intensity = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy])
+        intensity = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
         write_anatomy(args.out, anatomy)
         if intensity is None:
             beside.unlink(missing_ok=True)  # of an earlier mesh of this name

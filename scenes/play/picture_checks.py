@@ -136,8 +136,11 @@ def _estimate_printed(player: Player, frame: Frame) -> bool:
         anatomy, np.stack([player.positions(frame.deformation) - rest, player.believed(frame) - rest])
     )
     off, length = float(np.linalg.norm(moved - true)), float(np.linalg.norm(moved))
-    lines = folded(frame.remark, NARROW * frame.shown.shape[1])
-    said = f"moved {millimetres(length, found.location.p95)}", *lines
+    said = [
+        line
+        for text in (f"moved {millimetres(length, found.location.p95)}", frame.remark)
+        for line in folded(text, NARROW * frame.shown.shape[1])
+    ]
     return frame.remark.endswith(f"{1e3 * off:.1f} mm off") and all(stands(frame.shown, text, FINE) for text in said)
 
 

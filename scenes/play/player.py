@@ -18,6 +18,7 @@ from ar.overlay.styles import Style
 from ar.overlay.traces import Trace
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Picture
+from ar.rendering.vignette import vignetted
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
 from sim.geometry.ball_at_rest import resting_tip
@@ -195,6 +196,8 @@ class Player:
         held = None if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
         stage, camera = self.stage.at(loads), self.camera_at(float(loads.times[0]))
         picture = stage.picture(camera, positions, None if held is None else held.pose)
+        field = self.scene.viewpoint.field
+        picture = picture if field is None else vignetted(picture, field)
         corners = stage.corners(None if held is None else held.pose)
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
         # What an observer draws to see it is no part of the estimate.
@@ -208,6 +211,9 @@ class Player:
         shown = None if gauge is None else replace(gauge, error=error.bound)
         traces = () if estimate is None else traces_of(estimate, stage.truth(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
+        motion = float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean())
+        if estimate is None and error.moved is not None:
+            moved = motion, error.moved
         band = 0.0 if estimate is not None else error.bound or 0.0
         trained = answering(self.deformer, deformation) is not None
         lines = error_lines(promised, error, trained, doubt, camera.width < FEW)
@@ -227,7 +233,7 @@ class Player:
             number, float(loads.times[0]), touch, loads, deformation, camera,
             None if held is None else held.pose, None if held is None else held.tip, picture, over.colour, over.taken,
             None if gauge is None else gauge.distance, None if gauge is None else gauge.error,
-            float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean()) if moved is None else moved[0],
+            motion if moved is None else moved[0],
             promised, error, doubt, tuple(head), remark, took, estimate,
         )  # fmt: skip
 

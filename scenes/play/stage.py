@@ -37,7 +37,7 @@ TUMOUR_COLOUR = (0.20, 0.94, 0.42)
 TRUTH_COLOUR = (0.90, 0.35, 0.78)
 """Of the tumour where the finite elements have it."""
 # What a scan's black leaves of the cortex's colour, and how much deeper it lies than white [m].
-DARK, RELIEF = (0.34, 0.10, 0.10), 1.5e-3
+DARK, RELIEF = (0.33, 0.16, 0.17), 1.5e-3
 OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
 """What the tumour is seen through, and what is said of the rest."""
 PREDICTED_LINES = Names("predicted tumour", "its error, 95 %", "in the scan")
@@ -216,7 +216,7 @@ class Stage:
         sight = self.scene.sight
         if isinstance(sight, StereoSight) and sight.vessels:
             return with_vessels(self.intensity, self.site, sight.seed, DARK, RELIEF)
-        values = self.intensity.values.astype(np.float32) / 255.0
+        values = self.intensity.windowed(self.site.anatomy.mesh)
         return Solid(values, np.linalg.inv(self.intensity.affine), DARK, RELIEF)
 
     @cached_property

@@ -38,7 +38,7 @@ def with_vessels(intensity: Intensity, site: Site, seed: int, dark: tuple[float,
     T[:3, 3] = site.origin + across[0] * (site.right + site.up) + along[0] * site.axis
     inside = np.linalg.inv(intensity.affine) @ T
     shape = len(across), len(across), len(along)
-    grey = intensity.values.astype(np.float32) / 255.0
+    grey = intensity.windowed(site.anatomy.mesh)
     scan = affine_transform(grey, inside, output_shape=shape, order=1, mode="nearest")
     light = 1.0 - taken(across, np.random.default_rng([seed, 1])).astype(np.float32)
     return Solid(scan * light[:, :, None], np.linalg.inv(T), dark, relief, height=scan)

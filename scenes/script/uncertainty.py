@@ -14,7 +14,7 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
 
-from .priors import PRIORS
+from .priors import PRIORS, REGISTRATION, SEGMENTATION
 from .scene import Scene
 from .site import Site
 
@@ -23,6 +23,8 @@ LEVEL = 0.95
 """Of every bound that is printed."""
 SUFFIX = ".uncertainty.json"
 SURROGATE = "surrogate"
+AT_REST = (REGISTRATION, SEGMENTATION)
+"""Contributors that put a tumour elsewhere in the scan, and as far elsewhere after it has moved."""
 # A bound at 95 % is so many deviations of a Gaussian.
 DEVIATIONS = 1.96
 
@@ -40,11 +42,14 @@ class TumourError:
         The name of the largest contributor to that.
     observed
         The same with what is observed of the brain [m]; None where nothing is.
+    moved
+        The part of `prior` by which its motion since the scan may be off: that without registration and segmentation.
     """
 
     prior: float | None
     largest: str = ""
     observed: float | None = None
+    moved: float | None = None
 
     @property
     def bound(self) -> float | None:
@@ -96,7 +101,8 @@ class Uncertainty:
         parts = {name: self.read(values, time) for name, values in self.parts.items()}
         parts[SURROGATE] = surrogate / DEVIATIONS
         worst = float(np.hypot(self.read(self.worst, time), surrogate))
-        return TumourError(worst, max(parts, key=lambda name: parts[name]))
+        moved = DEVIATIONS * float(np.linalg.norm([size for name, size in parts.items() if name not in AT_REST]))
+        return TumourError(worst, max(parts, key=lambda name: parts[name]), moved=min(moved, worst))
 
     def read(self, values: tuple[float, ...], time: float) -> float:
         """One of the lists at a time [s], between its entries in proportion."""

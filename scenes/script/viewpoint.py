@@ -36,11 +36,14 @@ class Viewpoint:
     eye
         Which of an operating microscope's two ways of light is shown, with the axes meeting at the site; None: the
         middle.
+    field
+        Radius of a microscope's round field, in halves of the picture's longer side: beyond it the shown picture is
+        dark. What is found in pictures is found without it. None: the picture is whole.
 
     Raises
     ------
     InputError
-        A calibration for pictures of another size, or another eye than left and right.
+        A calibration for pictures of another size, another eye than left and right, or a field not above 0.
     """
 
     distance: float = 0.20
@@ -51,10 +54,13 @@ class Viewpoint:
     calibration: Calibration | None = None
     path: CameraPath | None = None
     eye: Eye | None = None
+    field: float | None = None
 
     def __post_init__(self) -> None:
         if self.eye not in (None, "left", "right"):
             raise InputError(f"an operating microscope has no eye {self.eye!r}: choose left or right.")
+        if self.field is not None and not 0.0 < self.field < np.inf:
+            raise InputError(f"a round field has the radius {self.field}: give a number above 0, or None.")
         if self.calibration is not None:
             try:
                 self.calibration.sized(self.width, self.height)

@@ -10,28 +10,44 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import InputError
+from ..geometry.tetmesh import TetMesh
 from ..runtime.atomic_files import written_whole
 from .nifti import read_volume
 
 HEADER = 348  # bytes of NIfTI
+# Grey values that differ by less than this share of them are one.
+ALIKE = 1e-6
 SIGNED = b"sulcus: intensities beside a mesh"
 """By which what was written here is distinguished from a user's own scan."""
 
 
 @dataclass(frozen=True)
-class Crop:
-    """What of a scan is kept beside a mesh.
+class Window:
+    """Which grey values of a brain are dark and which are light, whatever a scanner's scale and zero are.
 
     Parameters
     ----------
-    margin
-        [m] round what is looked at: a camera sees beyond the craniotomy's rim.
-    brightest
-        Per cent of the voxels in the crop are at most white: the few brightest are vessels, and would darken the rest.
+    low, high
+        Per cent of the brain, by volume, that is darker: few voxels, such as vessels, do not shift them.
+    dark, light
+        In 0 .. 1: what these two become. What is beyond goes on in the same way, up to 0 and 1.
+    beyond
+        What is brighter than `high` by so many times the difference of the two is no tissue: a vessel with contrast
+        agent, fat, or a voxel that is wrong.
+    plain
+        What all becomes where the brain has one grey value.
     """
 
-    margin: float = 0.015
-    brightest: float = 99.5
+    low: float = 5.0
+    high: float = 90.0
+    dark: float = 0.3
+    light: float = 0.97
+    beyond: float = 1.0
+    plain: float = 0.8
+
+
+KEPT = Window(dark=0.25, light=0.75)
+"""That of the file beside a mesh: it keeps what is darker and lighter than nearly all of the brain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,28 +63,54 @@ class Intensity:
         index = inverse[:3, :3] @ points.T + inverse[:3, 3:]
         return ndimage.map_coordinates(self.values, index, order=1, mode="constant", output=np.float64) / 255.0
 
-    def around(self, points: np.ndarray, crop: Crop = Crop()) -> Intensity:
-        """The part round the box of points (n, 3) [m], as 8-bit grey: black is 0, white the brightest.
+    def around(self, points: np.ndarray, mesh: TetMesh, margin: float = 0.015) -> Intensity:
+        """The part round the box of points (n, 3) [m], with a margin [m], in the 8-bit grey of `KEPT`.
 
         Raises
         ------
         InputError
-            A volume that does not reach there.
+            A volume that does not reach there, or has no numbers in the brain.
         """
         inverse = np.linalg.inv(self.affine)
         index = points @ inverse[:3, :3].T + inverse[:3, 3]
-        reach = crop.margin / np.linalg.norm(self.affine[:3, :3], axis=0)
+        reach = margin / np.linalg.norm(self.affine[:3, :3], axis=0)
         low = np.maximum(np.floor(index.min(axis=0) - reach), 0).astype(int)
         high = np.minimum(np.ceil(index.max(axis=0) + reach) + 1, self.values.shape).astype(int)
         if (high <= low).any():
             raise InputError("the T1 volume does not cover the craniotomy: give one in the labels' own space.")
-        part = self.values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].astype(np.float64)
-        white = float(np.percentile(part, crop.brightest))
-        if white <= 0.0:
-            raise InputError("the T1 volume is black at the craniotomy: give one in the labels' own space.")
         affine = self.affine.copy()
         affine[:3, 3] += self.affine[:3, :3] @ low
-        return Intensity(np.rint(255.0 * np.clip(part / white, 0.0, 1.0)).astype(np.uint8), affine)
+        part = Intensity(self.values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))], affine)
+        return Intensity(np.rint(255.0 * part.windowed(mesh, KEPT)).astype(np.uint8), affine)
+
+    def windowed(self, mesh: TetMesh, window: Window = Window()) -> np.ndarray:
+        """The values (I, J, K) float32 in 0 .. 1 by a window on the brain, a mesh in the same frame.
+
+        What is no number, or far too bright for tissue, becomes the brain's median.
+
+        Raises
+        ------
+        InputError
+            A volume that has no finite numbers in the brain.
+        """
+        corners = mesh.nodes[mesh.tets]
+        inverse = np.linalg.inv(self.affine)
+        index = np.rint(corners.mean(axis=1) @ inverse[:3, :3].T + inverse[:3, 3])
+        there = ((index >= 0) & (index < self.values.shape)).all(axis=1)
+        found = self.values[tuple(index[there].astype(int).T)].astype(np.float64)
+        known = np.isfinite(found)
+        if not known.any():
+            raise InputError("the T1 volume has no numbers in the brain: give one in the labels' own space.")
+        found, size = found[known], mesh.volumes[there][known]
+        order = np.argsort(found, kind="stable")
+        share = (np.cumsum(size[order]) - 0.5 * size[order]) / size.sum()
+        low, middle, high = np.interp([0.01 * window.low, 0.5, 0.01 * window.high], share, found[order])
+        values = self.values.astype(np.float64)
+        values[~(np.isfinite(values) & (values <= high + window.beyond * (high - low)))] = middle
+        if high - low <= ALIKE * max(abs(low), abs(high)):
+            return np.full(values.shape, window.plain, np.float32)
+        grey = window.dark + (window.light - window.dark) * (values - low) / (high - low)
+        return np.clip(grey, 0.0, 1.0).astype(np.float32)
 
 
 def sidecar(mesh: str | Path) -> Path:
@@ -106,7 +148,7 @@ def read_intensity(path: str | Path) -> Intensity:
     Raises
     ------
     InputError
-        A file that is missing, unreadable, or not a volume.
+        A file that is missing, unreadable, or not a volume. Voxels without a number are kept.
     """
-    volume = read_volume(path)
+    volume = read_volume(path, finite=False)
     return Intensity(volume.values, volume.affine)

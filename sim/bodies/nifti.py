@@ -49,8 +49,8 @@ class Volume:
     notes: tuple[str, ...]
 
 
-def read_volume(path: str | Path, voxels: Voxels = Voxels()) -> Volume:
-    """Read one volume of finite numbers from a NIfTI file.
+def read_volume(path: str | Path, voxels: Voxels = Voxels(), finite: bool = True) -> Volume:
+    """Read one volume of numbers from a NIfTI file; unless `finite` is off, all of them must be finite.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def read_volume(path: str | Path, voxels: Voxels = Voxels()) -> Volume:
         affine = np.array(image.affine, np.float64)
         metre = METRES.get(unit, 1e-3)
         affine[:3] *= metre
-        _check(path, values, affine, voxels)
+        _check(path, values, affine, voxels, finite)
         while values.ndim > 3:
             values = values[..., 0]
         return Volume(values, affine, _assumed(image, metre, voxels.same_place))
@@ -124,13 +124,13 @@ def _assumed(image: Nifti1Image, metre: float, same: float) -> tuple[str, ...]:
     return (f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken",)
 
 
-def _check(path: Path, values: np.ndarray, affine: np.ndarray, voxels: Voxels) -> None:
+def _check(path: Path, values: np.ndarray, affine: np.ndarray, voxels: Voxels, finite: bool) -> None:
     shape = " x ".join(map(str, values.shape))
     if values.dtype.kind not in "biuf":
         raise InputError(f"{path}: holds colours or complex numbers ({values.dtype}), not plain ones. {REMEDY}")
     if values.ndim < 3 or min(values.shape[:3]) < 2 or max(values.shape[3:], default=1) > 1:
         raise InputError(f"{path}: measures {shape} voxels, which is not one volume. {REMEDY}")
-    if not np.isfinite(values).all():
+    if finite and not np.isfinite(values).all():
         raise InputError(f"{path}: {int((~np.isfinite(values)).sum())} voxels are not finite. Replace them by 0.")
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) <= 1e-6 * spacing.prod():

@@ -1,0 +1,87 @@
+"""What the scan gives the picture: colours that no scanner's scale changes, a round field, the same bytes again."""
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from ar.rendering.vignette import vignetted
+from scenes.play.player import Player
+from scenes.play.stage import CORTEX, Stage
+from scenes.script.viewpoint import Viewpoint
+from sim.bodies.intensity import Intensity
+from sim.deformation import Deformer, guess
+from sim.errors import InputError
+
+from .theatres import small, template_theatre
+
+
+def seen(values, scene=None):
+    """The picture and its segmentation of the template with other grey values."""
+    theatre, scene = template_theatre(), scene or small()
+    stage = Stage(scene, theatre.site, Intensity(values, theatre.intensity.affine))
+    picture = stage.picture(scene.viewpoint.camera(theatre.site), theatre.anatomy.mesh.nodes, None)
+    return picture
+
+
+def test_the_cortex_has_the_same_colours_whatever_the_scanner_wrote():
+    grey = template_theatre().intensity.values.astype(np.float64)
+    brain = grey[grey > 0.0]
+    usual = seen(grey)
+    cortex = usual.segmentation == CORTEX
+    vessels = np.random.default_rng(0).random(grey.shape) < 0.02
+    others = {
+        "z-scores": (grey - brain.mean()) / brain.std(),
+        "a negative offset": grey - 1000.0,
+        "16 bits": np.rint(12.0 * grey - 3000.0).astype(np.int16),
+        "fat round the brain": np.where(grey > 0.0, grey, 900.0),
+    }
+    for name, values in others.items():
+        apart = np.abs(seen(values).colour.astype(int) - usual.colour)[cortex]
+        assert apart.max() <= 6, name
+    # Vessels with contrast agent are where they are, and change nothing elsewhere.
+    for value in (3.0 * grey.max(), np.nan):
+        apart = np.abs(seen(np.where(vessels, value, grey)).colour.astype(int) - usual.colour)[cortex]
+        assert np.percentile(apart, 90) <= 4 and apart.mean() < 2.0
+    # Folds are darker than crowns, which are not saturated.
+    red, green, _ = (usual.colour[cortex][:, k].astype(float) for k in range(3))
+    assert np.percentile(green, 10) < 0.75 * np.percentile(green, 75)
+    assert np.median(green / red) > 0.6
+
+
+def test_a_scan_of_one_value_gives_one_colour_and_no_folds():
+    plain = seen(np.full(template_theatre().intensity.values.shape, 3, np.uint8))
+    colours = plain.colour[plain.segmentation == CORTEX].astype(float)
+    shares = colours[:, 1] / colours[:, 0]
+    assert shares.std() < 0.03
+
+
+def test_a_round_field_is_dark_beyond_its_rim_and_changes_nothing_else():
+    grey = template_theatre().intensity.values
+    whole, field = seen(grey), vignetted(seen(grey), 1.0)
+    row, column = np.mgrid[:240, :320]
+    away = np.hypot(column - 159.5, row - 119.5)
+    assert not field.colour[away > 160.0].any()
+    np.testing.assert_array_equal(field.colour[away < 140.0], whole.colour[away < 140.0])
+    ring = (away > 145.0) & (away < 155.0)
+    assert 0 < field.colour[ring].mean() < whole.colour[ring].mean()
+    np.testing.assert_array_equal(field.depth, whole.depth)
+    np.testing.assert_array_equal(field.segmentation, whole.segmentation)
+    with pytest.raises(InputError, match="round field"):
+        Viewpoint(field=0.0)
+    with pytest.raises(ValueError, match="round field"):
+        vignetted(seen(grey), float("nan"))
+
+
+def test_a_scene_shows_its_field_and_the_same_bytes_again():
+    theatre, scene = template_theatre(), small()
+    rest = guess(np.zeros((1, *theatre.anatomy.mesh.nodes.shape)))
+    views = [replace(scene.viewpoint, field=field) for field in (None, 1.0, 1.0)]
+    stages = [Stage(replace(scene, viewpoint=view), theatre.site, theatre.intensity) for view in views]
+    # No deformer is asked.
+    players = [Player(stage, cast(Deformer, None)) for stage in stages]
+    frames = [each.drawn(10, each.touch(10), each.loads(10), rest, 0.0) for each in players]
+    assert frames[0].picture.colour[0, 0].any() and not frames[1].picture.colour[0, 0].any()
+    assert frames[1].picture.colour.tobytes() == frames[2].picture.colour.tobytes()
+    assert frames[1].shown.tobytes() == frames[2].shown.tobytes()
