@@ -222,12 +222,12 @@ class TestStored:
 
     def test_between_moments_it_goes_in_proportion_and_a_model_adds_its_own(self, theatre):
         found = stated(short(), theatre)
-        for time, worst, largest in ((0.0, 2e-3, "registration"), (0.15, 3.5e-3, "E")):
+        for time, most, largest in ((0.0, 2e-3, "registration"), (0.15, 3.5e-3, "E")):
             error = found.at(time)
-            assert error == TumourError(pytest.approx(worst), largest, moved=error.moved)
+            assert error == TumourError(pytest.approx(most), largest, moved=error.moved)
             # How far it has moved has nothing of what puts it elsewhere in the scan, too.
             own = [found.read(size, time) for name, size in found.parts.items() if name != "registration"]
-            assert error.moved == pytest.approx(min(1.96 * np.linalg.norm(own), worst))
+            assert error.moved == pytest.approx(min(1.96 * np.linalg.norm(own), most))
         assert found.at(0.0, 1.5e-3).moved >= 1.5e-3
         assert found.at(0.0, 1.5e-3).prior == pytest.approx(2.5e-3)
         assert found.at(0.0, 9e-3).largest == "surrogate"

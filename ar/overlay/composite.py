@@ -33,12 +33,14 @@ SEEN = (255.0, 245.0, 190.0)
 # Of the outline's brightness: that of the margin round it, which is no place of the surface.
 FAINT = 0.75
 # Lengths of the strokes and gaps of a doubtful outline, of a margin, and of an outline under closed ground [pixel].
-BROKEN, DASHED, HIDDEN = (9, 6), (7, 7), (9, 6)
+BROKEN, DASHED, HIDDEN = (9, 6), (12, 7), (9, 6)
 # Width of the latter [pixel].
 BOLD = 2
 UNNAMED = Names()
 # Width of lines that stand in the silhouette [pixel].
 SHORT = 96
+# Rows of text by which words of the head may be lower to leave a line in sight.
+LOWER = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +175,11 @@ def composite(
         for trace in traces:
             draw_trace(under, part, trace)
         draw_broken(under, found, ink_of(hidden.colour), ground, doubt)
-        if gauge is not None:
+        if gauge is not None or style == "cut":
             above = blank(part)
+        if gauge is not None and above is not None:
             draw_line(above, part, gauge)
-        measure.draw(under, around)
+        measure.draw(under, under if above is None else above, around)
         lines = Lines(ink_of(hidden.colour), not doubt, under, above)
         out, taken[around] = overlaid(picture.drawn, around, part, hidden, found, roles, style, lines)
     drawn, lined = Overlaid(out, taken), taken.copy()
@@ -289,10 +292,11 @@ def ground_lines(words: str) -> list[str]:
 
 def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:
     """Write lines at the left of the head, under the letter of a side, in place, even over other lines."""
-    free, middle = drawn.taken.copy(), len(drawn.taken) // 2
+    free, middle, below = drawn.taken.copy(), len(drawn.taken) // 2, HEAD + ROW * (len(lines) + LOWER)
     free[:HEAD] = free[middle - HEAD // 2 : middle + HEAD // 2] = 1  # letters of sides come there
+    free[below:] = 1  # rather over a line than in the midst of the picture
     before = free.copy()
-    lay(drawn.colour, free, lines, (0, HEAD), needed=True)
+    lay(drawn.colour, free, lines, (0, HEAD), needed=True, lines_there=drawn.taken)
     drawn.taken[free > before] = 1
 
 

@@ -19,6 +19,8 @@ SMALL, SAMPLE, AFTER = 0.4, 26, 6
 LEADING, TALL, LEAST = 16, 12, 480
 # The tint's scale is shown on ground of this colour.
 GROUND = (200.0, 150.0, 135.0)
+SHEET = 255
+"""Of `taken`, where a legend, a scale or an inset is: no panel goes there."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ def legend(entries: tuple[Entry, ...]) -> np.ndarray:
         row = LEADING * number + LEADING // 2
         stroke, gap = entry.pattern or (SAMPLE, 0)
         strokes = [(left, min(left + stroke, SAMPLE) - 1) for left in range(2, SAMPLE - 2, stroke + gap)]
-        for ink, width in ((DARK, entry.width + 2), (entry.ink, entry.width)):
+        rim = [(DARK, entry.width + 2)] if entry.width > 1 else []  # as `dash` has it
+        for ink, width in (*rim, (entry.ink, entry.width)):
             for left, right in strokes:
                 cv2.line(sheet, (left, row), (right, row), (*ink, OPAQUE), width, cv2.LINE_AA)
         haloed(sheet, entry.name, (SAMPLE + AFTER, row + 4), SMALL)
@@ -113,9 +116,9 @@ def place_sheet(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, sights
 
 
 def paste(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, at: tuple[int, int]) -> None:
-    """Lay a sheet (h, w, 4) uint8 over a picture (H, W, 3) uint8 at a column and a row, and take its place."""
+    """Lay a sheet (h, w, 4) uint8 over a picture (H, W, 3) uint8 at a column and a row; its place becomes `SHEET`."""
     column, row = at
     box = np.s_[row : row + sheet.shape[0], column : column + sheet.shape[1]]
     left = 1.0 - sheet[..., 3:] / np.float32(OPAQUE)
     colour[box] = np.minimum(colour[box] * left + sheet[..., :3], 255.0)
-    taken[box] = 1
+    taken[box] = SHEET

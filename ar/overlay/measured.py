@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ..optics.camera import Camera
@@ -13,13 +14,13 @@ from ..rendering.renderer import Picture
 from .cut import ENDS, Plane, captioned, plane_through, profile, section
 from .distances import distance_of_seen, tree_of
 from .gauge import Gauge
-from .hud import FINE, HEAD, folded, haloed, lay, millimetres
+from .hud import FINE, HEAD, bound_words, folded, haloed, lay
 from .legend import SMALL, depth_scale, paste, place_sheet
 from .outlines import OPAQUE, dash, ink_of, key_of
 from .places import PAD, free_place
 from .rings import RING, RINGS, draw_rings
 from .styles import Style
-from .window import Roles
+from .window import FRONT, Roles
 
 # Rings are looked for so far beyond the last [m].
 BEYOND = 3e-3
@@ -30,6 +31,8 @@ WIDTHS, ASPECT, CUT_STROKES = (0.34, 0.27, 0.21), 0.75, (3, 5)
 ACROSS = 4.0
 # Letters of the cut stay so far from a sheet's edge [pixel].
 EDGE = 12
+# They stand so far beside the line [pixel].
+ASIDE = 10
 NO_ROOM = "no room for the cut"
 
 
@@ -57,7 +60,7 @@ class Measure:
     @property
     def off(self) -> str:
         """How far off what is measured may be, in words."""
-        return "error not known" if self.error is None else f"error {millimetres(self.error)} (95 %)"
+        return "error not known" if self.error is None else f"error {bound_words(self.error, 1)} (95 %)"
 
     @property
     def reached(self) -> np.ndarray:
@@ -74,8 +77,11 @@ class Measure:
         middle = self.hidden.vertices.mean(axis=0)
         return plane_through(self.camera, middle, None if self.gauge is None else self.gauge.tip)
 
-    def draw(self, sheet: np.ndarray, box: tuple[slice, slice]) -> None:
-        """Draw the lines of rings, or that along which the picture is cut, on the sheet of a box; in place."""
+    def draw(self, sheet: np.ndarray, above: np.ndarray, box: tuple[slice, slice]) -> None:
+        """Draw the lines of rings, or that along which the picture is cut, on the sheet of a box; in place.
+
+        Letters go on the sheet `above` all lines.
+        """
         if self.style == "rings":
             free = self.roles.of(self.picture.segmentation, box) == 0
             tree = tree_of(self.hidden.vertices, self.hidden.triangles, str(self.picture.drawn.depth.device))
@@ -94,9 +100,13 @@ class Measure:
             line = line[np.diff(line, axis=0, append=-1).any(axis=1)]
             dash(sheet, [line[:, None]], RING, CUT_STROKES, 1)
             line = line[((line >= EDGE) & (line < (part.width - EDGE, part.height - EDGE))).all(axis=1)]
+            # Letters stand where the line comes out behind a tool.
+            front = (self.roles.of(self.picture.segmentation, box) == FRONT).astype(np.uint8)
+            line = line[cv2.dilate(front, np.ones((2 * EDGE + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] == 0]
             for letter, at in zip(ENDS, (0, -1), strict=True) if len(line) else ():
-                column, row = line[at].tolist()
-                haloed(sheet, letter, (column - 4, row + 4), FINE, RING)
+                # Beside the line: there may be another on it, from the tip.
+                column, row = (line[at] + (ASIDE if line[at, 0] < EDGE + ASIDE else -ASIDE, 0)).tolist()
+                haloed(above, letter, (column - 4, row + 4), FINE, RING)
 
     def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
         """Lay what explains the lines into a composite picture, as `place_sheet` takes it; in place.

@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
             "tumour_error_unobserved_mm": _mm(error.prior),
         }
         print(
-            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {name}: the tumour is off by {figures.error_mm:.3f} "
+            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {_who(scene, name)} is off by {figures.error_mm:.3f} "
             f"mm of the {figures.motion_mm:.2f} mm that it moves. Its outline is off by {figures.drawn:.1f} px, "
             f"overlap {figures.overlap:.3f} (1 is best). {figures.leaked:.0%} leaks out of the "
             f"skull{_bond(figures.bond)}{_estimates(figures)}",
@@ -134,6 +134,11 @@ def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
 
 def _mm(metres: float | None) -> float | None:
     return None if metres is None else 1e3 * metres
+
+
+def _who(scene: Scene, name: str) -> str:
+    """What is held against the finite elements: a deformer's tumour, or the estimate of one."""
+    return f"{name}: the tumour" if scene.sight is None else f"{name} is the truth; the estimate of the tumour"
 
 
 def _bond(share: float) -> str:

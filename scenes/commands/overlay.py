@@ -61,6 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FILM.mp4", help="the film with its overlay: .mp4, .gif or .webp")
     parser.add_argument("--table", type=Path, metavar="ROWS.csv", help="a row for each picture: state, place, error")
+    parser.add_argument(
+        "--covered", type=Path, metavar="MASKS",
+        help="a video or a folder of PNG masks, one for each picture in order. White is what lies in front, as a hand: "
+        "nothing is drawn over it",
+    )  # fmt: skip
     add_style(parser)
     parser.add_argument("--rate", type=float, default=30.0, help="pictures a second, of a folder (default %(default)s)")
     parser.add_argument(
@@ -108,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
     if camera or args.page:
         return until_ended(partial(_served, args, camera))
-    inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth]
+    inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth, args.covered]
     inputs += [*(args.poses or ()), args.hand_eye, args.camera_poses]
     demand_poses(args)
     out = None if args.out is None else _film_path(args.out, args.force, inputs)
@@ -134,8 +139,10 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
 
     from ..play.overlay.rows import write_rows
 
-    if args.out is not None or args.truth is not None or args.live or args.poses is not None:
-        raise InputError("--out, --truth, --live and --poses belong to films without a page: leave them out here.")
+    films = {"--out": args.out, "--truth": args.truth, "--covered": args.covered, "--poses": args.poses}
+    given = [name for name, value in (films | {"--live": args.live or None}).items() if value is not None]
+    if given:
+        raise InputError(f"{', '.join(given)}: for films without a page. Leave it out here.")
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
     table = None if args.table is None else claimed(args.table, ".csv", TABLE, args.force, [args.camera])
@@ -286,7 +293,8 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
     shown: list[Shown] = []
 
     def pictures() -> Iterator[np.ndarray]:
-        film = timed(film_of(Path(args.pictures), args.rate, colour=True))
+        masks = None if args.covered is None else film_of(args.covered, args.rate)
+        film = timed(film_of(Path(args.pictures), args.rate, colour=True), masks)
         for each in overlaid(film, parts.follower, parts.painter, args.live):
             shown.append(each.without_picture())
             yield each.colour

@@ -13,7 +13,7 @@ from ar.optics.camera import Camera
 from ar.overlay.composite import Overlaid, composite, draw_points
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import HEAD, NARROW, ROW, folded, lay, panel
-from ar.overlay.legend import Names
+from ar.overlay.legend import SHEET, Names
 from ar.overlay.styles import Style
 from ar.overlay.traces import Trace
 from ar.rendering.layer import Layer
@@ -341,7 +341,8 @@ def labelled(frame: Frame, name: str) -> np.ndarray:
     if not frame.deformation.outcome[0].good:
         lines.append(frame.deformation.outcome[0].value)
     seen = frame.picture.segmentation
-    sights = [frame.taken | hides.view(np.uint8) for hides in (seen != DRAPE, seen == TOOL)]
-    return panel(
-        frame.shown, lines, below=HEAD + ROW * len(frame.head), sights=[*sights, (seen == TOOL).view(np.uint8)]
-    )
+    # Least of all may it hide what explains the lines: the legend, a scale, a cut.
+    hides = [(frame.taken > 0) | (seen != DRAPE), (frame.taken > 0) | (seen == TOOL)]
+    hides += [(frame.taken == SHEET) | (seen == TOOL), frame.taken == SHEET]
+    sights = [each.view(np.uint8) for each in hides]
+    return panel(frame.shown, lines, below=HEAD + ROW * len(frame.head), sights=sights)

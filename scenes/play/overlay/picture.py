@@ -12,7 +12,7 @@ from ar.overlay.composite import Overlaid, composite, write_doubt, write_head
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import bound_words, folded
 from ar.overlay.outlines import box_around, dash, ink_of, joined, outlines, silhouette
-from ar.overlay.styles import Opening, Style
+from ar.overlay.styles import NOTICED, Opening, Style
 from ar.overlay.traces import BEFORE, DOTTED
 from ar.rendering.layer import Layer
 from ar.rendering.real_picture import real_picture
@@ -52,10 +52,14 @@ class Painter:
     style: Style = "window"
     device: str = "cpu"
 
-    def paint(self, colour: np.ndarray, known: Known) -> Overlaid:
-        """A picture (H, W, 3) uint8 with what is known of it."""
+    def paint(self, colour: np.ndarray, known: Known, covered: np.ndarray | None = None) -> Overlaid:
+        """A picture (H, W, 3) uint8 with what is known of it.
+
+        covered (H, W) bool: what lies in front of the brain, as a hand: nothing is drawn over it, and the picture says
+        how much of the tumour that hides.
+        """
         if known.state in IN_GREY or known.camera is None:
-            return self._grey(colour, known)
+            return self._grey(colour, known, covered)
         camera, tumour = known.camera, self.stage.tumour(known.motion.positions)
         gauge = self.gauge(known, tumour)
         before = self.stage.tumour_at_rest if known.motion.known and known.motion.moved > 0.0 else None
@@ -67,12 +71,23 @@ class Painter:
         layers = [] if box is None else self._layers(known)
         whole = slice(0, camera.height), slice(0, camera.width)
         picture = real_picture(colour, camera, layers, box or whole, self.device)
-        head = [part for line in head_lines(known) for part in folded(line, WIDE * camera.width)]
+        lines = [*head_lines(known), *self._hidden_words(camera, tumour, covered)]
+        head = [part for line in lines for part in folded(line, WIDE * camera.width)]
         return composite(
             picture, camera, tumour, (TOOL,), self.style, band, gauge, before, doubt,
             moved=(known.motion.moved, known.motion.error), head=head, opening=SEEN_THROUGH, error=known.band,
-            names=PREDICTED_LINES,
+            names=PREDICTED_LINES, covered=covered,
         )  # fmt: skip
+
+    def _hidden_words(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
+        """What a picture says of what lies in front of the tumour, where that hides a noticeable share of it."""
+        box = box_around(camera, tumour.vertices)
+        if covered is None or box is None or self.style == "none":
+            return ()
+        mask = silhouette(camera.cropped(*box), tumour.vertices, tumour.triangles)
+        hidden = np.count_nonzero(mask & covered[box])
+        share = hidden / max(np.count_nonzero(mask), 1)
+        return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= NOTICED else ()
 
     def _layers(self, known: Known) -> list[Layer]:
         """The open cortex, under which the tumour is seen, the drape round it as films have it, and the tool."""
@@ -96,11 +111,13 @@ class Painter:
         spread = DEVIATIONS * float(np.sqrt(along @ known.tip_covariance @ along))
         return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, known.motion.error)))
 
-    def _grey(self, colour: np.ndarray, known: Known) -> Overlaid:
+    def _grey(self, colour: np.ndarray, known: Known, covered: np.ndarray | None) -> Overlaid:
         """The outline in grey, if it has a place, and why."""
         over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
         if known.camera is not None and self.style != "none":
             self._dot(over, known.camera, self.stage.tumour(known.motion.positions))
+            if covered is not None:
+                over.colour[covered] = colour[covered]
         write_head(over, [])
         write_doubt(over, known.words)
         return over

@@ -20,6 +20,8 @@ from .picture import Painter
 EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)
 # A picture that is so much older than its overlay is not the view any more [s].
 OLD = 0.2
+# A mask's grey level from which something lies in front: video makes edges soft.
+WHITE = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,22 +63,47 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """A picture whose time [s] is read from its pixels, where it is written there, and from its source elsewhere."""
+    """A picture whose time [s] is read from its pixels, where it is written there, and from its source elsewhere.
+
+    `covered` (H, W) bool is what lies in front of the brain, as a hand, where somebody says so.
+    """
 
     picture: Named
     stamped: bool
+    covered: np.ndarray | None = None
 
 
-def timed(film: Iterator[Named]) -> Iterator[Timed]:
-    """Pictures with the times that they hold; a clock of 24 hours goes on at midnight."""
+def timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[Timed]:
+    """Pictures with the times that they hold, and with their masks: white is what lies in front.
+
+    A clock of 24 hours goes on at midnight.
+
+    Raises
+    ------
+    ValueError
+        A picture without a mask, a mask without a picture, or one of another size.
+    """
     before, days = -np.inf, 0.0
-    for picture in film:
+    for number, picture in enumerate(film):
+        covered = None if masks is None else _mask(masks, picture, number)
         stamp = read_stamp(picture.grey)
         time = days + (picture.time if stamp is None else stamp)
         if time < before - 0.5 * DAY:
             time, days = time + DAY, days + DAY
         before = time
-        yield Timed(replace(picture, time=time), stamp is not None)
+        yield Timed(replace(picture, time=time), stamp is not None, covered)
+    if masks is not None and next(masks, None) is not None:
+        raise ValueError("there are more masks than pictures. Give one for each picture, in order.")
+
+
+def _mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
+    """What lies in front in the picture of a number."""
+    mask = next(masks, None)
+    if mask is None:
+        raise ValueError(f"{picture.name} has no mask: there are {number}. Give one for each picture, in order.")
+    if mask.grey.shape != picture.grey.shape:
+        raise ValueError(f"the mask {mask.name} is {mask.grey.shape}, its picture {picture.grey.shape}.")
+    return mask.grey >= WHITE
 
 
 def paced(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
@@ -128,7 +155,7 @@ def overlaid_one(
     assert picture.colour is not None
     known = follower.step(picture.grey, picture.time, before)
     drawn = known if begun is None else aged(known, clock.perf_counter() - begun - picture.time)
-    colour = painter.paint(picture.colour, drawn).colour
+    colour = painter.paint(picture.colour, drawn, taken.covered).colour
     ready = clock.perf_counter()
     latency = None if begun is None else ready - begun - picture.time
     middle = drawn.motion.positions[painter.stage.tumour_vertices].mean(axis=0)

@@ -1,0 +1,85 @@
+"""What lies in front of the brain in a real picture, by masks: the overlay is not drawn there, and the picture says so."""
+
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from theatres import template_theatre
+
+from ar.overlay.hud import FINE
+from ar.overlay.outlines import ink_of, silhouette
+from ar.overlay.refind import of_ink, stands
+from ar.screen import write_film
+from ar.tracking.pictures import Named, film_of
+from scenes.cli import main
+from scenes.play.overlay.follower import Follower
+from scenes.play.overlay.picture import Painter
+from scenes.play.overlay.run import overlaid, timed
+from scenes.play.overlay.tool_motion import ToolMotion
+from scenes.play.stage import TUMOUR_COLOUR
+from scenes.script.calibration_file import read_calibration
+from scenes.script.registration_file import read_registration
+from scenes.script.scene import find_scene
+
+FILM = Path(__file__).parent / "data" / "film"
+INK = ink_of(TUMOUR_COLOUR)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    stage = template_theatre().stage(find_scene("palpate"))
+    calibration, registration = read_calibration(FILM / "camera.yaml"), read_registration(FILM / "registration.json")
+    return Follower(calibration, registration, None, ToolMotion(stage, None)), Painter(stage, None, "contour")
+
+
+def film(count):
+    return islice(film_of(FILM / "film.mp4", 30.0, colour=True), count)
+
+
+def test_nothing_is_drawn_over_what_is_white_and_the_picture_says_how_much_that_hides(parts):
+    follower, painter = parts
+    (whole,) = overlaid(timed(film(1)), follower, painter)
+    camera, tumour = whole.known.camera, painter.stage.tumour_at_rest
+    mask = silhouette(camera, tumour.vertices, tumour.triangles)
+    columns = np.flatnonzero(mask.any(axis=0))
+    covered = np.zeros(mask.shape, np.uint8)
+    covered[150:, : int(columns.mean())] = 255  # below the words of the head
+    (hidden,) = overlaid(timed(film(1), iter([Named("0.png", covered)])), follower, painter)
+    amber = [of_ink(each.colour, ink_of((0.92, 0.50, 0.05))) for each in (whole, hidden)]
+    assert amber[0][covered > 0].any() and not amber[1][covered > 0].any()
+    np.testing.assert_array_equal(amber[0][covered == 0], amber[1][covered == 0])
+    share = np.count_nonzero(mask & (covered > 0)) / np.count_nonzero(mask)
+    assert 0.2 < share < 0.8
+    assert stands(hidden.colour, f"{share:.0%} of the tumour is behind what lies in front", FINE)
+    assert hidden.known.band == whole.known.band and not hidden.known.relied
+
+
+def test_what_is_frozen_is_hidden_too(parts):
+    follower, painter = parts
+    (shown,) = overlaid(timed(film(1)), follower, painter)
+    blank = np.full(shown.colour.shape, 120, np.uint8)
+    lost = follower.step(blank[..., 0], 0.1, shown.known)
+    covered = np.zeros(blank.shape[:2], bool)
+    covered[:600] = True
+    assert (painter.paint(blank, lost).colour[:600] != 120).any()
+    assert (painter.paint(blank, lost, covered).colour[:600] == 120).all()
+
+
+def test_there_is_one_mask_for_each_picture_of_its_size():
+    black = Named("a.png", np.zeros((720, 960), np.uint8))
+    assert [each.covered.any() for each in timed(film(2), iter([black, black]))] == [False, False]
+    with pytest.raises(ValueError, match="frame 1 has no mask"):
+        list(timed(film(2), iter([black])))
+    with pytest.raises(ValueError, match="more masks than pictures"):
+        list(timed(film(1), iter([black, black])))
+    with pytest.raises(ValueError, match=r"the mask b\.png"):
+        list(timed(film(1), iter([Named("b.png", black.grey[1:])])))
+
+
+def test_the_command_takes_a_video_of_masks(tmp_path, capsys):
+    masks = tmp_path / "masks.mp4"
+    write_film(masks, iter([np.zeros((720, 960, 3), np.uint8)] * 2), 30.0)
+    given = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]
+    assert main(["overlay", str(FILM / "film.mp4"), *given, "--covered", str(masks)]) == 2
+    assert "frame 2 has no mask: there are 2" in capsys.readouterr().err
