@@ -1,4 +1,4 @@
-"""What lies in front of the brain in a real picture, by masks: the overlay is not drawn there, and the picture says so."""
+"""Masks of what lies in front in a real picture: the overlay is not drawn there, and the picture says so."""
 
 from itertools import islice
 from pathlib import Path

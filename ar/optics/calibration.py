@@ -16,8 +16,12 @@ from .lens import Lens
 
 # Pixels along a side.
 LARGEST_SIDE = 16384
+READOUT = "readout_time"
+"""The key of a rolling shutter's readout [s]: neither OpenCV nor ROS has one, and both leave it alone."""
 # Of a camera's name.
 LONGEST = 256
+# From the first row of a picture to the last [s].
+LONGEST_READOUT = 1.0
 
 
 @dataclass(frozen=True)
@@ -34,11 +38,14 @@ class Calibration:
         How its lens distorts.
     name
         Of the camera; may be empty.
+    readout
+        How much later the last row of a picture is taken than the first [s]: of a rolling shutter. A picture's time is
+        that of its middle row.
 
     Raises
     ------
     ValueError
-        A picture, a focal length or a principal point that no camera has.
+        A picture, a focal length, a principal point or a readout that no camera has.
     """
 
     focal: tuple[float, float]
@@ -47,6 +54,7 @@ class Calibration:
     height: int
     lens: Lens = field(default_factory=Lens)
     name: str = ""
+    readout: float = 0.0
 
     def __post_init__(self) -> None:
         for what, pixels in (("width", self.width), ("height", self.height)):
@@ -54,6 +62,11 @@ class Calibration:
                 raise ValueError(
                     f"a picture has an image_{what} of 1 to {LARGEST_SIDE}, not {pixels}: calibrate again."
                 )
+        if not 0.0 <= self.readout <= LONGEST_READOUT:
+            raise ValueError(
+                f"a picture's rows are read in 0 to {LONGEST_READOUT:g} s, not in {self.readout:g}: give another "
+                f"{READOUT} [s]."
+            )
         if not all(0.0 < each < np.inf for each in self.focal):
             raise ValueError(f"focal lengths are numbers of pixels above 0, not {self.focal}: calibrate again.")
         for at, size in zip(self.principal, (self.width, self.height), strict=True):
@@ -92,7 +105,7 @@ class Calibration:
         if (larger.width, larger.height) != (width, height):
             raise ValueError(f"{here}, which have another shape: choose a size of the same shape.")
         (fx, _, cx), (_, fy, cy) = larger.K[:2].tolist()
-        return Calibration((fx, fy), (cx, cy), width, height, self.lens, self.name)
+        return Calibration((fx, fy), (cx, cy), width, height, self.lens, self.name, self.readout)
 
 
 def opencv_text(calibration: Calibration) -> str:
@@ -103,6 +116,8 @@ def opencv_text(calibration: Calibration) -> str:
     storage.write("camera_name", calibration.name)
     storage.write("camera_matrix", calibration.K)
     storage.write("distortion_coefficients", coefficients_of(calibration.lens)[:, None])
+    if calibration.readout > 0.0:
+        storage.write(READOUT, calibration.readout)
     return storage.releaseAndGetString()
 
 
@@ -122,6 +137,7 @@ def ros_text(calibration: Calibration) -> str:
     lines += _matrix("distortion_coefficients", coefficients[None])
     lines += _matrix("rectification_matrix", np.eye(3))
     lines += _matrix("projection_matrix", np.hstack([calibration.K, np.zeros((3, 1))]))
+    lines += [f"{READOUT}: {calibration.readout!r}"] if calibration.readout > 0.0 else []
     return "\n".join(lines) + "\n"
 
 

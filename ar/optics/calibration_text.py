@@ -7,7 +7,7 @@ import re
 import cv2
 import numpy as np
 
-from .calibration import Calibration
+from .calibration import READOUT, Calibration
 from .lens import Lens
 
 # Characters: a calibration has some thousand.
@@ -53,7 +53,8 @@ def parsed(text: str) -> Calibration:
             _matrix(root, key, shape)  # of rectified pictures, which are not made here
     (fx, _, cx), (_, fy, cy) = K[:2].tolist()
     width, height = (_int(root, key) for key in ("image_width", "image_height"))
-    return Calibration((fx, fy), (cx, cy), width, height, _lens(root, keys), _name(root, keys))
+    lens, name = _lens(root, keys), _name(root, keys)
+    return Calibration((fx, fy), (cx, cy), width, height, lens, name, _readout(root, keys))
 
 
 def _opened(text: str) -> cv2.FileStorage:
@@ -118,6 +119,16 @@ def _lens(root: cv2.FileNode, keys: list[str]) -> Lens:
     if any(numbers[8:]):
         raise ValueError("a thin prism or a tilted sensor is not drawn: calibrate with at most 8 coefficients.")
     return Lens(*numbers[:8])
+
+
+def _readout(root: cv2.FileNode, keys: list[str]) -> float:
+    """The readout of a rolling shutter [s]; 0 where the text has none."""
+    if READOUT not in keys:
+        return 0.0
+    node = root.getNode(READOUT)
+    if not (node.isReal() or node.isInt()):
+        raise ValueError(f"{READOUT} must be a number of seconds, such as 0.02.")
+    return float(node.real())
 
 
 def _name(root: cv2.FileNode, keys: list[str]) -> str:

@@ -93,7 +93,7 @@ class Measure:
             )
         if self.style == "cut":
             plane, part = self.plane, self.camera.cropped(*box)
-            far = 1.2 * float(np.abs(plane.coordinates(self.hidden.vertices)[:, 0]).max())
+            far = 1.45 * float(np.abs(plane.coordinates(self.hidden.vertices)[:, 0]).max())
             steps = np.linspace(-far, far, 2 * part.width)
             pixels, _ = part.project(plane.points(np.stack([steps, 0.0 * steps], axis=1)))
             line = pixels[np.isfinite(pixels).all(axis=1)].round().astype(np.int32)
@@ -103,10 +103,13 @@ class Measure:
             # Letters stand where the line comes out behind a tool.
             front = (self.roles.of(self.picture.segmentation, box) == FRONT).astype(np.uint8)
             line = line[cv2.dilate(front, np.ones((2 * EDGE + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] == 0]
-            for letter, at in zip(ENDS, (0, -1), strict=True) if len(line) else ():
+            if len(line):
                 # Beside the line: there may be another on it, from the tip.
-                column, row = (line[at] + (ASIDE if line[at, 0] < EDGE + ASIDE else -ASIDE, 0)).tolist()
-                haloed(above, letter, (column - 4, row + 4), FINE, RING)
+                along = (line[-1] - line[0]) / max(float(np.linalg.norm(line[-1] - line[0])), 1.0)
+                beside = np.rint(ASIDE * np.array([along[1], -along[0]])).astype(int)
+                for letter, at in zip(ENDS, (line[0], line[-1]), strict=True):
+                    column, row = np.clip(at + beside, EDGE, (part.width - EDGE, part.height - EDGE)).tolist()
+                    haloed(above, letter, (column - 4, row + 4), FINE, RING)
 
     def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
         """Lay what explains the lines into a composite picture, as `place_sheet` takes it; in place.

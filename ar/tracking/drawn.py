@@ -49,6 +49,7 @@ def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, n
         slice(min(where[axis].start for *_, where in seen), max(where[axis].stop for *_, where in seen))
         for axis in (0, 1)
     )
+    box = tuple(_wider(side, size) for side, size in zip(box, (camera.height, camera.width), strict=True))
     straight, inverse = camera.straight[box], np.linalg.inv(camera.K)
     by_row, by_column = (np.gradient(straight, axis=axis) for axis in (0, 1))
     ink, cover = np.zeros(straight.shape[:2]), np.zeros(straight.shape[:2])
@@ -75,6 +76,12 @@ def drawn(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, n
 @lru_cache(maxsize=16)
 def _printed(face: Face) -> np.ndarray:
     return face.picture(TEXTURE)
+
+
+def _wider(side: slice, size: int) -> slice:
+    """Two pixels at least of a picture of so many: less has no slope."""
+    start = min(side.start, size - 2)
+    return slice(start, max(side.stop, start + 2))
 
 
 def _shifts() -> np.ndarray:

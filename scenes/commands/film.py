@@ -52,6 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--png", action="store_true", help="write DIR/frames/*.png, without loss, in place of film.mp4")
     parser.add_argument("--blur", type=float, default=0.5, metavar="PX", help="of the lens (default %(default)s)")
     parser.add_argument("--noise", type=float, default=2.0, help="of each pixel, of 255 (default %(default)s)")
+    parser.add_argument(
+        "--readout", type=float, metavar="MS",
+        help="a rolling shutter: how much later the last row is taken than the first [ms] (default: the camera's)",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of noise and of --registered (default %(default)s)")
     parser.add_argument(
         "--trouble", type=trouble, action="append", default=[], metavar="KIND:FROM-TO",
@@ -136,6 +140,14 @@ def run(args: argparse.Namespace) -> int:
 def _scene(args: argparse.Namespace) -> Scene:
     """The scene as the camera sees it, and no longer than is asked for."""
     scene = filmed_with_targets(args, scene_asked(args, args.scene))
+    if args.readout is not None:
+        view = scene.viewpoint
+        assert view.calibration is not None
+        try:
+            calibration = replace(view.calibration, readout=1e-3 * args.readout)
+        except ValueError as error:
+            raise InputError(f"--readout {args.readout:g}: {error}") from error
+        scene = replace(scene, viewpoint=replace(view, calibration=calibration))
     return scene if args.seconds is None else replace(scene, duration=min(args.seconds, scene.duration))
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from ar.optics.camera import Camera
+from ar.optics.rolling_shutter import row_bands, time_of_point
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Renderer
 from ar.tracking.detection import window_round
@@ -144,11 +146,17 @@ def registered(player: Player, mounts: Mounted, shift: float, turn: float, seed:
 
 
 def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[Shot]:
-    """The pictures of a scene, one in `every` frame; the deformer's answers are what is true."""
+    """The pictures of a scene, one in `every` frame; the deformer's answers are what is true.
+
+    A camera with a rolling shutter is where its path has it for each row; tool and tissue stay as at the picture's
+    time. The camera that is true of such a picture is that of the row in which the tumour's middle is seen.
+    """
     tool, site, stage, last = player.scene.tool, player.site, player.stage, None
     assert tool is not None
     vertices, triangles = mounts.tool.mesh
     renderer: Renderer | None = None
+    calibration = player.scene.viewpoint.calibration
+    readout = 0.0 if calibration is None else calibration.readout
     rest = site.anatomy.mesh.nodes
     for number in range(0, len(player.scene.times), every):
         time, touch = float(player.scene.times[number]), player.touch(number)
@@ -156,23 +164,49 @@ def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) ->
         wrong = taking.happening(time)
         if "gap" in wrong:
             continue
-        positions, camera = player.positions(last), player.camera_at(time)
+        positions = player.positions(last)
         pose = player.tool(tool, touch, positions).pose
         at = vertices @ pose[:3, :3].T + pose[:3, 3]
         held = Layer("tool", TOOL, at, triangles, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
         layers = [*stage.layers(positions, None), held]
         renderer = renderer or Renderer(layers, stage.lamp, stage.device)
-        sharp = renderer.picture(camera, [layer.vertices for layer in layers if not layer.still]).colour
         targets = [
             (tool_cube(), pose @ np.linalg.inv(mounts.tool.T_cube_tool)),
             (patient_reference(), mounts.T_scan_patient),
         ]
-        shown = drawn(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
-        for target, T in targets:
-            if NAMES[target.name] in wrong:
-                shown = _covered(shown, camera, target, T)
-        moved = (positions - rest)[stage.tumour_vertices]
+        view = partial(_seen, renderer, [layer.vertices for layer in layers if not layer.still], targets, wrong)
+        camera_at = partial(_later, player, time)
+        tumour = positions[stage.tumour_vertices]
+        places = np.stack([tumour.mean(axis=0), site.origin, *(T[:3, 3] for _, T in targets)])
+        shown = (
+            view(player.camera_at(time))
+            if readout == 0.0
+            else np.concatenate([view(camera) for _, camera in row_bands(camera_at, readout, places)])
+        )
+        camera = camera_at(time_of_point(camera_at, readout, places[0]))
+        moved = tumour - rest[stage.tumour_vertices]
         yield Shot(time, stamped(_taken(shown, taking, wrong, number), time), camera.T_camera_world, pose, moved)
+
+
+def _later(player: Player, time: float, after: float) -> Camera:
+    """The camera so long after a picture's time [s]."""
+    return player.camera_at(time + after)
+
+
+def _seen(
+    renderer: Renderer,
+    moving: Sequence[np.ndarray],
+    targets: Sequence[tuple[Target, np.ndarray]],
+    wrong: set[str],
+    camera: Camera,
+) -> np.ndarray:
+    """What a camera sees (H, W, 3) uint8 with targets T_scan_target (4, 4), some of which a hand covers."""
+    sharp = renderer.picture(camera, moving).colour
+    shown = drawn(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
+    for target, T in targets:
+        if NAMES[target.name] in wrong:
+            shown = _covered(shown, camera, target, T)
+    return shown
 
 
 NAMES = {"tool": "tool", "patient": "reference"}

@@ -19,7 +19,7 @@ from ar.tracking.targets import patient_reference, tool_cube
 from ar.tracking.track import Tracked, Tracker
 
 from ...script.tracked_tool import TrackedTool
-from ...script.uncertainty import LEVEL
+from ...script.uncertainty import DEVIATIONS, LEVEL
 from .elsewhere import Elsewhere
 from .plausible import NEAR, from_head, implausible
 from .tool_motion import Motion, ToolMotion
@@ -34,6 +34,12 @@ ROUNDING = 1e-6
 # A tumour whose place in the picture is not known this well is not to be relied on [m].
 LIMIT = 5e-3
 UNKNOWN = "as in the scan, and nobody says how it moved: do not rely on it"
+# What is seen moves while a rolling shutter reads a picture. So much of that way is an overlay's error, and so many
+# times as much the error of a tool's tip, which is far from its cube: measured in docs/overlay.md, "A rolling shutter".
+SKEW, LEVER = 0.5, 2.0
+# What is left after a second of how fast a hand was.
+CALMS = 0.1
+NO_PACE = "a rolling shutter, and how the camera moves is not known yet: do not rely on it"
 TOOL, PATIENT = tool_cube().name, patient_reference().name
 
 
@@ -78,6 +84,8 @@ class Known:
         The shortest between two pictures so far [s].
     near
         Whether the tool has been near the head: until then its place may be due to another patient's registration.
+    pace
+        How fast the brain has moved across the picture lately [m/s]; None: not known.
     """
 
     time: float
@@ -94,6 +102,7 @@ class Known:
     felt: float | None = None
     interval: float = SLOWEST
     near: bool = False
+    pace: float | None = None
 
     @property
     def relied(self) -> bool:
@@ -164,12 +173,16 @@ class Follower:
             return self._without_reference(tracked, time, before)
         T_patient_scan = self.registration.T_patient_scan
         camera = self.calibration.camera(reference.T_camera_target @ T_patient_scan)
-        known = self._with_tool(tracked, reference, time, before)
+        pace = self._pace(reference, time, None if forgotten else before)
+        shutter = SKEW * self.calibration.readout * (pace or 0.0)
+        known = self._with_tool(tracked, reference, time, before, shutter)
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
-        band, parts = self._band(reference, middle, known.motion)
-        known = replace(known, camera=camera, band=band, parts=parts, seen=time)
+        band, parts = self._band(reference, middle, known.motion, shutter)
+        known = replace(known, camera=camera, band=band, parts=parts, seen=time, pace=pace)
         doubt, near = self._implausible(camera, known.T_scan_tool, before)
         known = replace(known, near=near)
+        if known.relied and pace is None and self.calibration.readout > 0.0:
+            known = replace(known, state=State.UNSURE, words=NO_PACE)
         if doubt:
             known = replace(known, state=State.UNSURE, words=doubt)
         if doubt or known.state is State.UNKNOWN:
@@ -205,8 +218,21 @@ class Follower:
             felt=None if before is None else before.felt,
         )  # fmt: skip
 
-    def _with_tool(self, tracked: Tracked, reference: Pose, time: float, before: Known | None) -> Known:
-        """How the brain lies under the tool, by its pose beside the reference."""
+    def _pace(self, reference: Pose, time: float, before: Known | None) -> float | None:
+        """The fastest that the brain has moved across the picture lately [m/s]; None where that is not known.
+
+        A hand trembles: what it does while one picture is taken may be faster than from this picture to the next.
+        """
+        last = None if before is None else before.tracked.poses.get(PATIENT)
+        if before is None or last is None or not time > before.time:
+            return None
+        scan = self.registration.T_patient_scan @ np.append(self.motion.stage.site.origin, 1.0)
+        now, then = ((pose.T_camera_target @ scan)[:2] for pose in (reference, last))
+        speed = float(np.linalg.norm(now - then)) / (time - before.time)
+        return max(speed, CALMS ** (time - before.time) * (before.pace or 0.0))
+
+    def _with_tool(self, tracked: Tracked, reference: Pose, time: float, before: Known | None, shutter: float) -> Known:
+        """How the brain lies under the tool, by its pose beside the reference, and what a `shutter` adds to it [m]."""
         felt, last = (None, None) if before is None else (before.felt, before.motion)
         beside = self._beside(tracked, reference, time)
         if self.tool is None or beside is None:
@@ -219,7 +245,7 @@ class Follower:
             return Known(time, State.NO_TOOL, words, tracked, last, felt=felt)
         into = np.linalg.inv(self.registration.T_patient_scan)
         pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
-        spread = self._tip_covariance(beside)
+        spread = self._tip_covariance(beside) + (LEVER * shutter / DEVIATIONS) ** 2 * np.eye(3)
         motion = self.motion.under(pose, spread, last)
         moved = State.GOOD if motion.moved > 0.0 else State.REST
         state = State.UNSURE if motion.doubt else moved if motion.known else State.UNKNOWN
@@ -250,7 +276,9 @@ class Follower:
         whole = tracked + turned @ self.tool.tip_covariance @ turned.T + registered
         return T[:3, :3].T @ whole @ T[:3, :3]
 
-    def _band(self, reference: Pose, middle: np.ndarray, motion: Motion) -> tuple[float, dict[str, float]]:
+    def _band(
+        self, reference: Pose, middle: np.ndarray, motion: Motion, shutter: float
+    ) -> tuple[float, dict[str, float]]:
         """How far off the tumour's `middle` (3,) [m] may be across the line of sight, and by what."""
         place, beside = self.registration.point(middle)
         at, tracked = reference.point(place)
@@ -266,8 +294,9 @@ class Follower:
             "registration": across(registered, at),
             "tool": motion.tool,
             "model": motion.model,
+            **({"shutter": shutter} if self.calibration.readout > 0.0 else {}),
         }
-        return float(np.hypot(across(tracked + camera + registered, at), motion.error)), parts
+        return float(np.linalg.norm([across(tracked + camera + registered, at), motion.error, shutter])), parts
 
 
 def across(covariance: np.ndarray, sight: np.ndarray) -> float:

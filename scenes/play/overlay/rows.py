@@ -13,7 +13,7 @@ from .truth import Off
 
 COLUMNS = (
     "time_s", "state", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", "motion_off_mm", "within_mm",
-    "tracking_mm", "camera_mm", "registration_mm", "tool_mm", "model_mm", "ms", "latency_ms", "words",
+    "tracking_mm", "camera_mm", "registration_mm", "tool_mm", "model_mm", "shutter_mm", "ms", "latency_ms", "words",
     "outline_px", "overlap", "middle_off_mm", "worst_off_mm",
 )  # fmt: skip
 
@@ -37,7 +37,7 @@ def _row(shown: Shown, error: Off | None) -> list[str]:
     lengths.append(known.motion.error if known.motion.known else None)
     lengths += [
         known.band,
-        *(known.parts.get(name) for name in ("tracking", "camera", "registration", "tool", "model")),
+        *(known.parts.get(name) for name in ("tracking", "camera", "registration", "tool", "model", "shutter")),
     ]
     cells = [_number(None if value is None or not placed else 1e3 * value) for value in lengths]
     late = None if shown.latency is None else 1e3 * shown.latency
