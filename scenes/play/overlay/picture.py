@@ -55,8 +55,8 @@ class Painter:
     def paint(self, colour: np.ndarray, known: Known, covered: np.ndarray | None = None) -> Overlaid:
         """A picture (H, W, 3) uint8 with what is known of it.
 
-        covered (H, W) bool: what lies in front of the brain, as a hand: nothing is drawn over it, and the picture says
-        how much of the tumour that hides.
+        covered (H, W) bool is what lies in front of the brain, as a hand. Nothing is drawn over it, and the picture
+        says how much of the tumour that hides.
         """
         if known.state in IN_GREY or known.camera is None:
             return self._grey(colour, known, covered)
