@@ -12,13 +12,13 @@ from ar.overlay.composite import composite
 from ar.overlay.cut import EMPTY, Plane, plane_through, profile, section
 from ar.overlay.distances import distance_of_seen, signed_distance, tree_of
 from ar.overlay.gauge import GAUGE, Gauge, gauge_words
-from ar.overlay.hud import FINE, WHITE, panel
+from ar.overlay.hud import FINE, FONT, WHITE, panel
 from ar.overlay.legend import Names
 from ar.overlay.outlines import ink_of, key_of, silhouette
 from ar.overlay.refind import found_at, of_ink, outline_gap, stands
 from ar.overlay.rings import RING, RINGS, draw_rings
 from ar.overlay.styles import STYLES, Opening
-from ar.overlay.window import SHUT, Roles
+from ar.overlay.window import DARK, SHUT, Roles
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, render
 
@@ -222,3 +222,40 @@ def test_a_panel_moves_out_of_sight_of_what_it_would_hide():
 def test_a_mask_of_another_size_is_refused():
     with pytest.raises(ValueError, match="covered"):
         composite(seen(), CAMERA, tumour(), covered=np.zeros((4, 4), bool))
+
+
+def written(sheet, number):
+    """How often a ring's number stands in a sheet of rings."""
+    (wide, tall), _ = cv2.getTextSize(number, FONT, FINE, 1)
+    stamp = np.full((tall + 3, wide + 3, 3), np.array(DARK), np.uint8)
+    cv2.putText(stamp, number, (2, tall + 2), FONT, FINE, RING, 1, cv2.LINE_AA)
+    return int((cv2.matchTemplate(sheet[..., :3].copy(), stamp, cv2.TM_CCOEFF_NORMED) > 0.9).sum())
+
+
+def test_each_long_piece_of_a_ring_has_its_number_and_each_ring_one_at_least():
+    rows, columns = np.mgrid[:480, :640]
+    far = (0.1e-3 * np.hypot(rows - 240.0, columns - 320.0)).astype(np.float32)
+    far[:, 300:340] = np.nan  # halves of rings of 50, 100 and 150 pixels
+    for free, least in ((np.ones(far.shape, bool), 2), (np.zeros(far.shape, bool), 1)):
+        sheet = np.zeros((480, 640, 4), np.uint8)
+        assert draw_rings(sheet, far, free) == ["5", "10", "15"]
+        assert [written(sheet, number) >= least for number in ("5", "10", "15")] == [True] * 3
+
+
+def test_a_cut_has_letters_at_both_ends_also_where_a_tool_hides_one():
+    at = tumour((0.0, 0.0, -0.014))
+    for tool in (False, True):
+        picture = seen()
+        roles = np.zeros((480, 640), bool)
+        roles[:, 360:] = tool
+        shown = composite(picture, CAMERA, at, style="cut", covered=roles).colour
+        plain = composite(picture, CAMERA, at, style="contour", covered=roles).colour
+        # The line lies level through the middle, and letters stand above it.
+        (middle,), _ = CAMERA.project(at.vertices.mean(axis=0)[None])
+        reach = np.ptp(CAMERA.project(at.vertices)[0][:, 0]) / 2.0
+        above = slice(round(middle[1]) - 16, round(middle[1]) - 4)
+        columns = np.flatnonzero((shown != plain)[above, : round(middle[0] + 1.5 * reach)].any(axis=(0, 2)))
+        letters = np.split(columns, np.flatnonzero(np.diff(columns) > 4) + 1)
+        assert len(letters) == 2
+        assert letters[0][0] < middle[0] - reach
+        assert (letters[1][-1] > middle[0] + reach) is not tool and (letters[1][-1] < 360 or not tool)

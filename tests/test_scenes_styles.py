@@ -8,6 +8,7 @@ import pytest
 
 from ar.overlay.composite import DOUBTFUL, composite
 from ar.overlay.gauge import GAUGE, Gauge
+from ar.overlay.legend import SHEET
 from ar.overlay.outlines import ink_of
 from ar.overlay.refind import found_at
 from ar.overlay.styles import STYLES
@@ -132,6 +133,13 @@ def test_a_panel_leaves_the_tool_in_sight_in_a_low_picture():
     frame = frame_of()
     changed = (labelled(frame, "series-gp") != frame.shown).any(axis=2)
     assert changed.sum() > 5000 and not changed[frame.picture.segmentation == TOOL].any()
+
+
+def test_a_panel_hides_neither_a_scale_nor_a_legend():
+    for size in ((640, 360), (640, 480)):
+        frame = frame_of(size, "depth")
+        changed = (labelled(frame, "series-gp") != frame.shown).any(axis=2)
+        assert (frame.taken == SHEET).any() and changed.any() and not changed[frame.taken == SHEET].any()
 
 
 def test_a_tip_in_the_tumour_is_found_to_be():

@@ -114,12 +114,21 @@ class Measure:
     def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
         """Lay what explains the lines into a composite picture, as `place_sheet` takes it; in place.
 
-        needed (H, W) uint8: above 0 on what alone stays in sight where a cut would become too small.
+        needed (H, W) uint8: above 0 on what alone stays in sight where there is no other room.
         """
         width = taken.shape[1]
         if self.style == "depth":
             caption = f"{self.name or 'surface'}: mm under\nwhat is seen\n{self.off}"
-            place_sheet(colour, taken, depth_scale(key_of(ink_of(self.hidden.colour)), caption), sights)
+            scale = depth_scale(key_of(ink_of(self.hidden.colour)), caption)
+            if not place_sheet(colour, taken, scale, sights):
+                # A tint says nothing without its scale: rather over cortex than not at all.
+                wish = colour.shape[1], HEAD
+                places = (
+                    free_place(shut, scale.shape[1::-1], wish) for shut in (taken | sights, taken | needed, taken)
+                )
+                place = next((each for each in places if each is not None), None)
+                if place is not None:
+                    paste(colour, taken, scale, place)
         if self.style == "rings":
             said = f"rings: mm to the {self.name or 'surface'}; {self.off}"
             lay(colour, taken, folded(said, 0.3 * width), (width, HEAD), sights=sights)
