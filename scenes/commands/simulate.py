@@ -20,7 +20,7 @@ from sim.deformation import Outcome
 from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effects
 from sim.errors import InputError
 from sim.loads import Loads
-from sim.material import tissue_to_json
+from sim.material import Tissue, tissue_to_json
 from sim.runtime.atomic_files import unfinished_path
 from sim.runtime.device import device_names
 from sim.runtime.memory import Budget
@@ -28,6 +28,7 @@ from sim.runtime.timing import stage
 from sim.tools import Ball, BuiltIn, Capsule, Spatula
 from surrogate.data.crew import Asked, solving
 from surrogate.data.dataset import read_outcomes
+from surrogate.data.holding import HISTORY, drawn_times
 from surrogate.data.simulate import Solved, simulate
 from surrogate.data.tool_loads import PRESETS, draw, refused_share, refused_words
 from surrogate.data.tool_poses import draw_poses, tool_of
@@ -97,9 +98,9 @@ def run(args: argparse.Namespace) -> int:
     out = claimed(args.out, ".h5", DATA, args.force)
     with stage("draw"):
         anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
-        tool, loads = _drawn(args, anatomy)
+        tissue = tissue_of(args)
+        tool, loads = _drawn(args, anatomy, tissue)
     accuracy = Accuracy(tolerance=args.tolerance, precision="float32" if args.tolerance >= 1e-4 else "float64")
-    tissue = tissue_of(args)
     effects: tuple[Effect, ...] = (*pushed_effects(anatomy, tissue, args.skull), NodalForce())
     if tool is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
@@ -119,6 +120,7 @@ def run(args: argparse.Namespace) -> int:
             "preset": args.preset,
             "seed": str(args.seed),
             **({} if tool is None else {"shape": repr(tool)}),
+            **({"history": HISTORY} if tool is not None and tissue.prony else {}),
             **{f"{name} version": version(name) for name in ("sulcus", "warp-lang", "numpy")},
         }
         if args.force:
@@ -139,15 +141,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _drawn(args: argparse.Namespace, anatomy: Anatomy) -> tuple[BuiltIn | None, Loads]:
-    """The tool whose poses were asked for, if they were, and the loads."""
+def _drawn(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
+    """The tool whose poses were asked for, if they were, and the loads; of tissue that relaxes with times."""
     asked = _asked(args)
     if not args.poses:
         if asked is not None:
             raise InputError("--ball, --capsule and --blade are moved by pose: give --poses too, or leave them out.")
         return None, draw(args.preset, anatomy, args.count, args.seed)
     tool = tool_of(args.preset) if asked is None else asked
-    return tool, draw_poses(args.preset, anatomy, args.count, args.seed, tool)
+    loads = draw_poses(args.preset, anatomy, args.count, args.seed, tool)
+    return tool, Loads(loads.causes, drawn_times(len(loads), args.seed)) if tissue.prony else loads
 
 
 def _asked(args: argparse.Namespace) -> BuiltIn | None:

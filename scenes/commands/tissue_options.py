@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from sim.effects import SKULLS
 from sim.elements import ELEMENTS, RECOMMENDED
@@ -38,6 +39,12 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False) -
         "K/2 (ln J)^2. Where mu and alpha are given with 2 mu/alpha^2, C is 2 mu",
     )
     parser.add_argument("--bulk", type=float, metavar="K", help="bulk modulus of --material ogden [Pa]")
+    parser.add_argument(
+        "--prony",
+        metavar="G1,TAU1;G2,TAU2",
+        help="how the resistance to a change of shape relaxes: the share G goes with the time TAU [s]. In the scene "
+        'retract it is "0.45,0.5;0.365,50"',
+    )
 
 
 def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] = tuple(SKULLS)) -> None:
@@ -74,6 +81,20 @@ def tissue_of(args: argparse.Namespace) -> Tissue:
     InputError
         Constants that the law lacks or does not have, text of another form, constants that no tissue has.
     """
+    tissue = _elastic(args)
+    if args.prony is None:
+        return tissue
+    try:
+        series = parse_terms(args.prony.split(";"))
+    except ValueError as error:
+        raise InputError(
+            f'--prony {args.prony}: write pairs G,TAU with ; between, as in "0.45,0.5;0.365,50".'
+        ) from error
+    return replace(tissue, prony=tuple(series))
+
+
+def _elastic(args: argparse.Namespace) -> Material | Ogden:
+    """The tissue asked for, with the series that it has of its own."""
     known = MATERIALS[args.material].tissue if args.material in MATERIALS else None
     ours = {"--ogden": args.ogden, "--bulk": args.bulk}
     if args.material == Ogden.law or isinstance(known, Ogden):
@@ -102,7 +123,7 @@ def tissue_of(args: argparse.Namespace) -> Tissue:
 
 def tissue_asked(args: argparse.Namespace) -> Tissue | None:
     """The tissue asked for, or None where no option of it is given."""
-    constants = (args.young, args.poisson, args.ogden, args.bulk)
+    constants = (args.young, args.poisson, args.ogden, args.bulk, args.prony)
     given = args.material != "default" or any(value is not None for value in constants)
     return tissue_of(args) if given else None
 
@@ -156,7 +177,7 @@ def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
 
 
 def parse_terms(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
-    """Ogden's (c [Pa], m) from texts "C,M".
+    """Pairs of numbers from texts "A,B", as Ogden's (c [Pa], m).
 
     Raises
     ------

@@ -14,11 +14,12 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Deformer
 from sim.effects import Effect
 from sim.fem import Fem
-from sim.loads import Loads
+from sim.loads import Loads, Touching
 from sim.runtime.memory import check_fits
 from sim.runtime.processes import at_once, working
 from sim.strategy.memory_needed import Needed, foreseen
 
+from .holding import held, series_of
 from .tasks import Crew
 
 
@@ -56,7 +57,10 @@ class Asked:
         return foreseen(self.anatomy, self.element, self.accuracy, self.device, self.batch, self.loads, self.share)
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """As `Fem.deform`."""
+        """As `Fem.deform`; poses in tissue that relaxes are histories, as `held` has them."""
+        if start is None and series_of(self.effects) and loads.of(Touching) is not None:
+            answer = held(self.fem, loads)
+            return answer if at is None else answer.at(at)
         return self.fem.deform(loads, start, at)
 
 
