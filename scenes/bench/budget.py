@@ -25,12 +25,13 @@ def offers(theatre: Theatre, scene: Scene) -> list[Offer]:
     loads = [scene.loads(theatre.site, scene.path(float(time)), float(time)) for time in times]
     for name in theatre.names(scene):
         deformer = theatre.deformer(name, scene)
-        learnt, seconds, last = isinstance(deformer, Learned), [], None
+        forgets = isinstance(deformer, Learned) and not deformer.series
+        seconds, last = [], None
         error_mm = 1e3 * _stated(deformer)
         if np.isnan(error_mm):
             continue
         for load in loads:
-            last, spent = timed(deformer.deform, load, start=None if learnt else last)
+            last, spent = timed(deformer.deform, load, start=None if forgets else last)
             seconds.append(spent)
         made.append(Offer(name, error_mm, 1e3 * float(np.median(seconds[1:]))))
     return made

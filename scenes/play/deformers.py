@@ -122,7 +122,7 @@ class Theatre:
     def names(self, scene: Scene) -> tuple[str, ...]:
         """Every deformer that can be asked for a scene: learnt ones that know it, the best guarded, finite elements."""
         knowing = tuple(self.knowing(scene))
-        return (*knowing, *([GUARDED] if knowing else []), "fem")
+        return (*knowing, *([GUARDED] if self._guardable(scene) else []), "fem")
 
     def best(self, scene: Scene) -> str:
         """The learnt model of the tightest error bound; the finite elements where none knows the scene."""
@@ -137,10 +137,21 @@ class Theatre:
         return LIMIT if stated is None else stated.limit
 
     def usual(self, scene: Scene) -> str:
-        """Who plays a scene unless somebody else is asked: the best model, guarded where it may not answer alone."""
+        """Who plays a scene unless somebody else is asked: the best model, guarded where it may not answer alone.
+
+        A model of tissue that relaxes plays alone, with its bound: see `_guardable`.
+        """
         name = self.best(scene)
         stated = self.models[name].left_out if name in self.models else None
-        return name if stated is None or stated.enough else GUARDED
+        return name if stated is None or stated.enough or not self._guardable(scene) else GUARDED
+
+    def _guardable(self, scene: Scene) -> bool:
+        """Whether finite elements can stand behind the best model.
+
+        Where tissue relaxes they cannot: a frame that the model hands over depends on all that it did not.
+        """
+        name = self.best(scene)
+        return name in self.models and not self.models[name].series
 
     def described(self, name: str, scene: Scene) -> str:
         """A deformer by name, in words: what solves, or what it learned from."""
@@ -170,7 +181,12 @@ class Theatre:
         if name == "fem":
             return self.fem(scene, scene.accuracy, live=True)
         allowed = ", ".join(self.names(scene))
-        if name == GUARDED and self.knowing(scene):
+        if name == GUARDED and self.knowing(scene) and not self._guardable(scene):
+            raise InputError(
+                f"{self.best(scene)} cannot be {GUARDED} in the scene {scene.name}: its tissue relaxes, so that finite "
+                f"elements would have to answer from the first frame on. Choose one of {allowed}."
+            )
+        if name == GUARDED and self._guardable(scene):
             model, limit = self.models[self.best(scene)], self.limit_of(scene)
             return Guarded(model, self.fem(scene, scene.accuracy, live=True), limit)
         if name == GUARDED and self.models:

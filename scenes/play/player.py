@@ -166,7 +166,13 @@ class Player:
     @cached_property
     def remembers(self) -> bool:
         """Whether an answer depends on the one before it."""
-        return not isinstance(self.deformer, Learned) and remember(self.scene.effects_on(self.site.anatomy))
+        solved = not isinstance(self.deformer, Learned)
+        return self.follows or (solved and remember(self.scene.effects_on(self.site.anatomy)))
+
+    @cached_property
+    def follows(self) -> bool:
+        """Whether a trained model plays that follows its tissue in time."""
+        return isinstance(self.deformer, Learned) and bool(self.deformer.series)
 
     def touch(self, number: int) -> Touch:
         """What the script's hand asks for in a frame."""
@@ -179,7 +185,7 @@ class Player:
     def answer(self, loads: Loads, last: Deformation | None = None) -> Deformation:
         """The deformer's answer, from the last one: a learnt model's at the drawn vertices, which are all it knows."""
         if isinstance(self.deformer, Learned):
-            return self.deformer.deform(loads, at=self.stage.nodes)
+            return self.deformer.deform(loads, start=last if self.follows else None, at=self.stage.nodes)
         return self.deformer.deform(loads, start=last)
 
     def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:

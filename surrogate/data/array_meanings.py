@@ -60,7 +60,11 @@ MEANINGS = {
         "1", f"vertex; {RAS}", "unit normal along which the vertex cannot move, as it slides along the skull; else zero"
     ),
     "anatomy/craniotomy": Meaning("1", "vertex", "which vertices of the surface are free and may be touched"),
-    "loads/time": Meaning("s", CASE, "when the answer is wanted, of tissue that relaxes after the tool began to come; 0 where nothing depends on time"),
+    "loads/time": Meaning(
+        "s",
+        CASE,
+        "when the answer is wanted, in tissue that relaxes since the tool began to come; 0 where no time matters",
+    ),
     "loads/Pushed/point": Meaning("m", f"{CASE}; {RAS}", "centre of the tool's round footprint, on the body at rest"),
     "loads/Pushed/force": Meaning("N", f"{CASE}; {RAS}", "total force on the body, of fixed direction"),
     "loads/Pushed/footprint": Meaning(

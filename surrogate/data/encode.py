@@ -10,7 +10,7 @@ import numpy as np
 from sim.loads import Pushed
 
 from .cortex_patch import Patch
-from .indentation import Indented
+from .indentation import Indented, relaxed_of
 
 Encoder = Callable[[Patch, Pushed], np.ndarray]
 
@@ -47,6 +47,7 @@ def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Point [m], unit direction, force [N] and footprint radius [m]: (B, 8).
 
     Of a rod or a blade then its shaft, and products x_i x_j of its other axis, which are the same either way: (B, 17).
+    Last, of tissue that relaxes, the share of its resistance to a change of shape that is gone.
 
     The published 13 features describe the load as one node sees it (its distance, its angles). A model of all nodes at
     once needs the load alone, because the basis knows where the nodes are.
@@ -56,11 +57,13 @@ def tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     if isinstance(pushed, Indented):
         x, first, second = pushed.axes[:, :, 0], *np.triu_indices(3)
         found += [pushed.axes[:, :, 2], x[:, first] * x[:, second]]
-    return np.column_stack(found)
+    return np.column_stack([*found, *_relaxed(pushed)])
 
 
 def core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     """How a rod or a blade stands (B, 17): as `tool_features` of a ball, middle of its core [m], its axes x and z.
+
+    Last, of tissue that relaxes, as `tool_features`.
 
     Raises
     ------
@@ -72,7 +75,14 @@ def core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     magnitude, direction = directions(pushed)
     middle = pushed.point + pushed.force + pushed.offset
     axes = pushed.axes[:, :, 0], pushed.axes[:, :, 2]
-    return np.column_stack([pushed.point, direction, magnitude, pushed.footprint, middle, *axes])
+    found = [pushed.point, direction, magnitude, pushed.footprint, middle, *axes]
+    return np.column_stack([*found, *_relaxed(pushed)])
+
+
+def _relaxed(pushed: Pushed) -> list[np.ndarray]:
+    """How far tissue has relaxed (B,), if it does: one, or none."""
+    known = relaxed_of(pushed)
+    return [] if known is None else [known]
 
 
 ENCODERS: dict[str, Encoder] = {

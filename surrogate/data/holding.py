@@ -6,15 +6,16 @@ shorter, and stays where it is until the time.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from sim.deformation import Deformation, Deformer, joined
 from sim.effects import Effect, Elasticity
+from sim.errors import InputError
 from sim.loads import Loads
-from sim.material import Pairs
+from sim.material import Pairs, tissue_from_json
 
 BROUGHT = 1.0
 """The longest that a tool takes to where it is held [s]."""
@@ -54,11 +55,20 @@ def held(deformer: Deformer, loads: Loads) -> Deformation:
     return replace(joined([first, last]).rows(row), time=loads.times)
 
 
-def relaxed(series: Pairs, times: np.ndarray) -> np.ndarray:
-    """Which share (B,) of the resistance to a change of shape has gone at the end of histories of B times [s].
+def unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
+    """What is left (B, n) of each g of a series at the end of histories of B times [s].
 
     As the finite elements step: what comes within a step has been there for half of it.
     """
     coming = np.minimum(times, BROUGHT)
-    since = 0.5 * coming + (times - coming)
-    return sum((g * -np.expm1(-since / tau) for g, tau in series), np.zeros(len(times)))
+    g, tau = np.array(series).T
+    return g * np.exp(-(times - 0.5 * coming)[:, None] / tau)
+
+
+def stated_series(stated: Mapping[str, str]) -> Pairs:
+    """The series by which the tissue of a data set of histories relaxes, as its file states it; () of others."""
+    if "history" not in stated or "tissue" not in stated:
+        return ()
+    if stated["history"] != HISTORY:
+        raise InputError(f"the histories here are others than this version knows ({stated['history']}): simulate anew.")
+    return tissue_from_json(stated["tissue"]).prony

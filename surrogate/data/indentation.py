@@ -35,6 +35,31 @@ class Indented(Pushed):
     offset: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class Relaxing(Pushed):
+    """Indentations of tissue whose resistance to a change of shape has lost the share relaxed (B,)."""
+
+    relaxed: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class RelaxingIndented(Indented):
+    """The same by a rod or a blade."""
+
+    relaxed: np.ndarray
+
+
+def with_relaxed(pushed: Pushed, relaxed: np.ndarray) -> Pushed:
+    """The same indentations, of tissue that has relaxed by shares (B,)."""
+    kind = RelaxingIndented if isinstance(pushed, Indented) else Relaxing
+    return kind(**vars(pushed), relaxed=relaxed)
+
+
+def relaxed_of(pushed: Pushed) -> np.ndarray | None:
+    """How far tissue has relaxed (B,); None where it does not."""
+    return pushed.relaxed if isinstance(pushed, Relaxing | RelaxingIndented) else None
+
+
 def posed(loads: Loads, tool: BuiltIn) -> np.ndarray:
     """T_world_tool (B, 4, 4) of one tool: of `Touching` of it alone, or of a blade's `Retracted`.
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
+from typing import Any, cast
 
 from sim.effects import (
     SKULLS,
@@ -19,9 +21,10 @@ from sim.effects import (
     ToolDisplacement,
     ToolForce,
 )
-from sim.material import tissue_from_json
+from sim.material import Pairs, tissue_from_json
 from sim.tools import Tool, named
 
+from ..data.holding import series_of
 from .learned import Learned
 
 # Effects that do nothing until a load calls for them: a model's training may have more of them than a scene.
@@ -81,13 +84,31 @@ def _moved(effect: Effect) -> tuple[Tool, ...]:
     return effect.tools if isinstance(effect, ToolContact) else ()
 
 
+def _other_series(trained: Elasticity, here: Elasticity) -> str | None:
+    """Why tissues of one law and stiffness relax in different ways; None where they do not, or differ otherwise."""
+    learned, asked = series_of([trained]), series_of([here])
+    if learned == asked or here.default is None or replace(cast(Any, here.default), prony=learned) != trained.default:
+        return None
+    return f"it learned from tissue that {_relaxes(learned)}, and here it {_relaxes(asked)}"
+
+
+def _relaxes(series: Pairs) -> str:
+    """A Prony series in words."""
+    each = " and ".join(f"{100.0 * g:g} % in {tau:g} s" for g, tau in series)
+    return f"relaxes by {each}" if each else "does not relax"
+
+
 def _other_body(model: Learned, effects: tuple[Effect, ...], element: str | None) -> str | None:
     """Why a model's finite elements are others than these: tissue, or element."""
     stated, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
     if "tissue" in stated and here is not None:
         trained = Elasticity(tissue_from_json(stated["tissue"]))
+        if (series := _other_series(trained, here)) is not None:
+            return series
         if trained != here:
             return f"it learned from the tissue {trained}, and here it is {here}"
+        if series_of([here]) and not model.series:
+            return "it learned from loads without time, and here the tissue relaxes with it"
     if element is not None and stated.get("element", element) != element:
         return f"it learned from {stated['element']} elements, and here they are {element}"
     return None

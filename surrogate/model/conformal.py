@@ -15,6 +15,7 @@ import numpy as np
 from sim.loads import Pushed
 
 from ..array_functions import taken
+from ..data.indentation import relaxed_of
 from ..regressors.protocol import standardisation
 from .training_range import Measured, Outside
 
@@ -141,9 +142,13 @@ def fitted_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np
 
 
 def features_of(pushed: Pushed, known: Measured) -> np.ndarray:
-    """The features of an error's size (B, 7): logarithms of force and radius, angle, overhang and point [mm]."""
-    force = np.log(np.maximum(known.magnitude, np.finfo(float).tiny))
-    return np.column_stack([force, np.log(pushed.footprint), known.angle, 1e3 * known.overhang, 1e3 * pushed.point])
+    """The features of an error's size (B, 7): logarithms of force and radius, angle, overhang and point [mm].
+
+    Of tissue that relaxes, where all loads have one tool, the share that is gone stands for the radius.
+    """
+    force, relaxed = np.log(np.maximum(known.magnitude, np.finfo(float).tiny)), relaxed_of(pushed)
+    second = np.log(pushed.footprint) if relaxed is None else relaxed
+    return np.column_stack([force, second, known.angle, 1e3 * known.overhang, 1e3 * pushed.point])
 
 
 def conformal(ratio: np.ndarray, level: float) -> float:

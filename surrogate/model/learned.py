@@ -17,17 +17,19 @@ from sim.bodies.tip_distance import tip_gauge
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, check_loads
-from sim.material import tissue_from_json
+from sim.material import Pairs, tissue_from_json
 from sim.runtime.threads import one_thread
 from sim.tools import BuiltIn
 
 from ..data.cortex_patch import Patch, nearest, open_patch
 from ..data.encode import ENCODERS, Basis, Encoder, directions
-from ..data.indentation import indented, posed
+from ..data.holding import stated_series
+from ..data.indentation import indented, posed, with_relaxed
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import Contact
 from .conformal import LEVELS, Bound, features_of
 from .left_out import LeftOut
+from .relaxation import MEMORY, Relaxed, followed
 from .tip_distance import Distance, TipModel
 from .tool_force import ForceModel, wrench
 from .training_range import Envelope, Measured, Outside, measured
@@ -113,6 +115,11 @@ class Learned:
         return f"{stated.get('learner', 'learned')}, from finite elements ({element}; {tissue})"
 
     @cached_property
+    def series(self) -> Pairs:
+        """The Prony series of its tissue, if it follows that in time; () if its answers know no time."""
+        return () if self.tool is None else stated_series(self.training)
+
+    @cached_property
     def nodes(self) -> np.ndarray:
         """Sorted mesh vertices (n,) that it knows."""
         return np.unique(np.concatenate([part.basis.nodes for part in self.parts]))
@@ -184,11 +191,15 @@ class Learned:
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Predict the static answer to `Pushed` loads, or to the poses of its tool; `start` has no influence.
 
+        Where its tissue relaxes, it is what a tool is answered that goes on from the start within the time between.
+        Without a start the tool came and was held until the loads' time, as `data.holding` says.
+
         Raises
         ------
         InputError
             Loads of another kind, or that do not touch the open cortex, or are more than `FARTHEST` times as strong or
-            as wide as any of the training. A start with other rows; a vertex in `at` that the model does not know.
+            as wide as any of the training. A start with other rows, or as `relaxation.followed`; a vertex in `at` that
+            the model does not know.
         """
         check_loads(loads)
         if start is not None and not isinstance(start, Deformation):
@@ -199,20 +210,26 @@ class Learned:
                 f"{len(loads)} load cases."
             )
         begun = time.perf_counter()
-        pushed = self.asked(loads)
+        pushed, past = self._followed(loads, start)
         nodes = self.nodes if at is None else whole_numbers("at", at)
         self._demand_known(nodes)
         with one_thread() if len(loads) == 1 else nullcontext():
-            return self._summed(loads, pushed, nodes, begun)
+            return self._summed(loads, pushed, nodes, begun, past)
 
-    def _summed(self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float) -> Deformation:
+    def _summed(
+        self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: Relaxed | None
+    ) -> Deformation:
         """The sum of the parts, asked at `begun` [s]."""
         known = measured(self._patch, pushed)
         outside = self.envelope.outside(pushed, known)
         far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED
         self._demand_answerable(pushed, np.flatnonzero(far | small))
         promised = self.promised(self.bounds, pushed, known, outside)
+        if past is not None:
+            far = far | past.strange
         answer = predicted(self.motion(pushed, nodes), nodes, loads, far, begun, promised, self.source)
+        if past is not None:
+            answer = replace(answer, memory={MEMORY: past.memory})
         if self.force is None or self.tool is None:
             return answer
         return replace(
@@ -285,7 +302,8 @@ class Learned:
         InputError
             Loads of another kind, or an answer that does not know the open cortex and the tumour.
         """
-        pushed = self.asked(loads)
+        # From an answer to just these loads no time goes by.
+        pushed = self._followed(loads, answer)[0]
         if apart is None:
             if answer is None:
                 answer = self.deform(loads, at=self.nodes)
@@ -304,7 +322,17 @@ class Learned:
         InputError
             Loads of another kind.
         """
-        return only_pushed(loads) if self.tool is None else indented(loads, self.tool, self._patch)
+        return self._followed(loads)[0]
+
+    def _followed(self, loads: Loads, start: Deformation | None = None) -> tuple[Pushed, Relaxed | None]:
+        """The same from a start, and how far the tissue has relaxed, if it does."""
+        if self.tool is None:
+            return only_pushed(loads), None
+        pushed = indented(loads, self.tool, self._patch)
+        if not self.series:
+            return pushed, None
+        past = followed(self.series, pushed, loads.times, start, self.envelope.force[0])
+        return with_relaxed(pushed, past.share), past
 
 
 def predicted(

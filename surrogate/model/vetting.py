@@ -13,7 +13,7 @@ from sim.tools import Ball
 
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS, Basis
-from ..data.indentation import Indented
+from ..data.indentation import Indented, with_relaxed
 from ..data.tool_loads import axes_about
 from ..regressors.rigid_contact import Contact
 from .conformal import LEVELS, Bound
@@ -104,6 +104,8 @@ def _probe(encoder: str, model: Learned) -> np.ndarray:
     if model.tool is not None and not isinstance(model.tool, Ball):
         axes = axes_about(-inward[None])
         pushed = Indented(pushed.point, pushed.force, pushed.footprint, axes, -wide * inward[None])
+    if model.series:
+        pushed = with_relaxed(pushed, np.zeros(1))
     return ENCODERS[encoder](open_patch(model.anatomy), pushed)
 
 
@@ -114,7 +116,8 @@ def _check_force(model: Learned) -> None:
     _demand(model.force.encoder in ENCODERS, f"no encoder is called {model.force.encoder!r}")
     grips = [part.regressor.grip for part in model.parts if isinstance(part.regressor, Contact)]
     _demand(bool(grips) or model.force.learned is not None, "it knows nothing of its tool's force")
-    _demand(all(grip.shape == (2,) for grip in grips), "what it knows of its tool's force is none")
+    terms = 4 if model.series else 2
+    _demand(all(grip.shape == (terms,) for grip in grips), "what it knows of its tool's force is none")
     if model.force.learned is not None:
         found = model.force.learned.predict(_probe(model.force.encoder, model))
         _demand(found.shape == (1, 3) and bool(np.isfinite(found).all()), "it answers no force")

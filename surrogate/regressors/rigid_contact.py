@@ -46,6 +46,8 @@ LEAST = 0.02
 FACTORED, SOLVED = get_lapack_funcs(("potrf", "trtrs"), dtype=np.float64)
 # Points of neighbouring facets on a common edge are one: of the mean diagonal, so that their forces are distinct.
 APART = 1e-6
+# Features of a ball, and of a rod or a blade.
+LYING, STANDING = 8, 17
 
 
 @dataclass(eq=False)
@@ -55,7 +57,7 @@ class Contact:
     It is given `tool_features` of a ball, and `core_features` of a rod or a blade.
 
     What nonlinearity adds far from the tool is nearly a factor of the force, that grows with depth over radius: a line,
-    which is all that is learned.
+    which is all that is learned. Where tissue relaxes there is another line, in proportion to the share that is gone.
 
     Parameters
     ----------
@@ -68,9 +70,9 @@ class Contact:
     answers
         (3 k, r) [1/N] float32: coefficients of the basis's modes that unit forces have.
     line
-        (2, r): at no depth, and what a depth of one radius adds.
+        (2, r): at no depth, and what a depth of one radius adds. (4, r): then what both add once all has relaxed.
     grip
-        (2,): the same factor of the force that the tool exerts; (0,) where none was learned.
+        (2,) or (4,): the same factor of the force that the tool exerts; (0,) where none was learned.
     core
         (4,) [m]: half sizes of what a rod or a blade lies round, and its radius. (0,): a ball, its radius a feature.
     """
@@ -88,7 +90,7 @@ class Contact:
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Coefficients (B, r) float32 of features (B, f), whose force is depth [m]."""
         found = self.linear(X)
-        return (found * (self.line[0] + (X[:, 6:7] / X[:, 7:8]) * self.line[1])).astype(np.float32)
+        return (found * (self._terms(X)[:, : len(self.line)] @ self.line)).astype(np.float32)
 
     def linear(self, X: np.ndarray) -> np.ndarray:
         """The same (B, r) of tissue that is linear."""
@@ -96,7 +98,17 @@ class Contact:
 
     def exerted(self, X: np.ndarray) -> np.ndarray:
         """The force (B, 3) [N/m] that the tool exerts, by one metre of depth; `grip` must have been learned."""
-        return self._resultant(X) * (self.grip[0] + (X[:, 6:7] / X[:, 7:8]) * self.grip[1])
+        return self._resultant(X) * (self._terms(X) @ self.grip)[:, None]
+
+    def _terms(self, X: np.ndarray) -> np.ndarray:
+        """What lines are of (B, 2), or of tissue that relaxes (B, 4)."""
+        depth = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]])
+        return depth if X.shape[1] == self._width else np.hstack([depth, X[:, -1:] * depth])
+
+    @property
+    def _width(self) -> int:
+        """How many features say where the tool stands."""
+        return STANDING if len(self.core) else LYING
 
     def _resultant(self, X: np.ndarray) -> np.ndarray:
         """The same (B, 3) of tissue that is linear."""
@@ -105,6 +117,7 @@ class Contact:
 
     def force(self, X: np.ndarray) -> np.ndarray:
         """What the tool does to linear tissue at the nodes that it may touch (B, 3 k) [N]."""
+        X = np.ascontiguousarray(X[:, : self._width])
         asked, (known, found) = X.tobytes(), self._last
         if asked == known:
             return found
@@ -121,11 +134,12 @@ class Contact:
 
         `exerted` (B, 3) [N/m] is the tool's force by one metre of depth, where it is known.
         """
-        found, line = self.linear(X), np.zeros_like(self.line)
+        found, terms = self.linear(X), self._terms(X)
+        line = np.zeros((terms.shape[1], found.shape[1]))
         for each in np.unique(alike):
             mine = alike == each
-            line[:, mine] = _line(X, found[:, mine], Y[:, mine])[:, None]
-        grip = self.grip if exerted is None else _line(X, self._resultant(X), exerted)
+            line[:, mine] = _line(terms, found[:, mine], Y[:, mine])[:, None]
+        grip = self.grip if exerted is None else _line(terms, self._resultant(X), exerted)
         return replace(self, line=line, grip=grip)
 
     def state(self) -> dict[str, np.ndarray]:
@@ -205,11 +219,10 @@ class Contact:
         return nodes, table, (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
-def _line(X: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The factor (2,), at no depth and what one radius adds, of rows `found` (B, r) that fits `wanted` (B, r) best."""
-    depth = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]])
+def _line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The factor (k,), a sum of terms (B, k), of rows `found` (B, r) that fits `wanted` (B, r) best."""
     factor = np.einsum("br,br->b", found, wanted) / np.square(found).sum(axis=1)
-    return np.linalg.lstsq(depth, factor, rcond=None)[0]
+    return np.linalg.lstsq(terms, factor, rcond=None)[0]
 
 
 def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:

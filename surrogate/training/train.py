@@ -15,7 +15,8 @@ from sim.runtime.timing import stage
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
 from ..data.disc_split import APART, MOST_APART, Split, leave_discs_out
-from ..data.indentation import indented
+from ..data.holding import stated_series
+from ..data.indentation import indented, with_relaxed
 from ..evaluation.coverage import TENTHS, Coverage
 from ..evaluation.force_score import ForceScore, force_errors, force_score
 from ..evaluation.score import Score, errors, score
@@ -23,6 +24,7 @@ from ..model.conformal import LEVELS, USUAL_GROWTH, conformal
 from ..model.learned import Learned, only_pushed
 from ..model.left_out import left_out_of
 from ..model.own_learners import OWN, find_own
+from ..model.relaxation import followed
 from ..model.tip_distance import TipModel
 from ..model.training_range import envelope_of
 from .bounds import FORCE, TIP, TUMOUR, Missed, bound_by, bounds_on_discs, covered_by, growth_by, missed
@@ -261,7 +263,10 @@ def _without(split: Split, apart: np.ndarray) -> Split:
 def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
     """What loads of a data set ask of a model, as `Learned.asked` has it."""
     if data.tool is not None:
-        return indented(loads, data.tool, patch)
+        pushed, series = indented(loads, data.tool, patch), stated_series(data.provenance)
+        if not series:
+            return pushed
+        return with_relaxed(pushed, followed(series, pushed, loads.times, None, 0.0).share)
     if loads.only(Pushed) is None:
         raise InputError(
             "the data holds other loads than `Pushed`, which the learners do not take: simulate pushes, or one tool's "

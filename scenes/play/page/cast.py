@@ -14,6 +14,7 @@ from ...script.scene import Scene
 from ..deformers import GUARDED, Theatre
 from ..effect_ablation import without
 from ..player import Player
+from ..replay import Session
 from ..stage import Stage
 from .referee import Question, Referee, Truth
 
@@ -41,6 +42,7 @@ class Cast:
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
         self.filmed: dict[tuple[frozenset[str], str], Stage] = {}
         self.last: dict[str, Deformation] = {}
+        self.sessions: dict[str, Session] = {}
         self.solvers: dict[frozenset[str], Referee] = {}
         # The finite elements that are asked for what is shown next, and their question.
         self.seeking: tuple[Referee, Question] | None = None
@@ -93,8 +95,17 @@ class Cast:
             return replace(self.theatre, device="cpu").deformer(name, scene)
 
     def predicted(self, name: str, question: Question) -> Truth:
-        """A trained model's answer; finite elements behind it start from its last one."""
+        """A trained model's answer; finite elements behind it start from its last one.
+
+        One that follows its tissue in time goes through the frames before.
+        """
         begun, player = clock.perf_counter(), self.player(name)
+        if player.follows:
+            session = self.sessions.setdefault(name, Session(player))
+            number, answer = session.towards(*question)
+            while number != question[0]:
+                number, answer = session.towards(*question)
+            return Truth(number, player.loads(*question), answer, clock.perf_counter() - begun, question)
         loads = player.loads(*question)
         answer = self.last[name] = player.answer(loads, self.last.get(name))
         return Truth(question[0], loads, answer, clock.perf_counter() - begun, question)

@@ -288,8 +288,11 @@ class Demo:
         if truth is not None and (truth is not now.truth or now.by != (name, off)):
             whole = self.cast.player(name)
             move_wire(self.browser, self.stage, truth, whole)
-            if not off:
-                now.judged = judge(truth, whole, name == "fem")
+            if whole.follows and not fresh:
+                now.judged = None
+            elif not off:
+                shown = now.frame.deformation if whole.follows else None
+                now.judged = judge(truth, whole, name == "fem", shown)
                 if now.judged.mean is not None:
                     self.tally.missed(name, digest_of_loads(truth.loads), now.judged.mean)
             now.truth, now.by = truth, (name, off)

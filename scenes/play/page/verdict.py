@@ -36,13 +36,17 @@ class Judged:
     distance: float | None = None
 
 
-def judge(truth: Truth, player: Player, own: bool) -> Judged:
-    """Hold a deformer against the finite elements under the loads that they answered."""
+def judge(truth: Truth, player: Player, own: bool, shown: Deformation | None = None) -> Judged:
+    """Hold a deformer against the finite elements under the loads that they answered.
+
+    `shown` is what it answered these loads with, where that depends on what it answered before.
+    """
     nodes = player.stage.at(truth.loads).anatomy.tumour_nodes
     right = truth.deformation.at(nodes).displacement[0]
     error = None
     if not own:
-        error = np.linalg.norm(player.deformer.deform(truth.loads, at=nodes).displacement[0] - right, axis=1)
+        answer = player.deformer.deform(truth.loads, at=nodes) if shown is None else shown.at(nodes)
+        error = np.linalg.norm(answer.displacement[0] - right, axis=1)
     motion = float(np.linalg.norm(right, axis=1).mean())
     off = (None, None) if error is None else (float(error.mean()), float(error.max()))
     pushed = truth.loads.every(Pushed)

@@ -1,0 +1,253 @@
+"""Models of poses in tissue that relaxes: the past that they carry, what they learn of it, and where they play."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes.builtin.retract import RELAXING
+from scenes.cli import main
+from scenes.play.deformers import GUARDED, Theatre
+from scenes.script.scene import find_scene
+from sim.accuracy import REFERENCE
+from sim.anatomy import Anatomy
+from sim.bodies.meshfile import write_anatomy
+from sim.deformation import Deformation, Outcome, guess
+from sim.effects import Elasticity, Held, ToolContact, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads, Pushed, Touching
+from sim.material import Material, tissue_to_json
+from sim.tools import Ball
+from surrogate.data.cortex_patch import open_patch
+from surrogate.data.dataset import Dataset, read_dataset
+from surrogate.data.encode import tool_features
+from surrogate.data.holding import BROUGHT, HISTORY, drawn_times, held, stated_series, unfaded
+from surrogate.data.indentation import Relaxing, indented, posed, relaxed_of, with_relaxed
+from surrogate.data.simulate import simulate
+from surrogate.data.tool_poses import draw_poses
+from surrogate.evaluation.score import errors
+from surrogate.model.applicability import refusal
+from surrogate.model.learned import Learned
+from surrogate.model.relaxation import MEMORY, Relaxed, followed
+from surrogate.model.store import load, save
+from surrogate.model.tool_force import wrench
+from surrogate.training.condense_contact import condensed
+from surrogate.training.train import train
+
+SERIES = ((0.4, 0.5), (0.3, 20.0))
+SOFT = Material("neo-hookean", 3000.0, 0.45, prony=SERIES)
+BALL = Ball(6e-3)
+EFFECTS = (Elasticity(SOFT), Held(), ToolContact((BALL,)))
+SAID = {
+    "shape": repr(BALL),
+    "tissue": tissue_to_json(SOFT),
+    "effects": repr(EFFECTS),
+    "element": "p1",
+    "history": HISTORY,
+}
+
+
+def pressed(depth: float, x: float = 0.0) -> Pushed:
+    return Pushed(np.array([[x, 0.0, 0.0]]), np.array([[0.0, 0.0, -depth]]), np.array([BALL.radius]))
+
+
+def start_of(past: Relaxed, time: float) -> Deformation:
+    return replace(guess(np.zeros((1, 1, 3))), memory={MEMORY: past.memory}, time=np.array([time]))
+
+
+def played(depths: list[float], times: list[float], x: list[float] | None = None) -> list[Relaxed]:
+    """The frames of a tool that was in the air before."""
+    found = [followed(SERIES, pressed(0.0), np.zeros(1), None, 1e-4)]
+    for depth, before, time, place in zip(depths, [0.0, *times], times, x or [0.0] * len(times), strict=False):
+        start = start_of(found[-1], before)
+        found.append(followed(SERIES, pressed(depth, place), np.array([time]), start, 1e-4))
+    return found[1:]
+
+
+def test_what_is_gone_is_the_hereditary_integral_of_the_depth() -> None:
+    """Of a tool that comes evenly within a second and stays, against its closed form; a frame is 30 ms."""
+    times = list(np.arange(1, 91) / 30.0)
+    found = played([4e-3 * min(t, 1.0) for t in times], times)
+    for frame in (14, 29, 89):
+        t = times[frame]
+        coming = min(t, 1.0)
+        left = sum(g * tau / coming * (np.exp(-(t - coming) / tau) - np.exp(-t / tau)) for g, tau in SERIES)
+        assert found[frame].share[0] == pytest.approx(0.7 - left, abs=2e-4)
+        assert not found[frame].strange[0]
+
+
+def test_a_history_is_what_two_steps_make_of_it() -> None:
+    for time in (0.0, 0.2, BROUGHT, 3.0, 80.0):
+        alone = followed(SERIES, pressed(2e-3), np.array([time]), None, 1e-4)
+        steps = [t for t in (min(time, BROUGHT), time) if t > 0.0]
+        np.testing.assert_allclose(alone.share, played([2e-3] * len(steps), steps)[-1].share if steps else 0.0)
+        assert alone.share[0] == pytest.approx(0.7 - unfaded(SERIES, np.array([time])).sum())
+
+
+def test_pasts_that_no_training_has_are_strange() -> None:
+    """A tool that was held and goes back, or that slid far; what it does for the first time is not."""
+    back = played([4e-3, 4e-3, 3e-3, 0.0], [0.5, 6.0, 6.1, 6.2])
+    assert [bool(each.strange[0]) for each in back] == [False, False, True, True]
+    assert back[3].share[0] == 0.0
+    slid = played([4e-3] * 3, [0.5, 1.0, 1.5], [0.0, 2e-3, 4e-3])
+    assert [bool(each.strange[0]) for each in slid] == [False, False, True]
+
+
+def test_a_start_without_that_past_is_refused() -> None:
+    late = start_of(played([1e-3], [2.0])[0], 2.0)
+    with pytest.raises(InputError, match=r"the start is 1 s later than the loads"):
+        followed(SERIES, pressed(1e-3), np.ones(1), late, 1e-4)
+    with pytest.raises(InputError, match="does not say how far the tissue has relaxed"):
+        followed(SERIES, pressed(1e-3), np.ones(1), replace(late, memory={}), 1e-4)
+
+
+def test_finite_elements_depend_on_the_share_alone(box: Anatomy) -> None:
+    """A tool that came in one long step, and one that stayed: of equal shares they move and press alike."""
+    fem = Fem(box, list(EFFECTS), device="cpu", batch=1, element="p1")
+    causes = draw_poses("palpation", box, 1, 5, BALL).causes
+    slow = held(fem, Loads(causes, np.array([2.0])))
+    gone = unfaded(SERIES, np.array([2.0])).sum()
+    low, high = BROUGHT, 60.0
+    for _ in range(60):  # one step of so long
+        middle = 0.5 * (low + high)
+        left = sum(g * np.exp(-middle / (2.0 * tau)) for g, tau in SERIES)
+        low, high = (middle, high) if left > gone else (low, middle)
+    fast, elastic = (fem.deform(Loads(causes, np.array([time]))) for time in (low, 0.0))
+    assert slow.time[0] == 2.0 and slow.outcome[0].good
+    size = np.abs(slow.displacement).max()
+    np.testing.assert_allclose(slow.displacement, fast.displacement, atol=2e-3 * size)
+    np.testing.assert_allclose(slow.reaction[0, 0, :3], fast.reaction[0, 0, :3], atol=5e-4)
+    assert np.linalg.norm(slow.reaction[0, 0, :3]) < 0.8 * np.linalg.norm(elastic.reaction[0, 0, :3])
+
+
+class Fading:
+    """Answers histories of a ball as linear tissue, which moves less as it relaxes, and pushes much less."""
+
+    def __init__(self, anatomy: Anatomy):
+        self.anatomy, self.patch = anatomy, open_patch(anatomy)
+        fem = Fem(anatomy, pushed_effects(anatomy, SOFT), REFERENCE, "cpu", element="p1")
+        cortex = np.setdiff1d(self.patch.nodes, anatomy.tumour_nodes)
+        self.contact, self.bases = condensed(fem, [anatomy.tumour_nodes, cortex], BALL)
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        pushed = indented(loads, BALL, self.patch)
+        share = followed(SERIES, pushed, loads.times, start, 1e-4).share[:, None]
+        X, count = tool_features(self.patch, pushed), len(loads)
+        answered = self.contact.linear(X) * X[:, 6:7] * (1.0 - 0.3 * share)
+        split, moved = len(self.bases[0].modes), np.zeros((count, len(self.anatomy.mesh.nodes), 3))
+        for basis, coefficients in zip(self.bases, (answered[:, :split], answered[:, split:]), strict=True):
+            moved[:, basis.nodes] = basis.decode(coefficients)
+        force = self.contact.force(X).reshape(count, -1, 3).sum(axis=1) * (1.0 - share)
+        reaction, nodes = wrench(force, posed(loads, BALL), BALL), np.arange(moved.shape[1])
+        outcome = (Outcome.CONVERGED,) * count
+        answer = Deformation(moved, nodes, outcome, np.zeros(count, int), np.zeros(count), loads.times, reaction)
+        return answer if at is None else answer.at(at)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory, box: Anatomy) -> Dataset:
+    path = tmp_path_factory.mktemp("relaxing") / "data.h5"
+    causes = draw_poses("palpation", box, 80, 0, BALL).causes
+    simulate(path, Fading(box), Loads(causes, drawn_times(80, 0)), SAID)
+    return read_dataset(path)
+
+
+@pytest.fixture(scope="module")
+def model(data: Dataset) -> Learned:
+    return train(data, ["contact"]).models["contact"]
+
+
+def test_a_model_learns_what_time_does_and_keeps_it(tmp_path: Path, model: Learned, box: Anatomy) -> None:
+    """Motion and force at fresh places and times, from a file too; `train` cannot know this without the times."""
+    assert model.series == SERIES
+    causes, nodes = draw_poses("palpation", box, 30, 77, BALL).causes, box.tumour_nodes
+    fresh, truth = Loads(causes, drawn_times(30, 77)), Fading(box)
+    answer, right = model.deform(fresh), truth.deform(fresh)
+    moved = right.at(nodes).displacement
+    assert errors(model, fresh, moved, nodes).mean() < 0.01 * np.linalg.norm(moved, axis=2).mean()
+    force = np.linalg.norm(right.reaction[:, 0, :3], axis=1)
+    assert np.linalg.norm((answer.reaction - right.reaction)[:, 0, :3], axis=1).mean() < 0.02 * force.mean()
+    assert np.isfinite(answer.bound).any() and np.isfinite(answer.reaction_bound).any()
+    save(tmp_path / "model.npz", {"contact": model})
+    again = load(tmp_path / "model.npz", box)["contact"]
+    assert again.series == SERIES
+    np.testing.assert_array_equal(again.deform(fresh).displacement, answer.displacement)
+
+
+def test_answers_follow_from_the_ones_before(model: Learned, box: Anatomy) -> None:
+    """A tool that is held: its force goes on falling, as its own history has it; lifted off it is not relied on."""
+    loads = draw_poses("palpation", box, 3, 5, BALL)
+    touching = loads.of(Touching)
+    assert touching is not None
+    answer, forces = None, []
+    for time in (BROUGHT, 1.5, 3.0, 9.0):
+        answer = model.deform(Loads(loads.causes, np.full(3, time)), answer)
+        forces.append(np.linalg.norm(answer.reaction[:, 0, :3], axis=1))
+    assert answer is not None and (np.diff(forces, axis=0) < 0.0).all()
+    alone = model.deform(Loads(loads.causes, np.full(3, 9.0)))
+    np.testing.assert_allclose(answer.displacement, alone.displacement, atol=1e-9)
+    apart = model.distance(Loads(loads.causes, np.full(3, 9.0)), answer)
+    np.testing.assert_allclose(apart.value, model.distance(Loads(loads.causes, np.full(3, 9.0))).value, atol=1e-9)
+    up = touching.pose.copy()
+    up[:, 0, 2, 3] += 0.05
+    lifted = model.deform(Loads((Touching(up),), np.full(3, 9.1)), answer)
+    assert lifted.outcome == (Outcome.EXTRAPOLATED,) * 3 and np.abs(lifted.displacement).max() == 0.0
+
+
+def test_features_end_with_what_is_gone(box: Anatomy) -> None:
+    pushed = indented(draw_poses("palpation", box, 2, 0, BALL), BALL, open_patch(box))
+    assert relaxed_of(pushed) is None
+    known = with_relaxed(pushed, np.array([0.1, 0.2]))
+    assert isinstance(known, Relaxing)
+    np.testing.assert_array_equal(relaxed_of(known), [0.1, 0.2])
+
+
+def test_a_model_plays_the_series_that_it_learned_and_no_other(model: Learned, box: Anatomy) -> None:
+    assert refusal(model, EFFECTS) is None
+
+    def under(series: tuple) -> str:
+        return str(refusal(model, (Elasticity(replace(SOFT, prony=series)), *EFFECTS[1:])))
+
+    words = "it learned from tissue that relaxes by 40 % in 0.5 s and 30 % in 20 s, and here it "
+    assert under(((0.4, 0.5),)) == f"{words}relaxes by 40 % in 0.5 s"
+    assert under(()) == f"{words}does not relax"
+    timeless = replace(model, training={name: said for name, said in model.training.items() if name != "history"})
+    assert "from loads without time, and here the tissue relaxes" in str(refusal(timeless, EFFECTS))
+    with pytest.raises(InputError, match="others than this version knows"):
+        stated_series({**SAID, "history": "the tool fell"})
+
+
+def test_it_plays_alone_frame_by_frame(model: Learned, box: Anatomy) -> None:
+    """Finite elements cannot stand behind it, and a frame of a straight run depends on those before."""
+    scene = replace(find_scene("palpate"), effects=EFFECTS, tool=replace(find_scene("palpate").tool, radius=6e-3))
+    theatre = Theatre(box, None, {"contact": model}, "cpu")
+    scene = replace(scene, element="p1")
+    assert theatre.names(scene) == ("contact", "fem") and theatre.usual(scene) == "contact"
+    with pytest.raises(InputError, match="its tissue relaxes, so that finite elements would have to answer"):
+        theatre.deformer(GUARDED, scene)
+    player = theatre.player("contact", scene)
+    assert player.follows and player.remembers
+    last = None
+    for number in range(0, 40, 4):
+        last = player.answer(player.loads(number), last)
+    assert last is not None
+    assert last.memory[MEMORY].shape == (1, 4 + len(SERIES))
+
+
+def test_the_command_draws_times_where_tissue_relaxes(
+    tmp_path: Path, box: Anatomy, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
+    write_anatomy(mesh, box)
+    wanted = ["simulate", str(mesh), "--out", str(out), "--poses", "--ball", "6", "--count", "2", "--json"]
+    assert main([*wanted, "--element", "p1", "--prony", "0.45,0.5;0.365,50"]) == 0
+    found = read_dataset(out)
+    assert stated_series(found.provenance) == RELAXING.prony
+    np.testing.assert_array_equal(found.loads.times, drawn_times(2, 0))
+    assert found.good.all()
+    assert main([*wanted, "--prony", "0.45;50", "--force"]) == 2
+    assert '--prony 0.45;50: write pairs G,TAU with ; between, as in "0.45,0.5;0.365,50"' in capsys.readouterr().err
