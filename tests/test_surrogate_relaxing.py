@@ -234,8 +234,10 @@ def test_it_plays_alone_frame_by_frame(model: Learned, box: Anatomy) -> None:
     last = None
     for number in range(0, 40, 4):
         last = player.answer(player.loads(number), last)
-    assert last is not None
-    assert last.memory[MEMORY].shape == (1, 4 + len(SERIES))
+    assert last is not None and last.memory[MEMORY].shape == (1, 4 + len(SERIES))
+    held_there = player.loads(40)
+    going_on, alone = (player.answer(held_there, start).memory[MEMORY] for start in (last, None))
+    assert np.abs(going_on[0, 4:]).min() > 0.0 and not np.allclose(going_on, alone, atol=1e-5)
 
 
 def test_the_command_draws_times_where_tissue_relaxes(
