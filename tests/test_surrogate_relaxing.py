@@ -31,10 +31,12 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import draw_poses
 from surrogate.evaluation.score import errors
 from surrogate.model.applicability import refusal
+from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
 from surrogate.model.relaxation import MEMORY, Relaxed, followed
 from surrogate.model.store import load, save
 from surrogate.model.tool_force import wrench
+from surrogate.onnx_export.export import onnx_model
 from surrogate.training.condense_contact import condensed
 from surrogate.training.train import train
 
@@ -229,6 +231,10 @@ def test_it_plays_alone_frame_by_frame(model: Learned, box: Anatomy) -> None:
     assert theatre.names(scene) == ("contact", "fem") and theatre.usual(scene) == "contact"
     with pytest.raises(InputError, match="its tissue relaxes, so that finite elements would have to answer"):
         theatre.deformer(GUARDED, scene)
+    with pytest.raises(InputError, match="would need every frame before"):
+        Guarded(model, Fading(box))
+    with pytest.raises(InputError, match="contact follows tissue that relaxes in time"):
+        onnx_model("contact", model)
     player = theatre.player("contact", scene)
     assert player.follows and player.remembers
     last = None

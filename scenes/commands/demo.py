@@ -125,11 +125,11 @@ def deformer_name(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> s
             none = "none lies beside this anatomy; `sulcus train` makes them" if scene.sight is None else TRUTH
             why = next(iter(theatre.refusals(scene).values()), none)
             print(f"sulcus {args.command}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
-        usual, best = theatre.usual(scene), theatre.best(scene)
-        if args.deformer is None and usual != best:
-            why = theatre.models[best].left_out
-            print(f"sulcus {args.command}: on left-out cortex {best} is {why}", file=sys.stderr)
-        return args.deformer or usual
+        best = theatre.best(scene)
+        stated = theatre.models[best].left_out if best in theatre.models else None
+        if args.deformer is None and stated is not None and not stated.enough:
+            print(f"sulcus {args.command}: on left-out cortex {best} is {stated}", file=sys.stderr)
+        return args.deformer or theatre.usual(scene)
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
     from surrogate.evaluation.choose import choose

@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.anatomy import Anatomy
 from sim.deformation import Cost, Deformation, Deformer, Outcome, joined
+from sim.errors import InputError
 from sim.loads import Loads
 
 from .learned import Learned
@@ -27,11 +28,23 @@ class Guarded:
         of which it promises nothing, or for which its bound is above the limit.
     limit
         Of the worst tumour vertex, at 95 % [m].
+
+    Raises
+    ------
+    InputError
+        A model that follows tissue that relaxes: finite elements would need the frames that they did not answer.
     """
 
     model: Learned
     fem: Deformer
     limit: float = LIMIT
+
+    def __post_init__(self) -> None:
+        if self.model.series:
+            raise InputError(
+                "the model follows tissue that relaxes, and finite elements behind it would need every frame before: "
+                "let one of them answer alone."
+            )
 
     @property
     def anatomy(self) -> Anatomy:

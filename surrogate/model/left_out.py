@@ -50,7 +50,7 @@ class LeftOut:
             f"with finite elements behind it for {100 * self.solved:.0f} % of the loads, those that it may have over "
             f"{1e3 * self.limit:g} mm off, {100 * self.guarded:.2f} %"
         )
-        verdict = "it may answer alone" if self.enough else "scenes play it guarded"
+        verdict = "it may answer alone" if self.enough else "scenes play it guarded, unless its tissue relaxes"
         return f"{100 * self.mean:.2f} % of the motion off alone, {behind}: {verdict}"
 
 

@@ -60,8 +60,10 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     Raises
     ------
     InputError
-        A regressor that has no graph; the package `onnx` not installed.
+        A regressor that has no graph; a model that follows its tissue in time; the package `onnx` not installed.
     """
+    if model.series:
+        raise InputError(f"{name} follows tissue that relaxes in time, which no graph does: export another model.")
     sheet, patch, envelope = Sheet(), open_patch(model.anatomy), model.envelope
     nodes = model.nodes if cortex else model.anatomy.tumour_nodes
     for part in model.parts:
