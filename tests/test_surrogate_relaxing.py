@@ -12,6 +12,7 @@ from scenes.builtin.retract import RELAXING
 from scenes.cli import main
 from scenes.play.deformers import GUARDED, Theatre
 from scenes.script.scene import find_scene
+from scenes.script.tool import Probe
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
@@ -21,7 +22,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed, Touching
 from sim.material import Material, tissue_to_json
-from sim.tools import Ball
+from sim.tools import Ball, Capsule
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import tool_features
@@ -214,6 +215,9 @@ def test_a_model_plays_the_series_that_it_learned_and_no_other(model: Learned, b
     def under(series: tuple) -> str:
         return str(refusal(model, (Elasticity(replace(SOFT, prony=series)), *EFFECTS[1:])))
 
+    off = replace(model, tool=Ball(BALL.radius * (1.0 + 1e-15)))
+    assert off.tool != BALL and refusal(off, EFFECTS) is None  # sizes that were read in millimetres
+    assert "on the poses of a ball" in str(refusal(replace(model, tool=Ball(5e-3)), EFFECTS))
     words = "it learned from tissue that relaxes by 40 % in 0.5 s and 30 % in 20 s, and here it "
     assert under(((0.4, 0.5),)) == f"{words}relaxes by 40 % in 0.5 s"
     assert under(()) == f"{words}does not relax"
@@ -225,7 +229,7 @@ def test_a_model_plays_the_series_that_it_learned_and_no_other(model: Learned, b
 
 def test_it_plays_alone_frame_by_frame(model: Learned, box: Anatomy) -> None:
     """Finite elements cannot stand behind it, and a frame of a straight run depends on those before."""
-    scene = replace(find_scene("palpate"), effects=EFFECTS, tool=replace(find_scene("palpate").tool, radius=6e-3))
+    scene = replace(find_scene("palpate"), effects=EFFECTS, tool=Probe(BALL.radius))
     theatre = Theatre(box, None, {"contact": model}, "cpu")
     scene = replace(scene, element="p1")
     assert theatre.names(scene) == ("contact", "fem") and theatre.usual(scene) == "contact"
@@ -251,11 +255,12 @@ def test_the_command_draws_times_where_tissue_relaxes(
 ) -> None:
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
-    wanted = ["simulate", str(mesh), "--out", str(out), "--poses", "--ball", "6", "--count", "2", "--json"]
+    wanted = ["simulate", str(mesh), "--out", str(out), "--poses", "--count", "2", "--json"]
+    wanted += ["--preset", "dissector", "--capsule", "2", "26"]
     assert main([*wanted, "--element", "p1", "--prony", "0.45,0.5;0.365,50"]) == 0
     found = read_dataset(out)
     assert stated_series(found.provenance) == RELAXING.prony
     np.testing.assert_array_equal(found.loads.times, drawn_times(2, 0))
-    assert found.good.all()
+    assert found.good.all() and found.tool == Capsule(2e-3, 0.026)
     assert main([*wanted, "--prony", "0.45;50", "--force"]) == 2
     assert '--prony 0.45;50: write pairs G,TAU with ; between, as in "0.45,0.5;0.365,50"' in capsys.readouterr().err

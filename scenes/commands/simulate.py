@@ -168,10 +168,10 @@ def _asked(args: argparse.Namespace) -> BuiltIn | None:
                 f"{SMALLEST_MM:g} to {LARGEST_MM:g} each."
             )
     if args.ball is not None:
-        return Ball(1e-3 * args.ball)
+        return Ball(args.ball / 1e3)
     if args.capsule is not None:
-        return Capsule(*(1e-3 * size for size in args.capsule))
-    return None if args.blade is None else Spatula(*(1e-3 * size for size in args.blade))
+        return Capsule(*(size / 1e3 for size in args.capsule))
+    return None if args.blade is None else Spatula(*(size / 1e3 for size in args.blade))
 
 
 def _report(args: argparse.Namespace, solver: str, asked: int, solved: Solved) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import astuple, replace
 from typing import Any, cast
+
+import numpy as np
 
 from sim.effects import (
     SKULLS,
@@ -22,13 +24,15 @@ from sim.effects import (
     ToolForce,
 )
 from sim.material import Pairs, tissue_from_json
-from sim.tools import Tool, named
+from sim.tools import BuiltIn, Tool, named
 
 from ..data.holding import series_of
 from .learned import Learned
 
 # Effects that do nothing until a load calls for them: a model's training may have more of them than a scene.
 ON_CALL = {kind.__name__ for kind in (ToolForce, ToolDisplacement, NodalForce, Gravity)}
+# Sizes of tools that differ by less, as a share, are the same: 26 mm are 0.026 m or 1e-3 * 26.
+SAME = 1e-9
 # The training effects of models whose file does not state them.
 UNSAID = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
 
@@ -61,7 +65,7 @@ def refusal(model: Learned, effects: Iterable[Effect], element: str | None = Non
     trained, asked = trained_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
     if model.tool is not None:
         here = tuple(tool for effect in effects for tool in _moved(effect))
-        if here != (model.tool,):
+        if len(here) != 1 or not _alike(here[0], model.tool):
             tools = " and ".join(map(named, here)) or "none that is moved"
             return f"it was trained on the poses of {named(model.tool)}, and here is {tools}"
         asked = asked - {Retraction.__name__} | {ToolContact.__name__}
@@ -75,6 +79,13 @@ def refusal(model: Learned, effects: Iterable[Effect], element: str | None = Non
     differences = [f"not under {', '.join(sorted(strange))}"] * bool(strange)
     differences += [f"never without {', '.join(sorted(missing))}"] * bool(missing)
     return f"it was trained under {', '.join(sorted(trained))}, {' and '.join(differences)}"
+
+
+def _alike(one: Tool, other: BuiltIn) -> bool:
+    """Whether tools are of one kind and size, but for round-off."""
+    if not isinstance(one, BuiltIn) or type(one) is not type(other):
+        return False
+    return bool(np.allclose(astuple(one), astuple(other), rtol=SAME, atol=0.0))
 
 
 def _moved(effect: Effect) -> tuple[Tool, ...]:
