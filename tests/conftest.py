@@ -1,6 +1,6 @@
 """A body that many tests share, and a deformer that answers in microseconds."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from sim.deformation import Deformation, Outcome
 from sim.discretisation.footprint import footprint_weights
 from sim.geometry.tetmesh import TetMesh, oriented
 from sim.loads import Nodal, Pushed
+from surrogate.regressors.ann import Ann
 
 
 def make_box(cells=(12, 12, 7), spacing=6e-3, tumour=10e-3, depth=22e-3, opening=25e-3):
@@ -85,3 +86,12 @@ def box():
 @pytest.fixture(scope="session")
 def pretender(box):
     return Pretender(box)
+
+
+@pytest.fixture(scope="module")
+def short_fits():
+    """Networks are fitted in 120 steps, not in 1000: they are less exact, and nothing else."""
+    fit = Ann.fit
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Ann, "fit", lambda ann, X, Y: fit(replace(ann, steps=min(ann.steps, 120)), X, Y))
+        yield
