@@ -85,8 +85,8 @@ def test_the_tally_counts_what_happened():
     assert all(Outcome[record.outcome] for record in found)
 
 
-def test_an_interrupted_trial_goes_on(tmp_path, anatomy, capsys):
-    write_anatomy(tmp_path / "brain.vtu", anatomy)
+def test_an_interrupted_trial_goes_on(tmp_path, capsys):
+    write_anatomy(tmp_path / "brain.vtu", make_box((7, 7, 4), 8e-3, depth=18e-3))
     words = ["bench", "robust", "--anatomy", str(tmp_path / "brain.vtu"), "--count", "12", "--batch", "4"]
     out = tmp_path / "loads.csv"
     assert main([*words, "--out", str(out), "--json"]) == 0
@@ -123,11 +123,11 @@ def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_two_hundred_random_loads_converge(anatomy):
+def test_random_loads_converge(anatomy):
     """Half of them far beyond surgery; on the template, to 1e-4 in single precision."""
     effects = (Elasticity(), Held(), Slide(), ToolForce())
-    found = [record for some in records(Trial(anatomy, effects, "p1", "cpu", 50), 200, 1, ()) for record in some]
-    assert len(found) == 200
+    found = [record for some in records(Trial(anatomy, effects, "p1", "cpu", 30), 60, 1, ()) for record in some]
+    assert len(found) == 60
     assert [record for record in found if not Outcome[record.outcome].good] == []
     assert max(record.residual for record in found) <= 1e-4
     checked = [record.double for record in found if np.isfinite(record.double)]
