@@ -19,7 +19,7 @@ from sim.runtime.timing import stage
 from surrogate.model.store import load
 
 
-def test_a_patient_in_one_go(tmp_path, capsys):
+def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
     ball(tmp_path, EGG)
     out = tmp_path / "me" / "brain.vtu"
     volumes = [str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--t1", str(tmp_path / "t1.nii.gz")]
