@@ -83,7 +83,7 @@ HARD = {
     "far inside at once": Hard(((at(0.03, 0.03, 0.01),),)),
     "a touch of no depth": Hard(((at(0.03, 0.03, HEIGHT),), (at(0.03, 0.03, HEIGHT),))),
     "gap wider than the body": Hard(
-        ((DOWN,),), accuracy=Accuracy(1e-4, outer=40), gap=0.2, ends=CONVERGED | {Outcome.BUDGET, Outcome.STALLED}
+        ((DOWN,),), accuracy=Accuracy(1e-4, outer=3), gap=0.2, ends=CONVERGED | {Outcome.BUDGET, Outcome.STALLED}
     ),
     "gap of a micrometre": Hard(((DOWN,),), gap=1e-6),
     "linear tissue": Hard(((DOWN,), (at(0.035, 0.03, HEIGHT - 4e-3),)), tissue=Material("linear", 3000.0, 0.45)),
