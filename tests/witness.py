@@ -1,13 +1,16 @@
-"""What an interpreter that plays one scene holds: run as a program with a scene, more effects, a tissue and an element.
+"""What a process that plays one scene holds: a program that reads lines of a scene, more effects, a law, an element.
 
-Prints as JSON the modules of `sim.terms` that were imported; where the kernels come from that were compiled, and that
-were launched in a later frame; the classes of the terms that live; and modules that no scene needs on this machine.
+Each line is a JSON list, played by a fork that has imported what every scene needs, and that nothing was played in.
+Prints as a line of JSON, or null where the play failed, the modules of `sim.terms` that were imported; where the
+kernels come from that were compiled, and that were launched in a later frame; the classes of the terms that live; and
+modules that no scene needs on this machine.
 """
 
 from __future__ import annotations
 
 import gc
 import json
+import os
 import sys
 from dataclasses import replace
 
@@ -95,4 +98,10 @@ def played(scene: Scene) -> dict[str, list[str]]:
 
 if __name__ == "__main__":
     wp.launch = listened(wp.launch)
-    print(json.dumps(played(scene_of(*sys.argv[1:]))))
+    for line in sys.stdin:
+        child = os.fork()
+        if child == 0:
+            print(json.dumps(played(scene_of(*json.loads(line)))), flush=True)
+            os._exit(0)
+        if os.waitpid(child, 0)[1]:
+            print("null", flush=True)
