@@ -6,7 +6,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from theatres import player, small, theatre_of
+from theatres import player, put, small, theatre_of
 
 from ar.optics.calibration import Calibration
 from ar.optics.camera import Camera, project_cv2
@@ -178,10 +178,10 @@ def test_names_on_the_command_line_are_those_of_paths():
     assert tuple(PATHS) == NAMES
 
 
-def test_a_calibrated_camera_renders_checks_and_collects(tmp_path, capsys):
-    path, out = tmp_path / "camera.yaml", tmp_path / "frames"
+def test_a_calibrated_camera_renders_checks_and_collects(theatre, tmp_path, capsys):
+    path, out, body = tmp_path / "camera.yaml", tmp_path / "frames", put(theatre, tmp_path / "box.vtu")
     write_calibration(path, REAL, "ros")
-    seen = ["--camera", str(path), "--path", "microscope", "--eye", "right", "--device", "cpu"]
+    seen = ["--camera", str(path), "--path", "microscope", "--eye", "right", "--device", "cpu", "--anatomy", str(body)]
     assert main(["render", "press", "--out", str(out), "--every", "60", "--plain", *seen]) == 0
     pictures = sorted(out.iterdir())
     assert len(pictures) == 3 and read_png(pictures[0]).shape == (360, 480, 3)
