@@ -49,9 +49,8 @@ def spread_points(mesh, count):
     return np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), count), corners[chosen])
 
 
-@pytest.mark.parametrize("shape", ["sphere", "lobed"])
-def test_at_17k_nodes_angles_surface_and_volume_are_as_promised(shape):
-    subject = template_subject(Tumour(shape=shape, seed=7))
+def test_at_17k_nodes_angles_surface_and_volume_are_as_promised():
+    subject = template_subject(Tumour(shape="lobed", seed=7))
     mesh = make_anatomy(subject, MeshPlan(nodes=17_000)).mesh
     assert abs(len(mesh.nodes) - 17_000) <= 1_700
     assert dihedral_angles(mesh.nodes, mesh.tets).min() >= 10.0
@@ -99,7 +98,7 @@ def test_a_tumour_lies_where_it_is_put_and_the_skull_is_opened_over_it():
 def test_seeds_vary_the_lobed_shape_but_not_its_volume():
     first, again, other = (template_subject(Tumour(shape="lobed", seed=seed)).tumour for seed in (1, 1, 2))
     rng = np.random.default_rng(0)
-    directions = rng.normal(size=(200_000, 3))
+    directions = rng.normal(size=(50_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     np.testing.assert_array_equal(first.radius(directions), again.radius(directions))
     assert np.abs(first.radius(directions) - other.radius(directions)).max() > 1e-3
