@@ -16,7 +16,7 @@ from visitor import Visitor, free_port, wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from ar import guard
+from ar.page import guard
 from ar.page.browser import Browser
 from ar.page.messages import MessageError, checked
 from ar.page.parts import Choice, Playback, Slider, Toggle, Viewpoint
