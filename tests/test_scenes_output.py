@@ -127,7 +127,7 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
     truth = Truth("box", np.zeros(1), one, one, place[None])
     write_truth(tmp_path / "truth.npz", truth)
     write_table(tmp_path / "truth.csv", truth, place)
-    write_rows(tmp_path / "rows.csv", [], [], None)
+    write_rows(tmp_path / "rows.csv", [], [])
     write_registration(tmp_path / "registered.json", Registration(np.eye(4), np.eye(6), np.zeros(3), 1e-3, 6))
     (tmp_path / "text.txt").write_text("my own")
     expected = {

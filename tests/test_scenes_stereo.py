@@ -90,10 +90,12 @@ def test_a_tracked_microscope_is_off_as_a_whole(observer, shot, seen):
     off = observer_of(replace(EXACT, shift=1e-3, turn=np.radians(1.0))).seen(shot, NONE)
     plain = observer_of(EXACT).seen(shot, NONE)
     assert np.allclose(plain.now, seen.now)
-    common = len(off.now) == len(plain.now)
-    shift = off.now.mean(axis=0) - plain.now.mean(axis=0)
-    assert common and 0.5e-3 < np.linalg.norm(shift) < 1.5e-3
-    spread = [each - each.mean(axis=0) for each in (off.now, plain.now)]
+    away = np.linalg.norm(off.now[:, None] - plain.now, axis=2)
+    pair = np.flatnonzero(away.min(axis=1) < 2e-3)  # a point at the edge of what is seen may be in one of them alone
+    assert len(pair) > 0.95 * max(len(off.now), len(plain.now))
+    moved_so, as_it_is = off.now[pair], plain.now[away.argmin(axis=1)[pair]]
+    assert 0.5e-3 < np.linalg.norm(moved_so.mean(axis=0) - as_it_is.mean(axis=0)) < 1.5e-3
+    spread = [each - each.mean(axis=0) for each in (moved_so, as_it_is)]
     turn, _ = np.linalg.lstsq(spread[1], spread[0], rcond=None)[:2]
     assert np.linalg.norm(turn - np.eye(3), 2) == pytest.approx(np.radians(1.0), rel=0.3)
 

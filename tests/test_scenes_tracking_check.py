@@ -58,15 +58,15 @@ class Frozen(Follower):
 class Fresh(Painter):
     """Draws what is stale as if it were known."""
 
-    def paint(self, colour, known):
-        return super().paint(colour, as_known(known) if known.state is State.STALE else known)
+    def paint(self, colour, known, covered=None):
+        return super().paint(colour, as_known(known) if known.state is State.STALE else known, covered)
 
 
 class Silent(Painter):
     """Does not say why."""
 
-    def paint(self, colour, known):
-        return super().paint(colour, replace(known, words=""))
+    def paint(self, colour, known, covered=None):
+        return super().paint(colour, replace(known, words=""), covered)
 
 
 def test_what_was_not_perturbed_passes(film, parts):
