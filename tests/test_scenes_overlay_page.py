@@ -131,7 +131,7 @@ def test_a_film_plays_on_and_after_its_end_anew(follower, stage):
             page.sought.append(start)
             before, until = len(page.shown), time.monotonic() + 30.0
             while len(page.shown) < before + count and time.monotonic() < until:
-                page.play(film, 0.2)
+                page.play(film, 1.5)  # what is known of a picture is so for one call
             return [each.known.state for each in list(page.shown)[before : before + count]]
 
         assert played(14, 4) == [State.GOOD, State.GOOD, State.GOOD, State.REST] and film.count == 17
