@@ -146,7 +146,8 @@ def test_it_is_refused_for_another_body_and_not_for_another_mesh(tmp_path):
     write_registration(path, found)
     again = read_registration(path)
     assert again.scanned.digest == made.digest and again.scanned.apart(made) < 1e-9
-    assert other_mesh(again, anatomy, path) == other_mesh(replace(again, scanned=None), anatomy, path) == ""
+    assert other_mesh(again, anatomy, path) == ""
+    assert "does not say of which anatomy" in other_mesh(replace(again, scanned=None), anatomy, path)
     meshed = replace(again, scanned=replace(made, digest="other", bounds=made.bounds + 2e-3))
     assert "another mesh" in other_mesh(meshed, anatomy, path)
     for other in (replace(made, bounds=made.bounds + 2e-2), replace(made, target=made.target + [0.0, 1e-2, 0.0])):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +12,8 @@ from test_ar_tracking import CAMERA, CUBE, PLATE, flat, looking, taken
 from ar.optics.calibration import Calibration
 from ar.tracking.targets import TIP
 from scenes.cli import main
-from scenes.script.calibration_file import write_calibration
+from scenes.script.calibration_file import read_calibration, write_calibration
+from scenes.script.followed import followed
 from scenes.script.pose_file import COVARIANCE, read_poses
 
 PLATE_AT = flat((20.0, 15.0, 5.0), (-0.08, 0.0, 0.28))
@@ -151,3 +153,10 @@ def test_a_part_of_a_pose_is_refused(tmp_path):
     path.write_text("time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n1,,2,3,0,0,0,1\n")
     with pytest.raises(ValueError, match="row 3 has a part of a pose"):
         read_poses(path)
+
+
+def test_times_are_those_that_pictures_hold():
+    """The file's own last time is 2.133 s: of a film at another rate."""
+    film = Path(__file__).parent / "data" / "film"
+    rows = followed(film / "film.mp4", read_calibration(film / "camera.yaml"), "patient", "camera", 30.0)
+    assert [row.time for row in rows][-2:] == pytest.approx([2.1333, 2.2667], abs=1e-4)

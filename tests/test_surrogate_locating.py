@@ -338,6 +338,16 @@ def test_where_nothing_moved_nothing_is_claimed(locator, body, rigid):
     assert found.causes == dict.fromkeys(KINDS, 0.0) and found.p95 > 0.0
 
 
+def test_what_a_rigid_error_alone_would_explain_is_known(locator, body, truth):
+    """All of a shift of the whole; little of a dent, for points and clouds."""
+    shifted = replace(observed(body, np.zeros_like(body.mesh.nodes)), rigid=0.8e-3)
+    shifted = replace(shifted, now=shifted.rest + [0.0, 0.0, -4e-3])
+    for seen in (shifted, replace(shifted, rest=None)):
+        share, shift = locator.locate(seen).rigid_only
+        assert share == pytest.approx(1.0, abs=0.02) and shift == pytest.approx(4e-3, rel=0.05)
+    assert locator.locate(observed(body, truth[0][0], noise=0.2)).rigid_only[0] < 0.9
+
+
 def test_causes_are_named(locator, body, truth):
     """Of motions by fluid that drains, drainage has the largest share, more often than not."""
     found = [(kind, locator.locate(observed(body, motion, 1, noise=0.2)).causes) for motion, kind in truth]

@@ -12,6 +12,8 @@ from .rigid import turn_vectors
 
 # Two samples that are farther apart have none between them; nobody knows a pose so long after the last one [s].
 LONGEST, AHEAD = 0.1, 0.05
+# Times that are nearer are one [s]: files round them.
+ROUNDING = 1e-3
 DAY = 86_400.0
 """Seconds after which a clock of 24 hours begins anew."""
 
@@ -55,11 +57,11 @@ class PoseStream:
         may be off an even motion.
         """
         time = self.in_its_day(time)
-        first = int(np.searchsorted(self.times, time, side="right")) - 1
+        first = int(np.searchsorted(self.times, time + ROUNDING, side="right")) - 1
         if first < 0:
             return None
         if first + 1 == len(self.times) or self.times[first + 1] - self.times[first] > LONGEST:
-            if time == self.times[first]:
+            if abs(time - self.times[first]) <= ROUNDING:
                 return Pose(self.poses[first], self.covariances[first], 0.0, 0)
             first -= 1
             if first < 0 or self.times[first + 1] - self.times[first] > LONGEST:

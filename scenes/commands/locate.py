@@ -19,6 +19,8 @@ from .outputs import add_force, claimed
 
 # Nobody sees so small a motion [m].
 UNSEEN = 1e-5
+# A rigid error alone that explains such a share, and is so many times as large as stated, is named.
+RIGID, WIDE = 0.9, 2.0
 
 if TYPE_CHECKING:
     from surrogate.locating.locator import Location
@@ -112,6 +114,7 @@ def _numbers(found: Location, points: int, out: Path | None) -> dict[str, object
         "covariance_mm2": (1e6 * found.centroid_covariance).tolist(),
         "p95_mm": 1e3 * found.p95,
         "explained": found.explained,
+        "explained_by_rigid_error": found.rigid_only[0],
         "causes": found.causes,
         "bias_mm": (1e3 * found.bias).tolist(),
         "bias_degrees": np.degrees(found.rotation).tolist(),
@@ -134,6 +137,12 @@ def _sentences(found: Location, out: Path | None) -> str:
         f"The motion explains {found.explained:.0%} of what was seen. Causes: {found.named_causes}.",
         f"The observation as a whole seems off by {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
     ]
+    share, shift = found.rigid_only
+    if share > RIGID and shift > WIDE * found.posterior.evidence.shift:
+        lines.append(
+            f"A registration that is off by {1e3 * shift:.0f} mm would explain {share:.0%}, with a brain at rest. "
+            "If it may be off so far, say so by --rigid."
+        )
     if not found.calibrated:
         lines.append(
             "It is a guess: ellipsoids were not tried on so few or many points, or motions so near or far above errors."

@@ -11,6 +11,7 @@ import numpy as np
 from ar.optics.calibration import Calibration
 from ar.tracking.pictures import GIVE, film_of
 from ar.tracking.pose import Pose, Verdict
+from ar.tracking.stamp import read_stamp
 from ar.tracking.targets import all_targets
 from ar.tracking.track import Tracked, Tracker
 from sim.errors import InputError
@@ -24,6 +25,8 @@ AT_REST = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
 
 def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
     """A row for each picture: of `body` (tool, patient, board, camera) in the `frame` of one of them that is seen.
+
+    Times are those that pictures hold, or else those of the film.
 
     Raises
     ------
@@ -42,7 +45,8 @@ def followed(path: Path, calibration: Calibration, body: str, frame: str, rate: 
                 verdict, pose = _known(state, wanted)
                 if pose is not None and body == "camera":
                     pose = AT_REST.seen_from(pose)
-                yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun)
+                stamp = read_stamp(picture.grey)
+                yield TrackedRow(picture.time if stamp is None else stamp, verdict, pose, time.perf_counter() - begun)
         except ValueError as error:
             raise InputError(str(error)) from error
     if state is None:

@@ -77,7 +77,9 @@ def scanned_of(anatomy: Anatomy) -> Scanned:
 
 
 def other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -> str:
-    """Say that a registration in a file was made for another mesh of the same scan; empty where it was not.
+    """Say that a registration in a file was made for another mesh of the same scan, or that it does not say for which.
+
+    Empty where it was made for this one.
 
     Raises
     ------
@@ -85,7 +87,12 @@ def other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -
         One that was made for another body: its bounds or its tumour lie more than 5 mm from the anatomy's.
     """
     made, here = registration.scanned, scanned_of(anatomy)
-    if made is None or made.digest == here.digest:
+    if made is None:
+        return (
+            f"{path} does not say of which anatomy it is, so that another patient's would hardly be noticed. "
+            "`sulcus register --anatomy` writes it"
+        )
+    if made.digest == here.digest:
         return ""
     if made.apart(here) > SAME:
         raise InputError(

@@ -94,6 +94,17 @@ class Location:
         return max(0.0, 1.0 - float(left @ left) / whole) if whole else 0.0
 
     @property
+    def rigid_only(self) -> tuple[float, float]:
+        """What no motion at all, but another rigid error would explain of what was seen, and how far it shifts [m].
+
+        A share in mean square, by least squares, however large that error is.
+        """
+        evidence = self.posterior.evidence
+        found = np.linalg.lstsq(evidence.rigid, evidence.value, rcond=None)[0]
+        left, whole = evidence.value - evidence.rigid @ found, float(evidence.value @ evidence.value)
+        return (1.0 - float(left @ left) / whole if whole else 0.0), float(np.linalg.norm(found[:3]))
+
+    @property
     def causes(self) -> dict[str, float]:
         """Share of each of `KINDS` in what they move the open cortex by, in mean square; they sum to 1."""
         weight = self.posterior.weight

@@ -51,8 +51,9 @@ def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
     doubt = f'<p class="warn">{escape(known.words)}</p>'
     parts.append(f"<p><b>{DRAWN[known.state]}</b></p>" if known.relied else doubt)
     parts += [overlay_error(known), PATIENT_ERROR]
-    seen = f"reference {'seen' if known.seen == known.time else 'not seen'}"
-    facts = [place, seen, *([f"tool {'seen' if known.T_scan_tool is not None else 'not seen'}"] if tooled else [])]
+    placed = known.seen == known.time
+    tool = "seen" if known.T_scan_tool is not None else "not seen" if placed else "not placed without the reference"
+    facts = [place, f"reference {'seen' if placed else 'not seen'}", *([f"tool {tool}"] if tooled else [])]
     if known.motion.known and known.relied:
         facts.append(f"tumour moved {unbroken(known.motion.moved, known.motion.error)}")
     took = f"looked at and drawn in {1e3 * shown.seconds:.0f} ms"
