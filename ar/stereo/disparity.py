@@ -193,8 +193,9 @@ def cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
         raise ValueError(f"rows of the eyes are {rows:.1f} pixels apart: calibrate the pair again.")
     matched &= (np.abs(down) < OFF_ROW) & ~view.at(there, view.hidden_right)
     steep = view.at(here, view.slope)
+    apart = np.where(found.ravel() > 0, apart.ravel(), np.inf)  # it is not set where nothing was found
     with np.errstate(divide="ignore", invalid="ignore"):
-        sigma = np.hypot(ALIKE * MEAN_SIZE * apart.ravel() / np.sqrt(steep), LEAST_SIGMA)
+        sigma = np.hypot(ALIKE * MEAN_SIZE * apart / np.sqrt(steep), LEAST_SIGMA)
     depth = view.geometry.depths(disparity)
     deviation = depth**2 / view.geometry.gauge * sigma
     points = view.geometry.points(here.astype(float), disparity)
