@@ -33,13 +33,14 @@ from sim.geometry.locate import locate
 from sim.geometry.surface import unit
 from sim.geometry.tetmesh import TetMesh
 from sim.runtime.threads import one_thread
+from surrogate.array_functions import squared_distances
+from surrogate.locating.calibration import RADIUS_SQUARED
+from surrogate.locating.evidence import alike
 
 PUBLISHED = {"linear": "force 6.5 - 9.4 %, 0.8 - 1.2 s an update", "neohookean": "no figure that we know"}
 # Lengths [m] over which forces are alike, sizes of one vertex's force [N], and errors of points [m], to choose from.
 LENGTHS, SIZES, ERRORS = (4e-3, 1e-2, 2.5e-2), (1e-4, 1e-3, 1e-2, 1e-1, 1.0), (1e-5, 5e-5, 2e-4, 6e-4)
-ROUNDS, TOGETHER = 3, 128
-# Of chi-squared of three numbers, at 95 %.
-RADIUS_SQUARED = 7.815
+ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +103,7 @@ class Belief:
     def covariance(self, liver: Liver) -> np.ndarray:
         """Of the patch's forces (3 f, 3 f) [N^2]."""
         at = liver.mesh.nodes[liver.patch]
-        square = ((at[:, None] - at) ** 2).sum(axis=2)
-        return np.kron(self.size**2 * np.exp(-square / (2.0 * self.length**2)), np.eye(3))
+        return np.kron(self.size**2 * alike(squared_distances(at, at), self.length), np.eye(3))
 
 
 def seen(liver: Liver, cloud: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,8 +113,7 @@ def seen(liver: Liver, cloud: np.ndarray, force: np.ndarray) -> tuple[np.ndarray
     """
     nodes = liver.mesh.nodes
     corners = (nodes + liver.motion @ force)[liver.surface]
-    found = [closest(cloud[some : some + TOGETHER], corners) for some in range(0, len(cloud), TOGETHER)]
-    triangle, weights = (np.concatenate([getattr(each, name) for each in found]) for name in ("triangle", "weights"))
+    _, triangle, weights = closest(cloud, corners)
     a, b, c = np.moveaxis(corners[triangle], 1, 0)
     normal, vertices = unit(np.cross(b - a, c - a)), liver.surface[triangle]
     rows = np.einsum("nc,ni,ncif->nf", weights, normal, liver.motion[vertices], optimize=True)

@@ -105,14 +105,14 @@ def test_a_stamp_outlives_blur_and_noise_and_none_is_read_where_none_is():
 def test_a_registration_is_off_as_it_says(player):
     mounts, found = mounted(player), []
     for seed in range(200):
-        one = registered(player, mounts, 0.5, 0.4, seed)
+        one = registered(player.site, mounts, 0.5, 0.4, seed)
         off = one.T_patient_scan @ mounts.T_scan_patient
         place, covariance = one.point(player.site.origin + [0.02, 0.0, 0.0])
         true = np.linalg.inv(mounts.T_scan_patient) @ [*(player.site.origin + [0.02, 0.0, 0.0]), 1.0]
         found.append((place - true[:3]) @ np.linalg.solve(covariance, place - true[:3]))
         assert not np.allclose(off, np.eye(4), atol=1e-6)
     assert np.mean(found) == pytest.approx(3.0, rel=0.2)
-    exact = registered(player, mounts, 0.0, 0.0, 0).T_patient_scan
+    exact = registered(player.site, mounts, 0.0, 0.0, 0).T_patient_scan
     np.testing.assert_allclose(exact, np.linalg.inv(mounts.T_scan_patient), atol=1e-12)
 
 

@@ -115,7 +115,10 @@ def test_a_film_rolls_and_what_is_drawn_into_it_says_how_far_off_that_makes_it(p
     rows = np.abs(plain.colour.astype(int) - shots[0].colour).mean(axis=(1, 2))
     assert rows[290:310].mean() < 0.4 * max(rows[:100].mean(), rows[500:].mean())  # the middle row has its time
     follower = Follower(
-        calibration, registered(player, mounts, 0.0, 0.0, 0), mounts.tool, ToolMotion(player.stage, player.deformer)
+        calibration,
+        registered(player.site, mounts, 0.0, 0.0, 0),
+        mounts.tool,
+        ToolMotion(player.stage, player.deformer),
     )
     known, all_known = None, []
     for shot in shots:

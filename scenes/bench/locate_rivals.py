@@ -35,7 +35,6 @@ YOUNG, POISSON, STIFFER = 3000.0, 0.45, 2.0
 # Springs of the skull along every direction [N/m for each m^2], and of each seen point [N/m]. Of 1e2 to 1e6 and of 1 to
 # 100 these removed most of 20 other twins, at all levels of noise together (100 points on 36 % of the cortex).
 SKULL, POINT = 3e3, 30.0
-TOGETHER = 64
 
 
 def nothing(at: np.ndarray) -> Rival:
@@ -151,10 +150,8 @@ def _on_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     triangles, corners = anatomy.open_surface, anatomy.mesh.nodes[anatomy.open_surface]
     vertices = np.unique(triangles)
     weights = np.zeros((len(points), len(vertices)))
-    for first in range(0, len(points), TOGETHER):
-        found = closest(points[first : first + TOGETHER], corners)
-        row = first + np.arange(len(found.triangle))
-        weights[row[:, None], np.searchsorted(vertices, triangles[found.triangle])] = found.weights
+    found = closest(points, corners)
+    weights[np.arange(len(points))[:, None], np.searchsorted(vertices, triangles[found.triangle])] = found.weights
     return weights
 
 

@@ -119,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
     shots: list[Shot] = []
     film = _write_film(args, shots_of(player, mounts, taking, args.every), shots, player)
     write_calibration(paths["camera.yaml"], replace(calibration, name=f"sulcus film: {scene.name}"))
-    write_registration(paths["registration.json"], registered(player, mounts, shift, turn, args.seed))
+    write_registration(paths["registration.json"], registered(player.site, mounts, shift, turn, args.seed))
     write_tool(paths["tool.json"], mounts.tool)
     truth = Truth(
         player.site.anatomy.digest,

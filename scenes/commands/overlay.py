@@ -286,7 +286,7 @@ def _deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: 
 def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
     """Draw all pictures, into a film if one is asked for; returns them without their colours."""
     from ar.screen import write_film
-    from ar.tracking.pictures import GIVE, film_of, rate_of
+    from ar.tracking.pictures import film_of, rate_of
 
     from ..play.overlay.run import overlaid, timed
 
@@ -309,8 +309,6 @@ def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Sh
         raise InputError(str(error)) from error
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({why(error)}). {REMEDY}") from error
-    if not shown:
-        raise InputError(f"{args.pictures}: holds no picture. {GIVE}")
     return shown
 
 

@@ -67,6 +67,11 @@ class TrackedTool:
         at = box @ T_tool_cube[:3, :3].T + T_tool_cube[:3, 3]
         return np.concatenate([vertices, at]), np.concatenate([triangles, sides + len(vertices)])
 
+    def at(self, T_scan_tool: np.ndarray, cubed: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """How it looks at a pose (4, 4) [m], with its cube or without: vertices (n, 3) [m], triangles (m, 3)."""
+        vertices, triangles = self.mesh if cubed else self.bare
+        return vertices @ T_scan_tool[:3, :3].T + T_scan_tool[:3, 3], triangles
+
 
 def _cube() -> tuple[np.ndarray, np.ndarray]:
     """The printed cube as a box in its own frame: corners (8, 3) [m], and triangles (12, 3)."""

@@ -8,6 +8,8 @@ import numpy as np
 
 # Share of a distance that two ways to find it may differ by.
 ROUNDING = 1e-9
+# Points that are held against shared triangles at once: more only take more memory.
+TOGETHER = 128
 
 
 class Closest(NamedTuple):
@@ -26,9 +28,14 @@ def closest(points: np.ndarray, corners: np.ndarray) -> Closest:
     the closest; the distance to the middle of every one is looked at.
     """
     if corners.ndim == 3:
-        near = _candidates(points, corners)
-        found = closest(points, corners[near])
-        return found._replace(triangle=near[np.arange(len(near)), found.triangle])
+        middle, reach = bounding_balls(corners)
+        parts = []
+        for first in range(0, len(points), TOGETHER):
+            some = points[first : first + TOGETHER]
+            near = _candidates(some, middle, reach)
+            found = closest(some, corners[near])
+            parts.append(found._replace(triangle=near[np.arange(len(near)), found.triangle]))
+        return parts[0] if len(parts) == 1 else Closest(*map(np.concatenate, zip(*parts, strict=True)))
     edge = np.roll(corners, -1, axis=2) - corners
     arm = points[:, None, None] - corners
     square = np.einsum("bsei,bsei->bse", edge, edge)
@@ -62,17 +69,18 @@ def bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
 
 
-def _candidates(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Numbers (B, k) of triangles among which the closest is: no middle lies nearer than their nearest corner may.
+def _candidates(points: np.ndarray, middle: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Numbers (B, k) of triangles, given by their `bounding_balls`, among which the closest is.
+
+    No middle lies nearer than their nearest corner may.
 
     Each row begins with those that may be the closest, in rising order, so that of equal ones the first is found. The
     first of them fills the rest.
     """
-    middle, reach = bounding_balls(corners)
     x, y, z = (points[:, axis, None] - middle[:, axis] for axis in range(3))
     away = np.sqrt(x * x + y * y + z * z)
     maybe = ~(away - reach > (1.0 + ROUNDING) * away.min(axis=1, keepdims=True))
-    row, triangle = np.divmod(np.flatnonzero(maybe), len(corners))
+    row, triangle = np.divmod(np.flatnonzero(maybe), len(middle))
     count = np.bincount(row, minlength=len(points))
     first = np.cumsum(count) - count
     near = np.repeat(triangle[first][:, None], count.max(), axis=1)

@@ -26,8 +26,6 @@ NEAR, FAR, NEAR_NOW = 6e-3, 12e-3, 18e-3
 FARTHEST_TIP, ONE_PLACE = 30e-3, 1e-3
 # Motions [m] beyond which no brain goes, and rigid errors that no tracker has.
 LONGEST_MOTION, FARTHEST_OFF = 0.025, 0.02
-# Points of a cloud that are looked at together.
-TOGETHER = 128
 MOST = 400
 """Points of a cloud that are looked at, spread over it: more tell no more."""
 
@@ -142,9 +140,7 @@ def _along_normals(
     """One row a point, of its `number` (n,): how far along the moved surface's normal the surface moved to be there."""
     triangles, nodes = anatomy.open_surface, anatomy.mesh.nodes
     corners = (nodes + motion)[triangles]
-    asked = cloud - bias(cloud)
-    found = [closest(asked[some : some + TOGETHER], corners) for some in range(0, len(asked), TOGETHER)]
-    triangle, weights = (np.concatenate([getattr(each, name) for each in found]) for name in ("triangle", "weights"))
+    _, triangle, weights = closest(cloud - bias(cloud), corners)
     a, b, c = np.moveaxis(corners[triangle], 1, 0)
     normal = unit(np.cross(b - a, c - a))
     vertices = triangles[triangle]
@@ -207,9 +203,8 @@ def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     away = np.sqrt(squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
     far = np.flatnonzero(away > NEAR)
-    for some in range(0, len(far), TOGETHER):
-        part = far[some : some + TOGETHER]
-        away[part] = np.linalg.norm(closest(points[part], nodes[triangles]).point - points[part], axis=1)
+    if len(far):
+        away[far] = np.linalg.norm(closest(points[far], nodes[triangles]).point - points[far], axis=1)
     return away
 
 

@@ -14,7 +14,8 @@ from ar.tracking.pose import Pose
 from ar.tracking.pose_stream import PoseStream
 from ar.tracking.rigid import cross_matrices, turn_vectors
 from ar.tracking.targets import patient_reference, tool_cube
-from ar.tracking.track import Tracked, Tracker
+
+from ...script.followed import rows_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,18 +109,11 @@ def clock_of_film(film: Iterable[Named], calibration: Calibration, tool: PoseStr
     Raises
     ------
     ValueError
-        As `clock_by_motion` and `Tracker.track`.
+        As `clock_by_motion` and `rows_of`.
     """
-    cube, reference = tool_cube(), patient_reference()
-    tracker = Tracker(calibration.camera(np.eye(4)), (reference, cube))
-    tracked: Tracked | None = None
-    times, places = [], []
-    for each in film:
-        tracked = tracker.track(each.grey, tracked)
-        if len(tracked.poses) == 2:
-            beside = tracked.poses[cube.name].seen_from(tracked.poses[reference.name])
-            times.append(each.time)
-            places.append(beside.T_camera_target[:3, 3])
+    film_rows = rows_of(film, calibration, tool_cube().name, patient_reference().name)
+    seen = [(row.time, row.pose) for row in film_rows if row.pose is not None]
+    times, places = [time for time, _ in seen], [pose.T_camera_target[:3, 3] for _, pose in seen]
     both = [(time, pose) for time in tool.times.tolist() if (pose := Elsewhere(tool, patient).beside(time)) is not None]
     others = [pose.T_camera_target[:3, 3] for _, pose in both]
     if not both:

@@ -25,6 +25,7 @@ from sim.tools import BuiltIn
 
 from ...script.reference_place import reference_beside
 from ...script.registration_file import scanned_of
+from ...script.site import Site
 from ...script.tracked_tool import TrackedTool
 from ..player import Player
 from ..stage import TOOL, TOOL_COLOUR
@@ -133,16 +134,16 @@ def mounted(player: Player) -> Mounted:
     return Mounted(TrackedTool(shape, np.linalg.inv(T_tool_cube)), reference_beside(site, camera))
 
 
-def registered(player: Player, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:
+def registered(site: Site, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:
     """The reference's registration to the scan, with an error that is drawn once, and stated.
 
     `shift` [mm] and `turn` [degree] are its standard deviations along and about each axis, about the opening's middle.
     """
     deviations = np.repeat([1e-3 * shift, np.radians(turn)], 3)
     error = deviations * np.random.default_rng([seed, 1]).standard_normal(6)
-    centre = player.site.origin
+    centre = site.origin
     T = moved_about(np.linalg.inv(mounts.T_scan_patient), centre, error)
-    return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scanned=scanned_of(player.site.anatomy))
+    return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scanned=scanned_of(site.anatomy))
 
 
 def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[Shot]:
@@ -153,7 +154,6 @@ def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) ->
     """
     tool, site, stage, last = player.scene.tool, player.site, player.stage, None
     assert tool is not None
-    vertices, triangles = mounts.tool.mesh
     renderer: Renderer | None = None
     calibration = player.scene.viewpoint.calibration
     readout = 0.0 if calibration is None else calibration.readout
@@ -166,8 +166,7 @@ def shots_of(player: Player, mounts: Mounted, taking: Taking, every: int = 1) ->
             continue
         positions = player.positions(last)
         pose = player.tool(tool, touch, positions).pose
-        at = vertices @ pose[:3, :3].T + pose[:3, 3]
-        held = Layer("tool", TOOL, at, triangles, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
+        held = Layer("tool", TOOL, *mounts.tool.at(pose), TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
         layers = [*stage.layers(positions, None), held]
         renderer = renderer or Renderer(layers, stage.lamp, stage.device)
         targets = [

@@ -99,8 +99,7 @@ class Painter:
         pose = known.T_scan_tool
         if self.tool is None or pose is None:
             return None
-        vertices, triangles = self.tool.mesh if cubed else self.tool.bare
-        return Layer("tool", TOOL, vertices @ pose[:3, :3].T + pose[:3, 3], triangles, TOOL_COLOUR)
+        return Layer("tool", TOOL, *self.tool.at(pose, cubed), TOOL_COLOUR)
 
     def gauge(self, known: Known, tumour: Layer) -> Gauge | None:
         """From the tool's tip to the tumour, with the error of both; None where one is not known."""

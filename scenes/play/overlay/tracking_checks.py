@@ -13,12 +13,11 @@ from ar.overlay.hud import FINE, WHITE
 from ar.overlay.outlines import ink_of, silhouette
 from ar.overlay.refind import of_ink, outline_gap, stands
 from ar.overlay.styles import Style
-from ar.tracking.registration import Registration
 
 from ..picture_checks import SOFT
 from ..stage import TUMOUR_COLOUR
 from .drawn_film import DrawnFilm
-from .filming import Shot
+from .filming import Shot, registered
 from .follower import Follower, Known
 from .picture import Painter
 from .run import OLD, Timed, overlaid_one
@@ -102,7 +101,7 @@ def events_of(film: DrawnFilm) -> Iterator[Event]:
 def usual(film: DrawnFilm, style: Style = "window") -> tuple[Follower, Painter]:
     """Who follows a film with all that is known of it and an exact registration, and who draws that."""
     mounts, stage = film.mounts, film.stage
-    exact = Registration(np.linalg.inv(mounts.T_scan_patient), np.zeros((6, 6)), stage.site.origin, 0.0, 0)
+    exact = registered(stage.site, mounts, 0.0, 0.0, 0)
     follower = Follower(film.calibration, exact, mounts.tool, ToolMotion(stage, film.deformer))
     return follower, Painter(stage, mounts.tool, style, stage.device)
 
@@ -140,9 +139,7 @@ def _says(colour: np.ndarray, words: str, wanted: str) -> bool:
 def _off(film: DrawnFilm, shot: Shot, colour: np.ndarray) -> float:
     """How far the outline in a picture is from the true one [pixel]."""
     camera, rest = film.calibration.camera(shot.T_camera_scan), film.stage.tumour_at_rest
-    vertices, triangles = film.mounts.tool.mesh
-    pose = shot.T_scan_tool
     mask = silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
-    tool = silhouette(camera, vertices @ pose[:3, :3].T + pose[:3, 3], triangles)
+    tool = silhouette(camera, *film.mounts.tool.at(shot.T_scan_tool))
     words = (colour == np.asarray(WHITE, np.uint8)).all(axis=2)
     return outline_gap(colour, ink_of(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN[1] + SOFT)
