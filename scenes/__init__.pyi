@@ -1,7 +1,7 @@
 """What happens: scripted tools, the loop that plays them, and the command line."""
 
+from .episodes.episode import collect
 from .play.deformers import Theatre, open_theatre
-from .play.episode import collect
 from .play.player import Frame, Player
 from .script.calibration_file import read_calibration, write_calibration
 from .script.camera_paths import Focus, HandHeld, Microscope, Orbit

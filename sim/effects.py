@@ -350,10 +350,11 @@ SKULLS = {"bonded": Bonded(), "slide": Slide(), "contact": SkullContact()}
 """What the skull may do, by name; the first is recommended, the others are its brackets."""
 
 
-def pushed_effects(anatomy: Anatomy, tissue: Tissue, skull: str = "bonded") -> tuple[Effect, ...]:
+def pushed_effects(anatomy: Anatomy, tissue: Tissue | Elasticity, skull: str = "bonded") -> tuple[Effect, ...]:
     """What a tool that pushes on a body of this tissue calls for; one of `SKULLS` where the anatomy has a skull."""
+    made = tissue if isinstance(tissue, Elasticity) else Elasticity(tissue)
     covered = (SKULLS[skull],) if anatomy.slide_normal.any() else ()
-    return (Elasticity(tissue), Held(), *covered, ToolForce())
+    return (made, Held(), *covered, ToolForce())
 
 
 def remember(effects: Iterable[Effect]) -> bool:

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from scenes.cli import COMMANDS
+from scenes.episodes.episode import MEANINGS as EPISODE
 from scenes.play.deformers import model_path
-from scenes.play.episode import MEANINGS as EPISODE
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.shipped_files import template_path
 from sim.bodies.meshfile import read_anatomy

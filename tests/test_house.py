@@ -39,7 +39,7 @@ ORDER = (
     {"ar.page"},
     {"scenes.script"},
     {"scenes.builtin", "scenes.play"},
-    {"scenes.bench"},
+    {"scenes.bench", "scenes.episodes"},
     {"scenes.report"},
     {"scenes.commands"},
 )
@@ -209,7 +209,7 @@ def test_each_library_does_its_job(library):
 
 def test_rooms_without_pictures_or_networks_import_none():
     outside = {name for name in importers("cv2") if not name.startswith("ar/")}
-    assert outside == {"scenes/play/episode.py", "scenes/bench/loglog_chart.py"}
+    assert outside == {"scenes/episodes/episode.py", "scenes/bench/loglog_chart.py"}
     assert not {name for name in importers("warp") if name.startswith("surrogate/")}
 
 
@@ -370,7 +370,7 @@ def test_the_command_line_waits_for_nothing():
     print_heavy = f"import sys; print([name for name in {heavy} if name in sys.modules])"
     assert fresh(f"import scenes.cli; {print_heavy}").strip() == "[]"
     assert "torch" not in fresh(f"import scenes.commands.solve, scenes.commands.anatomy, sim.fem; {print_heavy}")
-    assert "viser" not in fresh(f"import scenes.commands.check, scenes.play.checks, scenes.play.episode; {print_heavy}")
+    assert "viser" not in fresh(f"import scenes.commands.check, scenes.episodes.episode; {print_heavy}")
 
 
 def test_public_names_are_there_and_importing_them_changes_no_setting():

@@ -201,7 +201,7 @@ def test_a_calibrated_camera_renders_checks_and_collects(theatre, tmp_path, caps
 
 
 def test_episodes_hold_the_lens_and_the_camera_of_each_frame(theatre, tmp_path):
-    from scenes.play.episode import collect
+    from scenes.episodes.episode import collect
 
     play = filmed(theatre, path=Microscope((Focus(0.0, 1.2, 1.5),), 0.2))
     play = player(theatre, replace(play.scene, duration=0.2), "fem")

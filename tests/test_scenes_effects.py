@@ -11,10 +11,10 @@ from theatres import player, short, sinking, small, template_theatre, theatre_of
 from visitor import Visitor, free_port, wait_for
 
 from scenes.builtin.retract import RELAXING
+from scenes.episodes.episode import UNITS, collect
 from scenes.play.checks import measure
 from scenes.play.deformers import Theatre
 from scenes.play.effect_ablation import without
-from scenes.play.episode import UNITS, collect
 from scenes.play.load_text import acting
 from scenes.play.page.demo import Demo
 from scenes.play.player import labelled

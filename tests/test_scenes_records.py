@@ -11,7 +11,7 @@ from theatres import player, put, short, theatre_of
 
 from ar.optics.camera import Camera, project_cv2
 from scenes.cli import main
-from scenes.play.episode import DEPTH_SCALE, collect
+from scenes.episodes.episode import DEPTH_SCALE, collect
 from scenes.play.player import STAGES
 from scenes.play.stage import CORTEX, DRAPE, TOOL
 from scenes.script.tool_paths import press
@@ -149,6 +149,7 @@ class TestEpisode:
         assert units == {
             "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
             "tumour_predicted": "m", "tumour_fem": "m", "seconds": "s", "tumour_rest": "m", "bound": "m",
+            "cortex_predicted": "m", "cortex_fem": "m", "cortex_rest": "m", "cortex_nodes": "1", "fem_frames": "1",
             "reaction_fem": "N, N m", "K": "pixel", "tumour_nodes": "1", "tumour_left": "1",
             "outcome_predicted": "text", "outcome_fem": "text", "distance": "m", "distance_error": "m",
             "model_error": "m", "tumour_error": "m", "tumour_error_unobserved": "m",
@@ -192,7 +193,7 @@ class TestEpisode:
         """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
         resource = pytest.importorskip("resource")
         monkeypatch.setattr(
-            "scenes.play.episode.demand_space", lambda *asked: None
+            "scenes.episodes.episode.demand_space", lambda *asked: None
         )  # as if there had been room at first
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         drawn = []

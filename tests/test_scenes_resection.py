@@ -13,7 +13,7 @@ from visitor import free_port, wait_for
 
 from ar.overlay.outlines import silhouette
 from scenes.cli import main
-from scenes.play.episode import collect
+from scenes.episodes.episode import collect
 from scenes.play.load_text import acting
 from scenes.play.page.demo import Demo
 from scenes.script.debulking import Debulking

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from theatres import player, theatre_of
 
-from scenes.play.episode import collect
+from scenes.episodes.episode import collect
 from scenes.play.load_text import acting
 from scenes.play.player import Player
 from scenes.play.reference import truth_of

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from scenes.play.episode import MEANINGS as EPISODE
-from scenes.play.episode import UNITS
+from scenes.episodes.episode import MEANINGS as EPISODE
+from scenes.episodes.episode import UNITS
 from surrogate.data.array_meanings import GROUPS
 from surrogate.data.array_meanings import MEANINGS as DATASET
 

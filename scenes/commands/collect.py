@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     """Play and write."""
     from tqdm import tqdm
 
-    from ..play.episode import collect
+    from ..episodes.episode import collect
 
     scene = filmed(args, scene_asked(args, args.scene))
     out = claimed(args.out, ".h5", "an episode of `sulcus collect`", args.force, [args.anatomy, args.camera])

@@ -33,6 +33,7 @@ from ..script.site import Site
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, lifted
 from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
+from .covers import COTTON, GLOVE
 from .error_text import error_lines
 from .load_text import acting, doubt_of
 from .observer import Estimate
@@ -42,6 +43,8 @@ from .tip_reading import reading
 REFUSED = "what is seen was refused, and the scan is shown: do not rely on it"
 # Strokes and gaps of the outlines of the truth and of the ellipsoid [pixel].
 TRUE_STROKES, ELLIPSOID_STROKES = (12, 4), (8, 5)
+COVERS = (TOOL, COTTON, GLOVE)
+"""What is drawn in front of the overlay."""
 LINES = "green estimate, pink truth, blue 95 % of its middle"
 """What lines beside an estimate are."""
 IN_BONE = "the bone is where this push needs the tool: do not rely on it"
@@ -225,7 +228,7 @@ class Player:
         lines = error_lines(promised, error, trained, doubt, camera.width < FEW)
         head = [part for line in lines for part in folded(line, WIDE * camera.width)]
         over = composite(
-            picture, camera, tumour, (TOOL,), self.style, band, shown, rest, doubt, traces, moved, head,
+            picture, camera, tumour, COVERS, self.style, band, shown, rest, doubt, traces, moved, head,
             opening=OPENING, error=error.bound, names=names_of(estimate),
         )  # fmt: skip
         if estimate is not None and self.style != "none":

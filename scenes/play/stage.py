@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ar.optics.camera import Camera
 from ar.overlay.legend import Names
@@ -21,12 +22,13 @@ from sim.loads import Loads, Resected
 from ..script.scene import Scene
 from ..script.sight import StereoSight
 from ..script.site import HOLE, Site
+from .covers import COTTON, GLOVE, Squares, finger, squares
 from .observer import Sees
 from .vessels import with_vessels
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 """Segmentation ids."""
-NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool"}
+NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", COTTON: "cotton", GLOVE: "glove"}
 """What can be seen of them: the tumour never can."""
 
 CORTEX_COLOUR = (0.86, 0.60, 0.54)
@@ -60,12 +62,13 @@ class Cortex:
     triangles: np.ndarray
     rest: np.ndarray
     solid: Solid | None
+    colour: np.ndarray | tuple[float, float, float] = CORTEX_COLOUR
 
     def at(self, positions: np.ndarray) -> Layer:
         """As it is seen at `positions` (V, 3) [m]."""
         rest = None if self.solid is None else self.rest
         return Layer(
-            "cortex", CORTEX, positions[self.vertices], self.triangles, CORTEX_COLOUR, 0.5, solid=self.solid, rest=rest
+            "cortex", CORTEX, positions[self.vertices], self.triangles, self.colour, 0.5, solid=self.solid, rest=rest
         )
 
 
@@ -108,8 +111,10 @@ class Stage:
     @cached_property
     def lamp(self) -> Lamp:
         """A lamp over the surgeon's shoulder."""
-        camera = self.scene.viewpoint.camera(self.site)
-        return lamp_beside(camera, self.site.origin, radius=1.6 * self.site.radius)
+        camera, site, look = self.scene.viewpoint.camera(self.site), self.site, self.scene.look
+        lamp = lamp_beside(camera, site.origin, radius=1.6 * site.radius)
+        turned = Rotation.from_rotvec(look.turn * site.axis).apply(lamp.position - site.origin)
+        return replace(lamp, position=site.origin + turned, strength=look.lamp, ambient=look.ambient)
 
     def cortex(self, positions: np.ndarray) -> Layer:
         """The open cortex at `positions` (V, 3) [m]."""
@@ -146,7 +151,10 @@ class Stage:
         return np.asarray(self.scene.tool.mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
 
     def _layers(self, positions: np.ndarray, corners: np.ndarray | None) -> list[Layer]:
+        look = self.scene.look
         seen = [self.visible(positions), self._drape]
+        seen += [] if look.finger is None else [self._finger]
+        seen += [self._squares.at(positions)] if look.cottonoids else []
         if self.scene.tool is None or corners is None:
             return seen
         faces = self.scene.tool.mesh.faces
@@ -163,6 +171,14 @@ class Stage:
         if count not in self._renderers:
             self._renderers[count] = Renderer(layers, self.lamp, self.device)
         return self._renderers[count].picture(camera, [layer.vertices for layer in layers if not layer.still])
+
+    @cached_property
+    def _squares(self) -> Squares:
+        return squares(self.site, self.scene.look.cottonoids)
+
+    @cached_property
+    def _finger(self) -> Layer:
+        return finger(self.site, self.scene.look.finger or 0.0)
 
     @cached_property
     def _renderers(self) -> dict[int, Renderer]:
@@ -206,16 +222,19 @@ class Stage:
         """Triangles (S, 3) of the mesh's surface that wear the scan."""
         vertices, triangles = np.unique(surface, return_inverse=True)
         at = self.anatomy.mesh.nodes[vertices]
-        return Cortex(vertices, triangles, at - READ_BELOW * vertex_normals(at, triangles), self.scan)
+        colour = np.array(CORTEX_COLOUR) * self.scene.look.tint
+        return Cortex(vertices, triangles, at - READ_BELOW * vertex_normals(at, triangles), self.scan, colour)
 
     @cached_property
     def scan(self) -> Solid | None:
         """The scan as a solid texture."""
         if self.intensity is None:
             return None
-        sight = self.scene.sight
+        sight, seed = self.scene.sight, self.scene.look.vessels
         if isinstance(sight, StereoSight) and sight.vessels:
-            return with_vessels(self.intensity, self.site, sight.seed, DARK, RELIEF)
+            seed = sight.seed
+        if seed is not None:
+            return with_vessels(self.intensity, self.site, seed, DARK, RELIEF)
         values = self.intensity.windowed(self.site.anatomy.mesh)
         return Solid(values, np.linalg.inv(self.intensity.affine), DARK, RELIEF)
 

@@ -33,6 +33,7 @@ from sim.runtime.user_script import error_text, run_script
 
 from .debulking import Debulking
 from .head_posture import Lie, supine
+from .look import PLAIN, Look
 from .sight import Sight, StereoSight
 from .site import Site
 from .tool import Instrument, Probe
@@ -113,6 +114,7 @@ class Scene:
     surgery: Debulking | None = None
     sight: Sight | StereoSight | None = None
     viewpoint: Viewpoint = USUAL
+    look: Look = PLAIN
     element: str | None = None
     accuracy: Accuracy = LIVE
     bounds: Bounds = Bounds()

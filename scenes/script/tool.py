@@ -21,6 +21,13 @@ def sphere(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(ball.vertices), np.asarray(ball.faces)
 
 
+def capsule(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """A rod with round ends, from the origin along +z: vertices (n, 3) [m], and triangles (m, 3)."""
+    rod = trimesh.creation.capsule(length, radius, count=(20, 20))
+    rod.apply_translation([0.0, 0.0, -float(rod.bounds[0, 2])])
+    return np.asarray(rod.vertices), np.asarray(rod.faces)
+
+
 def shafted(shape: BuiltIn, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A tool of which the shape alone is known, on a straight shaft to `top` (3,) [m].
 

@@ -23,10 +23,11 @@ from sim.effects import (
     ToolDisplacement,
     ToolForce,
 )
-from sim.material import Pairs, tissue_from_json
+from sim.material import Pairs
 from sim.tools import BuiltIn, Tool, named
 
 from ..data.holding import series_of
+from ..data.stated_tissue import stated_tissue
 from .learned import Learned
 
 # Effects that do nothing until a load calls for them: a model's training may have more of them than a scene.
@@ -113,7 +114,7 @@ def _other_body(model: Learned, effects: tuple[Effect, ...], element: str | None
     """Why a model's finite elements are others than these: tissue, or element."""
     stated, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
     if "tissue" in stated and here is not None:
-        trained = Elasticity(tissue_from_json(stated["tissue"]))
+        trained = stated_tissue(stated)
         if (series := _other_series(trained, here)) is not None:
             return series
         if trained != here:

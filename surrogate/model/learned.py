@@ -17,7 +17,7 @@ from sim.bodies.tip_distance import tip_gauge
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Pushed, check_loads
-from sim.material import Pairs, tissue_from_json
+from sim.material import Pairs
 from sim.runtime.threads import one_thread
 from sim.tools import BuiltIn
 
@@ -25,6 +25,7 @@ from ..data.cortex_patch import Patch, nearest, open_patch
 from ..data.encode import ENCODERS, Basis, Encoder, directions
 from ..data.holding import stated_series
 from ..data.indentation import indented, posed, with_relaxed
+from ..data.stated_tissue import stated_tissue
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import Contact
 from .conformal import LEVELS, Bound, features_of
@@ -110,7 +111,7 @@ class Learned:
     def source(self) -> str:
         """Its learner, and what it learned from, in words: every answer carries them."""
         stated = self.training
-        tissue = str(tissue_from_json(stated["tissue"])) if "tissue" in stated else "tissue not stated"
+        tissue = str(stated_tissue(stated)) if "tissue" in stated else "tissue not stated"
         element = stated.get("element", "not stated")
         return f"{stated.get('learner', 'learned')}, from finite elements ({element}; {tissue})"
 

@@ -15,7 +15,6 @@ from sim.effects import pushed_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Pushed
-from sim.material import tissue_from_json
 from sim.minimisers.second_order import second_order
 from sim.runtime.atomic_files import written_whole
 from sim.runtime.outside_files import read_as
@@ -23,6 +22,7 @@ from sim.runtime.outside_files import read_as
 from ..data.cortex_patch import Patch, open_patch
 from ..data.dataset import Dataset
 from ..data.encode import Basis, nodal_shares, reduce
+from ..data.stated_tissue import stated_tissue
 from ..data.tool_loads import spread
 from ..model.applicability import trained_skull
 from ..model.learned import Part, only_pushed
@@ -291,7 +291,7 @@ class Expansion:
                 f"{self.data.path}: does not state its tissue, so no series or contact can be had of it: "
                 "choose other learners, or simulate anew."
             )
-        effects = pushed_effects(self.data.anatomy, tissue_from_json(stated["tissue"]), trained_skull(stated))
+        effects = pushed_effects(self.data.anatomy, stated_tissue(stated), trained_skull(stated))
         return Fem(self.data.anatomy, effects, REFERENCE, self.device, element=stated.get("element"))
 
 

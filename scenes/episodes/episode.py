@@ -7,16 +7,19 @@ with which tissue, element and tool: `finite_elements` gives them in words, `tis
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
 import numpy as np
 
+from ar.optics.camera import Camera
 from ar.overlay.outlines import silhouette
 from sim.deformation import Deformation
 from sim.effects import Elasticity
@@ -27,12 +30,13 @@ from sim.runtime.atomic_files import demand_space, written_stream
 from surrogate.model.guarded import model_of
 from surrogate.model.learned import Learned
 
-from .deformers import Theatre
-from .player import STAGES, Frame, Player
-from .reference import truth_of
-from .stage import NAMES
+from ..play.deformers import Theatre
+from ..play.player import STAGES, Frame, Player
+from ..play.reference import truth_of
+from ..play.stage import NAMES, Stage
+from .checksums import seal
 
-FORMAT = "sulcus episode 1"
+FORMAT = "sulcus episode 2"
 DEPTH_SCALE = 1e-5
 """Metres in one step of the 16-bit depth; 0 where nothing is seen."""
 JPEG_QUALITY = 95
@@ -40,7 +44,8 @@ PIXEL_BYTES = 1.5
 """Of all pictures of a frame together, packed: 0.9 to 1.0 in the scenes `press` and `draw`."""
 MEANINGS = {
     "pictures/colour": "JPEG bytes: what the camera sees, BGR when decoded by OpenCV",
-    "pictures/overlay": "JPEG bytes: the same with the predicted tumour drawn into it",
+    "pictures/colour_right": "JPEG bytes: what the right eye of a stereo pair sees",
+    "pictures/overlay": "JPEG bytes: the colour picture with the predicted tumour drawn into it",
     "pictures/segmentation": "PNG bytes, 8 bit: the id of what is seen, see the root's `segmentation`",
     "pictures/tumour_mask": "PNG bytes, 8 bit: 1 where the predicted tumour would be seen were nothing in front of it",
     "K": "pinhole camera matrix (3, 3) [pixel]; of a camera that zooms or focuses, as it starts",
@@ -51,7 +56,15 @@ MEANINGS = {
     "tumour_nodes": "mesh vertices of the rows of tumour_*", "tumour_left": "which of them are not cut out",
     "outcome_predicted": "how the deformer's answer came about", "outcome_fem": "the same of the finite elements",
     "tumour_predicted": "positions, by the deformer, or by what is seen where the scene has a sight",
-    "tumour_fem": "positions, by the finite elements",
+    "tumour_fem": "positions, by the finite elements, in the frames `fem_frames`",
+    "cortex_nodes": "mesh vertices of the rows of cortex_*: the open cortex",
+    "cortex_predicted": "positions, by the deformer", "cortex_rest": "positions in the scan",
+    "cortex_fem": "positions, by the finite elements, in the frames `fem_frames`",
+    "fem_frames": "numbers of the frames that finite elements have solved: the rows of *_fem",
+    "force_read": "the force as a sensor reads it, with its noise",
+    "T_camera_world_right": "(frames, 4, 4): that of the right eye of a stereo pair, whose left eye is the camera",
+    "T_camera_world_tracked": "(frames, 4, 4): the same as a tracker has it, with its noise",
+    "T_world_tool_tracked": "(frames, 4, 4): the tool's pose as a tracker has it, with its noise",
     "tumour_rest": "positions in the scan",
     "reaction_fem": "(frames, tools, 6): force that each tool exerts, and its moment about the tool's lowest point",
     "reaction_predicted": "(frames, tools, 6): the same by the deformer, where it knows it",
@@ -77,7 +90,9 @@ UNITS = {
     "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
     "distance": "m", "distance_error": "m", "model_error": "m", "tumour_error": "m", "tumour_error_unobserved": "m",
     "direction": "1", "csf_level": "m", "share": "1", "done": "1",
-    "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "bound": "m", "seconds": "s",
+    "tumour_predicted": "m", "tumour_fem": "m", "tumour_rest": "m", "cortex_nodes": "1", "cortex_predicted": "m",
+    "cortex_rest": "m", "cortex_fem": "m", "fem_frames": "1", "force_read": "N", "T_camera_world_right": "m",
+    "T_camera_world_tracked": "m", "T_world_tool_tracked": "m", "colour_right": "JPEG", "bound": "m", "seconds": "s",
     "reaction_fem": "N, N m", "reaction_predicted": "N, N m", "reaction_bound": "N",
     "K": "pixel", "K_of_frame": "pixel", "distortion": "1",
     "pose": "m", "displacement": "m", "tumour_nodes": "1", "tumour_left": "1",
@@ -87,6 +102,38 @@ UNITS = {
 }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Recording:
+    """What of a scene is written.
+
+    Parameters
+    ----------
+    solved_every
+        Finite elements solve every so many frames; None: they play, and their answers are taken as they are.
+    overlay
+        Whether the picture with the overlay is kept too.
+    dated
+        Whether the date and wall times are kept: without them the same scene gives the same bytes.
+    grain
+        The colour picture (H, W, 3) uint8 of a frame's number as the camera reads it.
+    sensed
+        What sensors read of the other columns, by name.
+    stated
+        Further attributes.
+    """
+
+    solved_every: int | None = 1
+    overlay: bool = True
+    dated: bool = True
+    grain: Callable[[int, np.ndarray], np.ndarray] = lambda number, colour: colour
+    sensed: Callable[[Mapping[str, Any]], Mapping[str, np.ndarray]] = lambda columns: {}
+    stated: Mapping[str, str | int] = field(default_factory=dict)
+
+
+WHOLE = Recording()
+"""All of it, solved in every frame."""
+
+
 def collect(
     path: Path,
     theatre: Theatre,
@@ -94,6 +141,7 @@ def collect(
     deformer: str,
     progress: Callable[[Iterable], Iterable],
     solved: Callable[[int], object] = lambda more: None,
+    recording: Recording = WHOLE,
 ) -> dict[str, object]:
     """Play a scene and write its episode; the file appears whole or not at all. Returns what it holds.
 
@@ -106,44 +154,61 @@ def collect(
     """
     total = len(player.scene.times)
     demand_space(path, int(total * PIXEL_BYTES * player.camera.width * player.camera.height))
+    right = replace(player.stage) if player.scene.viewpoint.eye == "left" else None
     with written_stream(path, ".h5") as stream, h5py.File(stream, "w") as file:
         pictures = file.create_group("pictures")
-        stores = {
-            name: pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
-            for name in ("colour", "overlay", "depth", "segmentation", "tumour_mask")
-        }
+        stores: dict[str, h5py.Dataset] = {}
         rows, loads = [], []  # a frame itself holds seven megabytes
         for frame in progress(player.frames()):
-            for name, code in encoded(frame, player).items():
+            for name, code in encoded(frame, player, recording, right).items():
+                if name not in stores:
+                    stores[name] = pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
                 stores[name][frame.number] = code
             if stream.failure is not None:  # no frame after it would be kept
                 raise stream.failure
-            rows.append(motion(frame, player))
+            rows.append(motion(frame, player, recording.dated))
             loads.append(frame.loads)
-        outcomes = write_motion(file, player, rows, truth_of(theatre, player.scene, loads, solved))
-        describe(file, theatre, player, deformer)
+        every = recording.solved_every
+        numbers = np.arange(0, total, every or 1)
+        truth = None if every is None else truth_of(theatre, player.scene, [loads[k] for k in numbers], solved)
+        outcomes = write_motion(file, player, rows, numbers, truth, recording)
+        describe(file, theatre, player, deformer, recording)
+        seal(file)
     return {"out": str(path), "scene": player.scene.name, "deformer": deformer, "frames": total, "fem": outcomes}
 
 
-def encoded(frame: Frame, player: Player) -> dict[str, np.ndarray]:
-    """The frame's pictures as compressed bytes, by name."""
+def encoded(frame: Frame, player: Player, recording: Recording, right: Stage | None) -> dict[str, np.ndarray]:
+    """The frame's pictures as compressed bytes, by name; `right` draws for the right eye, if there is one."""
     picture = frame.picture
     tumour = player.stage.at(frame.loads).tumour(player.believed(frame))
     mask = silhouette(frame.camera, tumour.vertices, tumour.triangles)
     depth = np.clip(np.rint(picture.depth / DEPTH_SCALE), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    return {
-        "colour": cv2.imencode(".jpg", picture.colour[..., ::-1], quality)[1].ravel(),
-        "overlay": cv2.imencode(".jpg", frame.shown[..., ::-1], quality)[1].ravel(),
+    found = {"colour": _jpeg(recording.grain(2 * frame.number, picture.colour))}
+    if recording.overlay:
+        found["overlay"] = _jpeg(frame.shown)
+    if right is not None:
+        seen = right.at(frame.loads).picture(_right(player, frame), player.positions(frame.deformation), frame.pose)
+        found["colour_right"] = _jpeg(recording.grain(2 * frame.number + 1, seen.colour))
+    return found | {
         "depth": cv2.imencode(".png", depth)[1].ravel(),
         "segmentation": cv2.imencode(".png", picture.segmentation)[1].ravel(),
         "tumour_mask": cv2.imencode(".png", mask.astype(np.uint8))[1].ravel(),
     }
 
 
-def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
-    """What is not a picture, by name."""
-    nodes = player.site.anatomy.tumour_nodes
+def _jpeg(colour: np.ndarray) -> np.ndarray:
+    return cv2.imencode(".jpg", colour[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].ravel()
+
+
+def _right(player: Player, frame: Frame) -> Camera:
+    """The camera of the right eye."""
+    return replace(player.scene.viewpoint, eye="right").camera(player.site, frame.time)
+
+
+def motion(frame: Frame, player: Player, dated: bool = True) -> dict[str, np.ndarray | float | str]:
+    """What is not a picture, by name; the seconds that it took if it is `dated`."""
+    nodes, cortex = player.site.anatomy.tumour_nodes, cortex_of(player)
+    right = player.scene.viewpoint.eye == "left"
     return {
         "time": frame.time,
         "T_camera_world": frame.camera.T_camera_world,
@@ -152,14 +217,21 @@ def motion(frame: Frame, player: Player) -> dict[str, np.ndarray | float | str]:
         **caused(frame.loads),
         **(felt(frame.deformation) if player.scene.posed else {}),
         "tumour_predicted": player.believed(frame)[nodes],
+        "cortex_predicted": player.positions(frame.deformation)[cortex],
+        **({"T_camera_world_right": _right(player, frame).T_camera_world} if right else {}),
         "tumour_left": ~player.stage.at(frame.loads).anatomy.orphaned[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],
         "model_error": number(frame.model_error),
         "tumour_error": number(frame.tumour_error.bound),
         "tumour_error_unobserved": number(frame.tumour_error.prior),
-        "seconds": np.array([frame.seconds[stage] for stage in STAGES]),
+        **({"seconds": np.array([frame.seconds[stage] for stage in STAGES])} if dated else {}),
     }
+
+
+def cortex_of(player: Player) -> np.ndarray:
+    """Mesh vertices (c,) of the open cortex."""
+    return np.unique(player.site.anatomy.open_surface)
 
 
 def held(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, np.ndarray | float]:
@@ -202,27 +274,40 @@ def caused(loads: Loads) -> dict[str, np.ndarray]:
     return found
 
 
-def write_motion(file: h5py.File, player: Player, rows: list[dict], truth: Deformation) -> dict[str, int]:
-    """Write what is not a picture, one row per frame, and the finite elements' answers; returns their outcomes."""
-    nodes = player.site.anatomy.tumour_nodes
-    rest = player.site.anatomy.mesh.nodes[nodes]
-    outcomes = [outcome.name for outcome in truth.outcome]
+def write_motion(
+    file: h5py.File, player: Player, rows: list[dict], numbers: np.ndarray, truth: Deformation | None, how: Recording
+) -> dict[str, int]:
+    """Write what is not a picture, one row per frame, and the finite elements' answers; returns their outcomes.
+
+    `truth` has one row for each frame in `numbers` (F,); None: the rows themselves are the finite elements'.
+    """
+    nodes, cortex = player.site.anatomy.tumour_nodes, cortex_of(player)
+    rest = player.site.anatomy.mesh.nodes
     columns: dict[str, Sequence | np.ndarray] = {
         name: [row[name] for row in rows] for name in rows[0] if all(name in row for row in rows)
     }
-    columns |= {"tumour_fem": rest + truth.at(nodes).displacement, "outcome_fem": outcomes}
-    if truth.reaction.shape[1]:
-        columns["reaction_fem"] = truth.reaction
+    if truth is None:
+        outcomes = list(columns["outcome_predicted"])
+        columns |= {f"{of}_fem": columns[f"{of}_predicted"] for of in ("tumour", "cortex")}
+    else:
+        outcomes = [outcome.name for outcome in truth.outcome]
+        for of, which in (("tumour", nodes), ("cortex", cortex)):
+            columns[f"{of}_fem"] = rest[which] + truth.at(which).displacement
+        if truth.reaction.shape[1]:
+            columns["reaction_fem"] = truth.reaction
+    columns |= {"outcome_fem": outcomes, "fem_frames": numbers, **how.sensed(columns)}
     for name, values in columns.items():
         text = h5py.string_dtype() if isinstance(values[0], str) else None
         file.create_dataset(name, data=np.asarray(values, text), compression="gzip")
-    file["seconds"].attrs["stages"] = STAGES
-    file.create_dataset("tumour_rest", data=rest)
-    file.create_dataset("tumour_nodes", data=nodes)
+    if "seconds" in file:
+        file["seconds"].attrs["stages"] = STAGES
+    for of, which in (("tumour", nodes), ("cortex", cortex)):
+        file.create_dataset(f"{of}_rest", data=rest[which])
+        file.create_dataset(f"{of}_nodes", data=which)
     return {name.lower(): outcomes.count(name) for name in sorted(set(outcomes))}
 
 
-def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str) -> None:
+def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, recording: Recording) -> None:
     """Units, frames and provenance as attributes."""
     scene, camera, model = player.scene, player.camera, model_of(player.deformer)
     file.create_dataset("K", data=camera.K)
@@ -249,7 +334,7 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str) -
             "tool": repr(scene.tool),
             "footprint_m": np.nan if scene.tool is None else scene.tool.radius,
             "model_digest": "none" if model is None else digest_of_model(model),
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            **({"date": datetime.now(UTC).isoformat(timespec="seconds")} if recording.dated else {}),
             "anatomy": player.site.anatomy.digest,
             "world_frame": "RAS [m]",
             "camera_frame": "OpenCV: x right, y down, z forward; pixel centres at whole numbers",
@@ -258,6 +343,8 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str) -
             "depth_scale_m": DEPTH_SCALE,
             "segmentation": ", ".join(f"{label} {name}" for label, name in NAMES.items()) + ", 0 nothing",
             "sulcus_version": version("sulcus"),
+            "solved_every": recording.solved_every or 1,
+            **recording.stated,
         }
     )
 

@@ -1,0 +1,1 @@
+"""Data sets: plans, episodes drawn from them, and what reads them."""

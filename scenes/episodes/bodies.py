@@ -1,0 +1,186 @@
+"""The bodies that episodes are played on: each is drawn, meshed, and given a trained model, once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sim.accuracy import TRAIN, Accuracy
+from sim.anatomy import TUMOUR_LABEL, Anatomy
+from sim.bodies.intensity import Intensity, read_intensity, sidecar, write_intensity
+from sim.bodies.meshfile import read_anatomy, write_anatomy
+from sim.bodies.subject import MeshPlan, make_anatomy
+from sim.bodies.template import Tumour, template_subject
+from sim.discretisation.space import recommended
+from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce, pushed_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.material import Material
+from surrogate.data.dataset import read_dataset
+from surrogate.data.simulate import simulate
+from surrogate.data.stated_tissue import stating
+from surrogate.data.tool_loads import draw as draw_loads
+from surrogate.model.applicability import refusal
+from surrogate.model.store import load, save
+from surrogate.training.expansion import Expansion
+from surrogate.training.train import train
+
+from ..play.deformers import Theatre, model_path, open_theatre
+from ..script.shipped_files import template_path
+from .draws import drawn, random_of
+from .plan import Bodies, Plan, fields_of
+
+# Drawn tumours may reach out of the brain, or an opening have too few nodes: so many are tried.
+TRIES = 12
+PRESET = "palpation"
+NO_LEARNER = "none"
+ANATOMY, ABOUT = "anatomy.vtu", "body.json"
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body: where its files are, and what was drawn for it by name."""
+
+    folder: Path
+    drawn: Mapping[str, Any]
+
+    @property
+    def anatomy(self) -> Path:
+        """Its anatomy; the scan and the model lie beside it."""
+        return self.folder / ANATOMY
+
+    @property
+    def tissue(self) -> Elasticity:
+        """What it is made of."""
+        return tissue_of(self.drawn)
+
+    def effects(self, *more: Effect, lets_go: bool = False) -> tuple[Effect, ...]:
+        """What holds it, and what else acts; a skull that `lets_go` does so whatever was drawn."""
+        return (self.tissue, Held(), SKULLS["contact" if lets_go else self.drawn["bodies.tissue.skull"]], *more)
+
+    def theatre(self, device: str) -> Theatre:
+        """Who can play on it, as files have it.
+
+        Raises
+        ------
+        InputError
+            As `open_theatre`.
+        """
+        theatre = open_theatre(self.anatomy, device=device)
+        own = model_path(self.anatomy)
+        if own.is_file() or self.drawn["bodies.anatomies"] != "template":
+            return theatre
+        return open_theatre(self.anatomy, model_path(template_path()), device)
+
+
+def tissue_of(values: Mapping[str, Any]) -> Elasticity:
+    """The tissue of drawn values."""
+    about = {name: values[f"bodies.tissue.{name}"] for name in ("law", "young_pa", "poisson", "tumour_ratio")}
+    brain = Material(about["law"], about["young_pa"], about["poisson"])
+    if about["tumour_ratio"] == 1.0:
+        return Elasticity(brain)
+    tumour = Material(about["law"], about["tumour_ratio"] * about["young_pa"], about["poisson"])
+    return Elasticity(brain, {TUMOUR_LABEL: tumour})
+
+
+def drawn_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dict[str, Any]:
+    """What is drawn for a body by name; another `attempt` draws the tumour anew."""
+    found: dict[str, Any] = {}
+    for table, values, again in (
+        ("bodies", bodies, 0), ("bodies.tissue", bodies.tissue, 0), ("bodies.tumour", bodies.tumour, attempt),
+    ):  # fmt: skip
+        for name, value, *_ in fields_of(values):
+            found[f"{table}.{name}"] = drawn(value, random_of(seed, number, f"{table}.{name}/{again}"))
+    found["bodies.tumour.seed"] = int(random_of(seed, number, f"bodies.tumour.seed/{attempt}").integers(2**31))
+    return found
+
+
+def write_body(folder: Path, plan: Plan, seed: int, number: int, device: str) -> Body:
+    """Make a body in an empty folder: anatomy, scan, trained model, and `body.json`, last.
+
+    Raises
+    ------
+    InputError
+        No anatomy could be meshed in `TRIES` draws; an own anatomy that cannot be read; loads that train nothing.
+    """
+    bodies = plan.contents.bodies
+    anatomy, scan, values = _anatomy(plan, seed, number)
+    body = Body(folder, values)
+    write_anatomy(body.anatomy, anatomy)
+    if scan is not None:
+        write_intensity(sidecar(body.anatomy), scan)
+    if bodies.learner.name != NO_LEARNER and not _shipped(body, anatomy):
+        _train(body, anatomy, plan, seed, number, device)
+    (folder / ABOUT).write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    return body
+
+
+def read_body(folder: Path) -> Body:
+    """A body that `write_body` made.
+
+    Raises
+    ------
+    InputError
+        A file that is missing, or is none.
+    """
+    path = folder / ABOUT
+    try:
+        return Body(folder, json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is no body of a data set ({error}). Make the episodes anew.") from error
+
+
+def _anatomy(plan: Plan, seed: int, number: int) -> tuple[Anatomy, Intensity | None, dict[str, Any]]:
+    """An anatomy, its scan, and what was drawn."""
+    bodies = plan.contents.bodies
+    values = drawn_body(bodies, seed, number)
+    kind = str(values["bodies.anatomies"])
+    if kind != "drawn":
+        path = template_path() if kind == "template" else plan.folder / kind
+        scan = sidecar(path)
+        return read_anatomy(path), read_intensity(scan) if scan.is_file() else None, values
+    refused: list[str] = []
+    for attempt in range(TRIES):
+        values = drawn_body(bodies, seed, number, attempt)
+        about = {name: values[f"bodies.tumour.{name}"] for name in ("shape", "site", "seed")}
+        radius, cover, opening = (1e-3 * values[f"bodies.tumour.{each}_mm"] for each in ("radius", "cover", "opening"))
+        try:
+            subject = template_subject(Tumour(radius, cover, about["shape"], about["site"], about["seed"]))
+            anatomy = make_anatomy(subject, MeshPlan(round(values["bodies.tumour.nodes"]), opening))
+        except InputError as error:
+            refused.append(str(error))
+            continue
+        scan = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
+        return anatomy, scan, values
+    raise InputError(f"none of {TRIES} anatomies that were drawn can be meshed; the last: {refused[-1]}")
+
+
+def _shipped(body: Body, anatomy: Anatomy) -> bool:
+    """Whether the model that ships knows this body."""
+    if body.drawn["bodies.anatomies"] != "template":
+        return False
+    models = load(model_path(template_path()), anatomy)
+    effects = pushed_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"])
+    return any(refusal(model, effects, recommended(anatomy.mesh)) is None for model in models.values())
+
+
+def _train(body: Body, anatomy: Anatomy, plan: Plan, seed: int, number: int, device: str) -> None:
+    """Simulate loads on a body, and train its model on them; the data are not kept."""
+    learner = plan.contents.bodies.learner
+    effects = (*pushed_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"]), NodalForce())
+    accuracy = Accuracy(tolerance=TRAIN.tolerance, precision=TRAIN.precision)
+    fem = Fem(anatomy, effects, accuracy, device, 64)
+    first = int(random_of(seed, number, "bodies.learner").integers(2**31))
+    stated = {
+        "effects": repr(effects), **stating(body.tissue), "element": fem.space.element, "accuracy": repr(accuracy),
+        "preset": PRESET, "seed": str(first),
+    }  # fmt: skip
+    data = body.folder / "training.h5"
+    simulate(data, fem, draw_loads(PRESET, anatomy, learner.loads, first), stated)
+    known = read_dataset(data)
+    trained = train(known, [learner.name], expansion=Expansion(known, device))
+    save(model_path(body.anatomy), trained.models)
+    data.unlink()

@@ -1,0 +1,63 @@
+"""Checksums of a file's data sets and attributes: what was written is what is read."""
+
+from __future__ import annotations
+
+from hashlib import sha256
+
+import h5py
+import numpy as np
+
+SUM = "sha256"
+"""The attribute that a data set's checksum, and the file's own, is under."""
+
+
+def digest_of(data: h5py.Dataset) -> str:
+    """Hexadecimal digits of a data set's kind, shape and content."""
+    found = sha256(f"{data.shape} {data.dtype.str if data.dtype.kind != 'O' else 'objects'}".encode())
+    values = np.asarray(data[()])
+    if values.dtype.kind != "O":
+        found.update(np.ascontiguousarray(values).tobytes())
+        return found.hexdigest()
+    for each in values.ravel():
+        raw = each if isinstance(each, bytes) else str(each).encode() if isinstance(each, str) else each.tobytes()
+        found.update(len(raw).to_bytes(8, "little") + raw)
+    return found.hexdigest()
+
+
+def datasets_of(file: h5py.File) -> list[h5py.Dataset]:
+    """All data sets of a file, in the order of their names."""
+    found: dict[str, h5py.Dataset] = {}
+    file.visititems(lambda name, item: found.update({name: item}) if isinstance(item, h5py.Dataset) else None)
+    return [found[name] for name in sorted(found)]
+
+
+def digest_of_file(file: h5py.File) -> str:
+    """Hexadecimal digits of all attributes and of the data sets' checksums, as they are stated."""
+    found = sha256()
+    for item in (file, *datasets_of(file)):
+        for name in sorted(item.attrs):
+            if item is file and name == SUM:
+                continue
+            value = item.attrs[name]
+            said = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+            found.update(f"{item.name}\0{name}\0{said!r}\0".encode())
+    return found.hexdigest()
+
+
+def seal(file: h5py.File) -> None:
+    """State the checksum of every data set, and that of the file."""
+    for data in datasets_of(file):
+        data.attrs[SUM] = digest_of(data)
+    file.attrs[SUM] = digest_of_file(file)
+
+
+def broken(file: h5py.File) -> list[str]:
+    """What is not as it was written, in words; nothing of a file without checksums."""
+    if SUM not in file.attrs:
+        return []
+    found = [
+        f"{data.name}: is not as it was written" for data in datasets_of(file) if data.attrs.get(SUM) != digest_of(data)
+    ]
+    if file.attrs[SUM] != digest_of_file(file):
+        found.append("attributes are not as they were written")
+    return found

@@ -1,0 +1,134 @@
+"""Numbers and words that a plan leaves to chance, and how each is drawn from a seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from zlib import crc32
+
+import msgspec
+import numpy as np
+
+from sim.errors import InputError
+
+
+class Spread(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a number or a word is spread; just one of `uniform`, `log`, `normal` and `choice` is given.
+
+    Parameters
+    ----------
+    uniform, log
+        Least and greatest; evenly between, or evenly on a logarithmic scale.
+    normal
+        Mean and standard deviation; cut off at three deviations.
+    choice, weights
+        Values of which one is taken, and how often each, in any unit (default: all alike).
+    """
+
+    uniform: tuple[float, float] | None = None
+    log: tuple[float, float] | None = None
+    normal: tuple[float, float] | None = None
+    choice: list[float | str | bool] | None = None
+    weights: list[float] | None = None
+
+
+Number = float | tuple[float, float] | Spread
+"""In a plan: a number; its least and greatest, with evenly spread values between; or a `Spread`."""
+Word = str | list[str] | Spread
+"""In a plan: a word; words of which each is as probable; or a `Spread`."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Least and greatest value that a number of a plan may take."""
+
+    low: float
+    high: float
+
+
+def random_of(seed: int, number: int, name: str) -> np.random.Generator:
+    """Random numbers for one name of one episode: no other name, and no other episode, changes them."""
+    return np.random.default_rng([seed, number, crc32(name.encode())])
+
+
+def spread_of(value: object) -> Spread:
+    """A plan's value as a `Spread`."""
+    if isinstance(value, Spread):
+        return value
+    if isinstance(value, tuple):
+        return Spread(uniform=value)
+    return Spread(choice=list(value) if isinstance(value, list) else [value])  # type: ignore[list-item]
+
+
+def drawn(value: object, random: np.random.Generator) -> float | str | bool:
+    """One value of a plan's `Number` or `Word`."""
+    spread = spread_of(value)
+    if spread.uniform is not None:
+        return float(random.uniform(*spread.uniform))
+    if spread.log is not None:
+        return float(np.exp(random.uniform(*np.log(spread.log))))
+    if spread.normal is not None:
+        mean, deviation = spread.normal
+        return mean + deviation * float(np.clip(random.standard_normal(), -3.0, 3.0))
+    assert spread.choice is not None
+    weights = None if spread.weights is None else np.array(spread.weights) / np.sum(spread.weights)
+    return spread.choice[int(random.choice(len(spread.choice), p=weights))]
+
+
+def check_spread(value: object, name: str, limits: Limits | None, words: tuple[str, ...] = ()) -> None:
+    """See that all that may be drawn is possible.
+
+    Parameters
+    ----------
+    limits
+        Of numbers; None of words.
+    words
+        Those that are known; empty: any.
+
+    Raises
+    ------
+    InputError
+        A range that is upside down or without end, weights that are none, a value outside the limits, or a word that
+        is not known.
+    """
+    spread = spread_of(value)
+    given = [kind for kind in ("uniform", "log", "normal", "choice") if getattr(spread, kind) is not None]
+    if len(given) != 1:
+        said = " and ".join(given) or "none"
+        raise InputError(f"{name}: give one of uniform, log, normal and choice, not {said}.")
+    if spread.choice is not None:
+        _check_choice(spread, name)
+        values = spread.choice
+    elif spread.normal is not None:
+        mean, deviation = spread.normal
+        if not deviation >= 0.0:
+            raise InputError(f"{name}: a standard deviation of {deviation:g} is none: give 0 or more.")
+        values = [mean - 3.0 * deviation, mean + 3.0 * deviation]
+    else:
+        low, high = values = list(spread.uniform or spread.log or ())
+        if not low <= high:
+            raise InputError(f"{name}: from {low:g} to {high:g} is upside down: give the least value first.")
+        if spread.log is not None and not low > 0.0:
+            raise InputError(f"{name}: a logarithmic range starts above 0, not at {low:g}.")
+    for each in values:
+        _check_value(each, name, limits, words)
+
+
+def _check_choice(spread: Spread, name: str) -> None:
+    count, weights = len(spread.choice or ()), spread.weights
+    if not count:
+        raise InputError(f"{name}: there is nothing to choose from: give one value or more.")
+    if weights is None:
+        return
+    if len(weights) != count:
+        raise InputError(f"{name}: {len(weights)} weights for {count} values: give one for each.")
+    if not (all(0.0 <= each < np.inf for each in weights) and sum(weights) > 0.0):
+        raise InputError(f"{name}: weights {weights} are none: give numbers that are not below 0, and one above.")
+
+
+def _check_value(value: float | str | bool, name: str, limits: Limits | None, words: tuple[str, ...]) -> None:
+    if limits is None:
+        if words and value not in words:
+            raise InputError(f"{name}: {value!r} is not known: choose from {', '.join(map(str, words))}.")
+        return
+    if isinstance(value, str | bool) or not limits.low <= value <= limits.high:
+        raise InputError(f"{name}: {value!r} may be drawn, and {limits.low:g} to {limits.high:g} is possible.")

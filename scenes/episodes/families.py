@@ -1,0 +1,288 @@
+"""Families of motions: what hands do in the episodes of a data set, each with numbers that are left to chance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from sim.effects import Effect, Gravity, Retraction, SkullContact, ToolContact, ToolForce
+
+from ..builtin.retract import RELAXING
+from ..script.camera_paths import wandering
+from ..script.debulking import Debulking
+from ..script.head_posture import Lie, drained_then_turned, supine
+from ..script.tool import Blade, Instrument, Probe
+from ..script.tool_paths import Path, Touch, draw, idle, lay, palpate, slide, smooth
+from .draws import Limits, Number
+
+PRONY = RELAXING.prony
+"""How tissue relaxes under a spatula."""
+# A hand rests on its way between two places for this share of it.
+REST = 0.3
+
+
+class Motion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How often a family is taken, beside the weights of the others."""
+
+    weight: float = 1.0
+
+
+class Pushing(Motion, frozen=True):
+    """A ball is pushed with a force; `spread` is how far from the middle, as a share of the way to the bone."""
+
+    force_n: Annotated[Number, Limits(0.01, 2)] = (0.05, 0.35)
+    radius_mm: Annotated[Number, Limits(1, 15)] = (5.0, 7.5)
+    spread: Annotated[Number, Limits(0, 1)] = (0.0, 1.0)
+
+
+class Press(Pushing, frozen=True):
+    """Press on one place, aslant, hold, and let go."""
+
+    tilt_deg: Annotated[Number, Limits(0, 45)] = (0.0, 25.0)
+
+
+class Slide(Pushing, frozen=True):
+    """Press, slide along a straight line, and let go."""
+
+    force_n: Annotated[Number, Limits(0.01, 2)] = (0.05, 0.3)
+
+
+class Draw(Pushing, frozen=True):
+    """Lay on, and draw the tissue aside."""
+
+    force_n: Annotated[Number, Limits(0.01, 2)] = (0.05, 0.25)
+    tilt_deg: Annotated[Number, Limits(0, 45)] = (20.0, 40.0)
+
+
+class Reach(Pushing, frozen=True):
+    """Touch several places in turn, with minimum jerk between them."""
+
+    places: Annotated[Number, Limits(2, 12)] = (2.0, 5.0)
+
+
+class Walk(Pushing, frozen=True):
+    """Wander at random in place and force, always in contact."""
+
+    force_n: Annotated[Number, Limits(0.01, 2)] = (0.05, 0.25)
+
+
+class Palpate(Motion, frozen=True):
+    """A ball is moved by its pose, and slides through the tissue; finite elements play."""
+
+    depth_mm: Annotated[Number, Limits(0.5, 10)] = (1.0, 4.0)
+    radius_mm: Annotated[Number, Limits(3, 15)] = 7.0
+    spread: Annotated[Number, Limits(0, 1)] = (0.0, 0.8)
+
+
+class Retract(Motion, frozen=True):
+    """A spatula draws the cortex aside while the tissue relaxes; finite elements play."""
+
+    depth_mm: Annotated[Number, Limits(0.5, 12)] = (3.0, 8.0)
+    tilt_deg: Annotated[Number, Limits(0, 40)] = (10.0, 30.0)
+    spread: Annotated[Number, Limits(0, 1)] = (0.0, 0.3)
+
+
+class Drain(Motion, frozen=True):
+    """Fluid drains to a share of its height, and the head is turned; the skull lets go; finite elements play."""
+
+    fluid: Annotated[Number, Limits(0, 1)] = (0.0, 0.7)
+    turn_deg: Annotated[Number, Limits(-60, 60)] = (-30.0, 30.0)
+
+
+class Debulk(Motion, frozen=True):
+    """Fluid has partly drained, and the tumour is cut out in shares; finite elements play."""
+
+    fluid: Annotated[Number, Limits(0, 1)] = (0.2, 0.7)
+    steps: Annotated[Number, Limits(2, 8)] = (3.0, 5.0)
+
+
+class Motions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The families of a plan; those that are not named are not played."""
+
+    press: Press | None = None
+    slide: Slide | None = None
+    draw: Draw | None = None
+    reach: Reach | None = None
+    walk: Walk | None = None
+    palpate: Palpate | None = None
+    retract: Retract | None = None
+    drain: Drain | None = None
+    debulk: Debulk | None = None
+
+    @property
+    def named(self) -> dict[str, Motion]:
+        """Those that the plan has, by name."""
+        found = {name: getattr(self, name) for name in self.__struct_fields__}
+        return {name: motion for name, motion in found.items() if motion is not None}
+
+
+@dataclass(frozen=True)
+class Act:
+    """What happens in an episode.
+
+    Parameters
+    ----------
+    path, tool, lying, surgery
+        As of a `Scene`.
+    effects
+        What acts beside the tissue, what is held, and the skull.
+    relaxes
+        Whether the tissue does.
+    lets_go
+        Whether the skull lets go of the brain, whatever the body's skull does otherwise.
+    """
+
+    path: Path = idle
+    tool: Instrument | None = None
+    effects: tuple[Effect, ...] = (ToolForce(),)
+    lying: Lie = supine
+    surgery: Debulking | None = None
+    relaxes: bool = False
+    lets_go: bool = False
+
+
+@dataclass(frozen=True)
+class Chance:
+    """What an act is made of: values that were drawn, random numbers, how long it lasts [s], how far it may go [m].
+
+    `reach` is how far from the middle of the open cortex a tool of a radius [m] may go.
+    """
+
+    values: Mapping[str, Any]
+    random: np.random.Generator
+    seconds: float
+    reach: Callable[[float], float]
+
+    def place(self, radius: float) -> tuple[float, float]:
+        """A place for a tool of this radius [m], in the plane of the open cortex [m]."""
+        far = self.values["spread"] * self.reach(radius)
+        angle = self.random.uniform(0.0, 2.0 * np.pi)
+        return far * float(np.cos(angle)), far * float(np.sin(angle))
+
+    @property
+    def probe(self) -> Probe:
+        """The ball."""
+        return Probe(radius=1e-3 * self.values["radius_mm"])
+
+
+def press(chance: Chance) -> Act:
+    """The act of `Press`."""
+    probe, force = chance.probe, chance.values["force_n"]
+    x, y = chance.place(probe.radius)
+    tilt, angle = np.radians(chance.values["tilt_deg"]), chance.random.uniform(0.0, 2.0 * np.pi)
+    rise, hold = 0.35 * chance.seconds, 0.2 * chance.seconds
+    aslant = float(tilt * np.cos(angle)), float(tilt * np.sin(angle))
+
+    def path(time: float) -> Touch:
+        return Touch(x, y, force * (smooth(time / rise) - smooth((time - rise - hold) / rise)), aslant)
+
+    return Act(path, probe)
+
+
+def slid(chance: Chance) -> Act:
+    """The act of `Slide`."""
+    probe = chance.probe
+    start, end = chance.place(probe.radius), chance.place(probe.radius)
+    rise = 0.12 * chance.seconds
+    return Act(slide(chance.values["force_n"], start, end, chance.seconds - 2.0 * rise, rise), probe)
+
+
+def drawn_aside(chance: Chance) -> Act:
+    """The act of `Draw`."""
+    probe, rise = chance.probe, 0.25 * chance.seconds
+    tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(probe.radius)
+    way = draw(chance.values["force_n"], tilt, rise, 0.2 * chance.seconds, at)
+    angle = float(chance.random.uniform(0.0, 2.0 * np.pi))
+
+    def path(time: float) -> Touch:
+        touch = way(time)
+        return replace(touch, tilt=(touch.tilt[0] * float(np.cos(angle)), touch.tilt[0] * float(np.sin(angle))))
+
+    return Act(path, probe)
+
+
+def reach(chance: Chance) -> Act:
+    """The act of `Reach`."""
+    probe, count = chance.probe, round(chance.values["places"])
+    places = np.array([chance.place(probe.radius) for _ in range(count)])
+    forces = chance.values["force_n"] * chance.random.uniform(0.5, 1.0, count)
+    takes = chance.seconds / count
+
+    def path(time: float) -> Touch:
+        number = min(int(time / takes), count - 1)
+        share = time / takes - number
+        # On to the next place in the last part, lifted; down and up again before it.
+        on = smooth((share - (1.0 - REST)) / REST)
+        x, y = (1.0 - on) * places[number] + on * places[min(number + 1, count - 1)]
+        half = 0.5 * (1.0 - REST)
+        return Touch(float(x), float(y), float(forces[number] * (smooth(share / half) - smooth(share / half - 1.0))))
+
+    return Act(path, probe)
+
+
+def walk(chance: Chance) -> Act:
+    """The act of `Walk`."""
+    probe, seed = chance.probe, int(chance.random.integers(2**31))
+    far, force = 0.5 * chance.values["spread"] * chance.reach(probe.radius), chance.values["force_n"]
+
+    def path(time: float) -> Touch:
+        way = wandering(seed, time)
+        begun = smooth(time / (0.15 * chance.seconds))
+        return Touch(float(far * way[0]), float(far * way[1]), force * begun * float(np.clip(0.6 + 0.2 * way[2], 0, 1)))
+
+    return Act(path, probe)
+
+
+def palpated(chance: Chance) -> Act:
+    """The act of `Palpate`."""
+    probe, rise = chance.probe, 0.2 * chance.seconds
+    start, end = chance.place(probe.radius), chance.place(probe.radius)
+    way = palpate(1e-3 * chance.values["depth_mm"], start, end, chance.seconds - 2.0 * rise, rise)
+    return Act(way, probe, (ToolContact((probe.shape,)),))
+
+
+def retracted(chance: Chance) -> Act:
+    """The act of `Retract`."""
+    blade = Blade()
+    tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(blade.radius)
+    way = lay(1e-3 * chance.values["depth_mm"], tilt, 0.4 * chance.seconds, at)
+    return Act(way, blade, (Retraction(blade.shape),), relaxes=True)
+
+
+def drained(chance: Chance) -> Act:
+    """The act of `Drain`."""
+    turn, fluid = float(np.radians(chance.values["turn_deg"])), chance.values["fluid"]
+    lie = drained_then_turned(0.5 * chance.seconds, 0.1 * chance.seconds, 0.3 * chance.seconds, turn, fluid)
+    return Act(effects=(Gravity(),), lying=lie, lets_go=True)
+
+
+def debulked(chance: Chance) -> Act:
+    """The act of `Debulk`."""
+    count, fluid = round(chance.values["steps"]), chance.values["fluid"]
+    lie = drained_then_turned(0.3 * chance.seconds, 0.0, 1.0, 0.0, fluid)
+    times = tuple((chance.seconds * np.linspace(0.4, 0.9, count)).tolist())
+    return Act(effects=(Gravity(),), lying=lie, surgery=Debulking(times), lets_go=True)
+
+
+FAMILIES: dict[str, Callable[[Chance], Act]] = {
+    "press": press, "slide": slid, "draw": drawn_aside, "reach": reach, "walk": walk, "palpate": palpated,
+    "retract": retracted, "drain": drained, "debulk": debulked,
+}  # fmt: skip
+"""What each family of `Motions` does."""
+SKULL_LETS_GO = SkullContact()
+"""The skull of acts that it lets go in."""
+
+
+def trembling(path: Path, seed: int, place: float, force: float) -> Path:
+    """A path with a hand's tremor and drift: standard deviations of place [m] and force [N]; none in the air."""
+
+    def trembles(time: float) -> Touch:
+        touch, way = path(time), wandering(seed, time)
+        pushed = max(0.0, touch.force + force * float(way[2])) if touch.force > 0.0 else touch.force
+        return replace(touch, x=touch.x + place * float(way[0]), y=touch.y + place * float(way[1]), force=pushed)
+
+    return trembles

@@ -1,0 +1,133 @@
+"""One episode, or one body, of a data set: made in a folder, and only if it is not there."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time as clock
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+import numpy as np
+
+from sim.errors import InputError
+
+from .bodies import ABOUT, read_body, write_body
+from .draws import random_of
+from .episode import Recording, collect
+from .plan import Plan
+from .scripted import drawn_episode, scene_of
+from .sensing import noisy, sensed
+
+BODIES = "bodies"
+"""The folder of a data set's bodies."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What became of an episode, or of a body.
+
+    Parameters
+    ----------
+    path
+        Its file, or its folder.
+    frames, bytes, seconds
+        How many it has, how large it is, and how long it took.
+    failed
+        Why there is none; empty where there is.
+    skipped
+        Whether it was there before.
+    """
+
+    path: Path
+    frames: int = 0
+    bytes: int = 0
+    seconds: float = 0.0
+    failed: str = ""
+    skipped: bool = False
+
+
+def episode_path(folder: Path, number: int) -> Path:
+    """The file of an episode."""
+    return folder / f"episode_{number:06d}.h5"
+
+
+def body_path(folder: Path, number: int) -> Path:
+    """The folder of a body."""
+    return folder / BODIES / f"{number:04d}"
+
+
+def body_of(plan: Plan, seed: int, number: int) -> int:
+    """Which body an episode is played on."""
+    return drawn_episode(plan.contents, seed, number).body
+
+
+def make_body(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:
+    """Make a body, unless it is there; what cannot be made is said in `Made.failed`.
+
+    It is made under another name, `0003.partial.HOST.PID`, so that a folder of its name is whole. Who comes second
+    throws his own away: both are alike.
+    """
+    path, began = body_path(folder, number), clock.perf_counter()
+    if (path / ABOUT).is_file():
+        return Made(path, skipped=True)
+    partial = path.with_name(f"{path.name}.partial.{socket.gethostname()}.{os.getpid()}")
+    try:
+        rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        write_body(partial, plan, seed, number, device)
+        if not path.exists():
+            partial.rename(path)
+    except InputError as error:
+        return Made(path, seconds=clock.perf_counter() - began, failed=str(error))
+    except OSError:
+        if not (path / ABOUT).is_file():  # somebody else was faster
+            raise
+    finally:
+        rmtree(partial, ignore_errors=True)
+    size = sum(file.stat().st_size for file in path.iterdir())
+    return Made(path, bytes=size, seconds=clock.perf_counter() - began)
+
+
+def make_episode(folder: Path, plan: Plan, seed: int, number: int, device: str = "auto") -> Made:
+    """Make an episode, unless it is there; its body must be. What cannot be made is said in `Made.failed`.
+
+    Loads without equilibrium fail no episode: their frames say so in `outcome_predicted` and `outcome_fem`.
+    """
+    path, began = episode_path(folder, number), clock.perf_counter()
+    if path.is_file():
+        return Made(path, skipped=True)
+    try:
+        report = _collected(path, plan, seed, number, body_path(folder, body_of(plan, seed, number)), device)
+    except InputError as error:
+        return Made(path, seconds=clock.perf_counter() - began, failed=str(error))
+    return Made(path, int(str(report["frames"])), path.stat().st_size, clock.perf_counter() - began)
+
+
+def _collected(path: Path, plan: Plan, seed: int, number: int, place: Path, device: str) -> Mapping[str, Any]:
+    """Play an episode and write its file."""
+    contents = plan.contents
+    body, asked = read_body(place), drawn_episode(contents, seed, number)
+    theatre = body.theatre(device)
+    scene = scene_of(plan, body, theatre.site, asked, seed, number)
+    name = theatre.best(scene)
+    player = replace(theatre.player(name, scene), style="window" if contents.overlay else "none")
+    noise = asked.group("noise")
+
+    def grain(picture: int, colour: np.ndarray) -> np.ndarray:
+        return noisy(colour, noise["grey_levels"], random_of(seed, number, f"noise.picture/{picture}"))
+
+    recording = Recording(
+        None if name == "fem" else contents.solved_every, contents.overlay, False, grain,
+        lambda columns: sensed(columns, noise, seed, number),
+        {
+            "plan": plan.text, "plan_name": plan.name, "plan_digest": plan.digest, "seed": seed, "episode": number,
+            "family": asked.family, "body": asked.body,
+            "parameters": json.dumps({**asked.values, **body.drawn}, sort_keys=True),
+        },
+    )  # fmt: skip
+    return collect(path, theatre, player, name, lambda frames: frames, recording=recording)

@@ -1,0 +1,234 @@
+"""A plan: what a data set's episodes are drawn from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Annotated, get_args, get_type_hints
+
+import msgspec
+
+from sim.bodies.template import SITES
+from sim.effects import SKULLS
+from sim.errors import InputError
+from sim.material import LAWS
+
+from ..script.camera_paths import PATHS
+from .draws import Limits, Number, Spread, Word, check_spread
+from .families import Motions
+
+SHIPPED = Path(__file__).parent.parent / "data" / "plans"
+"""Plans that ship, by the names of their files."""
+FIXED = "fixed"
+"""The path of a camera that stays."""
+
+
+class Tumour(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The template's tumour and opening, for anatomies that are drawn; as the options of `sulcus anatomy`."""
+
+    radius_mm: Annotated[Number, Limits(3, 35)] = (9.0, 16.0)
+    cover_mm: Annotated[Number, Limits(1, 60)] = (3.0, 12.0)
+    shape: Annotated[Word, ("sphere", "lobed")] = msgspec.field(default_factory=lambda: ["sphere", "lobed"])
+    site: Annotated[Word, tuple(SITES)] = msgspec.field(default_factory=lambda: list(SITES))
+    opening_mm: Annotated[Number, Limits(25, 90)] = (40.0, 60.0)
+    nodes: Annotated[Number, Limits(2000, 250_000)] = 5300.0
+
+
+class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a body is made of, and what the skull does to it."""
+
+    law: Annotated[Word, LAWS] = "neo-hookean"
+    young_pa: Annotated[Number, Limits(100, 50_000)] = 3000.0
+    poisson: Annotated[Number, Limits(0.3, 0.495)] = 0.49
+    tumour_ratio: Annotated[Number, Limits(0.1, 10)] = 1.0
+    skull: Annotated[Word, tuple(SKULLS)] = "bonded"
+
+
+class Learner(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the model of a body is trained: which learner, on how many loads. `name` "none": finite elements play."""
+
+    name: str = "series-gp"
+    loads: int = 200
+
+
+class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The bodies that episodes are played on: so many, drawn once from the seed.
+
+    `anatomies`: "drawn", the template's brain with a tumour and an opening that are drawn; "template", the anatomy
+    that ships; or an own .vtu, beside the plan.
+    """
+
+    count: int = 1
+    anatomies: Word = "template"
+    tumour: Tumour = Tumour()
+    tissue: Tissue = Tissue()
+    learner: Learner = Learner()
+
+
+class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Camera, light and texture."""
+
+    distance_mm: Annotated[Number, Limits(80, 800)] = 200.0
+    tilt_deg: Annotated[Number, Limits(-75, 75)] = -46.0
+    fov_deg: Annotated[Number, Limits(4, 60)] = 16.0
+    path: Annotated[Word, (FIXED, *PATHS)] = FIXED
+    bent: Annotated[Number, Limits(-0.6, 0.6)] = 0.0
+    stereo: Annotated[Number, Limits(0, 1)] = 0.0
+    lamp: Annotated[Number, Limits(0.2, 3)] = 1.0
+    ambient: Annotated[Number, Limits(0, 1)] = 0.16
+    lamp_turn_deg: Annotated[Number, Limits(-180, 180)] = 0.0
+    vessels: Annotated[Number, Limits(0, 1)] = 0.0
+    tint: Annotated[Number, Limits(0, 0.5)] = 0.0
+    cottonoids: Annotated[Number, Limits(0, 5)] = 0.0
+    glove: Annotated[Number, Limits(0, 1)] = 0.0
+
+
+class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What sensors add; standard deviations of an episode."""
+
+    grey_levels: Annotated[Number, Limits(0, 60)] = 0.0
+    force_n: Annotated[Number, Limits(0, 1)] = 0.0
+    tool_mm: Annotated[Number, Limits(0, 20)] = 0.0
+    tool_deg: Annotated[Number, Limits(0, 20)] = 0.0
+    camera_mm: Annotated[Number, Limits(0, 20)] = 0.0
+    camera_deg: Annotated[Number, Limits(0, 20)] = 0.0
+
+
+class Hand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The hand's tremor, beside what it means to do: as standard deviations."""
+
+    tremor_mm: Annotated[Number, Limits(0, 3)] = 0.0
+    tremor_n: Annotated[Number, Limits(0, 0.1)] = 0.0
+
+
+class Contents(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole of a plan's file."""
+
+    title: str
+    motion: Motions
+    seconds: Annotated[Number, Limits(0.1, 600)] = 4.0
+    frames_per_second: float = 30.0
+    size: tuple[int, int] = (640, 480)
+    solved_every: int = 15
+    overlay: bool = False
+    bodies: Bodies = Bodies()
+    look: Look = Look()
+    hand: Hand = Hand()
+    noise: Noise = Noise()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A plan as it was read.
+
+    Parameters
+    ----------
+    name
+        Of the file, without its ending.
+    text
+        The file's TOML.
+    contents
+        What it says.
+    folder
+        Where own anatomies are looked for.
+    """
+
+    name: str
+    text: str
+    contents: Contents
+    folder: Path
+
+    @property
+    def digest(self) -> str:
+        """Sixteen hexadecimal digits of the text."""
+        return sha256(self.text.encode()).hexdigest()[:16]
+
+
+def shipped() -> list[str]:
+    """Names of the plans that ship."""
+    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+
+
+def load_plan(name: str) -> Plan:
+    """A plan that ships, by name, or one's own, by the path of its .toml.
+
+    Raises
+    ------
+    InputError
+        No such plan; a file that is no TOML, or says what no plan says; a range that is impossible.
+    """
+    path = Path(name) if name.endswith(".toml") else SHIPPED / f"{name}.toml"
+    if not path.is_file():
+        raise InputError(
+            f"no plan is called {name!r}: choose {', '.join(shipped())}, or name a file of your own, .toml."
+        )
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error}).") from error
+    return plan_from(text, path.stem, path.parent)
+
+
+def plan_from(text: str, name: str, folder: Path = Path()) -> Plan:
+    """The plan that a TOML text holds.
+
+    Raises
+    ------
+    InputError
+        As `load_plan`.
+    """
+    try:
+        contents = msgspec.toml.decode(text, type=Contents)
+    except (msgspec.MsgspecError, ValueError) as error:
+        raise InputError(f"the plan {name}: {error}. docs/episodes.md says what a plan holds.") from error
+    plan = Plan(name, text, contents, folder)
+    try:
+        _check(contents)
+    except InputError as error:
+        raise InputError(f"the plan {name}: {error}") from error
+    return plan
+
+
+def fields_of(table: msgspec.Struct) -> list[tuple[str, object, Limits | None, tuple[str, ...]]]:
+    """Of every field that may be drawn: name, value, limits of a number, and words that are known."""
+    found = []
+    for name, kind in get_type_hints(type(table), include_extras=True).items():
+        value = getattr(table, name)
+        about = get_args(kind)[1] if hasattr(kind, "__metadata__") else None
+        if about is None and kind != Word:
+            continue
+        limits, words = (about, ()) if isinstance(about, Limits) else (None, about or ())
+        found.append((name, value, limits, words))
+    return found
+
+
+def tables_of(contents: Contents) -> dict[str, msgspec.Struct]:
+    """The tables of a plan whose fields are drawn for each episode, and for each body, by name."""
+    bodies, motion = contents.bodies, {f"motion.{name}": each for name, each in contents.motion.named.items()}
+    of_bodies = {"bodies": bodies, "bodies.tumour": bodies.tumour, "bodies.tissue": bodies.tissue}
+    return {"": contents, **of_bodies, "look": contents.look, "hand": contents.hand, "noise": contents.noise, **motion}
+
+
+def _check(contents: Contents) -> None:
+    for table, values in tables_of(contents).items():
+        for name, value, limits, words in fields_of(values):
+            check_spread(value, f"{table}.{name}".lstrip("."), limits, words)
+    for name, value, low, high in (
+        ("bodies.count", contents.bodies.count, 1, 100_000),
+        ("bodies.learner.loads", contents.bodies.learner.loads, 40, 100_000),
+        ("frames_per_second", contents.frames_per_second, 1.0, 240.0),
+        ("solved_every", contents.solved_every, 1, 100_000),
+        ("size, its width", contents.size[0], 32, 4096),
+        ("size, its height", contents.size[1], 32, 4096),
+    ):
+        if not low <= value <= high:
+            raise InputError(f"{name}: {value} is outside {low:g} to {high:g}.")
+    weights = [each.weight for each in contents.motion.named.values()]
+    if not (weights and all(0.0 <= weight < float("inf") for weight in weights) and sum(weights) > 0.0):
+        raise InputError("motion: give one family or more, with a weight above 0.")
+    choices = contents.bodies.anatomies
+    named = choices.choice if isinstance(choices, Spread) else [choices] if isinstance(choices, str) else choices
+    for each in named or ():
+        if each not in ("drawn", "template") and not str(each).endswith(".vtu"):
+            raise InputError(f"bodies.anatomies: {each!r} is none: give drawn, template, or a .vtu beside the plan.")

@@ -1,0 +1,143 @@
+"""What an episode of a plan is: drawn from the seed and its number alone, and made into a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from ar.optics.calibration import Calibration
+from ar.optics.lens import Lens
+from sim.effects import Elasticity
+from sim.errors import InputError
+
+from ..script.camera_paths import PATHS
+from ..script.look import Cottonoid, Look
+from ..script.scene import Scene
+from ..script.site import Site
+from ..script.viewpoint import Viewpoint
+from .bodies import Body
+from .draws import drawn, random_of
+from .families import FAMILIES, PRONY, Chance, trembling
+from .plan import FIXED, Contents, Plan, fields_of, tables_of
+
+# Deviation of a cortex's red, green and blue from ours is the tint times one of these.
+TINTS = np.array([0.3, 1.0, 1.0])
+# A second radial coefficient is this share of the first: lenses bend less towards their edge.
+SECOND = -0.3
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is drawn for an episode.
+
+    Parameters
+    ----------
+    body
+        Number of its body.
+    family
+        Of its motion, by name.
+    values
+        All numbers and words by their names in the plan.
+    """
+
+    body: int
+    family: str
+    values: Mapping[str, Any]
+
+    def group(self, table: str) -> dict[str, Any]:
+        """The values of one table of the plan."""
+        head = f"{table}."
+        return {name.removeprefix(head): value for name, value in self.values.items() if name.startswith(head)}
+
+
+def drawn_episode(contents: Contents, seed: int, number: int) -> Drawn:
+    """What is drawn for an episode: from the seed and its number alone, each value by its own name."""
+    body = int(random_of(seed, number, "body").integers(contents.bodies.count))
+    named = contents.motion.named
+    weights = np.array([motion.weight for motion in named.values()])
+    family = list(named)[int(random_of(seed, number, "family").choice(len(named), p=weights / weights.sum()))]
+    values: dict[str, Any] = {}
+    for table, struct in tables_of(contents).items():
+        if table.startswith("bodies") or (table.startswith("motion") and table != f"motion.{family}"):
+            continue
+        for name, value, *_ in fields_of(struct):
+            full = f"{table}.{name}".lstrip(".")
+            values[full] = drawn(value, random_of(seed, number, full))
+    return Drawn(body, family, values)
+
+
+def scene_of(plan: Plan, body: Body, site: Site, asked: Drawn, seed: int, number: int) -> Scene:
+    """The scene of an episode on a body.
+
+    Raises
+    ------
+    InputError
+        What no scene can be: a tumour of too few tetrahedra for its shares, a lens that folds the picture.
+    """
+    contents, seconds = plan.contents, asked.values["seconds"]
+    chance = Chance(asked.group(f"motion.{asked.family}"), random_of(seed, number, "motion"), seconds, site.reach)
+    act = FAMILIES[asked.family](chance)
+    hand = asked.group("hand")
+    path = act.path
+    if act.tool is not None and (hand["tremor_mm"] > 0.0 or hand["tremor_n"] > 0.0):
+        first = int(random_of(seed, number, "hand").integers(2**31))
+        path = trembling(path, first, 1e-3 * hand["tremor_mm"], hand["tremor_n"])
+    effects = body.effects(*act.effects, lets_go=act.lets_go)
+    if act.relaxes:
+        effects = tuple(relaxing(each) if isinstance(each, Elasticity) else each for each in effects)
+    title = f"{FAMILIES[asked.family].__doc__ or ''} Episode {number} of the plan {plan.name}, seed {seed}."
+    return Scene(
+        asked.family, title, path, seconds, effects, act.tool, act.lying, act.surgery,
+        viewpoint=_viewpoint(contents, asked.group("look"), seed, number),
+        look=_look(asked.group("look"), site, seed, number), frames_per_second=contents.frames_per_second,
+    )  # fmt: skip
+
+
+def relaxing(tissue: Elasticity) -> Elasticity:
+    """The same tissues, relaxing."""
+
+    def relaxed(each: object) -> Any:
+        return replace(cast(Any, each), prony=PRONY)
+
+    regions = {label: relaxed(each) for label, each in tissue.regions.items()}
+    return Elasticity(None if tissue.default is None else relaxed(tissue.default), regions)
+
+
+def _viewpoint(contents: Contents, look: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
+    """The camera of an episode."""
+    random = random_of(seed, number, "look.camera")
+    width, height = contents.size
+    path = None if look["path"] == FIXED else PATHS[look["path"]](int(random.integers(2**31)))
+    view = Viewpoint(
+        1e-3 * look["distance_mm"], float(np.radians(look["tilt_deg"])), float(np.radians(look["fov_deg"])),
+        width, height, path=path, eye="left" if random.random() < look["stereo"] else None,
+    )  # fmt: skip
+    if look["bent"] == 0.0:
+        return view
+    focal = 0.5 * height / np.tan(0.5 * view.fov)
+    # Of a picture's half diagonal: the bend is that of its corners, whatever the field of view.
+    corner = float(np.hypot(width, height) / (2.0 * focal)) ** 2
+    bent = look["bent"] / corner
+    middle = 0.5 * (width - 1), 0.5 * (height - 1)
+    try:
+        lens = Lens(k1=0.3 * bent, k2=0.3 * SECOND * bent / corner)
+        return view.calibrated(Calibration((focal, focal), middle, width, height, lens))
+    except ValueError as error:
+        raise InputError(f"look.bent {look['bent']:g}: {error}") from error
+
+
+def _look(look: Mapping[str, Any], site: Site, seed: int, number: int) -> Look:
+    """Light, colour and covers of an episode."""
+    random = random_of(seed, number, "look.covers")
+    vessels = int(random.integers(2**31)) if random.random() < look["vessels"] else None
+    tint = 1.0 - look["tint"] * TINTS * random.random(3)
+    finger = float(random.uniform(0.0, 2.0 * np.pi)) if random.random() < look["glove"] else None
+    lain = []
+    for _ in range(round(look["cottonoids"])):
+        far, angle, turn = site.clearance * np.sqrt(random.random()), *random.uniform(0.0, 2.0 * np.pi, 2)
+        lain.append(Cottonoid(float(far * np.cos(angle)), float(far * np.sin(angle)), angle=float(turn)))
+    turned = float(np.radians(look["lamp_turn_deg"]))
+    return Look(look["lamp"], look["ambient"], turned, tuple(tint.tolist()), vessels, tuple(lain), finger)
