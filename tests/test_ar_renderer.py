@@ -104,7 +104,8 @@ def test_what_stands_still_is_drawn_once_and_looks_the_same():
     """Also where the shadow of what moves falls on it, and from another camera."""
     renderer, backdrops = Renderer(scene(still=True), LAMP), []
     here, there = camera(), camera(0.4)
-    for eye, centre in ((here, (0.0, 0.0, 0.03)), (here, (0.02, 0.01, 0.02)), (there, (0.0, 0.0, 0.03))):
+    aside, middle = (0.02, 0.01, 0.02), (0.0, 0.0, 0.03)
+    for eye, centre in ((here, middle), (here, aside), (here, middle), (there, middle), (there, aside)):
         moved = replace(scene()[1], vertices=ball(centre).vertices)
         one, other = renderer.picture(eye, [moved.vertices]), render(eye, [striped(), moved], LAMP)
         backdrops.append(renderer.backdrop)
@@ -113,8 +114,8 @@ def test_what_stands_still_is_drawn_once_and_looks_the_same():
         lit = render(eye, [striped(), replace(moved, casts_shadow=False)], LAMP)
         shaded = (lit.colour.astype(int) - other.colour).sum(axis=2) > 60
         assert (shaded & (other.segmentation == FLOOR)).sum() > 100
-    first, again, last = backdrops
-    assert again is first and first.camera is here and last.camera is there
+    none, first, again, moving, last = backdrops
+    assert none is None and again is first is moving and first.camera is here and last.camera is there
 
 
 def test_without_shadows_or_anything_that_moves_it_looks_the_same():

@@ -120,7 +120,8 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
 class Renderer:
     """Layers under a lamp, made ready once and drawn any number of times; from one thread at a time.
 
-    What one camera sees of layers that stand still is drawn once.
+    What one camera sees of layers that stand still is drawn once, from its second picture on. For a camera that moves
+    it would be drawn for nothing.
     """
 
     def __init__(self, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> None:
@@ -131,6 +132,7 @@ class Renderer:
         self.curve = wp.array(tone_curve(), dtype=wp.uint8, device=device)
         self.unshaded = wp.empty(0, dtype=wp.vec3i, device=device)
         self.nowhere = wp.empty(0, dtype=wp.vec3f, device=device)
+        self.seen_by: Camera | None = None
         self.backdrop: Backdrop | None = None
 
     def picture(self, camera: Camera, vertices: Sequence[np.ndarray]) -> Picture:
@@ -142,7 +144,9 @@ class Renderer:
             Vertices of other shapes than the layers'.
         """
         moved = self.stack.moved(np.concatenate([np.zeros((0, 3)), *vertices])[None])
-        return Picture(self._drawn([camera], moved, self._backdrop(camera, moved) if self.stack.still_faces else None))
+        stays, self.seen_by = camera is self.seen_by, camera
+        backdrop = self._backdrop(camera, moved) if stays and self.stack.still_faces else None
+        return Picture(self._drawn([camera], moved, backdrop))
 
     def pictures(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
         """What cameras of one size see; nothing leaves the device.

@@ -34,7 +34,7 @@ from .draws import drawn, random_of
 from .plan import Bodies, Plan, fields_of
 
 # Drawn tumours may reach out of the brain, or an opening have too few nodes: so many are tried.
-TRIES = 12
+TRIES = 6
 PRESET = "palpation"
 NO_LEARNER = "none"
 ANATOMY, ABOUT = "anatomy.vtu", "body.json"

@@ -16,7 +16,7 @@ import numpy as np
 
 from sim.errors import InputError
 
-from .bodies import ABOUT, read_body, write_body
+from .bodies import ABOUT, NO_LEARNER, read_body, write_body
 from .draws import random_of
 from .episode import Recording, collect
 from .plan import Plan
@@ -114,7 +114,7 @@ def _collected(path: Path, plan: Plan, seed: int, number: int, place: Path, devi
     body, asked = read_body(place), drawn_episode(contents, seed, number)
     theatre = body.theatre(device)
     scene = scene_of(plan, body, theatre.site, asked, seed, number)
-    name = theatre.best(scene)
+    name = "fem" if contents.bodies.learner.name == NO_LEARNER else theatre.best(scene)
     player = replace(theatre.player(name, scene), style="window" if contents.overlay else "none")
     noise = asked.group("noise")
 

@@ -1,0 +1,159 @@
+"""Plans of data sets: what may be drawn, that each episode is drawn by itself, and what is written of it."""
+
+import json
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from scenes.episodes.checksums import broken
+from scenes.episodes.families import FAMILIES, Motions
+from scenes.episodes.make import body_of, body_path, episode_path, make_body, make_episode
+from scenes.episodes.plan import load_plan, plan_from, shipped
+from scenes.episodes.scripted import drawn_episode
+from scenes.play.deformers import open_theatre
+from sim.anatomy import TUMOUR_LABEL
+from sim.effects import Elasticity, pushed_effects
+from sim.errors import InputError
+from sim.material import BRAIN, Material
+from surrogate.data.stated_tissue import stated_tissue, stating
+from surrogate.model.applicability import refusal
+
+TINY = """
+title = "tiny"
+seconds = 0.5
+frames_per_second = 8.0
+size = [96, 72]
+solved_every = 3
+[motion.press]
+[motion.walk]
+[look]
+path = "hand-held"
+stereo = 1
+cottonoids = 1
+glove = 1
+[noise]
+grey_levels = 4
+force_n = 0.01
+tool_mm = 1
+"""
+
+
+def test_the_plans_that_ship_can_be_drawn_from():
+    assert shipped() == ["hard", "small", "standard"]
+    families = set()
+    for name in shipped():
+        plan = load_plan(name)
+        drawn = [drawn_episode(plan.contents, 0, number) for number in range(60)]
+        assert {each.body for each in drawn} == set(range(plan.contents.bodies.count))
+        families |= {each.family for each in drawn}
+    assert families == set(FAMILIES) == set(Motions.__struct_fields__)
+
+
+def test_an_episode_is_drawn_by_itself_and_each_value_by_its_name():
+    plain, more = plan_from(TINY, "a"), plan_from(f"{TINY}tool_deg = [0, 1]\n[hand]\ntremor_mm = [0, 1]\n", "b")
+    first, again = drawn_episode(plain.contents, 4, 7), drawn_episode(plain.contents, 4, 7)
+    assert first == again and body_of(plain, 4, 7) == first.body
+    other = drawn_episode(more.contents, 4, 7)
+    same = {name: value for name, value in other.values.items() if name not in ("noise.tool_deg", "hand.tremor_mm")}
+    assert same == {name: first.values[name] for name in same}
+    assert drawn_episode(plain.contents, 4, 8).values != first.values != drawn_episode(plain.contents, 5, 7).values
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[motion.press]\nforce_n = [0.5, 0.1]", r"motion.press.force_n: from 0.5 to 0.1 is upside down"),
+        ("[motion.press]\nforce_n = [0.5, 100]", r"motion.press.force_n: 100.0 may be drawn, and 0.01 to 2"),
+        ("[motion.press]\nforce_n = {log = [0, 1]}", "logarithmic range starts above 0"),
+        ("[motion.press]\nforce_n = {normal = [0.1, 0.1]}", "motion.press.force_n: -0.2"),
+        ("[motion.press]\nforce_n = {choice = [0.1], weights = [1, 2]}", "2 weights for 1 values"),
+        ("[motion.press]\nforce_n = {}", "give one of uniform, log, normal and choice, not none"),
+        ("[motion.press]\nforce_n = [nan, 1.0]", "upside down"),
+        ("[motion.press]\n[look]\npath = 'flying'", "look.path: 'flying' is not known: choose from fixed"),
+        ("[motion.kick]", "unknown field `kick`"),
+        ("[motion.press]\nweight = 0", "with a weight above 0"),
+        ("[motion.press]\n[bodies]\ncount = 0", "bodies.count: 0 is outside"),
+        ("[motion.press]\n[bodies]\nanatomies = 'mine'", "bodies.anatomies: 'mine' is none"),
+        ("[motion.press", "docs/episodes.md says"),
+        ("", "motion"),
+    ],
+)
+def test_what_cannot_be_is_named(text, said):
+    with pytest.raises(InputError, match=said):
+        plan_from(f'title = "x"\n{text}', "mine")
+
+
+def test_a_plan_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(InputError, match="no plan is called 'big': choose hard, small, standard"):
+        load_plan("big")
+    (tmp_path / "own.toml").write_text(TINY)
+    assert load_plan(str(tmp_path / "own.toml")).digest == plan_from(TINY, "own").digest
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder, plan = tmp_path_factory.mktemp("set"), plan_from(TINY, "tiny")
+    assert not make_body(folder, plan, 1, 0, "cpu").failed
+    return folder, plan, make_episode(folder, plan, 1, 5, "cpu")
+
+
+def test_an_episode_says_what_it_was_drawn_from(made):
+    folder, plan, episode = made
+    assert episode.path == episode_path(folder, 5) and episode.frames == 5 and not episode.failed
+    with h5py.File(episode.path) as file:
+        assert file.attrs["plan"] == TINY and file.attrs["plan_digest"] == plan.digest and not broken(file)
+        assert (file.attrs["seed"], file.attrs["episode"], file.attrs["solved_every"]) == (1, 5, 3)
+        drawn = drawn_episode(plan.contents, 1, 5)
+        stated = json.loads(file.attrs["parameters"])
+        assert file.attrs["family"] == drawn.family and drawn.values.items() <= stated.items()
+        assert file["fem_frames"][:].tolist() == [0, 3] and file["cortex_fem"].shape[0] == 2
+        off = np.linalg.norm(file["tumour_fem"][:] - file["tumour_predicted"][:][[0, 3]], axis=2)
+        moved = np.linalg.norm(file["tumour_fem"][1] - file["tumour_rest"][:], axis=1)
+        assert off.max() < 0.2 * moved.max() > 1e-5
+        assert 0.0 < np.abs(file["force_read"][:] - file["force"][:]).max() < 0.06
+        assert not np.allclose(file["T_world_tool"][:], file["T_world_tool_tracked"][:], atol=1e-5)
+        base = file["T_camera_world_right"][:] @ np.linalg.inv(file["T_camera_world"][:])
+        assert np.allclose(np.linalg.norm(base[:, :3, 3], axis=1), 24e-3, atol=1e-4)
+        assert "date" not in file.attrs and "seconds" not in file
+
+
+def test_the_same_episode_has_the_same_bytes_wherever_it_is_made(made, tmp_path):
+    _, plan, episode = made
+    make_body(tmp_path, plan, 1, 0, "cpu")
+    make_episode(tmp_path, plan, 1, 6, "cpu")
+    again = make_episode(tmp_path, plan, 1, 5, "cpu")
+    assert again.path.read_bytes() == episode.path.read_bytes()
+    assert episode_path(tmp_path, 6).read_bytes() != episode.path.read_bytes()
+    assert make_episode(tmp_path, plan, 1, 5, "cpu").skipped and make_body(tmp_path, plan, 1, 0, "cpu").skipped
+
+
+def test_a_changed_number_breaks_a_checksum(made, tmp_path):
+    path = tmp_path / "changed.h5"
+    path.write_bytes(made[2].path.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file["tumour_predicted"][1, 0, 0] += 1e-9
+        assert broken(file) == ["/tumour_predicted: is not as it was written"]
+        file.attrs["seed"] = 2
+        assert "attributes" in broken(file)[1]
+
+
+def test_what_cannot_be_meshed_fails_with_its_reason(tmp_path):
+    plan = plan_from(f"{TINY}[bodies]\nanatomies = 'drawn'\n[bodies.tumour]\nradius_mm = 35\ncover_mm = 1\n", "big")
+    body = make_body(tmp_path, plan, 1, 0, "cpu")
+    assert "none of 6 anatomies that were drawn can be meshed; the last: a " in body.failed
+    assert not list(body_path(tmp_path, 0).parent.iterdir())
+    assert "is no body of a data set" in make_episode(tmp_path, plan, 1, 0, "cpu").failed
+
+
+def test_a_model_knows_what_the_tumour_is_made_of():
+    tissue = Elasticity(BRAIN, {TUMOUR_LABEL: Material("neo-hookean", 9000.0, 0.49)})
+    assert stated_tissue(stating(tissue)) == tissue and stated_tissue(stating(Elasticity(BRAIN))) == Elasticity(BRAIN)
+    theatre = open_theatre()
+    model = theatre.models["series-gp"]
+    other = replace(model, training={**model.training, **stating(tissue)})
+    here = pushed_effects(theatre.anatomy, tissue)
+    assert refusal(other, here) is None
+    assert "region 2" in (refusal(model, here) or "") and refusal(other, pushed_effects(theatre.anatomy, BRAIN))
+    assert "region 2" in other.source
