@@ -1,6 +1,9 @@
 """What happens: scripted tools, the loop that plays them, and the command line."""
 
 from .episodes.episode import collect
+from .episodes.exports.card import write_card
+from .episodes.reading.torch_dataset import EpisodeDataset
+from .episodes.reading.windows import Episodes, read_episodes
 from .play.deformers import Theatre, open_theatre
 from .play.player import Frame, Player
 from .script.calibration_file import read_calibration, write_calibration
@@ -19,6 +22,8 @@ __all__ = [
     "Blade",
     "Bounds",
     "Debulking",
+    "EpisodeDataset",
+    "Episodes",
     "Focus",
     "Frame",
     "HandHeld",
@@ -44,9 +49,11 @@ __all__ = [
     "palpate",
     "press",
     "read_calibration",
+    "read_episodes",
     "site_of",
     "slide",
     "template_path",
     "wander",
     "write_calibration",
+    "write_card",
 ]

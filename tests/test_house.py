@@ -33,7 +33,7 @@ ORDER = (
     {"surrogate.model"},
     {"surrogate.evaluation", "surrogate.locating", "surrogate.onnx_export"},
     {"surrogate.training", "surrogate.fitting"},
-    {"ar.optics", "ar.screen"},
+    {"ar.optics", "ar.screen", "ar.picture_bytes"},
     {"ar.rendering", "ar.stereo"},
     {"ar.overlay", "ar.tracking"},
     {"ar.page"},
@@ -48,17 +48,15 @@ TOGETHER = {"scenes.cli": "scenes.commands"}
 """The command line and its commands call each other."""
 OWNERS = {
     "torch": {
-        "sim/linalg/dense_inverse.py",
-        "sim/linalg/block_inverse.py",
-        "sim/runtime/dense_product.py",
-        "sim/runtime/views.py",
-        "surrogate/regressors/ann.py",
+        *(f"sim/{of}.py" for of in ["linalg/dense_inverse", "linalg/block_inverse", "runtime/dense_product"]),
+        *["sim/runtime/views.py", "surrogate/regressors/ann.py", "scenes/episodes/reading/torch_dataset.py"],
     },
     "sklearn": {"surrogate/regressors/svr.py"},
     "trimesh": {"scenes/script/tool.py"},
     "meshio": {"sim/bodies/meshfile.py"},
     "viser": {f"ar/page/{of}.py" for of in ["browser", "crowd", "guard", "inputs", "messages", "recorder", "scene"]},
     "nilearn": {"sim/bodies/template.py"},
+    "pyarrow": {"scenes/episodes/exports/lerobot.py"},
     "onnx": {"surrogate/onnx_export/export.py", "surrogate/onnx_export/graph.py"},
     "pyamg": {"sim/linalg/amg.py"},
     "PIL": {"ar/tracking/pages.py", "ar/tracking/pictures.py"},
@@ -106,12 +104,8 @@ def imports(path, everywhere=True, types=True):
         set() if everywhere else {id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)}
     )
     if not types:
-        left_out |= {
-            id(n)
-            for f in ast.walk(tree)
-            if isinstance(f, ast.If) and getattr(f.test, "id", "") == "TYPE_CHECKING"
-            for n in ast.walk(f)
-        }
+        typed = (f for f in ast.walk(tree) if isinstance(f, ast.If) and getattr(f.test, "id", "") == "TYPE_CHECKING")
+        left_out |= {id(n) for f in typed for n in ast.walk(f)}
     found = set()
     for node in ast.walk(tree):
         if id(node) in left_out:
@@ -215,7 +209,8 @@ def test_rooms_without_pictures_or_networks_import_none():
 
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported():
     project = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]
-    declared = [*project["dependencies"], *project["optional-dependencies"]["onnx"]]
+    extras = project["optional-dependencies"]
+    declared = [*project["dependencies"], *extras["exports"], *extras["onnx"]]
     names = {re.split(r"[<>=!~\[ ]", line)[0] for line in declared}
     allowed = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
     used = set().union(*map(libraries, FILES)) - set(sys.stdlib_module_names) - set(ROOMS)

@@ -17,6 +17,7 @@ from scenes.bench.figure_record import Origin, record_of, write_record
 from scenes.cli import main
 from scenes.commands.companion_files import demand_no_strangers, remove_data, strangers
 from scenes.commands.outputs import KINDS, claimed, claimed_frames, recognised
+from scenes.episodes.exports.card import LICENCE
 from scenes.play.overlay.rows import write_rows
 from scenes.script.calibration_file import write_calibration
 from scenes.script.film_truth import Truth, write_table, write_truth
@@ -107,6 +108,9 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
     np.savez(tmp_path / "model.npz", header=np.array(json.dumps({"format": "sulcus model 2"})))
     np.savez(tmp_path / "arrays.npz", mine=np.zeros(3))
     (tmp_path / "graph.onnx").write_bytes(b"\x08\x08 sulcus onnx 1")
+    with h5py.File(tmp_path / "demos.hdf5", "w") as file:
+        file.create_group("data").attrs["env_args"] = json.dumps({"env_name": "sulcus"})
+    (tmp_path / "LICENSE.md").write_text(LICENCE)
     save_tissue(tmp_path / "box.tissue.json", FittedTissue("0", 1, np.full((3, 13, 33), 1 / 1287), np.zeros(0)))
     (tmp_path / "table.csv").write_text("what,default,now,force mean_mm\n")
     (tmp_path / "factorial.csv").write_text("opening [mm],depth [mm],skull,nu\n")
@@ -139,6 +143,8 @@ def test_what_sulcus_wrote_is_recognised_as_what_it_is(tmp_path, box):
         "fitted tissue of `sulcus fit`": "box.tissue.json",
         "a data set of `sulcus simulate`": "data.h5",
         "an episode of `sulcus collect`": "episode.h5",
+        "a robomimic file of `sulcus convert`": "demos.hdf5",
+        "a card of `sulcus convert`": "LICENSE.md",
         "a model of `sulcus train`": "model.npz",
         "a graph of `sulcus export`": "graph.onnx",
         "a table of `sulcus sensitivity`": "table.csv",

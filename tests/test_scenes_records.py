@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import h5py
@@ -12,6 +13,10 @@ from theatres import player, put, short, theatre_of
 from ar.optics.camera import Camera, project_cv2
 from scenes.cli import main
 from scenes.episodes.episode import DEPTH_SCALE, collect
+from scenes.episodes.reading.contents import read_contents
+from scenes.episodes.reading.schema import ARRAYS, PICTURES
+from scenes.episodes.reading.silhouettes import mask_findings
+from scenes.episodes.reading.validation import validate_episode
 from scenes.play.player import STAGES
 from scenes.play.stage import CORTEX, DRAPE, TOOL
 from scenes.script.tool_paths import press
@@ -67,6 +72,13 @@ class TestEpisode:
             assert np.abs(depth * DEPTH_SCALE - frame.picture.depth).max() <= 0.51 * DEPTH_SCALE
             assert np.array_equal(depth == 0, frame.picture.depth == 0.0)
             assert np.array_equal(decoded(file, "segmentation", frame.number), frame.picture.segmentation)
+
+    def test_validation_finds_nothing_wrong_and_knows_every_array(self, episode, box):
+        _, file, _, _ = episode
+        path = Path(file.filename)
+        assert validate_episode(path).problems == []
+        assert mask_findings(file, read_contents(path), box) == ([], [])
+        assert set(file["pictures"]) <= set(PICTURES) and set(file) - {"pictures"} <= set(ARRAYS)
 
     def test_a_frame_is_recomputed_from_its_attributes_alone(self, episode, box):
         """Tissue, element, tool and load are those that the file names; so is what solved it."""

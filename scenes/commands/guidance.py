@@ -61,6 +61,15 @@ next: sulcus collect press --out press.h5, for depth, segmentation and forces to
     "collect": """example:
   sulcus collect press --out press.h5
 next: read it by h5py; its attributes give units and frames""",
+    "convert": """examples:
+  sulcus convert press.h5 --to folder --out press
+  sulcus convert episodes --to lerobot --out lerobot
+  sulcus convert episodes --to card
+next: sulcus validate, before you share the data set""",
+    "validate": """examples:
+  sulcus validate press.h5
+  sulcus validate episodes --json
+next: make broken episodes anew, or remove them""",
     "markers": """example:
   sulcus markers --out markers
 next: print markers/markers.pdf at 100 %, measure its rulers, glue; then film the board for sulcus calibrate""",

@@ -138,6 +138,13 @@ def _hdf5(words: str) -> Callable[[Path], bool]:
     return check
 
 
+def _is_robomimic(path: Path) -> bool:
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return '"env_name": "sulcus"' in str(file["data"].attrs["env_args"])
+
+
 def model_header(path: Path) -> dict:
     """The JSON header of a model file.
 
@@ -195,6 +202,8 @@ KINDS: dict[str, Callable[[Path], bool]] = {
     "fitted tissue of `sulcus fit`": _begins(b'"format": "sulcus tissue'),
     "a data set of `sulcus simulate`": _hdf5("sulcus data"),
     "an episode of `sulcus collect`": _hdf5("sulcus episode"),
+    "a robomimic file of `sulcus convert`": _is_robomimic,
+    "a card of `sulcus convert`": _begins(b"sulcus card"),
     "a model of `sulcus train`": lambda path: str(model_header(path)["format"]).startswith("sulcus model"),
     "a graph of `sulcus export`": lambda path: b"sulcus onnx" in path.read_bytes(),
     "a table of `sulcus sensitivity`": _begins(b"what,default,now,"),

@@ -1,0 +1,103 @@
+"""`sulcus convert`: episodes in the formats of others, and the card of a data set."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sim.errors import InputError
+
+from .json_line import json_line
+from .outputs import add_force, claimed
+
+FORMATS = ("lerobot", "robomimic", "folder", "xdmf", "card")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("episodes", nargs="+", type=Path, help="a folder of episodes, or episodes, .h5")
+    parser.add_argument(
+        "--to",
+        required=True,
+        choices=FORMATS,
+        help="LeRobot v3.0, robomimic (.hdf5), pictures and tables, XDMF for ParaView, or the card of a data set",
+    )
+    parser.add_argument("--out", type=Path, help="a new folder, or the .hdf5 file; a card lies in the data set itself")
+    add_force(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, and write whole.
+
+    Raises
+    ------
+    InputError
+        Episodes that are not there or not whole, or that do not go into one set; an output that cannot be written.
+    """
+    from tqdm import tqdm
+
+    from ..episodes.reading.contents import read_contents
+    from ..episodes.reading.windows import episode_paths
+
+    write = writer_of(args)
+    contents = [read_contents(path) for path in episode_paths(args.episodes)]
+    report = write(contents, progress=partial(tqdm, unit="episode", file=sys.stderr))
+    said = f"{len(contents)} episodes written to {report['out']}"
+    if report.get("points_only"):
+        said += f"; the surfaces of {report['points_only']} are not known, so that they hold points alone"
+    print(json_line(report) if args.json else said)
+    return 0
+
+
+def writer_of(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
+    """What writes episodes as it was asked; its output is known to be free.
+
+    Raises
+    ------
+    InputError
+        An output that is missing, or taken; a package that is missing.
+    """
+    if args.to == "card":
+        from ..episodes.exports.card import write_card
+
+        if len(args.episodes) != 1 or not args.episodes[0].is_dir():
+            raise InputError("--to card: name the folder of the data set; its card is written into it.")
+        if args.out is not None:
+            raise InputError("--out: a card lies in the data set itself. Leave --out away.")
+        return lambda contents, progress: write_card(args.episodes[0], contents, progress, args.force)
+    if args.out is None:
+        raise InputError(f"--to {args.to}: say where to by --out.")
+    if args.to == "robomimic":
+        from ..episodes.exports.robomimic import write_robomimic
+
+        out = claimed(args.out, ".hdf5", "a robomimic file of `sulcus convert`", args.force, args.episodes)
+        return partial(write_robomimic, path=out)
+    return partial(folder_writer(args.to), folder=args.out)
+
+
+def folder_writer(name: str) -> Callable[..., dict[str, Any]]:
+    """What writes a folder of that format.
+
+    Raises
+    ------
+    InputError
+        LeRobot without the package that writes its tables.
+    """
+    if name == "lerobot":
+        try:
+            from ..episodes.exports.lerobot import write_lerobot
+        except ImportError as error:
+            raise InputError("--to lerobot: needs pyarrow. Install it: pip install 'sulcus[exports]'.") from error
+        return write_lerobot
+    if name == "folder":
+        from ..episodes.exports.plain_folder import write_folder
+
+        return write_folder
+    from ..episodes.exports.xdmf import write_xdmf
+
+    return write_xdmf

@@ -1,0 +1,87 @@
+"""`sulcus validate`: whether episodes are whole, and what is wrong with those that are not."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .json_line import json_line
+
+if TYPE_CHECKING:
+    from ..episodes.reading.validation import Report
+
+# Files that are named one by one in what is printed.
+MOST_SAID = 50
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("episodes", nargs="+", type=Path, help="folders of episodes, or episodes, .h5")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes at a time (%(default)s)")
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Look at each. Returns 1 where one is broken.
+
+    Raises
+    ------
+    InputError
+        Nothing there to look at.
+    """
+    from tqdm import tqdm
+
+    from sim.errors import InputError
+
+    from ..episodes.reading.apart import validated
+    from ..episodes.reading.windows import episode_paths
+
+    if args.workers < 1:
+        raise InputError(f"--workers {args.workers}: at least one process must look.")
+    paths = episode_paths(args.episodes)
+    with tqdm(total=len(paths), unit="episode", file=sys.stderr) as bar:
+        found = {}
+        for report in validated(paths, min(args.workers, len(paths))):
+            found[report.path] = report
+            bar.update()
+    reports = [found[path] for path in dict.fromkeys(paths)]
+    broken = [report for report in reports if report.problems]
+    if args.json:
+        print(json_line({"episodes": len(reports), "broken": len(broken), "files": [as_json(one) for one in reports]}))
+    else:
+        print("\n".join(lines(reports, broken)))
+    return 1 if broken else 0
+
+
+def as_json(report: Report) -> dict[str, object]:
+    """A report with its path as text."""
+    return {**asdict(report), "path": str(report.path)}
+
+
+def lines(reports: list[Report], broken: list[Report]) -> list[str]:
+    """What is wrong with which file, what could not be looked at, and figures of all that are whole."""
+    said = [f"{report.path}: {problem}" for report in broken for problem in report.problems]
+    said = [
+        *said[:MOST_SAID],
+        *([f"and {len(said) - MOST_SAID} more: --json has all"] if len(said) > MOST_SAID else []),
+    ]
+    skipped: dict[str, int] = {}
+    for report in reports:
+        for one in report.skipped:
+            skipped[one] = skipped.get(one, 0) + 1
+    said += [f"not looked at in {count} of {len(reports)} episodes: {one}" for one, count in skipped.items()]
+    counts = ("frames", "solved", "unsolved")
+    frames, solved, unsolved = (sum(getattr(report, name) for report in reports) for name in counts)
+    said.append(
+        f"{len(reports) - len(broken)} of {len(reports)} episodes are whole: {frames} frames, {solved} of them solved "
+        f"by finite elements, {unsolved} without convergence"
+    )
+    errors = [one.error_mm for one in reports if one.error_mm is not None]
+    if errors:
+        mean, worst = sum(one[0] for one in errors) / len(errors), max(one[1] for one in errors)
+        said.append(f"tumour as predicted, against finite elements: {mean:.3f} mm on average, {worst:.3f} mm at most")
+    return said

@@ -1,0 +1,126 @@
+"""The card of a data set, written into its folder: table of episodes, Croissant, data sheet and licence."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from sim.errors import InputError
+from sim.runtime.atomic_files import written_whole
+
+from ..reading.contents import Contents, read_contents
+from ..reading.rows import numbers_in
+from ..reading.validation import solved_figures
+from ..reading.windows import episode_paths
+from .columns import opened
+from .croissant import COLUMNS, croissant
+from .datasheet import MARK, NAME, datasheet
+from .tasks import task_of
+
+TABLE = "episodes.csv"
+LICENCE = f"""# Licence of this data set
+
+{MARK}
+
+These data are licensed under the Creative Commons Attribution 4.0 International licence (CC BY 4.0).
+Its text: https://creativecommons.org/licenses/by/4.0/legalcode
+
+In plain words, which do not replace that text:
+
+- You may copy, share and change these data, also to earn money with them.
+- You must name who made them, link to the licence, and say whether you changed anything.
+- You may not suggest that who made them stands behind you or what you do.
+- There is no warranty. They are simulated, and are not fit for decisions about patients.
+
+If an anatomy in `bodies` was made from somebody's scan, this licence gives no right to that scan. Ask who holds it.
+The program that made the data, sulcus, has its own licence: Apache 2.0.
+"""
+
+
+def write_card(
+    folder: Path,
+    contents: Sequence[Contents] | None = None,
+    progress: Callable[[Iterable], Iterable] = iter,
+    force: bool = False,
+) -> dict[str, Any]:
+    """Write `episodes.csv`, `croissant.json`, `DATASHEET.md` and `LICENSE.md` into a data set's folder.
+
+    Each appears whole, and an earlier card is replaced. `contents` are those of its episodes, where they are known.
+
+    Raises
+    ------
+    InputError
+        A folder without episodes, an episode that is damaged, or a file of such a name that no card is, unless `force`.
+    """
+    names = (TABLE, "croissant.json", "DATASHEET.md", "LICENSE.md")
+    for name in names:
+        if not force and (folder / name).exists() and not is_card(folder / name):
+            raise InputError(f"{folder / name}: is not of a card. Move it away, or give --force to replace it.")
+    episodes = contents or [read_contents(path) for path in episode_paths(folder)]
+    rows = [row_of(one, folder) for one in progress(episodes)]
+    inside = "episodes/*.h5" if (folder / "episodes").is_dir() else "*.h5"
+    table = table_of(rows)
+    failed = len(list((folder / "failed").glob("*.json")))
+    sheet = datasheet(folder.resolve().name, episodes, rows, failed)
+    description = (
+        f"{len(rows)} episodes of scripted surgery on simulated brains with a tumour: pictures, depth, poses of camera "
+        "and tool, forces, and where the tumour is by finite elements."
+    )
+    date = max(str(one.said.get("date", ""))[:10] for one in episodes) or datetime.now(UTC).date().isoformat()
+    described = croissant(folder.resolve().name, description, date, TABLE, sha256(table.encode()).hexdigest(), inside)
+    texts = (table, json.dumps(described, indent=1) + "\n", sheet, LICENCE)
+    for name, text in zip(names, texts, strict=True):
+        with written_whole(folder / name, Path(name).suffix) as partial:
+            partial.write_text(text, encoding="utf-8")
+    return {
+        "out": str(folder),
+        "episodes": len(rows),
+        "frames": sum(one.frames for one in episodes),
+        "files": names,
+    }
+
+
+def is_card(path: Path) -> bool:
+    """Whether a file is of an earlier card."""
+    head = path.read_text(encoding="utf-8", errors="replace")[:4096]
+    return MARK in head or head.startswith(",".join(COLUMNS)) or ("mlcommons.org/croissant" in head and NAME in head)
+
+
+def row_of(contents: Contents, folder: Path) -> dict[str, object]:
+    """An episode as a row of the table."""
+    with opened(contents) as file:
+        times = numbers_in(file, contents, "time")
+        solved, _, error = solved_figures(file, contents)
+    width, height = contents.size
+    path = contents.path.resolve()
+    return {
+        "file": path.relative_to(folder.resolve()).as_posix(),
+        "family": contents.family,
+        "task": task_of(contents),
+        "frames": contents.frames,
+        "solved": solved,
+        "seconds": round(float(times[-1] - times[0]), 6),
+        "width": width,
+        "height": height,
+        "seed": contents.said.get("seed", ""),
+        "anatomy": contents.said.get("anatomy", ""),
+        "deformer": contents.said.get("deformer", ""),
+        "largest_error_mm": "" if error is None else round(error[1], 6),
+        "bytes": path.stat().st_size,
+        "sha256": contents.said.get("sha256", ""),
+    }
+
+
+def table_of(rows: Sequence[dict[str, object]]) -> str:
+    """The table as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(COLUMNS), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()

@@ -1,0 +1,115 @@
+"""What exports take of an episode: pictures that all have, the rate of its frames, its numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import count
+
+import h5py
+import numpy as np
+
+from sim.errors import InputError
+from sim.runtime.outside_files import read_as
+
+from ..reading.contents import Contents
+from ..reading.open_files import REMEDY
+from ..reading.rows import numbers_in
+from ..reading.schema import PICTURES
+from .motion import ACTION, STATE, states, twists
+
+# From one frame to the next, against the mean of all [s].
+UNEVEN = 1e-4
+# Frames that are held in memory at once.
+BLOCK = 64
+NUMBERS = ("force", "force_read", "tip", "contact", "distance", "T_camera_world", "tumour_predicted")
+"""Arrays with a row for each frame that go into other formats as they are, beside the tool's pose."""
+
+
+def opened(contents: Contents) -> h5py.File:
+    """An episode's file; InputError where it is none any more."""
+    with read_as(contents.path, "an episode", REMEDY):
+        return h5py.File(contents.path, "r")
+
+
+def shared_pictures(episodes: Sequence[Contents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
+    """Those of the wanted pictures that every episode has.
+
+    Raises
+    ------
+    InputError
+        Episodes whose pictures differ in size.
+    """
+    for one in episodes:
+        if one.size != episodes[0].size:
+            sizes = " and ".join(f"{width} x {height}" for width, height in (episodes[0].size, one.size))
+            raise InputError(f"{one.path}: pictures of {sizes} pixels do not go into one set: convert them apart.")
+    return tuple(name for name in wanted if all(name in one.shapes for one in episodes))
+
+
+def shared_numbers(episodes: Sequence[Contents]) -> tuple[str, ...]:
+    """Those `NUMBERS` that every episode has in the same shape: two bodies' tumours have not."""
+    first = episodes[0].shapes
+    return tuple(
+        name
+        for name in NUMBERS
+        if name in first and all(one.shapes.get(name, ())[1:] == first[name][1:] for one in episodes)
+        and all(name in one.shapes for one in episodes)
+    )  # fmt: skip
+
+
+def rate_of(contents: Contents, time: np.ndarray) -> float:
+    """Frames a second.
+
+    Raises
+    ------
+    InputError
+        Frames that are not evenly spaced, or fewer than two.
+    """
+    steps = np.diff(time)
+    if not len(steps) or not steps.mean() > 0.0 or np.abs(steps - steps.mean()).max() > UNEVEN:
+        raise InputError(f"{contents.path}: its frames are not evenly spaced in time: leave it out.")
+    return round(1.0 / float(steps.mean()), 6)
+
+
+def numbers_of(file: h5py.File, contents: Contents, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """`state` (T, 7), `action` (T, 6) and the named arrays, as float32; `time` as it is stored.
+
+    Raises
+    ------
+    InputError
+        An episode without a tool.
+    """
+    if "T_world_tool" not in contents.shapes:
+        raise InputError(f"{contents.path}: has no tool, and so no actions: leave it out.")
+    poses = numbers_in(file, contents, "T_world_tool")
+    found = {"state": states(poses), "action": twists(poses)}
+    found |= {name: numbers_in(file, contents, name).astype(np.float32) for name in names}
+    return {**found, "time": numbers_in(file, contents, "time")}
+
+
+def blocks(frames: int) -> Iterator[range]:
+    """All frames, `BLOCK` at a time."""
+    return (range(start, min(start + BLOCK, frames)) for start in range(0, frames, BLOCK))
+
+
+def named_axes(name: str) -> list[str] | None:
+    """Names of a vector's components, where they have some."""
+    return {"state": list(STATE), "action": list(ACTION), "distance": ["m"]}.get(
+        name, list("xyz") if name in ("force", "force_read", "tip", "contact") else None
+    )
+
+
+def stored_size(episodes: Sequence[Contents]) -> int:
+    """Bytes of all their files."""
+    return sum(one.path.stat().st_size for one in episodes)
+
+
+def file_names(episodes: Sequence[Contents]) -> Mapping[Contents, str]:
+    """A name for each, its file's; where two have the same, with a number."""
+    taken: set[str] = set()
+    found = {}
+    for one in episodes:
+        names = (one.path.stem if not number else f"{one.path.stem}_{number}" for number in count())
+        found[one] = next(name for name in names if name not in taken)
+        taken.add(found[one])
+    return found

@@ -1,0 +1,120 @@
+"""Croissant 1.1 metadata of a data set: JSON-LD that catalogues of data sets read.
+
+Akhtar et al. (2024), "Croissant: A Metadata Format for ML-Ready Datasets", DEEM; version 1.1 of the specification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+CONFORMS = ("http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0")
+LICENCE = "https://creativecommons.org/licenses/by/4.0/"
+PLAIN = (
+    "arrayShape", "citeAs", "column", "containedIn", "equivalentProperty", "extract", "field", "fileProperty",
+    "fileObject", "fileSet", "format", "includes", "isArray", "isLiveDataset", "jsonPath", "key", "md5", "parentField",
+    "path", "recordSet", "references", "regex", "repeated", "replace", "samplingRate", "separator", "source",
+    "subField", "transform",
+)  # fmt: skip
+CONTEXT: Mapping[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "dct": "http://purl.org/dc/terms/",
+    "sc": "https://schema.org/",
+    "conformsTo": "dct:conformsTo",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "description": {"@container": "@language"},
+    "name": {"@container": "@language"},
+    **{name: f"cr:{name}" for name in PLAIN},
+}
+"""The specification's own context."""
+COLUMNS: Mapping[str, tuple[str, str]] = {
+    "file": ("sc:Text", "The episode's HDF5 file."),
+    "family": ("sc:Text", "What happens in it."),
+    "task": ("sc:Text", "The same as a sentence."),
+    "frames": ("sc:Integer", "How many frames it has."),
+    "solved": ("sc:Integer", "How many of them finite elements solved."),
+    "seconds": ("sc:Float", "How long it lasts [s]."),
+    "width": ("sc:Integer", "Of its pictures [pixel]."),
+    "height": ("sc:Integer", "Of its pictures [pixel]."),
+    "seed": ("sc:Text", "What its draws began from; empty where nothing was drawn."),
+    "anatomy": ("sc:Text", "Digest of the anatomy."),
+    "deformer": ("sc:Text", "What moved the tissue in the pictures."),
+    "largest_error_mm": ("sc:Float", "Of the predicted tumour against finite elements, where they solved [mm]."),
+    "bytes": ("sc:Integer", "Size of the file."),
+    "sha256": ("sc:Text", "Checksum that the file states of its arrays; empty where it states none."),
+}
+"""Of the table of episodes: kind and meaning of each column."""
+
+
+def croissant(name: str, description: str, date: str, table: str, sha256: str, inside: str) -> dict[str, Any]:
+    """The metadata, as JSON.
+
+    Parameters
+    ----------
+    table, sha256
+        The file with a row for each episode, and its checksum.
+    inside
+        Pattern of the episodes' files.
+    """
+    return {
+        "@context": dict(CONTEXT),
+        "@type": "sc:Dataset",
+        "name": name,
+        "description": description,
+        "conformsTo": list(CONFORMS),
+        "license": LICENCE,
+        "version": "1.0.0",
+        "citeAs": f"{name}: simulated surgery, made by its authors with sulcus, {date}. CC BY 4.0.",
+        "datePublished": date,
+        "creator": {"@type": "sc:Organization", "name": "The maker of this data set, with sulcus"},
+        "keywords": ["simulated surgery", "brain tumour", "finite elements", "augmented reality"],
+        "rai:dataCollection": "Simulated by sulcus: no patient, no measurement.",
+        "rai:dataLimitations": "DATASHEET.md names what is not known.",
+        "rai:personalSensitiveInformation": "None, unless the anatomy is of a person: DATASHEET.md says which it is.",
+        "distribution": [
+            {
+                "@type": "cr:FileObject",
+                "@id": table,
+                "name": table,
+                "description": "A row for each episode.",
+                "contentUrl": table,
+                "encodingFormat": "text/csv",
+                "sha256": sha256,
+            },
+            {
+                "@type": "cr:FileSet",
+                "@id": "episode-files",
+                "name": "episode-files",
+                "description": "One HDF5 file for each episode; attributes say what each array is.",
+                "encodingFormat": "application/x-hdf5",
+                "includes": inside,
+            },
+        ],
+        "recordSet": [
+            {
+                "@type": "cr:RecordSet",
+                "@id": "episodes",
+                "name": "episodes",
+                "description": "The episodes.",
+                "key": {"@id": "episodes/file"},
+                "field": [_field(column, table) for column in COLUMNS],
+            }
+        ],
+    }
+
+
+def _field(column: str, table: str) -> dict[str, Any]:
+    kind, meaning = COLUMNS[column]
+    return {
+        "@type": "cr:Field",
+        "@id": f"episodes/{column}",
+        "name": column,
+        "description": meaning,
+        "dataType": kind,
+        "source": {"fileObject": {"@id": table}, "extract": {"column": column}},
+    }

@@ -1,0 +1,164 @@
+"""The data sheet of a data set, by the questions of Gebru et al. (2021), "Datasheets for Datasets", CACM 64(12)."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from ..reading.contents import Contents
+from ..reading.schema import ARRAYS, PICTURES
+
+MARK = "<!-- sulcus card 1 -->"
+NAME = "with sulcus"
+# Longest list of what was drawn.
+MOST_DRAWN = 60
+
+
+def datasheet(name: str, episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], failed: int) -> str:
+    """The sheet as Markdown, of what the files say: `rows` are those of the table of episodes.
+
+    `failed` is how many episodes were asked for and could not be made.
+    """
+    parts = (
+        f"# Data sheet: {name}\n\n{MARK}\n",
+        "Made by sulcus from the files themselves. The questions are those of Gebru et al. (2021), *Datasheets for "
+        "Datasets*.\n",
+        motivation(),
+        composition(episodes, rows, failed),
+        collection(episodes),
+        UNKNOWN,
+        "## Preprocessing\n\nColour is JPEG, depth PNG of 16 bits and labels PNG of 8 bits. Nothing else was changed. "
+        "`sulcus validate` compares pictures, arrays and checksums.\n",
+        "## Uses\n\nTo train and test methods that follow tools, estimate deformation or plan motion, before real data "
+        "are used. Not for decisions about patients: nothing here was measured on one.\n",
+        "## Distribution\n\nUnder CC BY 4.0, as `LICENSE.md` says in plain words.\n",
+        "## Maintenance\n\nWhoever gives these data out answers for them: write here who, and where errors are "
+        "reported. The plan and the seeds below make them anew.\n",
+        *plans(episodes),
+    )
+    return "\n".join(parts)
+
+
+def motivation() -> str:
+    """Why it was made."""
+    return (
+        "## Motivation\n\nA tool that presses moves the brain, and the tumour in it. Where the tumour is at each "
+        "moment is not known of real surgery. Here it is, because the surgery is simulated.\n"
+    )
+
+
+def composition(episodes: Sequence[Contents], rows: Sequence[Mapping[str, Any]], failed: int) -> str:
+    """What it consists of: counts, sizes, arrays."""
+    lines = ["## Composition\n", "| family | episodes | frames | solved | seconds | GB |", "|---|---|---|---|---|---|"]
+    for family in [*sorted({row["family"] for row in rows}), None]:
+        those = [row for row in rows if family in (None, row["family"])]
+        frames, solved, seconds, size = (
+            sum(row[key] for row in those) for key in ("frames", "solved", "seconds", "bytes")
+        )
+        lines.append(f"| {family or 'all'} | {len(those)} | {frames} | {solved} | {seconds:.1f} | {size / 1e9:.3f} |")
+    lines.append(f"\n*Solved* are frames that finite elements answered. {bodies_said(episodes)}")
+    if failed:
+        lines.append(f"Of those asked for {failed} could not be made and are missing: `failed` says why.")
+    lines.append("")
+    lines += ["| array | unit | in episodes |", "|---|---|---|"]
+    counts = Counter(name for one in episodes for name in one.shapes)
+    for key, count in sorted(counts.items()):
+        unit = "picture" if key in PICTURES else ARRAYS[key].unit or ""
+        lines.append(f"| `{key}` | {unit} | {count} |")
+    worst = [row["largest_error_mm"] for row in rows if row["largest_error_mm"] != ""]
+    if worst:
+        lines.append(
+            f"\nThe largest distance of a predicted tumour vertex from the finite elements' is {max(worst):.3f} mm, in "
+            "the frames that they solved. That is an error of the model, not of the tumour in a patient."
+        )
+    lines.append("Attributes of each array say what it means, and the file formats of sulcus describe them.\n")
+    return "\n".join(lines)
+
+
+def bodies_said(episodes: Sequence[Contents]) -> str:
+    """How many anatomies and pictures' sizes there are."""
+    bodies = len({one.said.get("anatomy") for one in episodes})
+    sizes = sorted({one.size for one in episodes})
+    said_sizes = ", ".join(f"{width} x {height}" for width, height in sizes)
+    return f"Anatomies: {bodies}. Pictures: {said_sizes} pixels."
+
+
+def collection(episodes: Sequence[Contents]) -> str:
+    """How it came about, and what was drawn at random."""
+    lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera drew what it would see.\n"]
+    for key, title in (
+        ("answered_by", "what moved the tissue"),
+        ("finite_elements", "what solved it"),
+        ("tool", "tool"),
+    ):
+        lines += [f"- {title}: {text} (in {count})" for text, count in Counter(map(str, said(episodes, key))).items()]
+    versions = sorted(set(map(str, said(episodes, "sulcus_version"))))
+    dates = sorted(str(date)[:10] for date in said(episodes, "date"))
+    if versions and dates:
+        lines.append(f"- sulcus {', '.join(versions)}, {dates[0]} to {dates[-1]}")
+    table = list(drawn(episodes))
+    if table:
+        lines += [
+            "\nWhat was drawn at random, from least to greatest:\n",
+            "| what | from | to | episodes |",
+            "|---|---|---|---|",
+        ]
+        lines += table[:MOST_DRAWN]
+    else:
+        lines.append("\nNothing was drawn at random, or the files do not say what.")
+    return "\n".join(lines) + "\n"
+
+
+def said(episodes: Sequence[Contents], key: str) -> list[Any]:
+    """An attribute of all episodes that have it."""
+    return [one.said[key] for one in episodes if key in one.said]
+
+
+def drawn(episodes: Sequence[Contents]) -> Iterator[str]:
+    """Rows of the table of what was drawn: ranges of numbers, and how often each text came."""
+    values: dict[str, list[Any]] = {}
+    for text in said(episodes, "parameters"):
+        try:
+            found = json.loads(text)
+        except (TypeError, ValueError, RecursionError):
+            continue
+        for key, value in leaves(found):
+            values.setdefault(key, []).append(value)
+    for key, found in values.items():
+        numbers = [one for one in found if isinstance(one, int | float) and not isinstance(one, bool)]
+        if len(numbers) == len(found):
+            yield f"| `{key}` | {min(numbers):.4g} | {max(numbers):.4g} | {len(found)} |"
+        else:
+            often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, found)).most_common(8))
+            yield f"| `{key}` | {often} | | {len(found)} |"
+
+
+def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers and texts of nested JSON by their dotted names; lists are numbered."""
+    match value:
+        case dict():
+            for key, inner in value.items():
+                yield from leaves(inner, f"{name}.{key}".strip("."))
+        case list():
+            for place, inner in enumerate(value):
+                yield from leaves(inner, f"{name}.{place}".strip("."))
+        case _:
+            yield name, value
+
+
+def plans(episodes: Sequence[Contents]) -> Iterator[str]:
+    """The plans, as they stand in the files."""
+    for text in dict.fromkeys(map(str, said(episodes, "plan"))):
+        yield f"## Plan\n\n```toml\n{text.strip()}\n```\n"
+
+
+UNKNOWN = """## What is not known
+
+- How near the simulated motion is to a patient's. Finite elements and models agree with each other, not with a patient.
+- The tissue of the person whose brain it is: stiffness, and how the skull and the fluid hold it, are assumed.
+- What light, blood, smoke, instruments of other makes and hands do to pictures: none of it is drawn.
+- Forces of real tools: they follow from the assumed tissue.
+- Whether what a method learns here carries over to real pictures. That needs real ones.
+"""

@@ -1,0 +1,264 @@
+"""Episodes as a LeRobot data set, v3.0: Parquet tables with the pictures' own bytes in them, and JSON.
+
+Pictures are features of the kind `image`, as they are stored: JPEG, and PNG of 8 or 16 bits. Depth is exact.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sim.errors import InputError
+
+from ..reading.contents import Contents
+from ..reading.rows import code_of, picture_of
+from ..reading.schema import COLOUR, DEPTH, PICTURES
+from .columns import blocks, named_axes, numbers_of, opened, rate_of, shared_numbers, shared_pictures, stored_size
+from .statistics import Spread
+from .tasks import task_of
+from .whole_folder import written_folder
+
+VERSION = "v3.0"
+DEPTH_RANGE = (0.2, 0.6)
+"""Of a camera's distance to the cortex [m]: what a reader that must scale depth should scale to."""
+EXPORTED = ("colour", "colour_right", "depth", "segmentation", "tumour_mask")
+# Megabytes of one table, and tables of one folder, as LeRobot has them.
+FILE_MEGABYTES, FOLDER_FILES = 100, 1000
+# Pictures of an episode that its statistics are taken of, and pixels along a side from one to the next.
+LOOKED_AT, SPARSE = 5, 4
+DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES = Path("meta/episodes/chunk-000/file-000.parquet")
+PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+COUNTED = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+
+def write_lerobot(
+    episodes: Sequence[Contents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
+) -> dict[str, Any]:
+    """Write a data set; the folder appears whole. Returns what it holds. `progress` passes the episodes on.
+
+    Raises
+    ------
+    InputError
+        Episodes without a tool, of different sizes or rates, or damaged; a folder that cannot be written.
+    """
+    pictures = shared_pictures(episodes, EXPORTED)
+    names = shared_numbers(episodes)
+    tasks = list(dict.fromkeys(task_of(one) for one in episodes))
+    rates: set[float] = set()
+    with written_folder(folder, stored_size(episodes)) as partial:
+        tables = Tables(partial)
+        rows, whole, shapes = [], {}, {}
+        first = 0
+        try:
+            for number, contents in enumerate(progress(episodes)):
+                with opened(contents) as file:
+                    numbers = numbers_of(file, contents, names)
+                    rates.add(rate_of(contents, numbers.pop("time")))
+                    if len(rates) > 1:
+                        slow, fast = sorted(rates)
+                        raise InputError(f"{contents.path}: {slow:g} and {fast:g} frames a second: convert them apart.")
+                    columns = counted(contents.frames, number, first, tasks.index(task_of(contents)), *rates)
+                    columns |= {key_of(name): rows_ for name, rows_ in numbers.items()}
+                    place = tables.write(file, contents, columns, pictures)
+                    spreads = {name: Spread.of(array) for name, array in columns.items()}
+                    spreads |= {f"observation.images.{name}": looks(file, contents, name) for name in pictures}
+                rows.append(
+                    {
+                        "episode_index": number,
+                        "tasks": [task_of(contents)],
+                        "length": contents.frames,
+                        "data/chunk_index": place[0],
+                        "data/file_index": place[1],
+                        "dataset_from_index": first,
+                        "dataset_to_index": first + contents.frames,
+                        "meta/episodes/chunk_index": 0,
+                        "meta/episodes/file_index": 0,
+                        **{
+                            f"stats/{name}/{key}": value
+                            for name, spread in spreads.items()
+                            for key, value in shaped(name, spread).items()
+                        },
+                    }
+                )
+                whole = {name: whole[name] + spread if whole else spread for name, spread in spreads.items()}
+                shapes = {name: array.shape[1:] for name, array in columns.items()}
+                first += contents.frames
+        finally:
+            tables.close()
+        (partial / "meta").mkdir()
+        (partial / EPISODES).parent.mkdir(parents=True)
+        pq.write_table(pa.Table.from_pylist(rows), partial / EPISODES)
+        pq.write_table(task_table(tasks), partial / "meta/tasks.parquet")
+        write_json(partial / "meta/stats.json", {name: shaped(name, spread) for name, spread in whole.items()})
+        features = {**features_of(shapes), **picture_features(episodes[0], pictures)}
+        described = info(len(episodes), first, len(tasks), rates.pop(), features)
+        write_json(partial / "meta/info.json", described)
+    return {"out": str(folder), "episodes": len(episodes), "frames": first, "features": sorted(features)}
+
+
+def key_of(name: str) -> str:
+    """LeRobot's name of an array of ours."""
+    return "action" if name == "action" else f"observation.{name}"
+
+
+def counted(frames: int, episode: int, first: int, task: int, rate: float) -> dict[str, np.ndarray]:
+    """The columns that each LeRobot data set has."""
+    every = np.arange(frames)
+    same = np.ones(frames, np.int64)
+    numbers = ((every / rate).astype(np.float32), every, episode * same, first + every, task * same)
+    return dict(zip(COUNTED, numbers, strict=True))
+
+
+@dataclass
+class Tables:
+    """The data tables, a new one wherever the last is large enough; frames are written in blocks."""
+
+    folder: Path
+    number: int = -1
+    writer: pq.ParquetWriter | None = None
+    path: Path = field(default_factory=Path)
+
+    def write(
+        self, file: h5py.File, contents: Contents, columns: Mapping[str, np.ndarray], pictures: Sequence[str]
+    ) -> tuple[int, int]:
+        """Write an episode; returns the numbers of the folder and the file that it is in."""
+        if self.writer is not None and self.path.stat().st_size > 1e6 * FILE_MEGABYTES:
+            self.close()
+        for block in blocks(len(columns["index"])):
+            arrays = {name: column_of(array[block.start : block.stop]) for name, array in columns.items()}
+            for name in pictures:
+                arrays[f"observation.images.{name}"] = pa.array(coded(file, contents, name, block), PICTURE)
+            table = pa.table(arrays)
+            if self.writer is None:
+                self.number += 1
+                chunk, place = divmod(self.number, FOLDER_FILES)
+                self.path = self.folder / DATA.format(chunk_index=chunk, file_index=place)
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self.writer = pq.ParquetWriter(self.path, table.schema)
+            self.writer.write_table(table)
+        return divmod(self.number, FOLDER_FILES)
+
+    def close(self) -> None:
+        """End the table that is open."""
+        if self.writer is not None:
+            self.writer.close()
+            self.writer = None
+
+
+def coded(file: h5py.File, contents: Contents, name: str, frames: range) -> Iterator[dict[str, Any]]:
+    """Pictures as LeRobot stores them."""
+    suffix = "jpg" if PICTURES[name] == COLOUR else "png"
+    return ({"bytes": code_of(file, contents, name, frame), "path": f"{name}_{frame:06d}.{suffix}"} for frame in frames)
+
+
+def column_of(array: np.ndarray) -> pa.Array:
+    """Rows (T, ...) as a column: numbers, vectors, or lists of lists."""
+    if array.ndim == 1:
+        return pa.array(array)
+    if array.ndim == 2:
+        return pa.FixedSizeListArray.from_arrays(array.ravel(), array.shape[1])
+    inner = pa.array(array.reshape(-1))
+    for length in array.shape[:0:-1]:
+        ends = np.arange(0, len(inner) + 1, length, dtype=np.int32)
+        inner = pa.ListArray.from_arrays(ends, inner)
+    return inner
+
+
+def looks(file: h5py.File, contents: Contents, name: str) -> Spread:
+    """Statistics of a few pictures: colour and labels as shares of 255, depth in its own steps."""
+    found = []
+    for frame in np.unique(np.linspace(0, contents.frames - 1, LOOKED_AT).round().astype(int)).tolist():
+        picture = picture_of(file, contents, name, frame)[::SPARSE, ::SPARSE]
+        scale = contents.depth_scale if PICTURES[name] == DEPTH else 255.0
+        found.append(picture.reshape(-1, picture.shape[2] if picture.ndim == 3 else 1) / scale)
+    return Spread.of(np.concatenate(found))
+
+
+def shaped(name: str, spread: Spread) -> dict[str, list]:
+    """Statistics as LeRobot has them: of a picture (channels, 1, 1)."""
+    said = spread.said()
+    if not name.startswith("observation.images."):
+        return said
+    return {key: value if key == "count" else [[[one]] for one in value] for key, value in said.items()}
+
+
+def task_table(tasks: Sequence[str]) -> pa.Table:
+    """Tasks with their numbers; the sentence is the index that pandas restores."""
+    index = "__index_level_0__"
+    table = pa.table({"task_index": np.arange(len(tasks)), index: list(tasks)})
+    kinds = (("task_index", "int64", "int64"), (index, "unicode", "object"))
+    columns = [
+        {
+            "name": None if name == index else name,
+            "field_name": name,
+            "pandas_type": of_pandas,
+            "numpy_type": of_numpy,
+            "metadata": None,
+        }
+        for name, of_pandas, of_numpy in kinds
+    ]
+    described = {"index_columns": [index], "column_indexes": [], "columns": columns}
+    return table.replace_schema_metadata({"pandas": json.dumps(described)})
+
+
+def features_of(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    """Numbers as `info.json` describes them."""
+    kinds = {name: "float32" if name not in COUNTED or name == "timestamp" else "int64" for name in shapes}
+    return {
+        name: {"dtype": kinds[name], "shape": list(shape) or [1], "names": named_axes(name.rpartition(".")[2])}
+        for name, shape in shapes.items()
+    }
+
+
+def picture_features(contents: Contents, pictures: Sequence[str]) -> dict[str, Any]:
+    """Pictures as `info.json` describes them; of depth its step, and the range to scale to [m]."""
+    width, height = contents.size
+    found = {}
+    for name in pictures:
+        channels = 3 if PICTURES[name] == COLOUR else 1
+        found[f"observation.images.{name}"] = {
+            "dtype": "image",
+            "shape": [height, width, channels],
+            "names": ["height", "width", "channels"],
+        }
+        if PICTURES[name] == DEPTH:
+            found[f"observation.images.{name}"]["info"] = {
+                "is_depth_map": True,
+                "step_m": contents.depth_scale,
+                "range_m": list(DEPTH_RANGE),
+                "bits": 16,
+            }
+    return found
+
+
+def info(episodes: int, frames: int, tasks: int, rate: float, features: Mapping[str, Any]) -> dict[str, Any]:
+    """What `info.json` holds."""
+    return {
+        "codebase_version": VERSION,
+        "robot_type": "simulated hand-held tool",
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": tasks,
+        "chunks_size": FOLDER_FILES,
+        "data_files_size_in_mb": FILE_MEGABYTES,
+        "video_files_size_in_mb": FILE_MEGABYTES,
+        "fps": int(rate) if rate.is_integer() else rate,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": DATA,
+        "video_path": None,
+        "features": dict(features),
+    }
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON with indents."""
+    path.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")

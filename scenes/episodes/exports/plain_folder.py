@@ -1,0 +1,102 @@
+"""Episodes as folders: pictures as JPEG and PNG files, numbers as CSV, and what they are as JSON."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ..reading.contents import Contents
+from ..reading.rows import code_of, numbers_in, rows_of
+from ..reading.schema import ARRAYS, COLOUR, PICTURES, SOLVED
+from .columns import file_names, opened, stored_size
+from .whole_folder import written_folder
+
+WIDE = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
+"""Arrays with many numbers a frame, each in a table of its own."""
+
+
+def write_folder(
+    episodes: Sequence[Contents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
+) -> dict[str, Any]:
+    """Write a folder for each episode; the whole appears at once. Returns what it holds.
+
+    Raises
+    ------
+    InputError
+        An episode that is damaged; a folder that cannot be written.
+    """
+    with written_folder(folder, 2 * stored_size(episodes)) as partial:
+        names = file_names(episodes)
+        for contents in progress(episodes):
+            place = partial / names[contents]
+            place.mkdir()
+            with opened(contents) as file:
+                write_pictures(place, file, contents)
+                write_tables(place, file, contents)
+                write_description(place / "episode.json", file, contents)
+    return {"out": str(folder), "episodes": len(episodes), "frames": sum(one.frames for one in episodes)}
+
+
+def write_pictures(place: Path, file: h5py.File, contents: Contents) -> None:
+    """Write the pictures' own bytes, one file each: `colour/000000.jpg`."""
+    for name, kind in PICTURES.items():
+        if name in contents.shapes:
+            (place / name).mkdir()
+            suffix = "jpg" if kind == COLOUR else "png"
+            for frame in range(contents.frames):
+                (place / name / f"{frame:06d}.{suffix}").write_bytes(code_of(file, contents, name, frame))
+
+
+def write_tables(place: Path, file: h5py.File, contents: Contents) -> None:
+    """Write `frames.csv`, a row for each frame, and a table for each array that is wide. NaN is an empty field."""
+    columns: dict[str, Sequence[object] | np.ndarray] = {"frame": range(contents.frames)}
+    for name in contents.shapes:
+        described = ARRAYS.get(name)
+        if described is None or name == "fem_frames" or not (described.framed or described.axes[0] == SOLVED):
+            continue
+        rows = rows_of(file, contents, name)
+        if name in WIDE:
+            flat = np.asarray(rows).reshape(contents.frames, -1)
+            axes = [f"{node}{axis}" for node in range(flat.shape[1] // 3) for axis in ("_x", "_y", "_z")]
+            titles = axes if described.axes[-1] == 3 else [str(node) for node in range(flat.shape[1])]
+            write_table(
+                place / f"{name}.csv", {"frame": range(contents.frames)} | dict(zip(titles, flat.T, strict=True))
+            )
+        elif isinstance(rows, list) or rows.ndim == 1:
+            columns[name] = rows
+        else:
+            flat = rows.reshape(contents.frames, -1)
+            columns |= {f"{name}_{place}": flat[:, place] for place in range(flat.shape[1])}
+    write_table(place / "frames.csv", columns)
+
+
+def write_table(path: Path, columns: dict[str, Any]) -> None:
+    """Write columns of equal length."""
+    with path.open("w", newline="") as out:
+        writer = csv.writer(out)
+        writer.writerow(columns)
+        writer.writerows(
+            [("" if cell != cell else cell) for cell in row] for row in zip(*columns.values(), strict=True)
+        )
+
+
+def write_description(path: Path, file: h5py.File, contents: Contents) -> None:
+    """Write the attributes, what each array is, and the arrays that an episode has once."""
+    arrays = {}
+    for name in contents.shapes:
+        item = file[f"pictures/{name}" if name in PICTURES else name]
+        arrays[name] = {key: str(item.attrs[key]) for key in ("meaning", "unit") if key in item.attrs}
+        described = ARRAYS.get(name)
+        if described is not None and not described.framed and described.axes[0] != SOLVED:
+            arrays[name]["values"] = numbers_in(file, contents, name).tolist()
+    said = {
+        name: value if isinstance(value, str | int | float | list) else str(value)
+        for name, value in contents.said.items()
+    }
+    path.write_text(json.dumps({"attributes": said, "arrays": arrays}, indent=1) + "\n")

@@ -1,0 +1,111 @@
+"""Episodes as one robomimic file: HDF5 with `data/demo_0`, ... and masks of those to train on and to hold out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sim.errors import InputError
+from sim.runtime.atomic_files import Stream, demand_space, written_stream
+
+from ..reading.contents import Contents
+from ..reading.rows import numbers_in
+from ..reading.schema import COLOUR, PICTURES
+from .columns import blocks, numbers_of, opened, rate_of, shared_numbers, shared_pictures, stored_size
+from .tasks import held_out, task_of
+
+EXPORTED = ("colour", "colour_right", "depth", "segmentation")
+# Decoded pictures, packed by gzip, against the episodes' JPEG and PNG.
+SWELLS = 4
+GYM = 2
+"""robomimic's number for environments of Gymnasium's kind."""
+
+
+def write_robomimic(
+    episodes: Sequence[Contents], path: Path, progress: Callable[[Iterable], Iterable] = iter
+) -> dict[str, Any]:
+    """Write the file; it appears whole. Returns what it holds. `progress` passes the episodes on.
+
+    Raises
+    ------
+    InputError
+        Episodes without a tool, of different picture sizes, or damaged; a file that cannot be written.
+    """
+    pictures, names = shared_pictures(episodes, EXPORTED), shared_numbers(episodes)
+    demand_space(path, SWELLS * stored_size(episodes))
+    total, rates = 0, []
+    with written_stream(path, ".hdf5") as stream, h5py.File(stream, "w") as out:
+        data = out.create_group("data")
+        for number, contents in enumerate(progress(episodes)):
+            demo = data.create_group(f"demo_{number}")
+            with opened(contents) as file:
+                numbers = numbers_of(file, contents, names)
+                rates.append(rate_of(contents, numbers.pop("time")))
+                obs = demo.create_group("obs")
+                write_demo(demo, obs, contents, numbers)
+                write_pictures(obs, file, contents, pictures, stream)
+            total += contents.frames
+        data.attrs.update({"total": total, "env_args": json.dumps(environment(episodes, rates))})
+        names_of = np.array([f"demo_{number}" for number in range(len(episodes))], "S")
+        out_of = np.array(held_out(episodes))
+        out.create_dataset("mask/train", data=names_of[~out_of])
+        out.create_dataset("mask/valid", data=names_of[out_of])
+    return {"out": str(path), "episodes": len(episodes), "frames": total, "held_out": int(out_of.sum())}
+
+
+def write_demo(demo: h5py.Group, obs: h5py.Group, contents: Contents, numbers: dict[str, np.ndarray]) -> None:
+    """Write all but the pictures of one episode: a state is the tool's, then the tumour's where all have as many."""
+    actions, state = numbers.pop("action"), numbers.pop("state")
+    tumour = [numbers[name].reshape(contents.frames, -1) for name in ("tumour_predicted",) if name in numbers]
+    dones = np.zeros(contents.frames, np.int64)
+    dones[-1] = 1
+    demo.create_dataset("actions", data=actions)
+    demo.create_dataset("states", data=np.concatenate([state, *tumour], axis=1))
+    demo.create_dataset("rewards", data=np.zeros(contents.frames))
+    demo.create_dataset("dones", data=dones)
+    for name, rows in {"tool_position": state[:, :3], "tool_quaternion": state[:, 3:], **numbers}.items():
+        obs.create_dataset(name, data=rows.reshape(contents.frames, -1))
+    demo.attrs.update({"num_samples": contents.frames, "task": task_of(contents), "episode": contents.path.name})
+
+
+def write_pictures(
+    obs: h5py.Group, file: h5py.File, contents: Contents, pictures: Sequence[str], stream: Stream
+) -> None:
+    """Write pictures decoded, (T, H, W, channels): uint8, and depth as float32 [m]."""
+    width, height = contents.size
+    for name in pictures:
+        kind = np.float32 if name == "depth" else np.uint8
+        channels = 3 if PICTURES[name] == COLOUR else 1
+        shape = (height, width, channels)
+        store = obs.create_dataset(
+            f"{name}_image", (contents.frames, *shape), kind, chunks=(1, *shape), compression="gzip",
+            compression_opts=1, shuffle=name == "depth",
+        )  # fmt: skip
+        for block in blocks(contents.frames):
+            rows = numbers_in(file, contents, name, block).reshape(len(block), *shape)
+            store[block.start : block.stop] = rows
+            if stream.failure is not None:
+                raise stream.failure
+
+
+def environment(episodes: Sequence[Contents], rates: Sequence[float]) -> dict[str, Any]:
+    """What robomimic asks of an environment: there is none to replay actions in, so it names what was played."""
+    families = sorted({one.family for one in episodes})
+    return {
+        "env_name": "sulcus",
+        "type": GYM,
+        "env_version": version("sulcus"),
+        "env_kwargs": {"families": families, "frames_per_second": sorted(set(rates))},
+    }
+
+
+def demand_hdf5(path: Path) -> None:
+    """Refuse a name that robomimic's files do not have."""
+    if path.suffix != ".hdf5":
+        raise InputError(f"{path}: robomimic's files end in .hdf5.")

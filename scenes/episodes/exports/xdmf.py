@@ -1,0 +1,108 @@
+"""The tumour, and the cortex where it is there, over time: XDMF with its numbers in HDF5, for ParaView."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
+
+import h5py
+import numpy as np
+
+from sim.runtime.atomic_files import written_stream
+
+from ..reading.bodies import anatomy_of, surface_rows
+from ..reading.contents import Contents, array_in
+from ..reading.rows import numbers_in
+from .columns import file_names, opened, stored_size
+from .whole_folder import written_folder
+
+SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
+"""What is written, and the surface of the anatomy that it is of."""
+
+
+def write_xdmf(
+    episodes: Sequence[Contents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
+) -> dict[str, Any]:
+    """Write two files an episode, `.xdmf` to open and `.h5` with its numbers; the folder appears whole.
+
+    Positions are metres. Beside them are the displacement from the scan, and the distance to the finite elements' own
+    answer where they solved the frame. Without the anatomy there are points alone: `points_only` counts such episodes.
+
+    Raises
+    ------
+    InputError
+        An episode that is damaged; a folder that cannot be written.
+    """
+    bare = 0
+    with written_folder(folder, stored_size(episodes)) as partial:
+        names = file_names(episodes)
+        for contents in progress(episodes):
+            anatomy = anatomy_of(contents)
+            bare += anatomy is None
+            root = Element("Xdmf", Version="3.0")
+            domain = SubElement(root, "Domain")
+            with opened(contents) as file, hdf5(partial / f"{names[contents]}.h5") as out:
+                times = numbers_in(file, contents, "time")
+                for name, surface in SURFACES.items():
+                    if f"{name}_predicted" in contents.shapes and f"{name}_rest" in contents.shapes:
+                        nodes = numbers_in(file, contents, f"{name}_nodes")
+                        triangles = None if anatomy is None else surface_rows(getattr(anatomy, surface), nodes)
+                        group = out.create_group(name)
+                        write_arrays(group, file, contents, name, triangles)
+                        add_series(domain, group, f"{names[contents]}.h5", times)
+            indent(root)
+            ElementTree(root).write(partial / f"{names[contents]}.xdmf", "utf-8", xml_declaration=True)
+    return {"out": str(folder), "episodes": len(episodes), "points_only": bare}
+
+
+@contextmanager
+def hdf5(path: Path) -> Iterator[h5py.File]:
+    """A new HDF5 file; a full disk ends in a sentence."""
+    with written_stream(path, ".h5") as stream, h5py.File(stream, "w") as file:
+        yield file
+
+
+def write_arrays(out: h5py.Group, file: h5py.File, contents: Contents, name: str, triangles: np.ndarray | None) -> None:
+    """Write positions, displacement and difference of each frame, single precision."""
+    at = numbers_in(file, contents, f"{name}_predicted")
+    arrays = {"positions": at, "displacement": at - numbers_in(file, contents, f"{name}_rest")}
+    if f"{name}_fem" in contents.shapes:
+        truth = numbers_in(file, contents, f"{name}_fem")
+        arrays["from_finite_elements"] = np.linalg.norm(at - truth, axis=2)
+    for key, rows in arrays.items():
+        for frame, row in enumerate(rows):
+            if np.isfinite(row).all():
+                out.create_dataset(f"{key}/{frame:06d}", data=row.astype(np.float32), compression="gzip")
+    cells = np.arange(at.shape[1])[:, None] if triangles is None or not len(triangles) else triangles
+    out.create_dataset("cells", data=cells.astype(np.int32), compression="gzip")
+
+
+def add_series(domain: Element, group: h5py.Group, name: str, times: np.ndarray) -> None:
+    """Describe the frames of one surface: a grid each."""
+    series = SubElement(
+        domain, "Grid", Name=str(group.name).strip("/"), GridType="Collection", CollectionType="Temporal"
+    )
+    cells = array_in(group, "cells")
+    kind = (
+        {"TopologyType": "Triangle"} if cells.shape[1] == 3 else {"TopologyType": "Polyvertex", "NodesPerElement": "1"}
+    )
+    for frame in map(str, group.require_group("positions")):
+        grid = SubElement(series, "Grid", Name=frame, GridType="Uniform")
+        SubElement(grid, "Time", Value=repr(float(times[int(frame)])))
+        add_item(SubElement(grid, "Topology", kind, NumberOfElements=str(len(cells))), cells, name)
+        add_item(SubElement(grid, "Geometry", GeometryType="XYZ"), array_in(group, f"positions/{frame}"), name)
+        for key, form in (("displacement", "Vector"), ("from_finite_elements", "Scalar")):
+            if f"{key}/{frame}" in group:
+                attribute = SubElement(grid, "Attribute", Name=f"{key} [m]", AttributeType=form, Center="Node")
+                add_item(attribute, array_in(group, f"{key}/{frame}"), name)
+
+
+def add_item(above: Element, array: h5py.Dataset, name: str) -> None:
+    """Refer to an array of the HDF5 file beside."""
+    kind, size = ("Int", "4") if array.dtype.kind == "i" else ("Float", "4")
+    shape = " ".join(map(str, array.shape))
+    item = SubElement(above, "DataItem", Dimensions=shape, NumberType=kind, Precision=size, Format="HDF")
+    item.text = f"{name}:{array.name}"

@@ -1,0 +1,1 @@
+"""Episodes out of files: what each array is, windows of frames, and the same for PyTorch."""

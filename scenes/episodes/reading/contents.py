@@ -1,0 +1,210 @@
+"""What one episode file holds, found out before any of it is believed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sim.errors import InputError
+from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
+from sim.runtime.outside_files import path_of, read_as
+
+from .open_files import REMEDY
+from .schema import ARRAYS, FORMATS, FRAMES, NEEDED, PICTURES, SOLVED, Array
+
+# Groups in groups, and what lies in all of them: an episode has one group, `pictures`.
+DEEPEST, MOST_NAMES = 3, 500
+# Frames of one episode: hours.
+MOST_FRAMES = 1_000_000
+# Pixels along a picture's side.
+LARGEST_SIDE = 16384
+# Bytes of a text that heads a file: a plan, or what was drawn.
+LONGEST_TEXT = 1 << 20
+FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """One episode as its file describes it.
+
+    Parameters
+    ----------
+    path
+        The file.
+    said
+        Attributes of the file: texts, numbers.
+    shapes
+        Of all arrays that are known, by name; pictures by their own, without the group's.
+    fem_frames
+        (F,) sorted numbers of the frames that finite elements solved.
+    """
+
+    path: Path
+    said: Mapping[str, Any]
+    shapes: Mapping[str, tuple[int, ...]]
+    fem_frames: np.ndarray
+
+    @property
+    def frames(self) -> int:
+        """How many."""
+        return self.shapes["time"][0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of its pictures [pixel]."""
+        return int(self.said["width"]), int(self.said["height"])
+
+    @property
+    def family(self) -> str:
+        """What happens in it; of the former format its scene."""
+        return str(self.said.get("family", self.said.get("scene", "episode")))
+
+    @property
+    def depth_scale(self) -> float:
+        """Metres in one step of its depth."""
+        return float(self.said.get("depth_scale_m", np.nan))
+
+
+def read_contents(path: str | Path) -> Contents:
+    """Find out what an episode holds.
+
+    Raises
+    ------
+    InputError
+        No such file, or none of an episode. Links to other files; arrays of other shapes or kinds than ours, or larger
+        than the file can hold.
+    """
+    path = path_of(path)
+    with read_as(path, "an episode", REMEDY), h5py.File(path, "r") as file:
+        return contents_of(file, path)
+
+
+def contents_of(file: h5py.File, path: Path) -> Contents:
+    """What an open file holds.
+
+    Raises
+    ------
+    InputError
+        As `read_contents`.
+    """
+    said = attributes_of(file)
+    if said.get("format") not in FORMATS:
+        raise InputError(f"it is no episode, but {said.get('format', 'HDF5')!r}. Give files of `sulcus collect`.")
+    arrays = dict(_arrays(file))
+    missing = [name for name in NEEDED if name not in arrays]
+    missing += [name for name in ("width", "height") if not isinstance(said.get(name), int)]
+    if missing:
+        raise InputError(f"it has no {missing[0]!r}. {REMEDY}")
+    if not all(0 < int(said[name]) <= LARGEST_SIDE for name in ("width", "height")):
+        raise InputError(f"its pictures have {said['width']} x {said['height']} pixels. {REMEDY}")
+    shapes = _checked(arrays)
+    return Contents(path, said, shapes, _solved(arrays, shapes))
+
+
+def attributes_of(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
+    """Attributes as Python's own texts, numbers, and lists of them.
+
+    Raises
+    ------
+    InputError
+        One that is larger than any of ours.
+    """
+    found = {}
+    for name in item.attrs:
+        described = item.attrs.get_id(name)
+        large = described.dtype.itemsize * int(np.prod(described.shape or (1,))) > LONGEST_TEXT
+        value = None if large else item.attrs[name]
+        if value is None or (isinstance(value, str | bytes) and len(value) > LONGEST_TEXT):
+            raise InputError(f"its attribute {name!r} has more than {LONGEST_TEXT} bytes. {REMEDY}")
+        found[name] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    return found
+
+
+def array_in(group: h5py.Group, name: str) -> h5py.Dataset:
+    """An array by its name; InputError of what is none."""
+    found = group[name]
+    if not isinstance(found, h5py.Dataset):
+        raise InputError(f"{name!r} is no array. {REMEDY}")
+    return found
+
+
+def _arrays(file: h5py.Group, inside: str = "", depth: int = 0) -> Iterator[tuple[str, h5py.Dataset]]:
+    """Arrays by their names; InputError where one is not in the file itself."""
+    if len(file) > MOST_NAMES or depth > DEEPEST:
+        raise InputError(f"it holds more groups or names than an episode has. {REMEDY}")
+    for name in file:
+        full = f"{inside}{name}"
+        if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+            raise InputError(f"{full!r} is a link and no array: episodes with links are not read. {REMEDY}")
+        item = file[name]
+        if isinstance(item, h5py.Group):
+            yield from _arrays(item, f"{full}/", depth + 1)
+        elif isinstance(item, h5py.Dataset):
+            _demand_inside(full, item)
+            yield full, item
+
+
+def _demand_inside(name: str, array: h5py.Dataset) -> None:
+    """Refuse an array whose numbers lie elsewhere, or are declared and not there."""
+    if array.external or array.is_virtual:
+        raise InputError(f"{name!r} lies in another file: episodes that refer to others are not read. {REMEDY}")
+    pipeline = array.id.get_create_plist()
+    filters = {pipeline.get_filter(number)[0] for number in range(pipeline.get_nfilters())}
+    if not filters <= FILTERS:
+        raise InputError(f"{name!r} is packed in a way that is not read. {REMEDY}")
+    size = array.size or 0
+    stored = array.id.get_storage_size()
+    if size * array.dtype.itemsize > min(LARGEST_ARRAY, INFLATION * max(stored, 1 << 10)):
+        raise InputError(f"{name!r} of shape {array.shape} is larger than its file can hold. {REMEDY}")
+
+
+def _checked(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays that are known; InputError where they do not fit one another."""
+    sizes: dict[str, int] = {}
+    if "fem_frames" not in arrays:
+        sizes[SOLVED] = arrays["time"].shape[0] if arrays["time"].ndim else 0
+    shapes = {}
+    for name in ("time", "fem_frames", *arrays):
+        if name not in arrays:
+            continue
+        inside, _, last = name.rpartition("/")
+        picture = inside == "pictures" and last in PICTURES
+        wanted = Array((FRAMES,), "O") if picture else ARRAYS.get(name)
+        if wanted is None:
+            continue
+        array = arrays[name]
+        if array.dtype.kind not in wanted.kind or (picture and h5py.check_vlen_dtype(array.dtype) != np.uint8):
+            raise InputError(f"{name!r} holds {array.dtype}: another kind is needed. {REMEDY}")
+        _fit(name, array.shape, wanted, sizes)
+        shapes[last if picture else name] = array.shape
+    if not 0 < sizes[FRAMES] <= MOST_FRAMES:
+        raise InputError(f"it has {sizes[FRAMES]} frames: 1 to {MOST_FRAMES} are read. {REMEDY}")
+    return shapes
+
+
+def _fit(name: str, shape: tuple[int, ...], wanted: Array, sizes: dict[str, int]) -> None:
+    """Refuse a shape with other lengths than those known; learn those that are not."""
+    axes = wanted.axes
+    if axes[-1] is None:
+        axes = (*axes[:-1], *shape[len(axes) - 1 :])
+    needed = tuple(axis if isinstance(axis, int) else sizes.get(str(axis)) for axis in axes)
+    if len(shape) != len(needed) or any(one not in (None, other) for one, other in zip(needed, shape, strict=True)):
+        said = ", ".join(str(axis) if one is None else str(one) for axis, one in zip(axes, needed, strict=True))
+        raise InputError(f"{name!r} has shape {shape} in place of ({said}). {REMEDY}")
+    sizes |= {axis: length for axis, length in zip(axes, shape, strict=True) if isinstance(axis, str)}
+
+
+def _solved(arrays: Mapping[str, h5py.Dataset], shapes: Mapping[str, tuple[int, ...]]) -> np.ndarray:
+    count = shapes["time"][0]
+    if "fem_frames" not in shapes:
+        known = any(name in shapes for name in ("tumour_fem", "outcome_fem"))
+        return np.arange(count if known else 0)
+    frames = np.asarray(arrays["fem_frames"][:], np.int64)
+    if len(frames) and (frames[0] < 0 or frames[-1] >= count or (np.diff(frames) < 1).any()):
+        raise InputError(f"'fem_frames' are not sorted numbers of its {count} frames. {REMEDY}")
+    return frames

@@ -1,0 +1,103 @@
+"""What arrays an episode may hold: their axes, kinds and units, of today's format and of the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+FORMATS = ("sulcus episode 1", "sulcus episode 2")
+COLOUR, DEPTH, LABELS = "colour", "depth", "labels"
+FRAMES, SOLVED = "frames", "solved"
+
+
+@dataclass(frozen=True)
+class Array:
+    """One array of an episode.
+
+    Parameters
+    ----------
+    axes
+        A length, or the name of one that all arrays share; `None` last: as many axes more as there are.
+    kind
+        Of its numbers, as NumPy's `dtype.kind`: any of these letters; "O" are texts or pictures.
+    unit
+        As the array's own attribute has it; None: no unit is asked for.
+    known
+        Whether every number must be known; NaN says that it is not.
+    limited
+        Whether every number must be finite or NaN; a bound of loads that a model was not trained on is infinite.
+    """
+
+    axes: tuple[int | str | None, ...]
+    kind: str = "f"
+    unit: str | None = "m"
+    known: bool = True
+    limited: bool = True
+
+    @property
+    def framed(self) -> bool:
+        """Whether there is a row for each frame."""
+        return bool(self.axes) and self.axes[0] == FRAMES
+
+
+PICTURES: Mapping[str, str] = {
+    "colour": COLOUR,
+    "colour_right": COLOUR,
+    "overlay": COLOUR,
+    "depth": DEPTH,
+    "segmentation": LABELS,
+    "tumour_mask": LABELS,
+}
+"""Pictures, one a frame in the group `pictures`, and how each is decoded."""
+
+_POSE = Array((FRAMES, 4, 4))
+_PLACE = Array((FRAMES, 3), known=False)
+_ERROR = Array((FRAMES,), known=False, limited=False)
+_FORCE = Array((FRAMES, 3), unit="N", known=False)
+
+ARRAYS: Mapping[str, Array] = {
+    "time": Array((FRAMES,), unit="s"),
+    "seconds": Array((FRAMES, "stages"), unit="s"),
+    "K": Array((3, 3), unit="pixel"),
+    "K_of_frame": Array((FRAMES, 3, 3), unit="pixel"),
+    "distortion": Array((8,), unit="1"),
+    "T_camera_world": _POSE,
+    "T_camera_world_tracked": Array((FRAMES, 4, 4), known=False),
+    "T_camera_world_right": _POSE,
+    "T_world_tool": _POSE,
+    "T_world_tool_tracked": Array((FRAMES, 4, 4), known=False),
+    "force": _FORCE,
+    "force_read": _FORCE,
+    "contact": _PLACE,
+    "tip": Array((FRAMES, 3)),
+    "distance": Array((FRAMES,), known=False),
+    "distance_error": _ERROR,
+    "bound": Array((FRAMES, 2), known=False, limited=False),
+    "model_error": _ERROR,
+    "tumour_error": _ERROR,
+    "tumour_error_unobserved": _ERROR,
+    "reaction_predicted": Array((FRAMES, "tools", 6), unit="N, N m", known=False),
+    "reaction_fem": Array((SOLVED, "tools", 6), unit="N, N m"),
+    "reaction_bound": Array((FRAMES, 2), unit="N", known=False, limited=False),
+    "direction": Array((FRAMES, 3), unit="1"),
+    "csf_level": Array((FRAMES,)),
+    "share": Array((FRAMES,), unit="1"),
+    "done": Array((FRAMES,), "iuf", "1"),
+    "pose": Array((FRAMES, None)),
+    "displacement": Array((FRAMES, None)),
+    "fem_frames": Array((SOLVED,), "iu", "1"),
+    "outcome_predicted": Array((FRAMES,), "O", "text"),
+    "outcome_fem": Array((SOLVED,), "O", "text"),
+    "tumour_predicted": Array((FRAMES, "tumour", 3)),
+    "tumour_fem": Array((SOLVED, "tumour", 3)),
+    "tumour_left": Array((FRAMES, "tumour"), "b", "1"),
+    "tumour_nodes": Array(("tumour",), "iu", "1"),
+    "tumour_rest": Array(("tumour", 3)),
+    "cortex_predicted": Array((FRAMES, "cortex", 3)),
+    "cortex_fem": Array((SOLVED, "cortex", 3)),
+    "cortex_nodes": Array(("cortex",), "iu", "1"),
+    "cortex_rest": Array(("cortex", 3)),
+}
+"""Arrays that are no pictures, by name. Only `time` must be there."""
+
+NEEDED = ("time",)

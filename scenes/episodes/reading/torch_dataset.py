@@ -1,0 +1,47 @@
+"""Episodes as a PyTorch data set, for a `DataLoader` with any number of workers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from .windows import Episodes, read_episodes
+
+
+class EpisodeDataset(Dataset[dict[str, Any]]):
+    """Windows of `read_episodes` as tensors; the order is the same, and texts stay lists.
+
+    It pickles without its open files: workers open their own, whether they are forked or spawned.
+    """
+
+    def __init__(
+        self,
+        paths: str | Path | Sequence[str | Path],
+        keys: Sequence[str] | None = None,
+        window: int = 1,
+        step: int = 1,
+        stride: int = 1,
+        most_open: int = 16,
+    ) -> None:
+        """Find out what the files hold; InputError as `read_episodes`."""
+        self.episodes: Episodes = read_episodes(paths, keys, window, step, stride, most_open)
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        """The window of a number, counted over all episodes."""
+        return {name: _tensor(value) for name, value in self.episodes[index].items()}
+
+    def at(self, episode: int, first: int) -> dict[str, Any]:
+        """The window of an episode that begins at a frame; InputError as `Episodes.at`."""
+        return {name: _tensor(value) for name, value in self.episodes.at(episode, first).items()}
+
+
+def _tensor(value: Any) -> Any:
+    return torch.from_numpy(value) if isinstance(value, np.ndarray) else value

@@ -1,0 +1,170 @@
+"""What is wrong with an episode, found out without trusting it: each finding is a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from sim.errors import InputError
+from sim.runtime.outside_files import read_as
+
+from .bodies import anatomy_of
+from .contents import Contents, array_in, attributes_of, contents_of
+from .open_files import REMEDY
+from .rows import numbers_in, picture_of
+from .schema import ARRAYS, LABELS, PICTURES
+from .silhouettes import mask_findings
+
+# Rows that are held in memory at once.
+BLOCK = 256
+# A rotation's rows against unit length and right angles.
+ROTATED = 1e-6
+POSES = ("T_camera_world", "T_camera_world_right", "T_camera_world_tracked", "T_world_tool", "T_world_tool_tracked")
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was found of one file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    problems
+        What is wrong: none, if the file is whole.
+    skipped
+        What could not be looked at, and why.
+    frames, solved
+        How many there are, and how many of them finite elements solved.
+    unsolved
+        Of those, how many did not converge.
+    error_mm
+        Of predicted tumour vertices against the finite elements' where they solved: mean and largest [mm]; None where
+        nothing was solved.
+    """
+
+    path: Path
+    problems: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    frames: int = 0
+    solved: int = 0
+    unsolved: int = 0
+    error_mm: tuple[float, float] | None = None
+
+
+Check = Callable[[h5py.File, Contents], Iterator[str]]
+
+
+def validate_episode(path: Path, sums: Check | None = None) -> Report:
+    """Look at all of one episode.
+
+    `sums` compares its checksums; None where there is nothing to compare them by.
+    """
+    problems: list[str] = []
+    skipped: list[str] = []
+    try:
+        with read_as(path, "an episode", REMEDY), h5py.File(path, "r") as file:
+            contents = contents_of(file, path)
+            for check in (unit_findings, number_findings, pose_findings, picture_findings):
+                problems += check(file, contents)
+            if contents.said["format"] == "sulcus episode 1" or sums is None:
+                skipped.append("checksums: files of this format have none")
+            else:
+                problems += sums(file, contents)
+            if not problems:
+                anatomy = anatomy_of(contents)
+                wrong, left = mask_findings(file, contents, anatomy)
+                problems += wrong
+                skipped += left
+            solved, unsolved, error = solved_figures(file, contents)
+            return Report(path, problems, skipped, contents.frames, solved, unsolved, error)
+    except InputError as error:
+        return Report(path, [*problems, str(error).removeprefix(f"{path}: ")], skipped)
+
+
+def unit_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
+    """Units that are missing or are others than ours; arrays that nobody knows."""
+    for name in contents.shapes:
+        if name in PICTURES:
+            continue
+        unit, said = ARRAYS[name].unit, attributes_of(array_in(file, name)).get("unit")
+        if name not in ("fem_frames",) and unit is not None and said != unit:
+            yield f"'{name}' has the unit {said!r} in place of {unit!r}."
+
+
+def number_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
+    """Numbers that are not finite and must be; infinite ones anywhere; times that do not grow."""
+    for name in contents.shapes:
+        if name in PICTURES or ARRAYS[name].kind != "f":
+            continue
+        array = array_in(file, name)
+        for start in range(0, array.shape[0], BLOCK):
+            rows = array[start : start + BLOCK]
+            wrong = (np.isnan(rows) & ARRAYS[name].known) | (np.isinf(rows) & ARRAYS[name].limited)
+            if wrong.any():
+                row = start + int(np.argwhere(wrong)[0][0])
+                yield f"'{name}' has a number in row {row} that is not finite."
+                break
+    times = numbers_in(file, contents, "time")
+    if (np.diff(times) <= 0.0).any():
+        row = int(np.argmax(np.diff(times) <= 0.0)) + 1
+        yield f"'time' does not grow from row {row - 1} to row {row}."
+
+
+def pose_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
+    """Poses that are no rotation and translation; a camera matrix that is none."""
+    for name in POSES:
+        if name not in contents.shapes:
+            continue
+        poses = numbers_in(file, contents, name)
+        known = np.isfinite(poses).all(axis=(1, 2))
+        turns = poses[:, :3, :3]
+        with np.errstate(all="ignore"):
+            off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+            rigid = (off < ROTATED) & (np.linalg.det(turns) > 0.0) & (poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+        if (known & ~rigid).any():
+            yield f"'{name}' of row {int(np.argmax(known & ~rigid))} is no rotation and translation."
+    for name in ("K", "K_of_frame"):
+        if name in contents.shapes:
+            found = numbers_in(file, contents, name).reshape(-1, 3, 3)
+            good = (found[:, 0, 0] > 0.0) & (found[:, 1, 1] > 0.0) & (found[:, 2] == [0.0, 0.0, 1.0]).all(axis=1)
+            if not good.all():
+                yield f"'{name}' is no matrix of a camera."
+
+
+def picture_findings(file: h5py.File, contents: Contents) -> Iterator[str]:
+    """Pictures that cannot be decoded, are of another size than the file says, or have labels that it does not name."""
+    labels = {int(word.split()[0]) for word in str(contents.said.get("segmentation", "")).split(",") if word.strip()}
+    for name, kind in PICTURES.items():
+        if name not in contents.shapes:
+            continue
+        allowed = {0, 1} if name == "tumour_mask" else labels
+        for frame in range(contents.frames):
+            try:
+                picture = picture_of(file, contents, name, frame)
+            except InputError as error:
+                yield str(error).removeprefix(f"{contents.path}: ").removesuffix(" Make the episode anew.")
+                break
+            if kind == LABELS and not (found := set(np.unique(picture).tolist())) <= allowed:
+                yield f"the picture {name!r} of frame {frame} has labels {sorted(found - allowed)} that nothing names."
+                break
+
+
+def solved_figures(file: h5py.File, contents: Contents) -> tuple[int, int, tuple[float, float] | None]:
+    """How many frames were solved, how many of them did not converge, and how far the prediction was off [mm]."""
+    solved = len(contents.fem_frames)
+    unsolved = 0
+    if "outcome_fem" in contents.shapes:
+        unsolved = sum(not text.startswith(b"CONVERGED") for text in array_in(file, "outcome_fem")[:])
+    if not solved or not {"tumour_fem", "tumour_predicted"} <= set(contents.shapes):
+        return solved, unsolved, None
+    truth, total, worst = array_in(file, "tumour_fem"), 0.0, 0.0
+    for start in range(0, solved, BLOCK):
+        frames = contents.fem_frames[start : start + BLOCK]
+        away = np.linalg.norm(array_in(file, "tumour_predicted")[frames] - truth[start : start + BLOCK], axis=2)
+        total, worst = total + float(away.mean()) * len(frames), max(worst, float(away.max(initial=0.0)))
+    return solved, unsolved, (1e3 * total / solved, 1e3 * worst)

@@ -1,0 +1,195 @@
+"""Windows of frames of many episodes, in one order wherever they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.errors import InputError
+from sim.runtime.outside_files import path_of
+
+from .contents import Contents, read_contents
+from .open_files import OpenFiles
+from .rows import Rows, rows_of
+from .schema import ARRAYS, PICTURES, SOLVED
+
+FEM_KNOWN = "fem_known"
+"""(T,) bool beside arrays of finite elements: which frames they solved."""
+
+
+def episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
+    """Files of episodes, in the order of their names: those given, and those in a folder, or in its `episodes`.
+
+    Raises
+    ------
+    InputError
+        Nothing there, or a folder without episodes.
+    """
+    paths: list[Path] = []
+    for one in [given] if isinstance(given, str | Path) else given:
+        place = path_of(one)
+        if not place.is_dir():
+            paths.append(place)
+            continue
+        inside = place / "episodes" if (place / "episodes").is_dir() else place
+        found = sorted(path for path in inside.glob("*.h5") if not path.name.startswith("."))
+        if not found:
+            raise InputError(f"{place}: holds no episodes (.h5). Name a folder of them, or the files.")
+        paths += found
+    if not paths:
+        raise InputError("no episodes: name a folder of them, or the files.")
+    missing = next((path for path in paths if not path.is_file()), None)
+    if missing is not None:
+        raise InputError(f"{missing}: no such file. Name an episode, .h5, or a folder of them.")
+    return paths
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes(Sequence[dict[str, Any]]):
+    """Windows of frames, each a dictionary by key: (T, ...) arrays, or what an episode has once.
+
+    Pictures are decoded: colour (T, H, W, 3) uint8, depth (T, H, W) float32 [m], segmentation (T, H, W) uint8. Rows of
+    finite elements are NaN where they solved nothing, and `fem_known` (T,) says where. `episode` and `frame` (T,) are
+    there always. Files are opened when they are read, in each process its own.
+
+    Parameters
+    ----------
+    contents
+        Of each episode, as `read_episodes` finds it.
+    keys
+        Arrays and pictures to read.
+    window, step, stride
+        Frames of a window, from one of them to the next, and from one window's first to the next one's.
+    files
+        Which holds the open files.
+    """
+
+    contents: tuple[Contents, ...]
+    keys: tuple[str, ...]
+    window: int = 1
+    step: int = 1
+    stride: int = 1
+    files: OpenFiles = field(default_factory=OpenFiles)
+
+    def __post_init__(self) -> None:
+        for name in ("window", "step", "stride"):
+            if not isinstance(value := getattr(self, name), int) or value < 1:
+                raise InputError(f"{name} {value!r}: give a whole number of frames, 1 or more.")
+        for name in self.keys:
+            without = next((one for one in self.contents if name not in one.shapes), None)
+            if without is not None:
+                raise InputError(f"{without.path}: has no {name!r}. It has {', '.join(sorted(without.shapes))}.")
+
+    @property
+    def span(self) -> int:
+        """Frames from a window's first to its last."""
+        return (self.window - 1) * self.step + 1
+
+    @cached_property
+    def ends(self) -> list[int]:
+        """How many windows there are up to each episode's last."""
+        counts = (
+            (one.frames - self.span) // self.stride + 1 if one.frames >= self.span else 0 for one in self.contents
+        )
+        return list(accumulate(counts))
+
+    def __len__(self) -> int:
+        return self.ends[-1]
+
+    def __getitem__(self, index: int) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The window of a number, counted over all episodes; IndexError beyond the last."""
+        episode, first = self.place(index)
+        return self.at(episode, first)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return (self[index] for index in range(len(self)))
+
+    def place(self, index: int) -> tuple[int, int]:
+        """The number of the episode of a window, and of its first frame; IndexError beyond the last."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"window {index} of {len(self)}")
+        index %= len(self)
+        episode = int(np.searchsorted(self.ends, index, "right"))
+        return episode, (index - (self.ends[episode - 1] if episode else 0)) * self.stride
+
+    def at(self, episode: int, first: int) -> dict[str, Any]:
+        """The window of an episode that begins at a frame.
+
+        Raises
+        ------
+        InputError
+            A window that the episode does not have, a file that is damaged, or a picture that cannot be decoded.
+        """
+        contents = self.contents[episode]
+        if not 0 <= first <= contents.frames - self.span:
+            raise InputError(f"{contents.path}: no {self.span} of its {contents.frames} frames begin at {first}.")
+        frames = range(first, first + self.span, self.step)
+        file = self.files.file(contents.path)
+        found: dict[str, Any] = {name: rows_of(file, contents, name, frames) for name in self.keys}
+        if any(name in ARRAYS and ARRAYS[name].axes[0] == SOLVED for name in self.keys):
+            found[FEM_KNOWN] = np.isin(np.asarray(frames), contents.fem_frames)
+        return {**found, "episode": episode, "frame": np.asarray(frames)}
+
+    def batches(self, size: int, seed: int | None = None) -> Iterator[dict[str, Any]]:
+        """Windows stacked, `size` at a time and fewer at the end; with a `seed` in an order that it shuffles.
+
+        Raises
+        ------
+        InputError
+            As `at`; a size below 1, or rows of different sizes, as those of tumours of two bodies are.
+        """
+        if size < 1:
+            raise InputError(f"batches of {size}: give a whole number of windows, 1 or more.")
+        order = np.arange(len(self)) if seed is None else np.random.default_rng(seed).permutation(len(self))
+        for start in range(0, len(order), size):
+            windows = [self[int(index)] for index in order[start : start + size]]
+            yield {name: _stacked(name, [one[name] for one in windows]) for name in windows[0]}
+
+
+def read_episodes(
+    paths: str | Path | Sequence[str | Path],
+    keys: Sequence[str] | None = None,
+    window: int = 1,
+    step: int = 1,
+    stride: int = 1,
+    most_open: int = 16,
+) -> Episodes:
+    """Windows of frames of episodes: a folder, or files.
+
+    Parameters
+    ----------
+    keys
+        Arrays and pictures by name; None: all numbers and pictures that every episode has.
+    window, step, stride
+        As of `Episodes`.
+    most_open
+        Files that a process holds open.
+
+    Raises
+    ------
+    InputError
+        As `episode_paths`, `read_contents` and `Episodes`.
+    """
+    contents = tuple(read_contents(path) for path in episode_paths(paths))
+    if keys is None:
+        common = set.intersection(*(set(one.shapes) for one in contents)) - {"fem_frames"}
+        keys = sorted(name for name in common if name in PICTURES or ARRAYS[name].kind != "O")
+    return Episodes(contents, tuple(keys), window, step, stride, OpenFiles(most_open))
+
+
+def _stacked(name: str, rows: list[Any]) -> Rows | list[Any]:
+    if isinstance(rows[0], list):
+        return rows
+    try:
+        return np.stack(rows)
+    except ValueError as error:
+        shapes = sorted({np.shape(one) for one in rows})
+        raise InputError(
+            f"{name!r} has shapes {shapes[0]} and {shapes[-1]}: leave it out, or take batches of 1."
+        ) from error
