@@ -69,7 +69,7 @@ def test_lerobot_has_its_layout_and_the_pictures_own_bytes(lerobot, folder):
     info = json.loads((lerobot / "meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0" and info["fps"] == 30 and info["total_frames"] == 16
     depth = info["features"]["observation.images.depth"]
-    assert depth["shape"] == [HEIGHT, WIDTH, 1] and depth["info"]["range_m"] == [0.2, 0.6]
+    assert depth["shape"] == [HEIGHT, WIDTH, 1] and depth["info"]["range_m"] == [0.1, 0.6]
     table = pq.read_table(lerobot / info["data_path"].format(chunk_index=0, file_index=0))
     assert set(table.column_names) == set(info["features"])
     assert table["index"].to_pylist() == list(range(16)) and table["episode_index"].to_pylist() == [0] * 7 + [1] * 9

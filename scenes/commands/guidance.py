@@ -68,7 +68,7 @@ next: read it by h5py; its attributes give units and frames""",
 next: sulcus validate, before you share the data set""",
     "validate": """examples:
   sulcus validate press.h5
-  sulcus validate episodes --json
+  sulcus validate episodes --solve 3 --json
 next: make broken episodes anew, or remove them""",
     "markers": """example:
   sulcus markers --out markers

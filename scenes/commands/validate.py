@@ -22,6 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("episodes", nargs="+", type=Path, help="folders of episodes, or episodes, .h5")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes at a time (%(default)s)")
+    parser.add_argument("--solve", type=int, default=0, metavar="K", help="solve K frames of each episode again")
+    parser.add_argument("--device", default="auto", help="for --solve: cpu, cuda, cuda:1, or auto (%(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
 
@@ -42,6 +44,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.workers < 1:
         raise InputError(f"--workers {args.workers}: at least one process must look.")
+    if args.solve < 0:
+        raise InputError(f"--solve {args.solve}: give a number of frames, or leave it away.")
     paths = episode_paths(args.episodes)
     with tqdm(total=len(paths), unit="episode", file=sys.stderr) as bar:
         found = {}
@@ -49,6 +53,11 @@ def run(args: argparse.Namespace) -> int:
             found[report.path] = report
             bar.update()
     reports = [found[path] for path in dict.fromkeys(paths)]
+    if args.solve:
+        from ..episodes.reading.again import solved_again
+
+        bar = tqdm(reports, unit="episode", desc="solved again", file=sys.stderr)
+        reports = [one if one.problems else solved_again(one, args.solve, args.device) for one in bar]
     broken = [report for report in reports if report.problems]
     if args.json:
         print(json_line({"episodes": len(reports), "broken": len(broken), "files": [as_json(one) for one in reports]}))
@@ -84,4 +93,10 @@ def lines(reports: list[Report], broken: list[Report]) -> list[str]:
     if errors:
         mean, worst = sum(one[0] for one in errors) / len(errors), max(one[1] for one in errors)
         said.append(f"tumour as predicted, against finite elements: {mean:.3f} mm on average, {worst:.3f} mm at most")
+    again = [one for one in reports if one.again_mm is not None]
+    if again:
+        said.append(
+            f"{sum(one.again for one in again)} frames solved again lie at most "
+            f"{max(one.again_mm or 0.0 for one in again):.4f} mm from where the files have them"
+        )
     return said

@@ -27,8 +27,8 @@ from .tasks import task_of
 from .whole_folder import written_folder
 
 VERSION = "v3.0"
-DEPTH_RANGE = (0.2, 0.6)
-"""Of a camera's distance to the cortex [m]: what a reader that must scale depth should scale to."""
+DEPTH_RANGE = (0.1, 0.6)
+"""What a reader that must scale depth should scale to [m]: tools, cortex and drape of all scenes lie within."""
 EXPORTED = ("colour", "colour_right", "depth", "segmentation", "tumour_mask")
 # Megabytes of one table, and tables of one folder, as LeRobot has them.
 FILE_MEGABYTES, FOLDER_FILES = 100, 1000

@@ -1,0 +1,78 @@
+"""Some frames of an episode solved again by finite elements, from its plan and its body alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sim.accuracy import TRAIN
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.runtime.outside_files import read_as
+
+from ...play.reference import TOGETHER, truth_of
+from ..bodies import Body, read_body
+from ..make import body_path
+from ..plan import plan_from
+from ..scripted import drawn_episode, scene_of
+from .contents import contents_of
+from .open_files import REMEDY
+from .rows import numbers_in
+from .validation import Report
+
+# How far two answers may be apart [mm]: at training accuracy; of frames that were played, at the live one.
+SAME_MM, LIVE_MM = 0.02, 0.2
+
+
+def solved_again(report: Report, count: int, device: str = "auto") -> Report:
+    """A report with what solving `count` of its frames again found: where the tumour comes to lie elsewhere.
+
+    Frames are spread evenly. Where the past matters they are the first that were solved, one after the other.
+    """
+    try:
+        with read_as(report.path, "an episode", REMEDY), h5py.File(report.path, "r") as file:
+            contents = contents_of(file, report.path)
+            missing = [name for name in ("plan", "seed", "episode", "body") if name not in contents.said]
+            if missing or "tumour_fem" not in contents.shapes:
+                return _skipped(report, f"frames solved again: it states no {(*missing, 'tumour_fem')[0]}")
+            place = body_path(report.path.parent, int(contents.said["body"]))
+            if not place.is_dir():
+                return _skipped(report, "frames solved again: its body is not beside it")
+            body = read_body(place)
+            frames, found = _answers(contents.said, body, contents.fem_frames, count, device)
+            stored = numbers_in(file, contents, "tumour_fem")[frames]
+            rest = numbers_in(file, contents, "tumour_rest")
+    except InputError as error:
+        said = str(error).removeprefix(f"{report.path}: ")
+        return replace(report, problems=[*report.problems, f"frames cannot be solved again: {said}"])
+    off = 1e3 * np.linalg.norm(rest + found - stored, axis=2).max(axis=1)
+    allowed = LIVE_MM if contents.said.get("deformer") == "fem" else SAME_MM
+    wrong = [f"frame {frame}, solved again, is {far:.3f} mm off." for frame, far in zip(frames, off, strict=True)]
+    broken = [words for words, far in zip(wrong, off, strict=True) if not far <= allowed]
+    return replace(report, problems=[*report.problems, *broken], again_mm=float(off.max()), again=len(frames))
+
+
+def _skipped(report: Report, words: str) -> Report:
+    return replace(report, skipped=[*report.skipped, words])
+
+
+def _answers(
+    said: Mapping[str, Any], body: Body, solved: np.ndarray, count: int, device: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the frames (k,), and the tumour's displacement (k, n, 3) [m] in each."""
+    plan = plan_from(str(said["plan"]), str(said.get("plan_name", "plan")), Path())
+    seed, number = int(said["seed"]), int(said["episode"])
+    theatre = body.theatre(device)
+    scene = scene_of(plan, body, theatre.site, drawn_episode(plan.contents, seed, number), seed, number)
+    fem = theatre.fem(scene, TRAIN, TOGETHER)
+    apart = isinstance(fem, Fem) and fem.problem.plain
+    spread = np.unique(np.linspace(0, len(solved) - 1, min(count, len(solved))).astype(int))
+    frames = solved[spread] if apart else solved[: len(spread)]
+    loads = [scene.loads(theatre.site, scene.path(time), time) for time in map(float, scene.times[frames])]
+    answer = truth_of(theatre, scene, loads)
+    return frames, answer.at(theatre.anatomy.tumour_nodes).displacement
